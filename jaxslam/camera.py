@@ -1,0 +1,143 @@
+"""A calibrated camera: one frozen record, its checks, and the files it comes from."""
+
+import dataclasses
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+
+import numpy as np
+
+from jaxslam.camera_file import read_camera_fields
+from jaxslam.checked import Checked, Range
+from jaxslam.config import configs_dir
+from jaxslam.errors import CameraError, JaxSlamError, nearest
+from jaxslam.files import write_atomically
+
+if TYPE_CHECKING:
+    from jax.typing import DTypeLike
+    from jaxslam_kernels.camera import Intrinsics
+
+_UNITS = {
+    "width": "pixels",
+    "height": "pixels",
+    "fx": "pixels",
+    "fy": "pixels",
+    "cx": "pixels, from the centre of the top-left pixel",
+    "cy": "pixels",
+    "distortion": "k1 k2 p1 p2 k3, as in OpenCV",
+    "depth_scale_per_m": "counts of the depth image a metre",
+    "fps": "frames a second",
+    "baseline_m": "metres between left and right camera",
+    "far_depth_m": "metres; depth beyond it is not trusted on its own",
+    "color_order": "of a live stream; image files are always read right",
+}
+
+
+@dataclass(frozen=True)
+class Camera(Checked):
+    """A pinhole camera with OpenCV's radial-tangential distortion.
+
+    Attributes:
+        name: What to call it in messages.
+        width: Image width in pixels.
+        height: Image height in pixels.
+        fx: Focal length along a row in pixels.
+        fy: Focal length along a column in pixels.
+        cx: Principal point along a row in pixels, from the centre of the top-left pixel.
+        cy: Principal point along a column in pixels.
+        distortion: `(k1, k2, p1, p2, k3)` as in OpenCV; zeros for rectified images.
+        depth_scale_per_m: Counts of the integer depth image a metre: 5000.0 for TUM and Bonn, 1000.0 for
+            millimetres; `None` for a camera whose depth comes in metres or from stereo.
+        fps: Nominal frames a second. Motion models use timestamps, never this.
+        baseline_m: Distance between left and right camera in metres; `None` if not stereo.
+        far_depth_m: Depth in metres beyond which a measured depth is not trusted on its own (in ORB-SLAM,
+            `ThDepth` times the baseline); `None` if not known.
+        color_order: Order of the channels in which the camera's driver hands over a colour image.
+
+    Raises:
+        CameraError: If a value has the wrong type or is impossible.
+    """
+
+    name: str
+    width: Annotated[int, Range(at_least=8, at_most=32768)]
+    height: Annotated[int, Range(at_least=8, at_most=32768)]
+    fx: Annotated[float, Range(above=0)]
+    fy: Annotated[float, Range(above=0)]
+    cx: float
+    cy: float
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    depth_scale_per_m: Annotated[float, Range(above=0)] | None = None
+    fps: Annotated[float, Range(above=0, at_most=100_000)] = 30.0
+    baseline_m: Annotated[float, Range(above=0, at_most=100)] | None = None
+    far_depth_m: Annotated[float, Range(above=0)] | None = None
+    color_order: Literal["rgb", "bgr"] = "rgb"
+
+    _error: ClassVar[type[JaxSlamError]] = CameraError
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_axis("x", self.fx, self.cx, self.width)
+        _check_axis("y", self.fy, self.cy, self.height)
+
+    @classmethod
+    def load(cls, source: str | Path) -> "Camera":
+        """Read a camera by its known name or from a file of jaxslam, ORB-SLAM2 or ORB-SLAM3.
+
+        Args:
+            source: A name such as `tum_fr1` (`known_cameras()` lists them) or the path of a YAML file.
+
+        Raises:
+            CameraError: If there is no such name or file, or the file is incomplete, misspelt or impossible.
+        """
+        path = Path(source)
+        if str(source) in known_cameras():
+            path = _cameras_dir() / f"{source}.yaml"
+        elif not path.is_file():
+            hint = nearest(str(source), known_cameras())
+            raise CameraError(f"camera: expected a known name or a YAML file, got '{source}'{hint}")
+        fields = read_camera_fields(path, [field.name for field in dataclasses.fields(cls)])
+        try:
+            return cls(**fields)
+        except CameraError as error:
+            raise CameraError(f"{path}: {error}") from None
+
+    def save(self, path: str | Path) -> None:
+        """Write jaxslam's own camera file, which `load` reads back to an equal camera.
+
+        Raises:
+            CameraError: If the file cannot be written.
+        """
+        lines = [_line(key, value) for key, value in dataclasses.asdict(self).items() if value is not None]
+        write_atomically(path, ("\n".join(lines) + "\n").encode(), CameraError)
+
+    def intrinsics(self, dtype: "DTypeLike" = np.float32) -> "Intrinsics":
+        """The part of the calibration that the kernels compute with, as arrays of `dtype`."""
+        from jaxslam_kernels.camera import make_intrinsics  # noqa: PLC0415 (JAX takes a second to import)
+
+        return make_intrinsics(self.fx, self.fy, self.cx, self.cy, self.distortion, dtype)
+
+
+def known_cameras() -> list[str]:
+    """The names of the cameras that come with jaxslam."""
+    return sorted(path.stem for path in _cameras_dir().glob("*.yaml"))
+
+
+def _cameras_dir() -> Path:
+    return configs_dir() / "cameras"
+
+
+def _check_axis(axis: str, focal: float, centre: float, extent: int) -> None:
+    shortest, longest = extent / 20, extent * 50  # 169 and 1.1 degrees of view
+    if not shortest <= focal <= longest:
+        raise CameraError(
+            f"Camera.f{axis}: expected pixels that suit an image of {extent}, {shortest:g} to {longest:g},"
+            f" got {focal:g} (millimetres, or relative to the width?)"
+        )
+    if not 0 < centre < extent:
+        raise CameraError(f"Camera.c{axis}: expected a pixel inside the image, 0 to {extent}, got {centre:g}")
+
+
+def _line(key: str, value: object) -> str:
+    unit = f"  # {_UNITS[key]}" if key in _UNITS else ""
+    return f"{key}: {json.dumps(value, ensure_ascii=False)}{unit}"

@@ -1,0 +1,181 @@
+"""Frozen dataclasses whose fields are checked against their annotations, ranges included."""
+
+import dataclasses
+import functools
+import math
+import numbers
+import reprlib
+import types
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias, Union, get_args, get_origin, get_type_hints
+
+from jaxslam.errors import ConfigError, JaxSlamError
+
+_Args: TypeAlias = tuple[Any, ...]
+_PLAIN: dict[Any, str] = {int: "an integer", float: "a finite number", bool: "true or false", str: "text"}
+
+
+@dataclass(frozen=True)
+class Range:
+    """The numbers a field accepts, as in `Annotated[float, Range(above=0, at_most=1)]`."""
+
+    at_least: float | None = None
+    at_most: float | None = None
+    above: float | None = None
+    below: float | None = None
+
+    def __contains__(self, value: float) -> bool:
+        return (
+            (self.at_least is None or value >= self.at_least)
+            and (self.at_most is None or value <= self.at_most)
+            and (self.above is None or value > self.above)
+            and (self.below is None or value < self.below)
+        )
+
+    def __str__(self) -> str:
+        bounds = ((">=", self.at_least), (">", self.above), ("<=", self.at_most), ("<", self.below))
+        return " and ".join(f"{sign} {bound:g}" for sign, bound in bounds if bound is not None)
+
+
+@dataclass(frozen=True)
+class Checked:
+    """Base of dataclasses that refuse a field of the wrong type or out of range, however they are built.
+
+    Annotations may be `int`, `float`, `bool`, `str`, `Literal`, `tuple`, another dataclass, a union of these
+    or `None`, each optionally `Annotated` with a `Range`. Lists become tuples and whole numbers floats where
+    the annotation says so: equal settings compare and hash equal.
+    """
+
+    _error: ClassVar[type[JaxSlamError]] = ConfigError
+
+    def __post_init__(self) -> None:
+        for name, hint in field_hints(type(self)).items():
+            value = checked_value(hint, getattr(self, name), f"{type(self).__name__}.{name}", self._error)
+            object.__setattr__(self, name, value)
+
+
+class _MismatchError(ValueError):
+    """A value that does not fit its annotation; never leaves this file."""
+
+
+@functools.cache
+def field_hints(cls: type) -> dict[str, Any]:
+    """The annotations of a dataclass's fields, in order, with their `Annotated` metadata."""
+    hints = get_type_hints(cls, include_extras=True)
+    return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
+
+
+def checked_value(hint: Any, value: object, key: str, error: type[JaxSlamError] = ConfigError) -> Any:
+    """`value` as its annotation wants it.
+
+    Args:
+        hint: The field's annotation.
+        value: What came, from a file, a command line or code.
+        key: What to call the field in the message, such as `track.num_points`.
+        error: The class of error to raise.
+
+    Raises:
+        JaxSlamError: Of class `error`, if the value has the wrong type or is out of range.
+    """
+    try:
+        return _converted(hint, value)
+    except _MismatchError:
+        raise error(f"{key}: expected {_expected(hint)}, got {reprlib.repr(value)}") from None
+
+
+def section_of(hint: Any) -> type[Any] | None:
+    """The dataclass that an annotation such as `X` or `X | None` holds, if it holds one."""
+    choices = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
+    return next((c for c in choices if isinstance(c, type) and dataclasses.is_dataclass(c)), None)
+
+
+def _converted(hint: Any, value: object) -> Any:
+    if convert := _CONVERTERS.get(get_origin(hint)):
+        return convert(get_args(hint), value)
+    if hint in _PLAIN:
+        return _plain(hint, value)
+    if isinstance(hint, type) and (hint is types.NoneType or dataclasses.is_dataclass(hint)):
+        return _require(value, isinstance(value, hint))
+    raise TypeError(f"no check for fields annotated {hint!r}")
+
+
+def _require(value: object, fits: bool) -> Any:
+    if not fits:
+        raise _MismatchError
+    return value
+
+
+def _in_ranges(args: _Args, value: object) -> Any:
+    converted = _converted(args[0], value)
+    ranges = [item for item in args[1:] if isinstance(item, Range)]
+    return _require(converted, converted is None or all(converted in item for item in ranges))
+
+
+def _choice(args: _Args, value: object) -> Any:
+    return _require(value, any(value == choice and type(value) is type(choice) for choice in args))
+
+
+def _first_that_fits(args: _Args, value: object) -> Any:
+    for hint in args:
+        try:
+            return _converted(hint, value)
+        except _MismatchError:
+            continue
+    raise _MismatchError
+
+
+def _tuple(args: _Args, value: object) -> tuple[Any, ...]:
+    if not isinstance(value, list | tuple):
+        raise _MismatchError
+    hints = args[:1] * len(value) if args[-1] is Ellipsis else args
+    _require(value, len(value) == len(hints))
+    return tuple(_converted(hint, item) for hint, item in zip(hints, value, strict=True))
+
+
+_CONVERTERS: dict[Any, Callable[[_Args, object], Any]] = {
+    Annotated: _in_ranges,
+    Literal: _choice,
+    Union: _first_that_fits,
+    types.UnionType: _first_that_fits,
+    tuple: _tuple,
+}
+
+
+def _plain(hint: type, value: object) -> Any:
+    if hint in (bool, str):
+        return _require(value, isinstance(value, hint))
+    kind = numbers.Real if hint is float else numbers.Integral
+    if isinstance(value, bool) or not isinstance(value, kind):
+        raise _MismatchError
+    try:
+        number = hint(value)
+    except OverflowError:
+        raise _MismatchError from None
+    return _require(number, hint is int or math.isfinite(number))
+
+
+def _expected(hint: Any) -> str:
+    args = get_args(hint)
+    if describe := _DESCRIPTIONS.get(get_origin(hint)):
+        return describe(args)
+    return _PLAIN.get(hint) or ("null" if hint is types.NoneType else f"a {hint.__name__}")
+
+
+def _expected_range(args: _Args) -> str:
+    return " ".join([_expected(args[0]), *(str(item) for item in args[1:] if isinstance(item, Range))])
+
+
+def _expected_list(args: _Args) -> str:
+    if args[-1] is Ellipsis:
+        return f"a list, each {_expected(args[0])}"
+    return f"a list of {len(args)}: " + ", ".join(map(_expected, args))
+
+
+_DESCRIPTIONS: dict[Any, Callable[[_Args], str]] = {
+    Annotated: _expected_range,
+    Literal: lambda args: "one of " + ", ".join(map(repr, args)),
+    Union: lambda args: " or ".join(map(_expected, args)),
+    types.UnionType: lambda args: " or ".join(map(_expected, args)),
+    tuple: _expected_list,
+}

@@ -1,0 +1,46 @@
+"""Decoding the images of a recording, with errors that name the file."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from jaxslam.errors import DatasetError
+
+_JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+_AS_STORED = cv2.IMREAD_IGNORE_ORIENTATION  # a calibration speaks of the pixels before any EXIF rotation
+
+
+def read_color(path: Path) -> np.ndarray:
+    """`(height, width, 3)` uint8 RGB; a grey file gives three equal channels.
+
+    Raises:
+        DatasetError: If the file is missing, cut short or no image.
+    """
+    return cv2.cvtColor(_decode(path, cv2.IMREAD_COLOR | _AS_STORED), cv2.COLOR_BGR2RGB)
+
+
+def read_depth(path: Path, scale_per_m: float) -> np.ndarray:
+    """`(height, width)` float32 metres from a uint16 file with `scale_per_m` counts a metre; 0 where missing.
+
+    Raises:
+        DatasetError: If the file is missing, cut short, no image, or its pixels are not one uint16 each.
+    """
+    counts = _decode(path, cv2.IMREAD_UNCHANGED)
+    if counts.dtype != np.uint16 or counts.ndim != 2:
+        channels = 1 if counts.ndim == 2 else counts.shape[2]
+        raise DatasetError(f"{path}: expected depth as one uint16 a pixel, got {channels} x {counts.dtype}")
+    return counts.astype(np.float32) / np.float32(scale_per_m)
+
+
+def _decode(path: Path, flags: int) -> np.ndarray:
+    try:
+        content = path.read_bytes()
+    except OSError as problem:
+        raise DatasetError(f"{path}: cannot be read: {problem.strerror}") from None
+    # libjpeg fills the missing part of a cut file with grey instead of failing
+    is_cut = content.startswith(_JPEG_START) and _JPEG_END not in content[-64:]
+    image = None if is_cut or not content else cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+    if image is None:
+        raise DatasetError(f"{path}: expected an image, got {len(content)} bytes that cannot be decoded")
+    return image

@@ -1,0 +1,87 @@
+"""What a recording is to the rest of jaxslam, and what a loader of one kind of recording provides."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
+from pathlib import Path
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+
+from jaxslam.camera import Camera
+from jaxslam.frame import Frame
+from jaxslam.trajectory import Trajectory
+
+
+class Dataset(Protocol):
+    """A finite recording: frames in the order of time, one camera, and ground truth if there is any."""
+
+    @property
+    def name(self) -> str:
+        """What to call the recording in results."""
+        ...
+
+    @property
+    def camera(self) -> Camera:
+        """The camera that took every frame."""
+        ...
+
+    @property
+    def timestamps_ns(self) -> np.ndarray:
+        """`(n,)` int64 times of the frames in nanoseconds, strictly increasing."""
+        ...
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """The true trajectory, on the frames' clock but at its own times; `None` if there is none."""
+        ...
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int) -> Frame:
+        """Decode frame `index`; raises `IndexError` outside `-n` to `n - 1`."""
+        ...
+
+
+class Unmatched(NamedTuple):
+    """Images left out because no image of the other kind was taken at nearly the same time."""
+
+    color: int
+    depth: int
+
+
+@runtime_checkable
+class Associated(Protocol):
+    """A recording whose colour and depth were taken apart and have been matched by time."""
+
+    @property
+    def unmatched(self) -> Unmatched:
+        """How many images found no partner."""
+        ...
+
+
+class Fit(IntEnum):
+    """How surely a loader recognises a folder; the surest loader opens it."""
+
+    NO = 0
+    LAYOUT = 1
+    """The files are there."""
+    NAME = 2
+    """The files are there and the folder's name says so too."""
+
+
+@dataclass(frozen=True)
+class Loader:
+    """One kind of recording. A module of this package that holds a `LOADER` is found by itself.
+
+    Attributes:
+        kind: The name by which it is chosen.
+        fit: How surely a folder is of this kind.
+        camera_name: The known camera that a folder was taken with; `None` if its name does not say.
+        open: Opens a folder with its camera.
+    """
+
+    kind: str
+    fit: Callable[[Path], Fit]
+    camera_name: Callable[[Path], str | None]
+    open: Callable[[Path, Camera], Dataset]

@@ -1,0 +1,75 @@
+"""Parts of a recording, and reading ahead of whoever consumes it."""
+
+from collections import deque
+from collections.abc import Generator
+from concurrent.futures import ThreadPoolExecutor
+from itertools import islice
+
+import numpy as np
+
+from jaxslam.camera import Camera
+from jaxslam.datasets.protocol import Dataset
+from jaxslam.errors import DatasetError
+from jaxslam.frame import Frame
+from jaxslam.trajectory import Trajectory
+
+
+class Subset:
+    """Frames `start` to `stop - 1` of another recording, with its camera and its whole ground truth."""
+
+    def __init__(self, dataset: Dataset, start: int = 0, stop: int | None = None) -> None:
+        """Choose the frames as a slice does: negative numbers count from the end.
+
+        Raises:
+            DatasetError: If no frame is left.
+        """
+        self._dataset = dataset
+        self._indices = range(len(dataset))[start:stop]
+        if not self._indices:
+            raise DatasetError(f"{dataset.name}: expected a part of {len(dataset)} frames, got {start}:{stop}")
+        self.name = f"{dataset.name}[{self._indices.start}:{self._indices.stop}]"
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of the whole recording."""
+        return self._dataset.camera
+
+    @property
+    def timestamps_ns(self) -> np.ndarray:
+        """`(n,)` int64 nanoseconds of the chosen frames."""
+        return self._dataset.timestamps_ns[self._indices.start : self._indices.stop]
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """The ground truth of the whole recording."""
+        return self._dataset.ground_truth
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    def __getitem__(self, index: int) -> Frame:
+        return self._dataset[self._indices[index]]
+
+
+def prefetch(dataset: Dataset, ahead: int = 4) -> Generator[Frame]:
+    """Every frame in order, decoded in one background thread while the caller works on earlier ones.
+
+    The thread ends with the iterator: when it is exhausted, closed, or thrown away half-way.
+
+    Args:
+        dataset: The recording.
+        ahead: Frames to decode ahead, at least 1; as many are held in memory.
+
+    Raises:
+        JaxSlamError: Whatever decoding a frame raised, when that frame's turn comes.
+    """
+    indices = iter(range(len(dataset)))
+    pool = ThreadPoolExecutor(1, thread_name_prefix="jaxslam-prefetch")
+    try:
+        pending = deque(pool.submit(dataset.__getitem__, index) for index in islice(indices, max(ahead, 1)))
+        while pending:
+            frame = pending.popleft().result()
+            pending.extend(pool.submit(dataset.__getitem__, index) for index in islice(indices, 1))
+            yield frame
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)

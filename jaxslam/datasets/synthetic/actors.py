@@ -1,0 +1,240 @@
+"""Who moves through the room: walking people of capsules, and boxes that are carried.
+
+Each actor has a frame of its own: origin on the floor under it (a person) or in its centre (a box), x forward, z up.
+Motions are closed forms of time in float64, so that ground truth is exact and any frame can be asked for.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from jaxslam.datasets.synthetic import rigid
+from jaxslam.datasets.synthetic.solids import Solid, box, capsule, pill
+from jaxslam.datasets.synthetic.texture import Material
+
+
+class Actor(Protocol):
+    """Something that moves on its own."""
+
+    solids: list[Solid]
+
+    def root(self, time_s: np.ndarray) -> np.ndarray:
+        """Poses `T_world_actor` at `(t,)` seconds: `(t, 7)`, wxyz_xyz."""
+        ...
+
+    def parts(self, time_s: np.ndarray) -> np.ndarray:
+        """Placements `T_actor_solid` of its solids: `(t, len(solids), 4, 4)`."""
+        ...
+
+
+@dataclass(frozen=True)
+class Lane:
+    """An ellipse on the floor and how it is walked.
+
+    Attributes:
+        centre: `(x, y)` metres.
+        semi_axes: Along x and y, metres.
+        rate: Radians a second, negative for clockwise.
+    """
+
+    centre: tuple[float, float]
+    semi_axes: tuple[float, float]
+    rate: float
+
+
+_ACROSS_VIEW = (
+    Lane((-0.90, 0.0), (0.10, 0.70), 0.95),
+    Lane((-0.38, 0.0), (0.10, 0.85), -0.80),
+    Lane((1.50, 0.0), (0.30, 1.30), 0.50),
+)
+_ROUND_DESK = (Lane((0.4, 0.0), (0.85, 1.10), 0.45),)
+
+
+def cast(path: str, people: int, boxes: int, seed: int) -> list[Actor]:
+    """The actors of a scene.
+
+    The first two cross the view of the camera close in front of it and in front of the desk, the others go round
+    behind the desk; where the camera goes round the desk, all go round it too. Who shares a lane keeps a distance.
+
+    Args:
+        path: The camera's path.
+        people: How many people walk; they are actors 1 to `people`.
+        boxes: How many boxes are carried; the actors after them.
+        seed: Chooses where they start, their sizes and clothes.
+    """
+    lanes = _ROUND_DESK if path == "loop" else _ACROSS_VIEW
+    actors: list[Actor] = []
+    for index in range(people + boxes):
+        lane = min(index, len(lanes) - 1)
+        sharing = people + boxes - lane if lane == len(lanes) - 1 else 1
+        start = np.random.default_rng([seed, 300, lane]).uniform(0.0, 2.0 * np.pi)
+        start += 2.0 * np.pi * (index - lane) / sharing
+        kind = Person if index < people else CarriedBox
+        actors.append(kind(lanes[lane], start, np.random.default_rng([seed, 200, index])))
+    return actors
+
+
+def _walk(lane: Lane, start: float, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Position `(t, 2)`, heading `(t,)` and speed `(t,)` on a lane, with a pace that varies a little."""
+    angle = start + lane.rate * time_s + 0.15 * np.sin(0.9 * time_s + start)
+    rate = lane.rate + 0.135 * np.cos(0.9 * time_s + start)
+    a, b = lane.semi_axes
+    position = np.array(lane.centre) + np.stack([a * np.cos(angle), b * np.sin(angle)], axis=-1)
+    speed = np.abs(rate) * np.hypot(a * np.sin(angle), b * np.cos(angle))
+    # A lane is narrow; whoever turns at its end turns as on a rounder one, not on the spot.
+    rounder = max(a, 0.4 * b)
+    sign = np.sign(lane.rate)
+    heading = np.arctan2(sign * b * np.cos(angle), -sign * rounder * np.sin(angle))
+    return position, heading, speed
+
+
+_SKIN = Material((0.72, 0.50, 0.38), (0.85, 0.64, 0.52), noise_per_m=9.0, noise=0.35)
+_HAIR = Material((0.10, 0.07, 0.05), (0.26, 0.18, 0.12), noise_per_m=20.0, stretch=4.0, noise=0.8)
+_SHOE = Material((0.10, 0.10, 0.11), (0.25, 0.24, 0.23), noise_per_m=12.0, noise=0.5)
+_STRIDES_PER_S = 0.85
+_LEG_M = 0.88
+
+
+class Person:
+    """A walking person of fifteen capsules and ellipsoids; the swing of arms and legs follows the speed."""
+
+    def __init__(self, lane: Lane, start: float, rng: np.random.Generator) -> None:
+        self._lane = lane
+        self._start = start
+        self._scale = rng.uniform(0.94, 1.05)
+        self.solids = _body(self._scale, rng)
+
+    def root(self, time_s: np.ndarray) -> np.ndarray:
+        """Poses of the point on the floor under the hips, x forward: `(t, 7)`, wxyz_xyz."""
+        position, heading, _ = _walk(self._lane, self._start, time_s)
+        floor = np.zeros((len(position), 1))
+        return np.concatenate([rigid.axis_rotation(2, heading), position, floor], axis=1)
+
+    def parts(self, time_s: np.ndarray) -> np.ndarray:
+        """Placements of the body's solids in its frame: `(t, 15, 4, 4)`."""
+        _, _, speed = _walk(self._lane, self._start, time_s)
+        phase = 2.0 * np.pi * _STRIDES_PER_S * time_s + self._start
+        swing = np.arcsin(np.minimum(speed / (4.0 * _STRIDES_PER_S * _LEG_M), 0.6))
+        trunk = [_still(time_s, place) for place in _TRUNK]
+        limbs = [_limbs(side, phase, swing) for side in (-1.0, 1.0)]
+        parts = np.stack([*trunk, *limbs[0], *limbs[1]], axis=1)
+        # The hips sink when the legs are apart.
+        parts[..., 2, 3] -= 0.04 * (swing * np.sin(phase))[:, None] ** 2
+        parts[..., :3, 3] *= self._scale
+        return parts
+
+
+_TRUNK = ((0.0, 0.0, 1.19), (0.0, 0.0, 0.96), (0.01, 0.0, 1.50), (0.02, 0.0, 1.63), (-0.01, 0.0, 1.655))
+"""Where torso, hips, neck, head and hair are on a person of average size, in metres."""
+
+
+def _body(scale: float, rng: np.random.Generator) -> list[Solid]:
+    shirt, trousers = _clothes(rng, patches=0.6), _clothes(rng, patches=0.15)
+    sleeve = shirt if rng.uniform() < 0.6 else _SKIN
+
+    def limb(radius: float, length: float, look: Material) -> Solid:
+        return capsule(scale * radius, scale * length, look, rng)
+
+    def oval(radii: tuple[float, float, float], length: float, look: Material) -> Solid:
+        x, y, z = (scale * radius for radius in radii)
+        return pill((x, y, z), scale * length, look, rng)
+
+    trunk = [
+        oval((0.115, 0.185, 0.10), 0.32, shirt),
+        oval((0.115, 0.165, 0.10), 0.10, trousers),
+        limb(0.055, 0.08, _SKIN),
+        oval((0.095, 0.078, 0.12), 0.0, _SKIN),
+        oval((0.098, 0.086, 0.115), 0.0, _HAIR),
+    ]
+    limbs = [
+        limb(0.085, 0.42, trousers),
+        limb(0.058, 0.40, trousers),
+        limb(0.045, 0.15, _SHOE),
+        limb(0.052, 0.27, shirt),
+        limb(0.042, 0.30, sleeve),
+    ]
+    return [*trunk, *limbs, *limbs]
+
+
+def _clothes(rng: np.random.Generator, patches: float) -> Material:
+    dark = rng.uniform(0.08, 0.55, 3)
+    light = np.clip(dark + rng.uniform(0.1, 0.35, 3), 0.0, 1.0)
+    size = rng.uniform(0.10, 0.22)
+    bright = np.clip(light + rng.uniform(0.1, 0.4, 3), 0.0, 1.0)
+    return Material(
+        tuple(dark),
+        tuple(light),
+        tuple(0.4 * dark),
+        tuple(bright),
+        noise_per_m=8.0,
+        noise=0.6,
+        patch_m=size,
+        patch_density=patches,
+    )
+
+
+def _limbs(side: float, phase: np.ndarray, swing: np.ndarray) -> list[np.ndarray]:
+    """Thigh, shin, foot, upper arm and forearm of one side, each `(t, 4, 4)`; the arm swings against the leg."""
+    step = side * np.sin(phase)
+    bend = swing * (0.8 + 0.7 * side * np.cos(phase))
+    hip, thigh = np.array([0.0, 0.09 * side, 0.92]), -swing * step
+    knee = hip + _below(thigh, 0.42)
+    ankle = knee + _below(thigh + bend, 0.40)
+    toe = ankle + _below(thigh + bend - np.pi / 2.0, 0.15)
+    shoulder, arm = np.array([0.0, 0.225 * side, 1.40]), 0.9 * swing * step
+    elbow = shoulder + _below(arm, 0.27)
+    wrist = elbow + _below(arm - 0.35, 0.30)
+    hips, shoulders = np.broadcast_to(hip, knee.shape), np.broadcast_to(shoulder, elbow.shape)
+    return [
+        _bone(hips, knee, thigh),
+        _bone(knee, ankle, thigh + bend),
+        _bone(ankle, toe, thigh + bend - np.pi / 2.0),
+        _bone(shoulders, elbow, arm),
+        _bone(elbow, wrist, arm - 0.35),
+    ]
+
+
+def _below(angle: np.ndarray, length: float) -> np.ndarray:
+    """`(t, 3)` vectors that hang down, turned about y; a negative angle swings forward."""
+    return -length * np.stack([np.sin(angle), np.zeros_like(angle), np.cos(angle)], axis=-1)
+
+
+def _bone(first: np.ndarray, second: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    rotation = rigid.rotation_matrix(rigid.axis_rotation(1, angle))
+    return rigid.transform(rotation, 0.5 * (first + second))
+
+
+def _still(time_s: np.ndarray, place: tuple[float, float, float]) -> np.ndarray:
+    return np.broadcast_to(rigid.transform(np.eye(3), np.array(place)), (len(time_s), 4, 4))
+
+
+class CarriedBox:
+    """A textured box carried about at the height of a chest, turning as it goes: a mover no detector knows."""
+
+    def __init__(self, lane: Lane, start: float, rng: np.random.Generator) -> None:
+        self._lane = lane
+        self._start = start
+        half = rng.uniform((0.16, 0.20, 0.18), (0.22, 0.32, 0.34))
+        look = Material(
+            (0.50, 0.40, 0.26),
+            (0.72, 0.58, 0.40),
+            dark=tuple(rng.uniform(0.0, 0.4, 3)),
+            noise_per_m=5.0,
+            stretch=2.0,
+            noise=0.6,
+            patch_m=0.22,
+            patch_density=0.6,
+        )
+        self.solids = [box((half[0], half[1], half[2]), look, rng)]
+
+    def root(self, time_s: np.ndarray) -> np.ndarray:
+        """Poses of the centre of the box: `(t, 7)`, wxyz_xyz."""
+        position, _, _ = _walk(self._lane, self._start, time_s)
+        height = 1.1 + 0.18 * np.sin(0.7 * time_s + 2.0 * self._start)
+        turn = 0.5 * np.sin(0.45 * time_s + self._start)
+        return np.concatenate([rigid.axis_rotation(2, turn), position, height[:, None]], axis=1)
+
+    def parts(self, time_s: np.ndarray) -> np.ndarray:
+        """The box lies along the axes of its frame: `(t, 1, 4, 4)` identities."""
+        return np.broadcast_to(np.eye(4), (len(time_s), 1, 4, 4))

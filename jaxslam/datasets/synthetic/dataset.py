@@ -1,0 +1,209 @@
+"""The synthetic recording: any frame of it, at any time, from a configuration and a seed."""
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam.camera import Camera
+from jaxslam.checked import Checked, Range
+from jaxslam.datasets.synthetic import rigid
+from jaxslam.datasets.synthetic.actors import cast
+from jaxslam.datasets.synthetic.camera_path import CameraPathKind, camera_path
+from jaxslam.datasets.synthetic.render import Rendering, View, pack_scene, render
+from jaxslam.datasets.synthetic.scene import furnish
+from jaxslam.datasets.synthetic.sensor import SensorConfig, measure, sensor_params
+from jaxslam.errors import ConfigError
+from jaxslam.frame import Frame
+from jaxslam.trajectory import Trajectory
+
+DEPTH_COUNTS_PER_M = 5000.0
+"""Of depth images in files, as in TUM RGB-D."""
+_START_NS = 1_600_000_000_000_000_000
+
+
+@dataclass(frozen=True)
+class SyntheticConfig(Checked):
+    """What to record. Frame `i` does not depend on how many frames there are.
+
+    Attributes:
+        seed: Chooses textures, clothes, where things lie, the phases of all motions, and the noise.
+        frames: Number of frames.
+        path: How the camera moves; see `camera_path.CameraPathKind`. `loop` comes back after 32 s.
+        people: Number of walking people: actors 1 to `people`. Two or three at times fill half of the picture.
+        boxes: Number of carried boxes: the actors after the people.
+        width: Pixels of a row.
+        height: Pixels of a column.
+        fps: Frames a second.
+        fx: Focal length along a row in pixels; `None` for `525 * width / 640`.
+        fy: Focal length along a column in pixels; `None` for the same as `fx`.
+        cx: Principal point in pixels; `None` for the middle of the image.
+        cy: Principal point in pixels; `None` for the middle of the image.
+        sensor: The faults of the camera.
+
+    Raises:
+        ConfigError: A field has the wrong type or is out of range, or `sensor.exposure_samples` is even.
+    """
+
+    seed: Annotated[int, Range(at_least=0, below=2**31)] = 0
+    frames: Annotated[int, Range(at_least=1)] = 300
+    path: CameraPathKind = "xyz"
+    people: Annotated[int, Range(at_least=0, at_most=24)] = 2
+    boxes: Annotated[int, Range(at_least=0, at_most=24)] = 0
+    width: Annotated[int, Range(at_least=8, at_most=8192)] = 640
+    height: Annotated[int, Range(at_least=8, at_most=8192)] = 480
+    fps: Annotated[float, Range(above=0, at_most=1000)] = 30.0
+    fx: Annotated[float, Range(above=0)] | None = None
+    fy: Annotated[float, Range(above=0)] | None = None
+    cx: float | None = None
+    cy: float | None = None
+    sensor: SensorConfig = field(default_factory=SensorConfig)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.sensor.exposure_samples % 2 == 0:
+            raise ConfigError(
+                "SensorConfig.exposure_samples: expected an odd integer, so that one moment is the frame's own,"
+                f" got {self.sensor.exposure_samples}"
+            )
+
+
+@dataclass(frozen=True)
+class SyntheticFrame:
+    """One frame with all that is known about it.
+
+    Attributes:
+        timestamp_ns: Time of the middle of the exposure.
+        rgb: `(height, width, 3)` uint8, as measured.
+        depth_m: `(height, width)` float32 depth as measured; 0 where missing.
+        exact_depth_m: `(height, width)` float32 depth at the pixels' centres; never missing.
+        instance_mask: `(height, width)` int32; 0 on static things, otherwise the number of the actor.
+        T_world_cam: `(7,)` float64 camera pose, wxyz_xyz.
+        T_world_actor: `(actors, 7)` float64 poses of the actors, wxyz_xyz; that of actor `k` is in row `k - 1`.
+    """
+
+    timestamp_ns: int
+    rgb: np.ndarray
+    depth_m: np.ndarray
+    exact_depth_m: np.ndarray
+    instance_mask: np.ndarray
+    T_world_cam: np.ndarray
+    T_world_actor: np.ndarray
+
+
+class SyntheticDataset:
+    """A recording of a furnished room with walking people, rendered when a frame is asked for.
+
+    Two datasets of the same configuration give the same bytes on the same machine, in any order of frames.
+
+    Args:
+        config: What to record; everything has a default.
+    """
+
+    def __init__(self, config: SyntheticConfig | None = None) -> None:
+        self.config = config = config or SyntheticConfig()
+        self.name = f"synthetic_{config.path}_{config.people}people_{config.boxes}boxes_seed{config.seed}"
+        self.width, self.height, self.fps = config.width, config.height, config.fps
+        self.fx = 525.0 * config.width / 640.0 if config.fx is None else config.fx
+        self.fy = self.fx if config.fy is None else config.fy
+        self.cx = 0.5 * (config.width - 1) if config.cx is None else config.cx
+        self.cy = 0.5 * (config.height - 1) if config.cy is None else config.cy
+        # Whole microseconds: six decimals of a second hold them exactly.
+        elapsed_us = np.round(np.arange(config.frames) * (1e6 / config.fps)).astype(np.int64)
+        self.timestamps_ns = _START_NS + 1000 * elapsed_us
+        self._time_s = 1e-6 * elapsed_us
+        self.T_world_cam = camera_path(config.path, self._time_s, config.seed)
+        self.ground_truth = Trajectory(self.timestamps_ns, self.T_world_cam)
+        self.camera = Camera(
+            self.name,
+            self.width,
+            self.height,
+            self.fx,
+            self.fy,
+            self.cx,
+            self.cy,
+            depth_scale_per_m=DEPTH_COUNTS_PER_M,
+            fps=self.fps,
+        )
+        self.actors = cast(config.path, config.people, config.boxes, config.seed)
+        static = furnish(config.seed)
+        owned = [(solid, number) for number, actor in enumerate(self.actors, 1) for solid in actor.solids]
+        solids = [(placed.solid, 0) for placed in static] + owned
+        self._scene, self._slots = pack_scene([solid for solid, _ in solids], [number for _, number in solids])
+        self._static_from_world = rigid.inverse(np.stack([placed.T_world_solid for placed in static]))
+        self._key = jax.random.key(config.seed)
+
+    def __len__(self) -> int:
+        return self.config.frames
+
+    def __getitem__(self, index: int) -> Frame:
+        """Frame `index` as a camera would deliver it: without a mask of what moves."""
+        frame = self.render(index)
+        return Frame(frame.timestamp_ns, frame.rgb, frame.depth_m)
+
+    def render(self, index: int) -> SyntheticFrame:
+        """Frame `index` with its ground truth.
+
+        Raises:
+            IndexError: If there is no such frame.
+        """
+        index = range(len(self))[index]
+        time_s = float(self._time_s[index])
+        moments = self._expose(time_s)
+        own = moments[len(moments) // 2]
+        channels, depth_m = measure(
+            tuple(moment.colour for moment in moments),
+            own.depth_m,
+            own.incidence,
+            self.fx,
+            self._gain(time_s),
+            sensor_params(self.config.sensor),
+            jax.random.fold_in(self._key, index),
+        )
+        return SyntheticFrame(
+            timestamp_ns=int(self.timestamps_ns[index]),
+            # Interleaving the channels takes XLA as long as rendering does.
+            rgb=cv2.merge(list(np.asarray(channels))),
+            depth_m=np.asarray(depth_m),
+            exact_depth_m=np.asarray(own.depth_m),
+            instance_mask=np.asarray(own.owner),
+            T_world_cam=self.T_world_cam[index].copy(),
+            T_world_actor=self.T_world_actor(np.array([time_s]))[0],
+        )
+
+    def T_world_actor(self, time_s: np.ndarray) -> np.ndarray:
+        """Poses of the actors at `(t,)` seconds since the start: `(t, actors, 7)` float64, wxyz_xyz."""
+        poses = [actor.root(time_s) for actor in self.actors]
+        return np.stack(poses, axis=1) if poses else np.zeros((len(time_s), 0, 7))
+
+    def _expose(self, time_s: float) -> list[Rendering]:
+        """The moments of one exposure, evenly in time, each on its own row and column within the pixel."""
+        n = self.config.sensor.exposure_samples
+        rank = np.arange(n)
+        centred = (rank + 0.5) / n - 0.5
+        offsets = np.stack([centred, centred[(2 * rank + (n + 1) // 2) % n]], axis=1)
+        views = self._views(time_s + self.config.sensor.exposure_s * centred, offsets)
+        return [render(self._scene, view, height=self.height, width=self.width) for view in views]
+
+    def _views(self, time_s: np.ndarray, offsets: np.ndarray) -> list[View]:
+        world_from_cam = rigid.matrix_from_pose(camera_path(self.config.path, time_s, self.config.seed))
+        from_world = [np.broadcast_to(self._static_from_world, (len(time_s), *self._static_from_world.shape))]
+        for actor in self.actors:
+            root = rigid.matrix_from_pose(actor.root(time_s))
+            from_world.append(rigid.inverse(root[:, None] @ actor.parts(time_s)))
+        solid_from_cam = np.zeros((len(time_s), len(self._scene.owner), 3, 4), np.float32)
+        solid_from_cam[:] = np.eye(4)[:3]
+        solid_from_cam[:, self._slots] = (np.concatenate(from_world, axis=1) @ world_from_cam[:, None])[:, :, :3]
+        intrinsics = np.array([self.fx, self.fy, self.cx, self.cy], np.float32)
+        return [
+            View(*map(jnp.asarray, (solids, camera[:3].astype(np.float32), intrinsics, offset.astype(np.float32))))
+            for solids, camera, offset in zip(solid_from_cam, world_from_cam, offsets, strict=True)
+        ]
+
+    def _gain(self, time_s: float) -> float:
+        phases = np.random.default_rng([self.config.seed, 400]).uniform(0.0, 2.0 * np.pi, 2)
+        waves = np.sin(2.0 * np.pi * time_s / np.array([9.0, 5.3]) + phases)
+        return float(1.0 + self.config.sensor.gain_swing * (0.7 * waves[0] + 0.3 * waves[1]))

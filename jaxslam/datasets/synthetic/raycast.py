@@ -1,0 +1,148 @@
+"""Which solid each ray of a tile of the image meets first.
+
+A tile only looks at the solids whose bounds reach into it, in loops of data-dependent length: what is out of sight
+costs nothing. Each loop carries one plane of integers, the depth's bits with the index of the solid in the lowest of
+them: positive floats are ordered as their bits are, so that the nearest hit is a minimum, one pass over the tile a
+solid. On a CPU this takes a sixth of the time that carrying depth and index side by side takes.
+"""
+
+from typing import NamedTuple, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+Plane: TypeAlias = Float[Array, " p"]
+Vectors: TypeAlias = tuple[Plane, Plane, Plane]
+"""One vector a pixel, one plane a component."""
+
+TILE_HEIGHT, TILE_WIDTH = 60, 80
+_NEAR_M = 0.05
+_NOTHING = np.int32(0x7F000000)
+
+
+class Shapes(NamedTuple):
+    """Every solid as seen from one camera pose: first boxes, of which the first is the room, then capsules.
+
+    Attributes:
+        unit_from_cam: Affine maps from camera coordinates to those in which a box is the cube from -1 to 1 and a
+            capsule has radius 1 and its axis along z.
+        stem: Half length of a capsule's axis in those coordinates; 0 for boxes.
+    """
+
+    unit_from_cam: Float[Array, "n 3 4"]
+    stem: Float[Array, " n"]
+
+
+class InTile(NamedTuple):
+    """The solids of one kind that reach into a tile: `indices[:n_reaching]`."""
+
+    indices: Int[Array, "*tiles n"]
+    n_reaching: Int[Array, "*tiles"]
+
+
+def solids_in_tiles(
+    corners: Float[Array, "3 8 n"], intrinsics: Float[Array, " 4"], rows: int, columns: int
+) -> Bool[Array, "tiles n"]:
+    """Whether the bounding box of each solid may reach into each tile.
+
+    Args:
+        corners: The corners of the bounding boxes in camera coordinates.
+        intrinsics: `fx, fy, cx, cy` in pixels.
+        rows: Rows of tiles.
+        columns: Columns of tiles.
+    """
+    x, y, z = corners
+    fx, fy, cx, cy = intrinsics
+    edge_u = jnp.arange(columns + 1, dtype=jnp.float32) * TILE_WIDTH - 0.5 - cx
+    edge_v = jnp.arange(rows + 1, dtype=jnp.float32) * TILE_HEIGHT - 0.5 - cy
+    across, along = _between(fx * x, z, edge_u), _between(fy * y, z, edge_v)
+    ahead = jnp.any(z > _NEAR_M, axis=0)
+    return (along[:, None, :] & across[None, :, :] & ahead[None, None, :]).reshape(rows * columns, -1)
+
+
+def _between(x: Float[Array, "8 n"], z: Float[Array, "8 n"], edges: Float[Array, " k"]) -> Bool[Array, "j n"]:
+    """Between neighbouring edges, with a pixel to spare: false where all corners lie beyond the same edge."""
+    below = jnp.all(x[None] < (edges[:, None, None] - 1.0) * z[None], axis=1)
+    above = jnp.all(x[None] > (edges[:, None, None] + 1.0) * z[None], axis=1)
+    return ~below[:-1] & ~above[1:]
+
+
+def compact(reaches: Bool[Array, "tiles n"], first: int) -> InTile:
+    """List the solids that reach into each tile; `first` is the index of the first column."""
+    order = jnp.argsort(~reaches, axis=1, stable=True).astype(jnp.int32)
+    return InTile(order + first, jnp.sum(reaches, axis=1, dtype=jnp.int32))
+
+
+def nearest_solid(shapes: Shapes, x: Plane, y: Plane, boxes: InTile, capsules: InTile) -> Int[Array, " p"]:
+    """The nearest solid along each ray `(x, y, 1)` of a tile, packed: see `unpack`."""
+    mask = _index_mask(shapes)
+
+    def box(k: Int[Array, ""], nearest: Int[Array, " p"]) -> Int[Array, " p"]:
+        which = boxes.indices[k]
+        enter, leave = _slabs(*_into(shapes.unit_from_cam[which], x, y))
+        return jnp.minimum(nearest, _packed(enter, enter < leave, which, mask))
+
+    def capsule(k: Int[Array, ""], nearest: Int[Array, " p"]) -> Int[Array, " p"]:
+        which = capsules.indices[k]
+        depth, hit = _round(*_into(shapes.unit_from_cam[which], x, y), shapes.stem[which])
+        return jnp.minimum(nearest, _packed(depth, hit, which, mask))
+
+    _, wall = _slabs(*_into(shapes.unit_from_cam[0], x, y))
+    nearest = _packed(wall, wall > 0.0, jnp.int32(0), mask)
+    nearest = jax.lax.fori_loop(0, boxes.n_reaching, box, nearest)
+    return jax.lax.fori_loop(0, capsules.n_reaching, capsule, nearest)
+
+
+def unpack(shapes: Shapes, packed: Int[Array, " p"]) -> tuple[Plane, Int[Array, " p"]]:
+    """Depth, short of the few bits that the index takes, and index of the solid."""
+    mask = _index_mask(shapes)
+    return jax.lax.bitcast_convert_type(packed & ~mask, jnp.float32), packed & mask
+
+
+def _index_mask(shapes: Shapes) -> np.int32:
+    return np.int32((1 << (shapes.stem.shape[0] - 1).bit_length()) - 1)
+
+
+def _packed(depth: Plane, hit: Bool[Array, " p"], which: Int[Array, ""], mask: np.int32) -> Int[Array, " p"]:
+    bits = jax.lax.bitcast_convert_type(depth, jnp.int32)
+    return jnp.where(hit & (depth > _NEAR_M), (bits & ~mask) | which, _NOTHING)
+
+
+def _into(transform: Float[Array, "3 4"], x: Plane, y: Plane) -> tuple[Float[Array, " 3"], Vectors]:
+    """Origin and directions of the rays `(x, y, 1)` in the coordinates of a solid."""
+    a, b, c = (row[0] * x + row[1] * y + row[2] for row in transform)
+    return transform[:, 3], (a, b, c)
+
+
+def _slabs(origin: Float[Array, " 3"], rays: Vectors) -> tuple[Plane, Plane]:
+    """Depths at which rays enter and leave the cube from -1 to 1 (slab method, Kay & Kajiya 1986)."""
+    inverse = [1.0 / jnp.where(jnp.abs(ray) < 1e-9, 1e-9, ray) for ray in rays]
+    middle = [-start * slope for start, slope in zip(origin, inverse, strict=True)]
+    x, y, z = (jnp.abs(slope) for slope in inverse)
+    enter = jnp.maximum(jnp.maximum(middle[0] - x, middle[1] - y), middle[2] - z)
+    leave = jnp.minimum(jnp.minimum(middle[0] + x, middle[1] + y), middle[2] + z)
+    return enter, leave
+
+
+def _round(origin: Float[Array, " 3"], rays: Vectors, stem: Float[Array, ""]) -> tuple[Plane, Bool[Array, " p"]]:
+    """Depths at which rays enter a capsule of radius 1, and whether they do.
+
+    Distances to the axis are measured from the point of closest approach, which keeps float32 accurate for thin
+    limbs far away.
+    """
+    dx, dy, dz = rays
+    ox, oy, oz = origin
+    slope = 1.0 / jnp.maximum(dx * dx + dy * dy, 1e-12)
+    closest = -(ox * dx + oy * dy) * slope
+    rim = 1.0 - (ox + closest * dx) ** 2 - (oy + closest * dy) ** 2
+    side = closest - jnp.sqrt(jnp.maximum(rim, 0.0) * slope)
+    height = oz + side * dz
+    from_cap = oz - jnp.clip(height, -stem, stem)
+    slope = 1.0 / (dx * dx + dy * dy + dz * dz)
+    closest = -(ox * dx + oy * dy + from_cap * dz) * slope
+    ball = 1.0 - (ox + closest * dx) ** 2 - (oy + closest * dy) ** 2 - (from_cap + closest * dz) ** 2
+    end = closest - jnp.sqrt(jnp.maximum(ball, 0.0) * slope)
+    on_side = jnp.abs(height) <= stem
+    return jnp.where(on_side, side, end), (rim > 0.0) & (on_side | (ball > 0.0))

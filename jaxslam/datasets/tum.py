@@ -1,0 +1,129 @@
+"""Recordings in the layout of the TUM RGB-D benchmark: `rgb.txt`, `depth.txt`, perhaps `groundtruth.txt`.
+
+Source: Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012.
+"""
+
+import functools
+import re
+from pathlib import Path
+
+import numpy as np
+
+from jaxslam.camera import Camera
+from jaxslam.datasets.file_list import FileList, read_file_list
+from jaxslam.datasets.image_file import read_color, read_depth
+from jaxslam.datasets.protocol import Fit, Loader, Unmatched
+from jaxslam.errors import CameraError, DatasetError
+from jaxslam.frame import Frame
+from jaxslam.trajectory import Trajectory, associate, read_tum
+
+MAX_GAP_S = 0.02
+"""Colour and depth further apart in time than this are no pair (the benchmark's own `associate.py`)."""
+
+_COLOR_LIST, _DEPTH_LIST, _GROUND_TRUTH = "rgb.txt", "depth.txt", "groundtruth.txt"
+_NAME = re.compile(r"rgbd_dataset_freiburg([123])_")
+
+
+class TumDataset:
+    """A recording whose colour and depth images are listed apart and matched by time, one to one.
+
+    A frame has the time of its colour image. Depth counts become metres; nothing else is done to the images.
+
+    Attributes:
+        name: The folder's name.
+        camera: The camera that took the frames.
+        timestamps_ns: `(n,)` int64 nanoseconds, strictly increasing.
+        unmatched: How many images were left out because they found no partner within `MAX_GAP_S`.
+    """
+
+    def __init__(self, folder: Path, camera: Camera) -> None:
+        """Read the lists and match them; images are decoded when a frame is asked for.
+
+        Raises:
+            DatasetError: If a list is missing or malformed, a listed image is missing, or nothing matches.
+            CameraError: If the camera does not say how many counts make a metre.
+        """
+        if camera.depth_scale_per_m is None:
+            raise CameraError(f"camera '{camera.name}': depth_scale_per_m: expected a number, got none")
+        color, depth = read_file_list(folder / _COLOR_LIST), read_file_list(folder / _DEPTH_LIST)
+        color_index, depth_index = _match(color, depth)
+        matched = len(color_index)
+        self.name = folder.name
+        self.camera = camera
+        self.timestamps_ns = color.timestamps_ns[color_index]
+        self.unmatched = Unmatched(len(color.files) - matched, len(depth.files) - matched)
+        self._folder = folder
+        self._depth_scale_per_m = camera.depth_scale_per_m
+        self._files = [(color.files[i], depth.files[j]) for i, j in zip(color_index, depth_index, strict=True)]
+        _check_present(self._files)
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """The poses of `groundtruth.txt`, read when first asked for; `TrajectoryError` if malformed."""
+        return self._ground_truth
+
+    @functools.cached_property
+    def _ground_truth(self) -> Trajectory | None:
+        path = self._folder / _GROUND_TRUTH
+        return read_tum(path) if path.is_file() else None
+
+    def __len__(self) -> int:
+        return len(self._files)
+
+    def __getitem__(self, index: int) -> Frame:
+        """Decode one frame.
+
+        Raises:
+            IndexError: If there is no such frame.
+            DatasetError: If an image is unreadable, or the two images or the camera differ in size.
+        """
+        color_file, depth_file = self._files[index]
+        image, depth_m = read_color(color_file), read_depth(depth_file, self._depth_scale_per_m)
+        for file, shape in ((color_file, image.shape), (depth_file, depth_m.shape)):
+            if shape[:2] != (self.camera.height, self.camera.width):
+                raise DatasetError(
+                    f"{file}: expected {self.camera.width}x{self.camera.height} pixels, the size of camera"
+                    f" '{self.camera.name}', got {shape[1]}x{shape[0]}"
+                )
+        return Frame(int(self.timestamps_ns[index]), image, depth_m)
+
+
+def has_layout(folder: Path) -> bool:
+    """Whether a folder holds the two lists that every recording of this layout has."""
+    return (folder / _COLOR_LIST).is_file() and (folder / _DEPTH_LIST).is_file()
+
+
+def _match(color: FileList, depth: FileList) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of the colour and depth images that belong together, in the order of time."""
+    pairs = associate(color.timestamps_ns, depth.timestamps_ns, MAX_GAP_S)
+    if not len(pairs[0]):
+        raise DatasetError(
+            f"{color.source}: expected times within {MAX_GAP_S} s of those in {depth.source.name},"
+            f" got {_span(color)} against {_span(depth)} (another clock or unit?)"
+        )
+    return pairs
+
+
+def _span(images: FileList) -> str:
+    first, last = images.timestamps_ns[[0, -1]] / 1e9
+    return f"{first:.3f} to {last:.3f} s"
+
+
+def _check_present(files: list[tuple[Path, Path]]) -> None:
+    missing = [file for pair in files for file in pair if not file.is_file()]
+    if missing:
+        raise DatasetError(f"{missing[0]}: listed but missing, one of {len(missing)} such images")
+
+
+def _fit(folder: Path) -> Fit:
+    if not has_layout(folder):
+        return Fit.NO
+    return Fit.NAME if _NAME.match(folder.name) else Fit.LAYOUT
+
+
+def _camera_name(folder: Path) -> str | None:
+    match = _NAME.match(folder.name)
+    return f"tum_fr{match[1]}" if match else None
+
+
+LOADER = Loader("tum", _fit, _camera_name, TumDataset)

@@ -1,0 +1,37 @@
+"""The errors jaxslam raises at its edge: every one is a `JaxSlamError` and prints as one line."""
+
+import difflib
+from collections.abc import Iterable
+
+
+class JaxSlamError(Exception):
+    """Bad input or a bad setting; the message names the field, what was expected and what came."""
+
+
+class FrameError(JaxSlamError):
+    """A frame that cannot be used: wrong type, shape, or a time that goes backwards."""
+
+
+class ConfigError(JaxSlamError):
+    """An unknown key or preset, or a value of the wrong type or out of range."""
+
+
+class CameraError(JaxSlamError):
+    """A camera file that is missing, unreadable, incomplete or implausible."""
+
+
+class DatasetError(JaxSlamError):
+    """A recording that is missing, incomplete or unreadable."""
+
+
+class TrajectoryError(JaxSlamError):
+    """A trajectory file that is unreadable, or two trajectories that cannot be compared."""
+
+
+def nearest(name: str, valid: Iterable[str]) -> str:
+    """A hint for a misspelt name: ` (did you mean 'x'?)` or, when nothing is close, the valid names."""
+    choices = sorted(valid)
+    close = difflib.get_close_matches(name, choices, n=1)
+    if close:
+        return f" (did you mean '{close[0]}'?)"
+    return f" (valid: {', '.join(choices)})" if choices else ""

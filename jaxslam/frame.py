@@ -1,0 +1,117 @@
+"""One frame as it enters jaxslam, checked once, here."""
+
+import numbers
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from jaxslam.errors import FrameError
+
+_INT64 = np.iinfo(np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A colour or grey image with depth, taken at one time.
+
+    Only the structure is checked: a black image, a frozen one or a depth of NaN is a frame like any other,
+    and the tracker reports what it makes of it. Arrays are kept as they are, not copied: do not write to them
+    while jaxslam works on the frame.
+
+    Attributes:
+        timestamp_ns: Time of exposure, int nanoseconds on any clock that only goes forward.
+        image: `(height, width, 3)` RGB or `(height, width)` grey, uint8.
+        depth_m: `(height, width)` float32 depth along the optical axis in metres; 0 or NaN where missing.
+        dynamic_mask: `(height, width)` bool, true where something moves or may move; `None` if unknown.
+
+    Raises:
+        FrameError: If a field has the wrong type or shape, or the images differ in size.
+    """
+
+    timestamp_ns: int
+    image: np.ndarray
+    depth_m: np.ndarray
+    dynamic_mask: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        _check_timestamp(self.timestamp_ns)
+        _check_image(self.image)
+        _check_plane("depth_m", self.depth_m, np.float32, self.size)
+        if self.dynamic_mask is not None:
+            _check_plane("dynamic_mask", self.dynamic_mask, np.bool_, self.size)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """`(width, height)` in pixels."""
+        return self.image.shape[1], self.image.shape[0]
+
+
+def check_frame(frame: Frame, width: int, height: int, last_timestamp_ns: int | None = None) -> None:
+    """Refuse a frame that does not fit the camera or the time already reached.
+
+    Args:
+        frame: The frame to check.
+        width: The camera's width in pixels.
+        height: The camera's height in pixels.
+        last_timestamp_ns: Time of the frame before this one; `None` for the first.
+
+    Raises:
+        FrameError: If the size differs from the camera's, or time stands still or goes backwards.
+    """
+    if frame.size != (width, height):
+        raise FrameError(f"image: expected the camera's {_by((width, height))} pixels, got {_by(frame.size)}")
+    if last_timestamp_ns is not None and frame.timestamp_ns <= last_timestamp_ns:
+        raise FrameError(
+            f"timestamp_ns: expected more than the last frame's {last_timestamp_ns}, got {frame.timestamp_ns}"
+            f" ({(last_timestamp_ns - frame.timestamp_ns) / 1e9:.6f} s back)"
+        )
+
+
+def to_grey(image: np.ndarray) -> np.ndarray:
+    """`(height, width)` uint8 grey of an RGB image (ITU-R BT.601 weights); a grey image stays as it is."""
+    return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+
+
+def _check_timestamp(timestamp_ns: object) -> None:
+    if isinstance(timestamp_ns, bool) or not isinstance(timestamp_ns, numbers.Integral):
+        hint = " seconds? (use round(seconds * 1e9))" if isinstance(timestamp_ns, float) else ""
+        raise FrameError(f"timestamp_ns: expected an int in nanoseconds, got {timestamp_ns!r}{hint}")
+    if not _INT64.min <= int(timestamp_ns) <= _INT64.max:
+        raise FrameError(f"timestamp_ns: expected an int that fits 64 bits, got {timestamp_ns}")
+
+
+def _check_image(image: object) -> None:
+    expected = "expected (height, width, 3) RGB or (height, width) grey, uint8"
+    if not isinstance(image, np.ndarray):
+        raise FrameError(f"image: {expected}, got {type(image).__name__}")
+    if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3) or image.size == 0:
+        hint = "; drop the alpha channel: image[..., :3]" if image.shape[2:] == (4,) else ""
+        raise FrameError(f"image: {expected}, got shape {image.shape}{hint}")
+    if image.dtype != np.uint8:
+        hint = "; scale it to 0 to 255 and use astype(numpy.uint8)" if image.dtype.kind == "f" else ""
+        raise FrameError(f"image: {expected}, got {image.dtype}{hint}")
+
+
+def _check_plane(field: str, plane: object, dtype: type[np.generic], size: tuple[int, int]) -> None:
+    expected = f"expected (height, width) {np.dtype(dtype).name}"
+    if not isinstance(plane, np.ndarray):
+        raise FrameError(f"{field}: {expected}, got {type(plane).__name__}")
+    if plane.dtype != dtype:
+        raise FrameError(f"{field}: {expected}, got {plane.dtype}{_dtype_hint(field, plane.dtype)}")
+    if plane.ndim != 2:
+        raise FrameError(f"{field}: {expected}, got shape {plane.shape}")
+    if plane.shape != size[::-1]:
+        raise FrameError(f"{field}: expected the image's {_by(size)} pixels, got {_by(plane.shape[::-1])}")
+
+
+def _dtype_hint(field: str, dtype: np.dtype) -> str:
+    if field != "depth_m":
+        return "; use mask > 0"
+    if dtype.kind in "iu":
+        return "; divide the counts by the camera's depth_scale_per_m: (counts / scale).astype(numpy.float32)"
+    return "; use astype(numpy.float32)"
+
+
+def _by(size: tuple[int, ...]) -> str:
+    return f"{size[0]}x{size[1]}"

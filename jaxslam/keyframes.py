@@ -1,0 +1,158 @@
+"""The ring of keyframes: which to look into, looking their points up in a frame, and adding one."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxlie import SE3
+from jaxslam_kernels.camera import Intrinsics, distort, normalise, to_pixels
+from jaxslam_kernels.depth_image import sample_depth
+from jaxslam_kernels.image import Pyramid
+from jaxslam_kernels.patch_align import align_patches
+from jaxslam_kernels.rolling_shutter import image_velocity, row_time
+from jaxslam_kernels.types import Mask, Pixels, Points, Scalar, Weights
+from jaxtyping import Array, Bool, Float, Int, Num
+
+from jaxslam.state import Keyframes, TrackedPoints, TrackParams, TrackSizes
+
+_MARGIN_PX = 8
+_MAX_SHIFT_PX = 12.0
+"""A point found further from where the pose predicts it is another one."""
+
+
+class LookedUp(NamedTuple):
+    """Points of keyframes found in a frame.
+
+    Attributes:
+        X_world: `(3, n)` metres.
+        uv: `(2, n)` pixels in the frame.
+        found: `(n,)` which were found.
+        overlap: Largest share of a keyframe's points that the frame shows.
+    """
+
+    X_world: Points
+    uv: Pixels
+    found: Mask
+    overlap: Scalar
+
+
+def empty_keyframes(height: int, width: int, sizes: TrackSizes, image_dtype: jnp.dtype, dtype: jnp.dtype) -> Keyframes:
+    """A ring without keyframes."""
+    k, n = sizes.num_keyframes, sizes.num_points
+    return Keyframes(
+        images=jnp.zeros((k, height, width), image_dtype),
+        T_world_cam=jnp.tile(SE3.identity().wxyz_xyz.astype(dtype), (k, 1)),
+        uv=jnp.zeros((k, 2, n), dtype),
+        X_world=jnp.zeros((k, 3, n), dtype),
+        valid=jnp.zeros((k, n), bool),
+        count=jnp.zeros((), jnp.int32),
+    )
+
+
+def to_camera(T_world_cam: SE3, X_world: Points) -> Points:
+    """World points in the axes of the camera."""
+    T_cam_world = T_world_cam.inverse()
+    return T_cam_world.rotation().as_matrix() @ X_world + T_cam_world.translation()[:, None]
+
+
+def predict_pixels(X_cam: Points, twist: Float[Array, "6"], height: int, params: TrackParams) -> Pixels:
+    """Where points appear in a frame of a rolling shutter, while the camera moves with `twist`."""
+    depth = jnp.maximum(X_cam[2], params.min_depth_m / 2)
+    xy = X_cam[:2] / depth[None, :]
+    v = to_pixels(params.intrinsics, distort(params.intrinsics, xy))[1]
+    moved = xy + image_velocity(xy, depth, twist) * row_time(v, height, params.readout_s)[None, :]
+    return to_pixels(params.intrinsics, distort(params.intrinsics, moved))
+
+
+def look_up(
+    keyframes: Keyframes,
+    T_world_cam: SE3,
+    twist: Float[Array, "6"],
+    pyramid: Pyramid,
+    depth: Float[Array, "h w"],
+    params: TrackParams,
+    sizes: TrackSizes,
+) -> LookedUp:
+    """Look points of the best keyframes up in the current frame, around where the pose predicts them.
+
+    Args:
+        keyframes: The ring.
+        T_world_cam: Pose of the current frame, good to a few pixels.
+        twist: Velocity of the camera, for the rolling shutter.
+        pyramid: Of the current frame.
+        depth: Of the current frame, to drop points that something covers.
+        params: Thresholds and camera.
+        sizes: Static.
+    """
+    height, width = pyramid.size()
+    k, n = keyframes.valid.shape
+    X_cam = to_camera(T_world_cam, jnp.moveaxis(keyframes.X_world, 1, 0).reshape(3, k * n))
+    predicted = predict_pixels(X_cam, twist, height, params)
+    visible = _visible(predicted, X_cam[2], height, width) & keyframes.valid.reshape(-1)
+    shown = jnp.sum(visible.reshape(k, n), axis=1)
+    overlap = jnp.max(shown / jnp.maximum(jnp.sum(keyframes.valid, axis=1), 1))
+    _, sources = jax.lax.top_k(shown, sizes.num_sources)
+    chosen = jax.vmap(lambda s: jnp.nonzero(visible.reshape(k, n)[s], size=sizes.points_per_source, fill_value=n)[0])(
+        sources
+    )
+    real = (chosen < n).reshape(-1)
+    index = (sources[:, None] * n + jnp.minimum(chosen, n - 1)).reshape(-1)
+    take = lambda array: jnp.take(array, index, axis=-1, mode="clip")
+    guess, X_there = take(predicted), take(X_cam)
+    seen_depth = sample_depth(depth, jax.lax.stop_gradient(guess), reach=0)
+    covered = (seen_depth > 0) & (jnp.abs(seen_depth - X_there[2]) > 0.1 * X_there[2] + 0.05)
+    source = index // n
+    X_world = take(jnp.moveaxis(keyframes.X_world, 1, 0).reshape(3, k * n))
+    match = align_patches(
+        keyframes.images,
+        source,
+        take(jnp.moveaxis(keyframes.uv, 1, 0).reshape(2, k * n)),
+        _warp(guess, X_there[2], T_world_cam, keyframes.T_world_cam[source], params.intrinsics),
+        pyramid,
+        guess,
+        real & ~covered,
+    )
+    shift = jnp.sum(jnp.square(match.points - guess), axis=0)
+    found = match.converged & (match.correlation > params.min_correlation) & (shift < _MAX_SHIFT_PX**2)
+    return LookedUp(X_world, match.points, found, overlap)
+
+
+def _visible(uv: Pixels, depth: Weights, height: int, width: int) -> Mask:
+    u, v = uv
+    inside = (u > _MARGIN_PX) & (v > _MARGIN_PX) & (u < width - _MARGIN_PX) & (v < height - _MARGIN_PX)
+    return inside & (depth > 0)
+
+
+def _warp(
+    uv: Pixels, depth: Weights, T_world_cam: SE3, sources: Float[Array, "n 7"], intrinsics: Intrinsics
+) -> Float[Array, "2 2 n"]:
+    """Offset in the keyframe for an offset in the frame, `[to, from]`, on a plane that faces the camera."""
+    xy = normalise(intrinsics, uv)
+    focal = jnp.stack([intrinsics.fx, intrinsics.fy])
+
+    def ray_in_keyframe(source: Float[Array, "7"], x: Scalar, y: Scalar, z: Scalar) -> Float[Array, "2"]:
+        point = SE3(source).inverse() @ (T_world_cam @ jnp.stack([x * z, y * z, z]))
+        return focal * point[:2] / jnp.maximum(point[2], 0.1)
+
+    step = 1.0
+    at = jax.vmap(ray_in_keyframe)
+    centre = at(sources, xy[0], xy[1], depth)
+    right = at(sources, xy[0] + step / intrinsics.fx, xy[1], depth)
+    below = at(sources, xy[0], xy[1] + step / intrinsics.fy, depth)
+    return jnp.stack([(right - centre).T, (below - centre).T], axis=1) / step
+
+
+def with_keyframe(
+    keyframes: Keyframes, make: Bool[Array, ""], image: Num[Array, "h w"], T_world_cam: SE3, points: TrackedPoints
+) -> Keyframes:
+    """The ring with a keyframe in place of the oldest one where `make` is true, else unchanged."""
+    slot: Int[Array, ""] = keyframes.count % keyframes.valid.shape[0]
+    put = lambda ring, new: ring.at[slot].set(jnp.where(make, new, ring[slot]))
+    return Keyframes(
+        images=put(keyframes.images, image.astype(keyframes.images.dtype)),
+        T_world_cam=put(keyframes.T_world_cam, T_world_cam.wxyz_xyz),
+        uv=put(keyframes.uv, points.uv),
+        X_world=put(keyframes.X_world, points.X_world),
+        valid=put(keyframes.valid, points.valid),
+        count=keyframes.count + make.astype(jnp.int32),
+    )

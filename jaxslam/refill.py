@@ -1,0 +1,69 @@
+"""New points for free slots: corners where no point is, with depth that can be believed."""
+
+import jax.numpy as jnp
+from jaxlie import SE3
+from jaxslam_kernels.camera import normalise
+from jaxslam_kernels.corners import corner_score, grid_corners, occupied_cells
+from jaxslam_kernels.depth_image import sample_depth
+from jaxslam_kernels.image import Pyramid
+from jaxslam_kernels.rolling_shutter import image_velocity, row_time
+from jaxtyping import Array, Bool, Float
+
+from jaxslam.state import TrackedPoints, TrackParams, TrackSizes
+
+_MIN_SCORE = 2.0
+"""Smallest eigenvalue of a corner worth tracking, in squared intensity a squared pixel, on the second level."""
+_EDGE_PX = 12
+
+
+def refill(
+    points: TrackedPoints,
+    pyramid: Pyramid,
+    depth: Float[Array, "h w"],
+    ignore: Bool[Array, "h w"],
+    depth_delay_s: Float[Array, ""],
+    T_world_cam: SE3,
+    twist: Float[Array, "6"],
+    params: TrackParams,
+    sizes: TrackSizes,
+) -> TrackedPoints:
+    """Put the best corners of empty grid cells into free slots.
+
+    Corners are sought on the second level of the pyramid: a quarter of the work, and less noise. A new point has the
+    depth measured at it, the rolling shutter and the delay of the depth image taken into account.
+    """
+    height, width = pyramid.size()
+    border, cell = pyramid.border, sizes.cell_px // 2
+    image = pyramid.levels[1][border:-border, border:-border]
+    v, u = jnp.mgrid[: image.shape[0], : image.shape[1]]
+    edge = _EDGE_PX // 2
+    inside = (u >= edge) & (v >= edge) & (u < image.shape[1] - edge) & (v < image.shape[0] - edge)
+    corners = grid_corners(
+        corner_score(image), inside & ~ignore[::2, ::2][: image.shape[0], : image.shape[1]], cell=cell
+    )
+    taken = occupied_cells(points.uv / 2, points.valid, image.shape, cell=cell)
+    uv = corners.points * 2
+
+    xy = normalise(params.intrinsics, uv)
+    rough = sample_depth(depth, uv, reach=2)
+    speed = image_velocity(xy, rough, twist)
+    focal = jnp.stack([params.intrinsics.fx, params.intrinsics.fy])[:, None]
+    measured = sample_depth(depth, uv + focal * speed * depth_delay_s, reach=2)
+    seen = xy - speed * row_time(uv[1], height, params.readout_s)[None, :]
+    X_cam = jnp.concatenate([seen, jnp.ones_like(seen[:1])]) * measured[None, :]
+    X_world = T_world_cam.rotation().as_matrix() @ X_cam + T_world_cam.translation()[:, None]
+    sigma = params.depth_sigma_m + params.depth_sigma_per_m2 * jnp.square(measured)
+
+    good = (corners.score > _MIN_SCORE) & ~taken & (rough > 0) & (measured > 0)
+    order = jnp.argsort(jnp.where(good, -corners.score, jnp.inf))
+    rank = jnp.cumsum(~points.valid) - 1
+    candidate = order[jnp.clip(rank, 0, order.shape[0] - 1)]
+    new = ~points.valid & (rank < jnp.sum(good))
+    put = lambda old, fresh: jnp.where(new, jnp.take(fresh, candidate, axis=-1), old)
+    return TrackedPoints(
+        uv=put(points.uv, uv),
+        X_world=put(points.X_world, X_world),
+        information=put(points.information, 1 / jnp.square(sigma)),
+        weight=jnp.where(new, 1, points.weight),
+        valid=points.valid | new,
+    )

@@ -1,0 +1,233 @@
+"""Everything the tracker carries from frame to frame, as pytrees of fixed capacity, and what it says of a frame."""
+
+import enum
+from typing import NamedTuple
+
+from jaxlie import SE3
+from jaxslam_kernels.camera import Intrinsics
+from jaxslam_kernels.image import Pyramid
+from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Points, Scalar, Weights
+from jaxtyping import Array, Bool, Float, Key, Num
+
+
+class TrackStatus(enum.IntEnum):
+    """What a pose is worth."""
+
+    OK = 0
+    WEAK = 1
+    """Few points agree, or they agree badly: the pose is an estimate, its covariance is wide."""
+    LOST = 2
+    """No pose was found; the one given is the last one, held."""
+    STARTED = 3
+    """Tracking begins here, or begins anew at the pose held while lost."""
+
+
+class TrackReason(enum.IntEnum):
+    """Why a status is not `OK`."""
+
+    NONE = 0
+    NO_POINTS = 1
+    FEW_INLIERS = 2
+    FEW_SHARE = 3
+    IMPLAUSIBLE_MOTION = 4
+    NO_DEPTH = 5
+    BAD_TIME = 6
+
+    @property
+    def text(self) -> str:
+        """One line for a person."""
+        return _REASON_TEXT[self]
+
+
+_REASON_TEXT = {
+    TrackReason.NONE: "",
+    TrackReason.NO_POINTS: "too few points could be followed into the frame (dark, blurred, covered or too far away)",
+    TrackReason.FEW_INLIERS: "too few points agree on one motion",
+    TrackReason.FEW_SHARE: "only a small share of the points agrees on one motion",
+    TrackReason.IMPLAUSIBLE_MOTION: "the motion found is faster than the limit",
+    TrackReason.NO_DEPTH: "too few points have depth to start from",
+    TrackReason.BAD_TIME: "the time since the last frame is not positive",
+}
+
+
+class TrackSizes(NamedTuple):
+    """Sizes of all arrays; static: each combination is compiled once.
+
+    Attributes:
+        num_points: Points followed from frame to frame.
+        num_levels: Levels of the image pyramid.
+        num_keyframes: Pictures kept to look points up in again.
+        num_sources: How many of them are looked into in a frame.
+        points_per_source: Points looked up from each.
+        num_hypotheses: Pose hypotheses a frame.
+        cell_px: Side of the cells that each get at most one new corner, even.
+    """
+
+    num_points: int = 512
+    num_levels: int = 4
+    num_keyframes: int = 12
+    num_sources: int = 2
+    points_per_source: int = 192
+    num_hypotheses: int = 64
+    cell_px: int = 20
+
+
+class TrackParams(NamedTuple):
+    """Everything that can change, or be differentiated, without recompiling; scalars unless said otherwise.
+
+    Attributes:
+        intrinsics: Pinhole camera with distortion.
+        readout_s: Seconds from the first row to the last of a rolling shutter; 0 for a global one.
+        depth_sigma_m: Standard deviation of measured depth close to the camera.
+        depth_sigma_per_m2: Its growth with the square of depth, a metre (Khoshelham and Elberink 2012). Both include
+            the errors that neighbouring pixels share, and so are larger than the noise of a single one.
+        min_depth_m: Nearest depth believed.
+        max_depth_m: Farthest depth believed.
+        pixel_sigma: Standard deviation of a tracked point, pixels.
+        loss_scale: Scale of the Cauchy loss, in standard deviations.
+        ransac_px: Reprojection error up to which a point supports a pose hypothesis, pixels.
+        outlier_px: Reprojection error over which a point is dropped, pixels.
+        min_correlation: Correlation from which a point looked up in a keyframe is believed.
+        min_inliers: Fewest points that make a pose.
+        weak_inliers: Below this the status is `WEAK`.
+        min_share: Smallest share of the followed points that must agree on the pose.
+        refill_below: New points are sought when fewer than this share of the capacity is alive.
+        keyframe_below: A keyframe is made when no kept one shows more than this share of its points.
+        restart_after: Frames of loss after which tracking starts anew at the held pose.
+        max_speed: Highest believed speed, metres a second.
+        max_turn: Highest believed angular speed, radians a second.
+    """
+
+    intrinsics: Intrinsics
+    readout_s: Scalar
+    depth_sigma_m: Scalar
+    depth_sigma_per_m2: Scalar
+    min_depth_m: Scalar
+    max_depth_m: Scalar
+    pixel_sigma: Scalar
+    loss_scale: Scalar
+    ransac_px: Scalar
+    outlier_px: Scalar
+    min_correlation: Scalar
+    min_inliers: Scalar
+    weak_inliers: Scalar
+    min_share: Scalar
+    refill_below: Scalar
+    keyframe_below: Scalar
+    restart_after: Scalar
+    max_speed: Scalar
+    max_turn: Scalar
+
+
+class FrameArrays(NamedTuple):
+    """One frame as the compiled step takes it.
+
+    Attributes:
+        image: `(h, w)` grey, 0 to 255; `uint8`, or floating point to differentiate with respect to it.
+        depth: `(h, w)` metres, floating point; 0 or not finite where missing.
+        ignore: `(h, w)` true where nothing is to be trusted (people, the robot itself).
+        dt_s: Seconds since the frame before.
+        depth_delay_s: Seconds from the time of the image to the time of the depth.
+    """
+
+    image: Num[Array, "h w"]
+    depth: Float[Array, "h w"]
+    ignore: Bool[Array, "h w"]
+    dt_s: Scalar
+    depth_delay_s: Scalar
+
+
+class TrackedPoints(NamedTuple):
+    """Points followed from frame to frame; slots that are not `valid` are free.
+
+    Attributes:
+        uv: `(2, n)` where they are in the last good frame, pixels.
+        X_world: `(3, n)` where they are in the world, metres.
+        information: `(n,)` inverse variance of their depth, 1 / m^2.
+        weight: `(n,)` how much each counts, 0 to 1; the caller may change it between steps.
+        valid: `(n,)` which slots hold a point.
+    """
+
+    uv: Pixels
+    X_world: Points
+    information: Weights
+    weight: Weights
+    valid: Mask
+
+
+class Keyframes(NamedTuple):
+    """A ring of past frames with the points seen in them, to look up again.
+
+    Attributes:
+        images: `(k, h, w)` pictures, of the type of the frames.
+        T_world_cam: `(k, 7)` poses as `wxyz_xyz`.
+        uv: `(k, 2, n)` the points in them, pixels.
+        X_world: `(k, 3, n)` the points in the world, metres.
+        valid: `(k, n)` which are there.
+        count: Keyframes made so far.
+    """
+
+    images: Num[Array, "k h w"]
+    T_world_cam: Float[Array, "k 7"]
+    uv: Float[Array, "k 2 n"]
+    X_world: Float[Array, "k 3 n"]
+    valid: Bool[Array, "k n"]
+    count: Code
+
+
+class TrackState(NamedTuple):
+    """What the tracker knows after a frame.
+
+    Attributes:
+        pyramid: Of the last good frame.
+        points: Followed points, as in the last good frame.
+        keyframes: Past frames to look points up in.
+        T_world_cam: Pose of the camera.
+        twist: Velocity of the camera in its own axes, metres a second then radians a second.
+        elapsed_s: Seconds since the last good frame.
+        lost_frames: Frames since tracking was lost, 0 while it is not.
+        frame: Frames seen.
+        key: Source of every random choice.
+    """
+
+    pyramid: Pyramid
+    points: TrackedPoints
+    keyframes: Keyframes
+    T_world_cam: SE3
+    twist: Float[Array, "6"]
+    elapsed_s: Scalar
+    lost_frames: Code
+    frame: Code
+    key: Key[Array, ""]
+
+
+class TrackOutput(NamedTuple):
+    """What the tracker says of one frame.
+
+    Attributes:
+        T_world_cam: Pose of the camera; meaningful when `status` is not `LOST`, then it is the last one.
+        covariance: `(6, 6)` of the pose, in the tangent space at the camera, translation first.
+        status: A `TrackStatus`.
+        reason: A `TrackReason`.
+        num_inliers: Followed points that agree with the pose.
+        inlier_ratio: Their share of the points that could be followed.
+        num_looked_up: Points found again in keyframes.
+        residual_px: Robust standard deviation of the reprojection error of the inliers, pixels.
+        uv: `(2, n)` pixels of the points in this frame, new ones included.
+        weights: `(n,)` final weight of each, 0 to 1; 0 for what is no inlier, 1 times the given weight for a new point.
+        tracked: `(n,)` which of the points came from the frame before.
+        is_keyframe: Whether the frame was kept.
+    """
+
+    T_world_cam: SE3
+    covariance: Float[Array, "6 6"]
+    status: Code
+    reason: Code
+    num_inliers: Code
+    inlier_ratio: Scalar
+    num_looked_up: Code
+    residual_px: Scalar
+    uv: Pixels
+    weights: Weights
+    tracked: Mask
+    is_keyframe: Flag

@@ -1,0 +1,379 @@
+"""The main path: one frame in, one pose out.
+
+`track_step` is a pure function of arrays. It can be jitted, batched with `vmap`, run over a clip with `lax.scan`, and
+differentiated with respect to camera, weights, map points, thresholds that are not comparisons, and images. Which
+points agree and which keyframes are looked into are choices, constant for a derivative; the refinement after them
+carries it, by the implicit function theorem.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxlie import SE3
+from jaxslam_kernels.camera import Intrinsics, normalise, to_pixels
+from jaxslam_kernels.depth_image import believable, sample_depth
+from jaxslam_kernels.image import Pyramid, build_pyramid
+from jaxslam_kernels.lk_flow import FlowPlan, lk_flow
+from jaxslam_kernels.pnp import ransac_pnp
+from jaxslam_kernels.pose_refine import PoseRefinement, refine_pose
+from jaxslam_kernels.rolling_shutter import image_velocity, row_time
+from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Points, Scalar, Weights
+from jaxtyping import Array, Float
+
+from jaxslam.keyframes import LookedUp, empty_keyframes, look_up, predict_pixels, to_camera, with_keyframe
+from jaxslam.refill import refill
+from jaxslam.state import (
+    FrameArrays,
+    TrackedPoints,
+    TrackOutput,
+    TrackParams,
+    TrackReason,
+    TrackSizes,
+    TrackState,
+    TrackStatus,
+)
+
+DEFAULT_SIZES = TrackSizes()
+_FLOW_PLAN = FlowPlan()
+_MAX_PREDICTION_S = 0.1
+"""A constant velocity says nothing about longer gaps."""
+_MAX_FUSED = 4
+_UNKNOWN_VARIANCE = 1e2
+
+
+class _View(NamedTuple):
+    """The current frame, prepared."""
+
+    frame: FrameArrays
+    pyramid: Pyramid
+    depth: Float[Array, "h w"]
+    elapsed_s: Scalar
+    """Seconds since the last good frame."""
+
+
+class _Seen(NamedTuple):
+    """Map points as seen in the frame, corrected to one time and an ideal camera."""
+
+    X_world: Points
+    uv: Pixels
+    depth: Weights
+
+
+class _Verdict(NamedTuple):
+    """Whether the frame was tracked, and why not."""
+
+    lost: Flag
+    weak: Flag
+    reason: Code
+    inlier_ratio: Scalar
+
+
+def init_state(
+    height: int,
+    width: int,
+    sizes: TrackSizes = DEFAULT_SIZES,
+    *,
+    T_world_cam: SE3 | None = None,
+    seed: int = 0,
+    image_dtype: jnp.dtype = jnp.uint8,
+    dtype: jnp.dtype = jnp.float32,
+) -> TrackState:
+    """A state that has seen nothing: the first frame given to `track_step` starts tracking.
+
+    Args:
+        height: Rows of the frames.
+        width: Columns of the frames.
+        sizes: Capacities, static.
+        T_world_cam: Pose of the camera at the first frame; the world's origin if not given.
+        seed: Of every random choice.
+        image_dtype: Type of the images given later; floating point to differentiate with respect to them.
+        dtype: Floating-point type of everything else.
+    """
+    n = sizes.num_points
+    blank = build_pyramid(jnp.zeros((height, width), dtype), num_levels=sizes.num_levels)
+    pose = SE3.identity() if T_world_cam is None else T_world_cam
+    return TrackState(
+        pyramid=blank,
+        points=TrackedPoints(
+            uv=jnp.zeros((2, n), dtype),
+            X_world=jnp.zeros((3, n), dtype),
+            information=jnp.zeros(n, dtype),
+            weight=jnp.ones(n, dtype),
+            valid=jnp.zeros(n, bool),
+        ),
+        keyframes=empty_keyframes(height, width, sizes, image_dtype, dtype),
+        T_world_cam=SE3(pose.wxyz_xyz.astype(dtype)),
+        twist=jnp.zeros(6, dtype),
+        elapsed_s=jnp.zeros((), dtype),
+        lost_frames=jnp.full((), 2**20, jnp.int32),
+        frame=jnp.zeros((), jnp.int32),
+        key=jax.random.key(seed),
+    )
+
+
+def track_step(
+    state: TrackState, frame: FrameArrays, params: TrackParams, sizes: TrackSizes = DEFAULT_SIZES
+) -> tuple[TrackState, TrackOutput]:
+    """Track one frame.
+
+    Args:
+        state: From `init_state` or the step before.
+        frame: Image, depth and time.
+        params: Camera and thresholds, traced.
+        sizes: Capacities, static; those the state was made with.
+
+    Returns:
+        The new state and what is known of the frame. Nothing raises: a frame that cannot be used leaves points and
+        pose as they were and says so in `status` and `reason`.
+    """
+    view = _prepare(state, frame, params, sizes)
+    predicted = _predict(state, view)
+    uv, followed = _follow(state, view, predicted, params)
+    coarse, agreeing = _coarse_pose(state, view, uv, followed, predicted, params, sizes)
+    twist = _twist(state.T_world_cam, coarse, view.elapsed_s)
+    looked_up = look_up(state.keyframes, coarse, twist, view.pyramid, view.depth, params, sizes)
+    seen, refined = _refine(state, view, uv, agreeing, looked_up, coarse, twist, params)
+    inliers = agreeing & _close(refined, seen, params)[: sizes.num_points]
+    verdict = _judge(state, view, refined, followed, inliers, params)
+    kept = _update_points(state, view, uv, inliers, refined.T_world_cam, params)
+    return _conclude(state, view, kept, refined, looked_up, verdict, params, sizes)
+
+
+def _prepare(state: TrackState, frame: FrameArrays, params: TrackParams, sizes: TrackSizes) -> _View:
+    pyramid = build_pyramid(frame.image.astype(state.twist.dtype), num_levels=sizes.num_levels)
+    depth = believable(frame.depth, params.min_depth_m, params.max_depth_m)
+    return _View(frame, pyramid, depth, state.elapsed_s + frame.dt_s)
+
+
+def _predict(state: TrackState, view: _View) -> SE3:
+    """Constant velocity."""
+    return state.T_world_cam @ SE3.exp(state.twist * jnp.clip(view.elapsed_s, 0, _MAX_PREDICTION_S))
+
+
+def _follow(state: TrackState, view: _View, predicted: SE3, params: TrackParams) -> tuple[Pixels, Mask]:
+    """Follow the points into the frame by optical flow, starting where the prediction puts them."""
+    points = state.points
+    height, width = view.pyramid.size()
+    before = predict_pixels(to_camera(state.T_world_cam, points.X_world), state.twist, height, params)
+    after = predict_pixels(to_camera(predicted, points.X_world), state.twist, height, params)
+    guess = points.uv + lax.stop_gradient(after - before)
+    inside = jnp.all((guess > 0) & (guess < jnp.array([[width - 1], [height - 1]], guess.dtype)), axis=0)
+    guess = jnp.where(inside[None, :], guess, points.uv)
+    flow = lk_flow(state.pyramid, view.pyramid, points.uv, guess, points.valid, plan=_FLOW_PLAN)
+    column, row = jnp.round(lax.stop_gradient(flow.points)).astype(jnp.int32)
+    ignored = view.frame.ignore.at[row, column].get(mode="fill", fill_value=True)
+    return flow.points, flow.ok & ~ignored & (points.weight > 0)
+
+
+def _see(X_world: Points, uv: Pixels, pose: SE3, twist: Float[Array, "6"], view: _View, params: TrackParams) -> _Seen:
+    """Remove distortion, rolling shutter and the delay of the depth image from observations."""
+    height = view.depth.shape[0]
+    xy = normalise(params.intrinsics, uv)
+    speed = image_velocity(xy, jnp.maximum(to_camera(pose, X_world)[2], params.min_depth_m), twist)
+    depth = sample_depth(view.depth, uv + _focal(params.intrinsics) * speed * view.frame.depth_delay_s)
+    middle = xy - speed * row_time(uv[1], height, params.readout_s)[None, :]
+    return _Seen(X_world, to_pixels(params.intrinsics, middle), depth)
+
+
+def _depth_sigma(depth: Weights, params: TrackParams) -> Weights:
+    return params.depth_sigma_m + params.depth_sigma_per_m2 * jnp.square(depth)
+
+
+def _coarse_pose(
+    state: TrackState, view: _View, uv: Pixels, followed: Mask, predicted: SE3, params: TrackParams, sizes: TrackSizes
+) -> tuple[SE3, Mask]:
+    """The pose most points agree with, and which do."""
+    seen = _see(state.points.X_world, uv, predicted, state.twist, view, params)
+    usable = followed.astype(uv.dtype) * state.points.weight
+    result = ransac_pnp(
+        jax.random.fold_in(state.key, state.frame),
+        seen.X_world,
+        seen.uv,
+        _ideal(params.intrinsics),
+        weights=usable,
+        depth=seen.depth,
+        threshold_px=params.ransac_px,
+        num_hypotheses=sizes.num_hypotheses,
+        initial=predicted,
+    )
+    return result.T_world_cam, result.inliers & followed
+
+
+def _twist(before: SE3, after: SE3, elapsed_s: Scalar) -> Float[Array, "6"]:
+    """Velocity of the camera in its own axes."""
+    known = elapsed_s > 1e-4
+    return jnp.where(known, (before.inverse() @ after).log() / jnp.where(known, elapsed_s, 1), 0)
+
+
+def _refine(
+    state: TrackState,
+    view: _View,
+    uv: Pixels,
+    agreeing: Mask,
+    looked_up: LookedUp,
+    coarse: SE3,
+    twist: Float[Array, "6"],
+    params: TrackParams,
+) -> tuple[_Seen, PoseRefinement]:
+    """The pose that fits followed points and points of keyframes together."""
+    X_world = jnp.concatenate([state.points.X_world, looked_up.X_world], axis=1)
+    seen = _see(X_world, jnp.concatenate([uv, looked_up.uv], axis=1), coarse, twist, view, params)
+    weights = jnp.concatenate([agreeing * state.points.weight, looked_up.found.astype(uv.dtype)])
+    refined = refine_pose(
+        coarse,
+        seen.X_world,
+        seen.uv,
+        _ideal(params.intrinsics),
+        weights=weights,
+        depth=seen.depth,
+        sigma_px=params.pixel_sigma,
+        sigma_depth=_depth_sigma(seen.depth, params),
+        loss="cauchy",
+        scale=params.loss_scale,
+    )
+    return seen, refined
+
+
+def _ideal(intrinsics: Intrinsics) -> Intrinsics:
+    return intrinsics._replace(distortion=jnp.zeros_like(intrinsics.distortion))
+
+
+def _close(refined: PoseRefinement, seen: _Seen, params: TrackParams) -> Mask:
+    """Which observations lie within the outlier threshold of the refined pose."""
+    X_cam = to_camera(refined.T_world_cam, seen.X_world)
+    front = X_cam[2] > params.min_depth_m / 2
+    xy = X_cam[:2] / jnp.where(front, X_cam[2], 1)[None, :]
+    error = to_pixels(params.intrinsics, xy) - seen.uv
+    return front & (jnp.sum(jnp.square(error), axis=0) < jnp.square(params.outlier_px))
+
+
+def _judge(
+    state: TrackState, view: _View, refined: PoseRefinement, followed: Mask, inliers: Mask, params: TrackParams
+) -> _Verdict:
+    """Lost, weak or fine, and why."""
+    num_followed, num_inliers = jnp.sum(followed), jnp.sum(inliers)
+    ratio = (num_inliers / jnp.maximum(num_followed, 1)).astype(state.twist.dtype)
+    twist = _twist(state.T_world_cam, refined.T_world_cam, view.elapsed_s)
+    speed, turn = jnp.linalg.norm(twist[:3]), jnp.linalg.norm(twist[3:])
+    causes = (
+        (view.frame.dt_s <= 0, TrackReason.BAD_TIME),
+        (num_followed < params.min_inliers, TrackReason.NO_POINTS),
+        (num_inliers < params.min_inliers, TrackReason.FEW_INLIERS),
+        (ratio < params.min_share, TrackReason.FEW_SHARE),
+        (~((speed < params.max_speed) & (turn < params.max_turn)), TrackReason.IMPLAUSIBLE_MOTION),
+    )
+    conditions, reasons = zip(*causes, strict=True)
+    lost = jnp.any(jnp.stack(conditions))
+    weak = num_inliers < params.weak_inliers
+    mild = jnp.where(weak, TrackReason.FEW_INLIERS, TrackReason.NONE)
+    codes = [jnp.full((), reason, jnp.int32) for reason in reasons]
+    return _Verdict(lost, weak & ~lost, jnp.select(conditions, codes, mild.astype(jnp.int32)), ratio)
+
+
+def _update_points(
+    state: TrackState, view: _View, uv: Pixels, inliers: Mask, T_world_cam: SE3, params: TrackParams
+) -> TrackedPoints:
+    """Keep the inliers, and fuse the depth measured now into where they are.
+
+    A point counts as at most `_MAX_FUSED` measurements, so that an early error of the pose is forgotten.
+    """
+    points = state.points
+    twist = _twist(state.T_world_cam, T_world_cam, view.elapsed_s)
+    seen = _see(points.X_world, uv, T_world_cam, twist, view, params)
+    X_cam = to_camera(T_world_cam, points.X_world)
+    sigma = _depth_sigma(seen.depth, params)
+    agrees = inliers & (seen.depth > 0) & (jnp.abs(seen.depth - X_cam[2]) < 3 * sigma)
+    information = jnp.where(agrees, 1 / jnp.square(sigma), 0)
+    total = jnp.where(agrees, points.information + information, 1)
+    xy = (seen.uv - _centre(params.intrinsics)) / _focal(params.intrinsics)
+    measured = jnp.concatenate([xy, jnp.ones_like(xy[:1])]) * seen.depth[None, :]
+    fused = X_cam + (information / total)[None, :] * (measured - X_cam)
+    X_world = T_world_cam.rotation().as_matrix() @ fused + T_world_cam.translation()[:, None]
+    cap = _MAX_FUSED * information
+    return TrackedPoints(
+        uv=jnp.where(inliers[None, :], uv, points.uv),
+        X_world=jnp.where(agrees[None, :], X_world, points.X_world),
+        information=jnp.where(agrees, jnp.minimum(points.information + information, cap), points.information),
+        weight=points.weight,
+        valid=points.valid & inliers,
+    )
+
+
+def _centre(intrinsics: Intrinsics) -> Float[Array, "2 1"]:
+    return jnp.stack([intrinsics.cx, intrinsics.cy])[:, None]
+
+
+def _focal(intrinsics: Intrinsics) -> Float[Array, "2 1"]:
+    return jnp.stack([intrinsics.fx, intrinsics.fy])[:, None]
+
+
+def _conclude(
+    state: TrackState,
+    view: _View,
+    kept: TrackedPoints,
+    refined: PoseRefinement,
+    looked_up: LookedUp,
+    verdict: _Verdict,
+    params: TrackParams,
+    sizes: TrackSizes,
+) -> tuple[TrackState, TrackOutput]:
+    """The new state, and the output: tracked, held, or started anew."""
+    lost_frames = jnp.where(verdict.lost, state.lost_frames + 1, 0)
+    start = verdict.lost & (lost_frames > params.restart_after)
+    held = verdict.lost & ~start
+    choose = lambda when_lost, when_tracked: jax.tree.map(
+        lambda a, b: jnp.where(verdict.lost, a, b), when_lost, when_tracked
+    )
+    pose = choose(state.T_world_cam, refined.T_world_cam)
+    twist = choose(jnp.zeros_like(state.twist), _twist(state.T_world_cam, pose, view.elapsed_s))
+    points = choose(state.points._replace(valid=state.points.valid & held), kept)
+
+    alive = jnp.sum(points.valid)
+    few = alive < params.refill_below * sizes.num_points
+    points = lax.cond(
+        start | (few & ~verdict.lost),
+        lambda p: refill(
+            p, view.pyramid, view.depth, view.frame.ignore, view.frame.depth_delay_s, pose, twist, params, sizes
+        ),
+        lambda p: p,
+        points,
+    )
+    failed = start & (jnp.sum(points.valid) < params.min_inliers)
+    started = start & ~failed
+    make = started | (~verdict.lost & (looked_up.overlap < params.keyframe_below))
+    keyframes = with_keyframe(state.keyframes, make, view.frame.image, pose, points)
+    stale = held | failed
+    new_state = TrackState(
+        pyramid=jax.tree.map(lambda old, new: jnp.where(stale, old, new), state.pyramid, view.pyramid),
+        points=points,
+        keyframes=keyframes,
+        T_world_cam=pose,
+        twist=twist,
+        elapsed_s=jnp.where(stale, jnp.maximum(view.elapsed_s, 0), 0),
+        lost_frames=jnp.where(started, 0, lost_frames),
+        frame=state.frame + 1,
+        key=state.key,
+    )
+    status = jnp.select(
+        [started, verdict.lost, verdict.weak],
+        [jnp.full((), code, jnp.int32) for code in (TrackStatus.STARTED, TrackStatus.LOST, TrackStatus.WEAK)],
+        0,
+    )
+    reason = jnp.where(failed, TrackReason.NO_DEPTH, verdict.reason)
+    output = TrackOutput(
+        T_world_cam=pose,
+        covariance=jnp.where(verdict.lost, jnp.eye(6, dtype=twist.dtype) * _UNKNOWN_VARIANCE, refined.covariance),
+        status=status,
+        reason=reason,
+        num_inliers=jnp.where(verdict.lost, 0, jnp.sum(kept.valid)),
+        inlier_ratio=jnp.where(verdict.lost, 0, verdict.inlier_ratio),
+        num_looked_up=jnp.where(verdict.lost, 0, jnp.sum(looked_up.found)),
+        residual_px=refined.residual_scale * params.pixel_sigma,
+        uv=points.uv,
+        weights=jnp.where(points.valid & ~held, points.weight, 0),
+        tracked=kept.valid & ~verdict.lost,
+        is_keyframe=make,
+    )
+    return new_state, output

@@ -1,0 +1,132 @@
+"""Pictures of trajectories and their errors, drawn with Matplotlib and without a screen."""
+
+import io
+import os
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+
+from jaxslam.errors import TrajectoryError
+from jaxslam.evaluation import Evaluation
+from jaxslam.files import write_atomically
+from jaxslam.trajectory import Trajectory
+
+_BREAK_INTERVALS = 3.0
+_TRUTH_COLOR, _PATH_COLOR, _LOST_COLOR = "0.6", "tab:blue", "tab:red"
+
+
+def plot_trajectory(
+    estimate: Trajectory,
+    reference: Trajectory | None,
+    evaluation: Evaluation | None,
+    path: str | os.PathLike[str],
+) -> None:
+    """Write one PNG: the path and, if it was evaluated, the error over time and the figures.
+
+    The path is seen along its flattest axis, at one scale. With an evaluation the estimate is drawn aligned and
+    coloured by error, and times without estimated poses are shaded; otherwise both paths are drawn as they are.
+
+    Args:
+        estimate: What was estimated.
+        reference: The truth, if known.
+        evaluation: `evaluate(estimate, reference, ...)`, if it was done.
+        path: Where the picture goes.
+
+    Raises:
+        TrajectoryError: If there is nothing to draw or the file cannot be written.
+    """
+    if not len(estimate):
+        raise TrajectoryError("nothing to plot: the estimate holds no poses")
+    if evaluation is None:
+        figure = Figure(figsize=(8, 7), layout="constrained")
+        _draw_paths(figure.add_subplot(), estimate, reference)
+        figure.suptitle(f"{len(estimate)} poses, not evaluated", fontsize=9)
+    else:
+        figure = Figure(figsize=(8, 10), layout="constrained")
+        seen, over_time = figure.subplots(2, height_ratios=(3, 1))
+        _draw_evaluated_paths(seen, reference, evaluation)
+        _draw_errors(over_time, evaluation)
+        figure.suptitle(str(evaluation), fontsize=8, family="monospace", x=0.02, ha="left")
+    picture = io.BytesIO()
+    FigureCanvasAgg(figure).print_png(picture)
+    write_atomically(path, picture.getvalue(), TrajectoryError)
+
+
+def _draw_paths(axes: Axes, estimate: Trajectory, reference: Trajectory | None) -> None:
+    shown = [estimate.positions] if reference is None else [estimate.positions, reference.positions]
+    plane = _prepare(axes, np.concatenate(shown))
+    if reference is not None:
+        _draw_truth(axes, reference, plane)
+    _draw_path(axes, estimate, plane, color=_PATH_COLOR, label="estimate")
+    _mark_ends(axes, estimate.positions[:, plane])
+    axes.legend(fontsize=8)
+
+
+def _draw_evaluated_paths(axes: Axes, reference: Trajectory | None, evaluation: Evaluation) -> None:
+    positions, errors = evaluation.positions_m, evaluation.errors_m
+    truth = evaluation.reference_m if reference is None else reference.positions
+    plane = _prepare(axes, np.concatenate([positions, truth]))
+    if reference is not None:
+        _draw_truth(axes, reference, plane)
+    ends = np.stack([positions[:-1, plane], positions[1:, plane]], axis=1)
+    whole = ~_breaks(evaluation.timestamps_ns)
+    path = LineCollection(list(ends[whole]), linewidths=1.6, cmap="viridis", label="estimate, by error")
+    path.set_array(0.5 * (errors[:-1] + errors[1:])[whole])
+    path.set_clim(0.0, max(evaluation.ate_max_m, np.finfo(float).tiny))
+    axes.add_collection(path)
+    _mark_ends(axes, positions[:, plane])
+    axes.legend(fontsize=8)
+    axes.figure.colorbar(path, ax=axes, label="error [m]", shrink=0.8)
+
+
+def _draw_errors(axes: Axes, evaluation: Evaluation) -> None:
+    begin = min(evaluation.timestamps_ns[0], evaluation.lost_spans_ns.min(initial=evaluation.timestamps_ns[0]))
+    seconds = (evaluation.timestamps_ns - begin) / 1e9
+    after_break = np.flatnonzero(_breaks(evaluation.timestamps_ns)) + 1
+    axes.plot(
+        np.insert(seconds, after_break, np.nan), np.insert(evaluation.errors_m, after_break, np.nan), color=_PATH_COLOR
+    )
+    rmse = f"rmse {evaluation.ate_rmse_m:.4f} m"
+    axes.axhline(evaluation.ate_rmse_m, color="0.3", linestyle="--", linewidth=0.8, label=rmse)
+    for k, (lost, found) in enumerate((evaluation.lost_spans_ns - begin) / 1e9):
+        label = "no estimate" if k == 0 else None
+        axes.axvspan(lost, found, color=_LOST_COLOR, alpha=0.15, linewidth=0, label=label)
+    axes.set(xlabel="time [s]", ylabel="error [m]")
+    axes.set_ylim(bottom=0)
+    axes.margins(x=0)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+
+
+def _prepare(axes: Axes, positions: np.ndarray) -> list[int]:
+    """Label and scale the axes; the two coordinates of largest extent, in the order of the alphabet."""
+    plane = sorted(np.argsort(-np.ptp(positions, axis=0), kind="stable")[:2].tolist())
+    axes.set_xlabel(f"{'xyz'[plane[0]]} [m]")
+    axes.set_ylabel(f"{'xyz'[plane[1]]} [m]")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.grid(alpha=0.3)
+    return plane
+
+
+def _draw_truth(axes: Axes, reference: Trajectory, plane: list[int]) -> None:
+    _draw_path(axes, reference, plane, color=_TRUTH_COLOR, label="ground truth")
+
+
+def _draw_path(axes: Axes, trajectory: Trajectory, plane: list[int], color: str, label: str) -> None:
+    after_break = np.flatnonzero(_breaks(trajectory.timestamps_ns)) + 1
+    u, v = np.insert(trajectory.positions[:, plane], after_break, np.nan, axis=0).T
+    axes.plot(u, v, color=color, linewidth=1.2, label=label)
+
+
+def _mark_ends(axes: Axes, uv: np.ndarray) -> None:
+    axes.plot(*uv[0], "o", color="black", markersize=5, label="begin")
+    axes.plot(*uv[-1], "s", color="black", markersize=5, label="end")
+
+
+def _breaks(timestamps_ns: np.ndarray) -> np.ndarray:
+    """`(n - 1,)` which steps to the next pose bridge so long a time that no line should."""
+    steps = np.diff(timestamps_ns)
+    return steps > _BREAK_INTERVALS * np.median(steps) if len(steps) else np.zeros(0, bool)

@@ -1,0 +1,1 @@
+"""Pure, compiled, differentiable kernels of jaxslam: arrays in, arrays out, nothing else."""

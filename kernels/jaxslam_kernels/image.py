@@ -1,0 +1,54 @@
+"""Image pyramids, in a form from which kernels cut patches without bounds checks."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxslam_kernels.types import Image
+
+_BINOMIAL = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
+
+
+class Pyramid(eqx.Module):
+    """Levels of half the size each, every one padded by repeating its edge.
+
+    Attributes:
+        levels: Finest first; level `l` has shape `(h / 2**l + 2 * border, w / 2**l + 2 * border)`, halves rounded up.
+            Pixel `(u, v)` of level 0 lies at `(u, v) / 2**l` of level `l` (as in OpenCV, so the centre of the
+            top-left pixel stays (0, 0)).
+        border: Width of the padding in pixels, static.
+    """
+
+    levels: tuple[Float[Array, "_h _w"], ...]
+    border: int = eqx.field(static=True)
+
+    def size(self, level: int = 0) -> tuple[int, int]:
+        """Height and width of a level without its padding."""
+        height, width = self.levels[level].shape
+        return height - 2 * self.border, width - 2 * self.border
+
+
+def half_size(image: Image) -> Float[Array, "_h _w"]:
+    """The image smoothed by the 5-tap binomial filter and halved, `cv2.pyrDown` in floating point.
+
+    Source: Burt and Adelson, The Laplacian Pyramid as a Compact Image Code, 1983. Edges are mirrored without
+    repeating the outermost pixel. An odd side rounds up.
+    """
+    height, width = image.shape
+    padded = jnp.pad(image, 2, mode="reflect")
+    rows = sum(weight * padded[tap : tap + height : 2] for tap, weight in enumerate(_BINOMIAL))
+    return sum(weight * rows[:, tap : tap + width : 2] for tap, weight in enumerate(_BINOMIAL))  # pyright: ignore[reportIndexIssue, reportReturnType]
+
+
+def build_pyramid(image: Image, *, num_levels: int = 4, border: int = 16) -> Pyramid:
+    """A pyramid of `num_levels` levels, the image itself first.
+
+    Args:
+        image: Grey image, at least 3 pixels a side at the coarsest level but one.
+        num_levels: Number of levels, static.
+        border: Padding of each level in pixels, static; `lk_flow` needs `window // 2 + 6`.
+    """
+    levels = [image]
+    while len(levels) < num_levels:
+        levels.append(half_size(levels[-1]))
+    return Pyramid(tuple(jnp.pad(level, border, mode="edge") for level in levels), border)

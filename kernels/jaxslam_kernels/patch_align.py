@@ -1,0 +1,204 @@
+"""Find points of an older picture in the current one, by the patch around them, warped as the pose predicts.
+
+Where `lk_flow` follows a point from frame to frame, this looks a point up again after any time: the patch is cut from
+the picture the point was first seen in, warped by the affine map that the relative pose and the depth predict (as PTAM
+and SVO do), matched in brightness, and aligned by Lucas-Kanade steps on one level.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, Num
+
+from jaxslam_kernels import _patches as patches
+from jaxslam_kernels._patches import Window
+from jaxslam_kernels.image import Pyramid
+from jaxslam_kernels.implicit import implicit_positions
+from jaxslam_kernels.lk_search import LevelPlan, Search, Template, difference, in_chunks, iterate, look, template_of
+from jaxslam_kernels.types import Mask, Pixels
+
+DEFAULT_PLAN = LevelPlan(21, 8, 0.05)
+_CONVERGED_PX = 0.1
+
+
+class PatchMatch(NamedTuple):
+    """Where patches were found.
+
+    Attributes:
+        points: `(2, n)` pixel coordinates in the current image.
+        correlation: `(n,)` zero-mean normalised cross-correlation of the warped patch and what is there, -1 to 1.
+        converged: `(n,)` whether the search settled.
+    """
+
+    points: Pixels
+    correlation: Float[Array, " n"]
+    converged: Mask
+
+
+def warped_patches(
+    pictures: Num[Array, "k h w"],
+    picture: Int[Array, " n"],
+    centre: Pixels,
+    warp: Float[Array, "2 2 n"],
+    *,
+    side: int,
+    stride: int,
+) -> Float[Array, "n l"]:
+    """Patches of `side` rows of `stride` pixels around points, sampled through an affine map, as flat rows.
+
+    Args:
+        pictures: `k` pictures of one size.
+        picture: `(n,)` which picture each point is in.
+        centre: `(2, n)` pixel coordinates of the points in their pictures.
+        warp: `(2, 2, n)` offset in the picture for an offset in the patch, `[to, from]`.
+        side: Rows of the patch, odd, static; its middle row and column `side // 2` is the point.
+        stride: Columns of the patch, static.
+    """
+    height, width = pictures.shape[1:]
+    offset = jnp.arange(side * stride)
+    du = (offset % stride - side // 2).astype(centre.dtype)[None, :]
+    dv = (offset // stride - side // 2).astype(centre.dtype)[None, :]
+    column = lambda array: array[:, None]
+    u = column(centre[0]) + column(warp[0, 0]) * du + column(warp[0, 1]) * dv
+    v = column(centre[1]) + column(warp[1, 0]) * du + column(warp[1, 1]) * dv
+    # Held one pixel inside, so that the neighbours right and below exist.
+    u, v = jnp.clip(u, 0, width - 1.001), jnp.clip(v, 0, height - 1.001)
+    left, top = jnp.floor(u), jnp.floor(v)
+    fu, fv = u - left, v - top
+    index = (column(picture) * height + top.astype(jnp.int32)) * width + left.astype(jnp.int32)
+    flat = pictures.reshape(-1)
+    at = lambda shift: jnp.take(flat, index + shift, mode="clip").astype(centre.dtype)
+    return (1 - fv) * ((1 - fu) * at(0) + fu * at(1)) + fv * ((1 - fu) * at(width) + fu * at(width + 1))
+
+
+class _Inputs(NamedTuple):
+    pictures: Num[Array, "k h w"]
+    picture: Int[Array, " n"]
+    centre: Pixels
+    warp: Float[Array, "2 2 n"]
+    guess: Pixels
+    mask: Mask
+    current: Float[Array, "h w"]
+
+
+def _template(inputs: _Inputs, window: Window, border: int, once: Callable[[Callable[[], Any]], Any]) -> Template:
+    """The warped patches, brought to the mean and the contrast of the current image around the guess."""
+    sample = lambda: warped_patches(
+        inputs.pictures, inputs.picture, inputs.centre, inputs.warp, side=window.side + 2, stride=window.stride
+    )
+    smooth = jnp.pad(once(sample), ((0, 0), (0, 2)))
+    patch = smooth[:, window.stride + 1 : window.stride + 1 + window.length]
+    there = _there(inputs.guess, inputs, window, border, once)
+    gain, offset = _match(patch, there, window)
+    counts = jnp.broadcast_to(window.columns()[None, :], patch.shape)
+    return template_of(gain * smooth + offset, counts, window, once)
+
+
+def _there(position: Pixels, inputs: _Inputs, window: Window, border: int, once: Callable) -> Float[Array, "n l"]:
+    """What the current image shows around positions."""
+    sight = once(lambda: look(position, inputs.current, border, window))
+    return difference(sight, jnp.zeros((), sight.fraction.dtype), window)
+
+
+def _moments(patch: Float[Array, "n l"], window: Window) -> tuple[Float[Array, "n 1"], Float[Array, "n 1"]]:
+    inside = window.columns().astype(patch.dtype)
+    area = window.side**2
+    mean = jnp.einsum("nl,l->n", patch, inside)[:, None] / area
+    variance = jnp.einsum("nl,l->n", jnp.square(patch - mean), inside)[:, None] / area
+    return mean, variance
+
+
+def _match(patch: Float[Array, "n l"], there: Float[Array, "n l"], window: Window):
+    mean, variance = _moments(patch, window)
+    mean_there, variance_there = _moments(there, window)
+    ratio = (variance_there + 1) / (variance + 1)
+    gain = jnp.sqrt(jnp.clip(ratio, 0.25, 4.0))
+    return gain, mean_there - gain * mean
+
+
+def _correlation(patch: Float[Array, "n l"], there: Float[Array, "n l"], window: Window) -> Float[Array, " n"]:
+    inside = window.columns().astype(patch.dtype)[None, :]
+    centred = [(array - _moments(array, window)[0]) * inside for array in (patch, there)]
+    cross = jnp.einsum("nl,nl->n", *centred)
+    power = [jnp.einsum("nl,nl->n", array, array) for array in centred]
+    return cross / jnp.sqrt(power[0] * power[1] + 1)
+
+
+def _solve(
+    inputs: _Inputs, *, plan: LevelPlan, border: int, chunk: int, min_texture: float
+) -> tuple[Pixels, Mask, Float[Array, " n"]]:
+    """Positions, which of them converged, and the correlation there."""
+    window = Window(plan.window)
+
+    def search_chunk(inputs: _Inputs) -> tuple[Pixels, Mask, Float[Array, " n"]]:
+        once = partial(patches.at_once, alive=jnp.all(jnp.isfinite(inputs.centre)))
+        template = _template(inputs, window, border, once)
+        active = inputs.mask & (template.texture > min_texture)
+        begin = Search(inputs.guess, jnp.full_like(inputs.guess[0], jnp.inf), active)
+        end = iterate(begin, template, inputs.current, border, plan)
+        there = _there(end.position, inputs, window, border, once)
+        correlation = jnp.where(active, _correlation(template.patch, there, window), -1)
+        return end.position, active & (end.last_step < _CONVERGED_PX**2), correlation
+
+    # One of a batch after the other, as in `lk_search.search`, and for the same reasons.
+    @jax.custom_batching.sequential_vmap
+    def search_all(inputs: _Inputs) -> tuple[Pixels, Mask, Float[Array, " n"]]:
+        run = lambda picture, centre, warp, guess, mask: search_chunk(
+            inputs._replace(picture=picture, centre=centre, warp=warp, guess=guess, mask=mask)
+        )
+        return in_chunks(run, (inputs.picture, inputs.centre, inputs.warp, inputs.guess, inputs.mask), chunk)
+
+    return search_all(inputs)
+
+
+def _slope(position: Pixels, inputs: _Inputs, *, plan: LevelPlan, border: int) -> Pixels:
+    """Of half the squared difference; zero where the search converged."""
+    window = Window(plan.window)
+    directly = lambda compute: compute()
+    template = _template(inputs, window, border, directly)
+    error = _there(position, inputs, window, border, directly) - template.patch
+    return jnp.einsum("nkl,nl->kn", template.gradient, error)
+
+
+def align_patches(
+    pictures: Num[Array, "k h w"],
+    picture: Int[Array, " n"],
+    centre: Pixels,
+    warp: Float[Array, "2 2 n"],
+    current: Pyramid,
+    guess: Pixels,
+    mask: Mask,
+    *,
+    plan: LevelPlan = DEFAULT_PLAN,
+    chunk: int = 64,
+    min_texture: float = 1.0,
+) -> PatchMatch:
+    """Look points up in the current image by the patches around them in older pictures.
+
+    Differentiable in the pictures (when they are floating point), the current image, `centre` and `warp`, by the
+    implicit function theorem; the guess matters only through the brightness around it, which patches are matched to.
+
+    Args:
+        pictures: `k` pictures, of the size of the current image without its border.
+        picture: `(n,)` which of them each point is in.
+        centre: `(2, n)` pixel coordinates there.
+        warp: `(2, 2, n)` offset in the picture for an offset in the current image, `[to, from]`.
+        current: Pyramid of the current image; its finest level is searched.
+        guess: `(2, n)` where to start; it must be within a few pixels.
+        mask: `(n,)` which points to look up.
+        plan: Window and steps, static.
+        chunk: Points searched together, static.
+        min_texture: As for `lk_flow`.
+    """
+    finite = jnp.all(jnp.isfinite(guess) & jnp.isfinite(centre), axis=0) & jnp.all(jnp.isfinite(warp), axis=(0, 1))
+    usable = mask & finite
+    held = lambda array: jnp.where(usable.reshape((1,) * (array.ndim - 1) + (-1,)), array, 0)
+    inputs = _Inputs(pictures, picture, held(centre), held(warp), held(guess), usable, current.levels[0])
+    settings = {"plan": plan, "border": current.border}
+    solve = partial(_solve, chunk=chunk, min_texture=min_texture, **settings)
+    position, converged, correlation = implicit_positions(solve, partial(_slope, **settings), inputs)
+    fine = usable & jnp.all(jnp.isfinite(position), axis=0)
+    return PatchMatch(jnp.where(fine, position, 0), jnp.where(fine, correlation, -1), converged & fine)

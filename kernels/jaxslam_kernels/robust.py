@@ -1,0 +1,114 @@
+"""Robust losses on squared residuals, and robust estimates of scale.
+
+A loss maps the squared, whitened residual `s >= 0` (a squared Mahalanobis norm) to `rho(s)`. All are normalised as
+in Ceres and SciPy: `rho(s) = c² rho_1(s / c²)`, so `rho(s) = s + O(s²)` near zero and an inlier counts as in plain
+least squares. The cost of a problem is `½ Σ rho(s_i)`, the weight in iteratively reweighted least squares is
+`rho'(s)`, and the scale `c` is in the unit of the whitened residual: standard deviations.
+
+Source: Triggs et al., "Bundle Adjustment: A Modern Synthesis", 2000, section 4.3; Black and Rangarajan, "On the
+Unification of Line Processes, Outlier Rejection, and Robust Statistics", 1996, for the Geman-McClure loss.
+"""
+
+from typing import Literal, TypeAlias, assert_never
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxslam_kernels.types import Scalar, Weights
+
+Loss: TypeAlias = Literal["squared", "huber", "cauchy", "geman_mcclure"]
+"""`squared` trusts everyone, `huber` bounds the pull, `cauchy` lets it fade, `geman_mcclure` lets go."""
+
+SquaredResiduals: TypeAlias = Float[Array, "*batch"]
+
+_MAD_TO_SIGMA = 1.482602218505602  # 1 / Φ⁻¹(3/4): the deviation of a Gaussian per median absolute deviation
+
+
+def loss_value(squared: SquaredResiduals, scale: Scalar | float, loss: Loss) -> SquaredResiduals:
+    """The robust cost `rho(s)` of each squared residual; 0 where `squared` is not finite.
+
+    Args:
+        squared: Squared whitened residuals `s`, any shape.
+        scale: The scale `c` at which the loss departs from a parabola, traced.
+        loss: Which loss, static.
+    """
+    s, known = _known(squared)
+    c2 = _squared_scale(scale, s)
+    match loss:
+        case "squared":
+            value = s
+        case "huber":
+            outside = s > c2
+            root = jnp.sqrt(jnp.where(outside, s, c2) * c2)
+            value = jnp.where(outside, 2.0 * root - c2, s)
+        case "cauchy":
+            value = c2 * jnp.log1p(s / c2)
+        case "geman_mcclure":
+            value = s / (1.0 + s / c2)
+        case _:
+            assert_never(loss)
+    return jnp.where(known, value, 0.0)
+
+
+def loss_weight(squared: SquaredResiduals, scale: Scalar | float, loss: Loss) -> SquaredResiduals:
+    """The weight `rho'(s)` in [0, 1] of each squared residual; 0 where `squared` is not finite.
+
+    Args:
+        squared: Squared whitened residuals `s`, any shape.
+        scale: The scale `c`, traced.
+        loss: Which loss, static.
+    """
+    s, known = _known(squared)
+    c2 = _squared_scale(scale, s)
+    match loss:
+        case "squared":
+            weight = jnp.ones_like(s)
+        case "huber":
+            weight = jnp.sqrt(c2 / jnp.maximum(s, c2))
+        case "cauchy":
+            weight = 1.0 / (1.0 + s / c2)
+        case "geman_mcclure":
+            weight = 1.0 / jnp.square(1.0 + s / c2)
+        case _:
+            assert_never(loss)
+    return jnp.where(known, weight, 0.0)
+
+
+def weighted_median(values: Weights, weights: Weights) -> Scalar:
+    """The smallest value at which half of the weight is reached; 0 if nothing has weight.
+
+    Values that are not finite do not count. `O(n log n)`, one sort.
+
+    Args:
+        values: The numbers, any sign.
+        weights: Non-negative weights; a mask works as `mask.astype(values.dtype)`.
+    """
+    counts = jnp.isfinite(values) & (weights > 0)
+    order = jnp.argsort(jnp.where(counts, values, jnp.inf))
+    ordered = jnp.where(counts, values, 0.0)[order]
+    reached = jnp.cumsum(jnp.where(counts, weights, 0.0)[order])
+    return ordered[jnp.argmax(reached >= 0.5 * reached[-1])]
+
+
+def robust_scale(residuals: Weights, weights: Weights) -> Scalar:
+    """The standard deviation of the inliers, from the median absolute deviation: 1.4826 med |r - med r|.
+
+    Stands up to just under half of the weight on outliers; 0 if nothing has weight.
+
+    Args:
+        residuals: Signed residuals in any unit; not-finite ones do not count.
+        weights: Non-negative weights.
+    """
+    deviation = jnp.abs(residuals - weighted_median(residuals, weights))
+    return _MAD_TO_SIGMA * weighted_median(deviation, weights)
+
+
+def _known(squared: SquaredResiduals) -> tuple[Array, Array]:
+    known = jnp.isfinite(squared)
+    return jnp.where(known, squared, 0.0), known
+
+
+def _squared_scale(scale: Scalar | float, like: Array) -> Array:
+    """`c²`, kept off zero so that a vanishing scale gives vanishing weights and no NaN."""
+    c2 = jnp.square(jnp.asarray(scale, like.dtype))
+    return jnp.maximum(c2, jnp.finfo(like.dtype).tiny * 1e8)

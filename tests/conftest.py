@@ -1,0 +1,23 @@
+"""Strict settings for every test: no silent promotion of types or ranks; warnings are errors (pyproject)."""
+
+import os
+from pathlib import Path
+
+import jax
+import pytest
+
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+def _folder(variable: str) -> Path:
+    value = os.environ.get(variable)
+    if not value:
+        pytest.skip(f"{variable} is not set: no recordings here")
+    return Path(value).resolve()
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """The folder of real recordings, or a skip."""
+    return _folder("JAXSLAM_DATA")
