@@ -1,0 +1,29 @@
+"""jaxslam: differentiable, real-time visual SLAM for dynamic scenes, on a plain CPU.
+
+The public index. `Slam` is for robots and recordings, `track_step` for gradients and batches.
+"""
+
+from jaxslam.camera import Camera as Camera
+from jaxslam.camera import known_cameras as known_cameras
+from jaxslam.config import Config as Config
+from jaxslam.config import load_config as load_config
+from jaxslam.datasets import open_dataset as open_dataset
+from jaxslam.errors import JaxSlamError as JaxSlamError
+from jaxslam.evaluation import Evaluation as Evaluation
+from jaxslam.evaluation import evaluate as evaluate
+from jaxslam.frame import Frame as Frame
+from jaxslam.slam import Slam as Slam
+from jaxslam.slam import Tracked as Tracked
+from jaxslam.slam import track_params as track_params
+from jaxslam.slam import track_sizes as track_sizes
+from jaxslam.state import FrameArrays as FrameArrays
+from jaxslam.state import TrackOutput as TrackOutput
+from jaxslam.state import TrackParams as TrackParams
+from jaxslam.state import TrackSizes as TrackSizes
+from jaxslam.state import TrackState as TrackState
+from jaxslam.state import TrackStatus as TrackStatus
+from jaxslam.track import init_state as init_state
+from jaxslam.track import track_step as track_step
+from jaxslam.trajectory import Trajectory as Trajectory
+
+__version__ = "0.1.0"

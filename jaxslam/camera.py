@@ -30,6 +30,7 @@ _UNITS = {
     "fps": "frames a second",
     "baseline_m": "metres between left and right camera",
     "far_depth_m": "metres; depth beyond it is not trusted on its own",
+    "readout_s": "seconds from the first row to the last; 0 for a global shutter",
     "color_order": "of a live stream; image files are always read right",
 }
 
@@ -53,6 +54,8 @@ class Camera(Checked):
         baseline_m: Distance between left and right camera in metres; `None` if not stereo.
         far_depth_m: Depth in metres beyond which a measured depth is not trusted on its own (in ORB-SLAM,
             `ThDepth` times the baseline); `None` if not known.
+        readout_s: Time in seconds a rolling shutter takes from the first row of a colour image to the last; 0 for a
+            global shutter. `jaxslam.Slam` corrects for it.
         color_order: Order of the channels in which the camera's driver hands over a colour image.
 
     Raises:
@@ -71,6 +74,7 @@ class Camera(Checked):
     fps: Annotated[float, Range(above=0, at_most=100_000)] = 30.0
     baseline_m: Annotated[float, Range(above=0, at_most=100)] | None = None
     far_depth_m: Annotated[float, Range(above=0)] | None = None
+    readout_s: Annotated[float, Range(at_least=0, at_most=0.1)] = 0.0
     color_order: Literal["rgb", "bgr"] = "rgb"
 
     _error: ClassVar[type[JaxSlamError]] = CameraError

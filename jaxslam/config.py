@@ -18,12 +18,67 @@ from jaxslam.yaml_file import parse_yaml, read_mapping
 _Section = TypeVar("_Section")
 
 
+Positive = Range(above=0)
+Share = Range(at_least=0, at_most=1)
+
+
 @dataclass(frozen=True)
 class TrackConfig(Checked):
-    """The tracker: what happens to every frame."""
+    """The tracker: what happens to every frame. Whole numbers are sizes: changing one compiles anew."""
 
-    num_points: Annotated[int, Range(at_least=16, at_most=8192)] = 1000
-    """Points tracked from frame to frame."""
+    num_points: Annotated[int, Range(at_least=32, at_most=4096)] = 512
+    """Points followed from frame to frame."""
+    num_levels: Annotated[int, Range(at_least=2, at_most=6)] = 4
+    """Levels of the image pyramid; one more follows motions twice as fast."""
+    num_keyframes: Annotated[int, Range(at_least=1, at_most=64)] = 12
+    """Past pictures kept to look points up in again."""
+    num_sources: Annotated[int, Range(at_least=1, at_most=8)] = 2
+    """How many of the keyframes are looked into in a frame."""
+    points_per_source: Annotated[int, Range(at_least=16, at_most=2048)] = 192
+    """Points looked up from each of them."""
+    num_hypotheses: Annotated[int, Range(at_least=16, at_most=1024)] = 64
+    """Pose hypotheses a frame."""
+    cell_px: Annotated[int, Range(at_least=8, at_most=80)] = 20
+    """Side of the grid cells that each get at most one new corner, pixels, even."""
+
+    depth_sigma_m: Annotated[float, Positive] = 0.005
+    """Standard deviation of measured depth close to the camera, metres."""
+    depth_sigma_per_m2: Annotated[float, Range(at_least=0)] = 0.007
+    """Its growth with the square of depth, a metre. Larger than a pixel's noise: neighbours share their errors."""
+    min_depth_m: Annotated[float, Positive] = 0.3
+    """Nearest depth believed, metres."""
+    max_depth_m: Annotated[float, Positive] = 6.0
+    """Farthest depth believed, metres."""
+    pixel_sigma: Annotated[float, Positive] = 1.0
+    """Standard deviation of a tracked point, pixels."""
+    loss_scale: Annotated[float, Positive] = 1.0
+    """Scale of the robust (Cauchy) loss, in standard deviations."""
+    ransac_px: Annotated[float, Positive] = 1.5
+    """Reprojection error up to which a point supports a pose hypothesis while nothing moves, pixels."""
+    outlier_px: Annotated[float, Positive] = 2.0
+    """Reprojection error over which a point is dropped while nothing moves, pixels."""
+    error_per_flow: Annotated[float, Range(at_least=0, at_most=1)] = 0.1
+    """Growth of both with the median motion in the image, pixels a pixel."""
+    min_correlation: Annotated[float, Range(at_least=-1, at_most=1)] = 0.8
+    """Correlation from which a point looked up in a keyframe is believed."""
+    min_inliers: Annotated[float, Range(at_least=4)] = 15
+    """Fewest points that make a pose."""
+    weak_inliers: Annotated[float, Range(at_least=4)] = 40
+    """Below this many points a pose is `WEAK`."""
+    min_share: Annotated[float, Share] = 0.3
+    """Smallest share of the followed points that must agree on the pose."""
+    refill_below: Annotated[float, Share] = 0.8
+    """New points are sought when fewer than this share of `num_points` is alive."""
+    keyframe_below: Annotated[float, Share] = 0.8
+    """A keyframe is made when no kept one shows more than this share of its points."""
+    probation_frames: Annotated[float, Range(at_least=1)] = 8
+    """Frames after which a point counts in full: what moves on its own is an outlier before that."""
+    restart_after: Annotated[float, Range(at_least=0)] = 15
+    """Frames of loss after which tracking starts anew at the pose held."""
+    max_speed_m_per_s: Annotated[float, Positive] = 5.0
+    """Highest believed speed of the camera."""
+    max_turn_rad_per_s: Annotated[float, Positive] = 12.0
+    """Highest believed angular speed of the camera."""
 
 
 @dataclass(frozen=True)

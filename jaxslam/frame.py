@@ -24,6 +24,8 @@ class Frame:
         image: `(height, width, 3)` RGB or `(height, width)` grey, uint8.
         depth_m: `(height, width)` float32 depth along the optical axis in metres; 0 or NaN where missing.
         dynamic_mask: `(height, width)` bool, true where something moves or may move; `None` if unknown.
+        depth_timestamp_ns: Time of the depth image where the sensor takes it apart from the colour image; `None` if
+            both are of one time.
 
     Raises:
         FrameError: If a field has the wrong type or shape, or the images differ in size.
@@ -33,9 +35,12 @@ class Frame:
     image: np.ndarray
     depth_m: np.ndarray
     dynamic_mask: np.ndarray | None = None
+    depth_timestamp_ns: int | None = None
 
     def __post_init__(self) -> None:
-        _check_timestamp(self.timestamp_ns)
+        _check_timestamp("timestamp_ns", self.timestamp_ns)
+        if self.depth_timestamp_ns is not None:
+            _check_timestamp("depth_timestamp_ns", self.depth_timestamp_ns)
         _check_image(self.image)
         _check_plane("depth_m", self.depth_m, np.float32, self.size)
         if self.dynamic_mask is not None:
@@ -73,12 +78,12 @@ def to_grey(image: np.ndarray) -> np.ndarray:
     return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
 
 
-def _check_timestamp(timestamp_ns: object) -> None:
+def _check_timestamp(field: str, timestamp_ns: object) -> None:
     if isinstance(timestamp_ns, bool) or not isinstance(timestamp_ns, numbers.Integral):
         hint = " seconds? (use round(seconds * 1e9))" if isinstance(timestamp_ns, float) else ""
-        raise FrameError(f"timestamp_ns: expected an int in nanoseconds, got {timestamp_ns!r}{hint}")
+        raise FrameError(f"{field}: expected an int in nanoseconds, got {timestamp_ns!r}{hint}")
     if not _INT64.min <= int(timestamp_ns) <= _INT64.max:
-        raise FrameError(f"timestamp_ns: expected an int that fits 64 bits, got {timestamp_ns}")
+        raise FrameError(f"{field}: expected an int that fits 64 bits, got {timestamp_ns}")
 
 
 def _check_image(image: object) -> None:

@@ -26,13 +26,13 @@ class LookedUp(NamedTuple):
     Attributes:
         X_world: `(3, n)` metres.
         uv: `(2, n)` pixels in the frame.
-        found: `(n,)` which were found.
+        weight: `(n,)` how much each counts; 0 for what was not found.
         overlap: Largest share of a keyframe's points that the frame shows.
     """
 
     X_world: Points
     uv: Pixels
-    found: Mask
+    weight: Weights
     overlap: Scalar
 
 
@@ -44,8 +44,8 @@ def empty_keyframes(height: int, width: int, sizes: TrackSizes, image_dtype: jnp
         T_world_cam=jnp.tile(SE3.identity().wxyz_xyz.astype(dtype), (k, 1)),
         uv=jnp.zeros((k, 2, n), dtype),
         X_world=jnp.zeros((k, 3, n), dtype),
-        valid=jnp.zeros((k, n), bool),
-        count=jnp.zeros((), jnp.int32),
+        weight=jnp.zeros((k, n), dtype),
+        made=jnp.zeros((), jnp.int32),
     )
 
 
@@ -85,12 +85,13 @@ def look_up(
         sizes: Static.
     """
     height, width = pyramid.size()
-    k, n = keyframes.valid.shape
+    k, n = keyframes.weight.shape
+    valid = keyframes.weight > 0
     X_cam = to_camera(T_world_cam, jnp.moveaxis(keyframes.X_world, 1, 0).reshape(3, k * n))
     predicted = predict_pixels(X_cam, twist, height, params)
-    visible = _visible(predicted, X_cam[2], height, width) & keyframes.valid.reshape(-1)
+    visible = _visible(predicted, X_cam[2], height, width) & valid.reshape(-1)
     shown = jnp.sum(visible.reshape(k, n), axis=1)
-    overlap = jnp.max(shown / jnp.maximum(jnp.sum(keyframes.valid, axis=1), 1))
+    overlap = jnp.max(shown / jnp.maximum(jnp.sum(valid, axis=1), 1))
     _, sources = jax.lax.top_k(shown, sizes.num_sources)
     chosen = jax.vmap(lambda s: jnp.nonzero(visible.reshape(k, n)[s], size=sizes.points_per_source, fill_value=n)[0])(
         sources
@@ -114,7 +115,7 @@ def look_up(
     )
     shift = jnp.sum(jnp.square(match.points - guess), axis=0)
     found = match.converged & (match.correlation > params.min_correlation) & (shift < _MAX_SHIFT_PX**2)
-    return LookedUp(X_world, match.points, found, overlap)
+    return LookedUp(X_world, match.points, jnp.where(found, take(keyframes.weight.reshape(-1)), 0), overlap)
 
 
 def _visible(uv: Pixels, depth: Weights, height: int, width: int) -> Mask:
@@ -143,16 +144,21 @@ def _warp(
 
 
 def with_keyframe(
-    keyframes: Keyframes, make: Bool[Array, ""], image: Num[Array, "h w"], T_world_cam: SE3, points: TrackedPoints
+    keyframes: Keyframes,
+    make: Bool[Array, ""],
+    image: Num[Array, "h w"],
+    T_world_cam: SE3,
+    points: TrackedPoints,
+    weight: Weights,
 ) -> Keyframes:
     """The ring with a keyframe in place of the oldest one where `make` is true, else unchanged."""
-    slot: Int[Array, ""] = keyframes.count % keyframes.valid.shape[0]
+    slot: Int[Array, ""] = keyframes.made % keyframes.weight.shape[0]
     put = lambda ring, new: ring.at[slot].set(jnp.where(make, new, ring[slot]))
     return Keyframes(
         images=put(keyframes.images, image.astype(keyframes.images.dtype)),
         T_world_cam=put(keyframes.T_world_cam, T_world_cam.wxyz_xyz),
         uv=put(keyframes.uv, points.uv),
         X_world=put(keyframes.X_world, points.X_world),
-        valid=put(keyframes.valid, points.valid),
-        count=keyframes.count + make.astype(jnp.int32),
+        weight=put(keyframes.weight, weight),
+        made=keyframes.made + make.astype(jnp.int32),
     )

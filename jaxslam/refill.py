@@ -32,7 +32,7 @@ def refill(
     Corners are sought on the second level of the pyramid: a quarter of the work, and less noise. A new point has the
     depth measured at it, the rolling shutter and the delay of the depth image taken into account.
     """
-    height, width = pyramid.size()
+    height = pyramid.size()[0]
     border, cell = pyramid.border, sizes.cell_px // 2
     image = pyramid.levels[1][border:-border, border:-border]
     v, u = jnp.mgrid[: image.shape[0], : image.shape[1]]
@@ -41,7 +41,7 @@ def refill(
     corners = grid_corners(
         corner_score(image), inside & ~ignore[::2, ::2][: image.shape[0], : image.shape[1]], cell=cell
     )
-    taken = occupied_cells(points.uv / 2, points.valid, image.shape, cell=cell)
+    taken = occupied_cells(points.uv / 2, points.valid, (image.shape[0], image.shape[1]), cell=cell)
     uv = corners.points * 2
 
     xy = normalise(params.intrinsics, uv)
@@ -65,5 +65,6 @@ def refill(
         X_world=put(points.X_world, X_world),
         information=put(points.information, 1 / jnp.square(sigma)),
         weight=jnp.where(new, 1, points.weight),
+        age=jnp.where(new, 0, points.age),
         valid=points.valid | new,
     )

@@ -7,7 +7,7 @@ from jaxlie import SE3
 from jaxslam_kernels.camera import Intrinsics
 from jaxslam_kernels.image import Pyramid
 from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Points, Scalar, Weights
-from jaxtyping import Array, Bool, Float, Key, Num
+from jaxtyping import Array, Bool, Float, Int, Key, Num
 
 
 class TrackStatus(enum.IntEnum):
@@ -20,6 +20,8 @@ class TrackStatus(enum.IntEnum):
     """No pose was found; the one given is the last one, held."""
     STARTED = 3
     """Tracking begins here, or begins anew at the pose held while lost."""
+    REJECTED = 4
+    """The frame could not be read or does not fit; it never reached the tracker."""
 
 
 class TrackReason(enum.IntEnum):
@@ -85,17 +87,21 @@ class TrackParams(NamedTuple):
         max_depth_m: Farthest depth believed.
         pixel_sigma: Standard deviation of a tracked point, pixels.
         loss_scale: Scale of the Cauchy loss, in standard deviations.
-        ransac_px: Reprojection error up to which a point supports a pose hypothesis, pixels.
-        outlier_px: Reprojection error over which a point is dropped, pixels.
+        ransac_px: Reprojection error up to which a point supports a pose hypothesis while nothing moves, pixels.
+        outlier_px: Reprojection error over which a point is dropped while nothing moves, pixels.
+        error_per_flow: Growth of both with the median motion in the image, pixels a pixel: blur and what is left of
+            the rolling shutter grow with it, and so would a threshold that lets people pass in a calm picture.
         min_correlation: Correlation from which a point looked up in a keyframe is believed.
         min_inliers: Fewest points that make a pose.
         weak_inliers: Below this the status is `WEAK`.
         min_share: Smallest share of the followed points that must agree on the pose.
         refill_below: New points are sought when fewer than this share of the capacity is alive.
         keyframe_below: A keyframe is made when no kept one shows more than this share of its points.
+        probation_frames: Frames after which a point counts in full. What moves on its own is an outlier within a few
+            frames, so that it never counts for much.
         restart_after: Frames of loss after which tracking starts anew at the held pose.
-        max_speed: Highest believed speed, metres a second.
-        max_turn: Highest believed angular speed, radians a second.
+        max_speed_m_per_s: Highest believed speed of the camera.
+        max_turn_rad_per_s: Highest believed angular speed of the camera.
     """
 
     intrinsics: Intrinsics
@@ -108,19 +114,21 @@ class TrackParams(NamedTuple):
     loss_scale: Scalar
     ransac_px: Scalar
     outlier_px: Scalar
+    error_per_flow: Scalar
     min_correlation: Scalar
     min_inliers: Scalar
     weak_inliers: Scalar
     min_share: Scalar
     refill_below: Scalar
     keyframe_below: Scalar
+    probation_frames: Scalar
     restart_after: Scalar
-    max_speed: Scalar
-    max_turn: Scalar
+    max_speed_m_per_s: Scalar
+    max_turn_rad_per_s: Scalar
 
 
 class FrameArrays(NamedTuple):
-    """One frame as the compiled step takes it.
+    """One frame as the compiled step takes it; NumPy arrays will do.
 
     Attributes:
         image: `(h, w)` grey, 0 to 255; `uint8`, or floating point to differentiate with respect to it.
@@ -133,8 +141,8 @@ class FrameArrays(NamedTuple):
     image: Num[Array, "h w"]
     depth: Float[Array, "h w"]
     ignore: Bool[Array, "h w"]
-    dt_s: Scalar
-    depth_delay_s: Scalar
+    dt_s: Float[Array, ""]
+    depth_delay_s: Float[Array, ""]
 
 
 class TrackedPoints(NamedTuple):
@@ -145,6 +153,7 @@ class TrackedPoints(NamedTuple):
         X_world: `(3, n)` where they are in the world, metres.
         information: `(n,)` inverse variance of their depth, 1 / m^2.
         weight: `(n,)` how much each counts, 0 to 1; the caller may change it between steps.
+        age: `(n,)` frames each has survived.
         valid: `(n,)` which slots hold a point.
     """
 
@@ -152,6 +161,7 @@ class TrackedPoints(NamedTuple):
     X_world: Points
     information: Weights
     weight: Weights
+    age: Int[Array, " n"]
     valid: Mask
 
 
@@ -163,16 +173,16 @@ class Keyframes(NamedTuple):
         T_world_cam: `(k, 7)` poses as `wxyz_xyz`.
         uv: `(k, 2, n)` the points in them, pixels.
         X_world: `(k, 3, n)` the points in the world, metres.
-        valid: `(k, n)` which are there.
-        count: Keyframes made so far.
+        weight: `(k, n)` how much each counted when the keyframe was made; 0 for a slot without a point.
+        made: Keyframes made so far.
     """
 
     images: Num[Array, "k h w"]
     T_world_cam: Float[Array, "k 7"]
     uv: Float[Array, "k 2 n"]
     X_world: Float[Array, "k 3 n"]
-    valid: Bool[Array, "k n"]
-    count: Code
+    weight: Float[Array, "k n"]
+    made: Code
 
 
 class TrackState(NamedTuple):

@@ -6,6 +6,7 @@ points agree and which keyframes are looked into are choices, constant for a der
 carries it, by the implicit function theorem.
 """
 
+import enum
 from typing import NamedTuple
 
 import jax
@@ -18,6 +19,7 @@ from jaxslam_kernels.image import Pyramid, build_pyramid
 from jaxslam_kernels.lk_flow import FlowPlan, lk_flow
 from jaxslam_kernels.pnp import ransac_pnp
 from jaxslam_kernels.pose_refine import PoseRefinement, refine_pose
+from jaxslam_kernels.robust import weighted_median
 from jaxslam_kernels.rolling_shutter import image_velocity, row_time
 from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Points, Scalar, Weights
 from jaxtyping import Array, Float
@@ -101,6 +103,7 @@ def init_state(
             X_world=jnp.zeros((3, n), dtype),
             information=jnp.zeros(n, dtype),
             weight=jnp.ones(n, dtype),
+            age=jnp.zeros(n, jnp.int32),
             valid=jnp.zeros(n, bool),
         ),
         keyframes=empty_keyframes(height, width, sizes, image_dtype, dtype),
@@ -131,6 +134,7 @@ def track_step(
     view = _prepare(state, frame, params, sizes)
     predicted = _predict(state, view)
     uv, followed = _follow(state, view, predicted, params)
+    params = _widened(params, state.points.uv, uv, followed)
     coarse, agreeing = _coarse_pose(state, view, uv, followed, predicted, params, sizes)
     twist = _twist(state.T_world_cam, coarse, view.elapsed_s)
     looked_up = look_up(state.keyframes, coarse, twist, view.pyramid, view.depth, params, sizes)
@@ -167,6 +171,13 @@ def _follow(state: TrackState, view: _View, predicted: SE3, params: TrackParams)
     return flow.points, flow.ok & ~ignored & (points.weight > 0)
 
 
+def _widened(params: TrackParams, before: Pixels, after: Pixels, followed: Mask) -> TrackParams:
+    """Thresholds on reprojection errors, widened by the motion in the image."""
+    length = jnp.sqrt(jnp.sum(jnp.square(lax.stop_gradient(after - before)), axis=0))
+    extra = params.error_per_flow * weighted_median(length, followed.astype(length.dtype))
+    return params._replace(ransac_px=params.ransac_px + extra, outlier_px=params.outlier_px + extra)
+
+
 def _see(X_world: Points, uv: Pixels, pose: SE3, twist: Float[Array, "6"], view: _View, params: TrackParams) -> _Seen:
     """Remove distortion, rolling shutter and the delay of the depth image from observations."""
     height = view.depth.shape[0]
@@ -181,12 +192,18 @@ def _depth_sigma(depth: Weights, params: TrackParams) -> Weights:
     return params.depth_sigma_m + params.depth_sigma_per_m2 * jnp.square(depth)
 
 
+def _trust(points: TrackedPoints, params: TrackParams) -> Weights:
+    """How much each point counts: its weight, less while it is on probation; 0 for a slot without a point."""
+    served = (points.age + 1).astype(points.weight.dtype) / params.probation_frames
+    return jnp.where(points.valid, points.weight * jnp.minimum(served, 1), 0)
+
+
 def _coarse_pose(
     state: TrackState, view: _View, uv: Pixels, followed: Mask, predicted: SE3, params: TrackParams, sizes: TrackSizes
 ) -> tuple[SE3, Mask]:
     """The pose most points agree with, and which do."""
     seen = _see(state.points.X_world, uv, predicted, state.twist, view, params)
-    usable = followed.astype(uv.dtype) * state.points.weight
+    usable = followed * _trust(state.points, params)
     result = ransac_pnp(
         jax.random.fold_in(state.key, state.frame),
         seen.X_world,
@@ -220,7 +237,7 @@ def _refine(
     """The pose that fits followed points and points of keyframes together."""
     X_world = jnp.concatenate([state.points.X_world, looked_up.X_world], axis=1)
     seen = _see(X_world, jnp.concatenate([uv, looked_up.uv], axis=1), coarse, twist, view, params)
-    weights = jnp.concatenate([agreeing * state.points.weight, looked_up.found.astype(uv.dtype)])
+    weights = jnp.concatenate([agreeing * _trust(state.points, params), looked_up.weight])
     refined = refine_pose(
         coarse,
         seen.X_world,
@@ -262,14 +279,18 @@ def _judge(
         (num_followed < params.min_inliers, TrackReason.NO_POINTS),
         (num_inliers < params.min_inliers, TrackReason.FEW_INLIERS),
         (ratio < params.min_share, TrackReason.FEW_SHARE),
-        (~((speed < params.max_speed) & (turn < params.max_turn)), TrackReason.IMPLAUSIBLE_MOTION),
+        (~((speed < params.max_speed_m_per_s) & (turn < params.max_turn_rad_per_s)), TrackReason.IMPLAUSIBLE_MOTION),
     )
-    conditions, reasons = zip(*causes, strict=True)
+    conditions = [condition for condition, _ in causes]
     lost = jnp.any(jnp.stack(conditions))
     weak = num_inliers < params.weak_inliers
-    mild = jnp.where(weak, TrackReason.FEW_INLIERS, TrackReason.NONE)
-    codes = [jnp.full((), reason, jnp.int32) for reason in reasons]
-    return _Verdict(lost, weak & ~lost, jnp.select(conditions, codes, mild.astype(jnp.int32)), ratio)
+    mild = jnp.where(weak, _code(TrackReason.FEW_INLIERS), _code(TrackReason.NONE))
+    codes = [_code(reason) for _, reason in causes]
+    return _Verdict(lost, weak & ~lost, jnp.select(conditions, codes, mild), ratio)
+
+
+def _code(value: enum.IntEnum) -> Code:
+    return jnp.full((), value, jnp.int32)
 
 
 def _update_points(
@@ -297,6 +318,7 @@ def _update_points(
         X_world=jnp.where(agrees[None, :], X_world, points.X_world),
         information=jnp.where(agrees, jnp.minimum(points.information + information, cap), points.information),
         weight=points.weight,
+        age=points.age + inliers.astype(jnp.int32),
         valid=points.valid & inliers,
     )
 
@@ -343,7 +365,7 @@ def _conclude(
     failed = start & (jnp.sum(points.valid) < params.min_inliers)
     started = start & ~failed
     make = started | (~verdict.lost & (looked_up.overlap < params.keyframe_below))
-    keyframes = with_keyframe(state.keyframes, make, view.frame.image, pose, points)
+    keyframes = with_keyframe(state.keyframes, make, view.frame.image, pose, points, _trust(points, params))
     stale = held | failed
     new_state = TrackState(
         pyramid=jax.tree.map(lambda old, new: jnp.where(stale, old, new), state.pyramid, view.pyramid),
@@ -358,10 +380,10 @@ def _conclude(
     )
     status = jnp.select(
         [started, verdict.lost, verdict.weak],
-        [jnp.full((), code, jnp.int32) for code in (TrackStatus.STARTED, TrackStatus.LOST, TrackStatus.WEAK)],
-        0,
+        [_code(TrackStatus.STARTED), _code(TrackStatus.LOST), _code(TrackStatus.WEAK)],
+        _code(TrackStatus.OK),
     )
-    reason = jnp.where(failed, TrackReason.NO_DEPTH, verdict.reason)
+    reason = jnp.select([failed, started], [_code(TrackReason.NO_DEPTH), _code(TrackReason.NONE)], verdict.reason)
     output = TrackOutput(
         T_world_cam=pose,
         covariance=jnp.where(verdict.lost, jnp.eye(6, dtype=twist.dtype) * _UNKNOWN_VARIANCE, refined.covariance),
@@ -369,7 +391,7 @@ def _conclude(
         reason=reason,
         num_inliers=jnp.where(verdict.lost, 0, jnp.sum(kept.valid)),
         inlier_ratio=jnp.where(verdict.lost, 0, verdict.inlier_ratio),
-        num_looked_up=jnp.where(verdict.lost, 0, jnp.sum(looked_up.found)),
+        num_looked_up=jnp.where(verdict.lost, 0, jnp.sum(looked_up.weight > 0)),
         residual_px=refined.residual_scale * params.pixel_sigma,
         uv=points.uv,
         weights=jnp.where(points.valid & ~held, points.weight, 0),

@@ -2,12 +2,15 @@
 
 import io
 import os
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
+from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure, SubFigure
 
 from jaxslam.errors import TrajectoryError
 from jaxslam.evaluation import Evaluation
@@ -16,6 +19,26 @@ from jaxslam.trajectory import Trajectory
 
 _BREAK_INTERVALS = 3.0
 _TRUTH_COLOR, _PATH_COLOR, _LOST_COLOR = "0.6", "tab:blue", "tab:red"
+_FOLLOWED_COLOR, _NEW_COLOR = "lime", "orange"
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """One frame and the points in it.
+
+    Attributes:
+        title: What to write above it.
+        image: `(h, w, 3)` or `(h, w)` uint8.
+        uv: `(2, n)` points, pixels.
+        weights: `(n,)` how much each counts, 0 to 1; a point of weight 0 is not drawn.
+        followed: `(n,)` which came from the frame before; the others are new.
+    """
+
+    title: str
+    image: np.ndarray
+    uv: np.ndarray
+    weights: np.ndarray
+    followed: np.ndarray
 
 
 def plot_trajectory(
@@ -23,8 +46,9 @@ def plot_trajectory(
     reference: Trajectory | None,
     evaluation: Evaluation | None,
     path: str | os.PathLike[str],
+    snapshots: Sequence[Snapshot] = (),
 ) -> None:
-    """Write one PNG: the path and, if it was evaluated, the error over time and the figures.
+    """Write one PNG: the path and, if it was evaluated, the error over time and the figures; below, some frames.
 
     The path is seen along its flattest axis, at one scale. With an evaluation the estimate is drawn aligned and
     coloured by error, and times without estimated poses are shaded; otherwise both paths are drawn as they are.
@@ -34,25 +58,45 @@ def plot_trajectory(
         reference: The truth, if known.
         evaluation: `evaluate(estimate, reference, ...)`, if it was done.
         path: Where the picture goes.
+        snapshots: Frames to show with their points.
 
     Raises:
         TrajectoryError: If there is nothing to draw or the file cannot be written.
     """
     if not len(estimate):
         raise TrajectoryError("nothing to plot: the estimate holds no poses")
+    height, frames_height = (7 if evaluation is None else 10), 3.2 * ((len(snapshots) + 1) // 2)
+    figure = Figure(figsize=(8, height + frames_height), layout="constrained")
+    plots: Figure | SubFigure = figure
+    if snapshots:
+        parts = np.asarray(figure.subfigures(2, 1, height_ratios=(height, frames_height)))
+        plots = parts[0]
+        _draw_snapshots(parts[1], snapshots)
     if evaluation is None:
-        figure = Figure(figsize=(8, 7), layout="constrained")
-        _draw_paths(figure.add_subplot(), estimate, reference)
-        figure.suptitle(f"{len(estimate)} poses, not evaluated", fontsize=9)
+        _draw_paths(plots.add_subplot(), estimate, reference)
+        plots.suptitle(f"{len(estimate)} poses, not evaluated", fontsize=9)
     else:
-        figure = Figure(figsize=(8, 10), layout="constrained")
-        seen, over_time = figure.subplots(2, height_ratios=(3, 1))
+        seen, over_time = plots.subplots(2, height_ratios=(3, 1))
         _draw_evaluated_paths(seen, reference, evaluation)
         _draw_errors(over_time, evaluation)
-        figure.suptitle(str(evaluation), fontsize=8, family="monospace", x=0.02, ha="left")
+        plots.suptitle(str(evaluation), fontsize=8, family="monospace", x=0.02, ha="left")
     picture = io.BytesIO()
     FigureCanvasAgg(figure).print_png(picture)
     write_atomically(path, picture.getvalue(), TrajectoryError)
+
+
+def _draw_snapshots(figure: SubFigure, snapshots: Sequence[Snapshot]) -> None:
+    every = figure.subplots((len(snapshots) + 1) // 2, 2, squeeze=False).ravel()
+    for axes in every:
+        axes.set_axis_off()
+    for axes, snapshot in zip(every, snapshots, strict=False):
+        axes.imshow(snapshot.image, cmap="gray", vmin=0, vmax=255)
+        axes.set_title(snapshot.title, fontsize=8)
+        alive = snapshot.weights > 0
+        colors = np.where(snapshot.followed[:, None], to_rgba(_FOLLOWED_COLOR), to_rgba(_NEW_COLOR))
+        colors[:, 3] = snapshot.weights
+        axes.scatter(*snapshot.uv[:, alive], s=4, c=colors[alive])
+    figure.supxlabel("points: followed in green, new in orange", fontsize=8)
 
 
 def _draw_paths(axes: Axes, estimate: Trajectory, reference: Trajectory | None) -> None:

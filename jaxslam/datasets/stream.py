@@ -4,6 +4,7 @@ from collections import deque
 from collections.abc import Generator
 from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -12,6 +13,8 @@ from jaxslam.datasets.protocol import Dataset
 from jaxslam.errors import DatasetError
 from jaxslam.frame import Frame
 from jaxslam.trajectory import Trajectory
+
+_Item_co = TypeVar("_Item_co", covariant=True)
 
 
 class Subset:
@@ -51,7 +54,15 @@ class Subset:
         return self._dataset[self._indices[index]]
 
 
-def prefetch(dataset: Dataset, ahead: int = 4) -> Generator[Frame]:
+class Indexed(Protocol[_Item_co]):
+    """What `prefetch` reads: a recording, or anything with a length and items."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int) -> _Item_co: ...
+
+
+def prefetch(dataset: Indexed[_Item_co], ahead: int = 4) -> Generator[_Item_co]:
     """Every frame in order, decoded in one background thread while the caller works on earlier ones.
 
     The thread ends with the iterator: when it is exhausted, closed, or thrown away half-way.

@@ -27,7 +27,8 @@ _NAME = re.compile(r"rgbd_dataset_freiburg([123])_")
 class TumDataset:
     """A recording whose colour and depth images are listed apart and matched by time, one to one.
 
-    A frame has the time of its colour image. Depth counts become metres; nothing else is done to the images.
+    A frame has the time of its colour image, and says that of its depth.
+    Depth counts become metres; nothing else is done to the images.
 
     Attributes:
         name: The folder's name.
@@ -51,6 +52,7 @@ class TumDataset:
         self.name = folder.name
         self.camera = camera
         self.timestamps_ns = color.timestamps_ns[color_index]
+        self._depth_timestamps_ns = depth.timestamps_ns[depth_index]
         self.unmatched = Unmatched(len(color.files) - matched, len(depth.files) - matched)
         self._folder = folder
         self._depth_scale_per_m = camera.depth_scale_per_m
@@ -85,7 +87,8 @@ class TumDataset:
                     f"{file}: expected {self.camera.width}x{self.camera.height} pixels, the size of camera"
                     f" '{self.camera.name}', got {shape[1]}x{shape[0]}"
                 )
-        return Frame(int(self.timestamps_ns[index]), image, depth_m)
+        depth_time = int(self._depth_timestamps_ns[index])
+        return Frame(int(self.timestamps_ns[index]), image, depth_m, depth_timestamp_ns=depth_time)
 
 
 def has_layout(folder: Path) -> bool:

@@ -8,12 +8,15 @@ from jaxtyping import Array, Bool, Float
 
 from jaxslam_kernels.types import Image, Mask, Pixels
 
+_WINDOW = 5
+_EDGE = 4
+
 
 class Corners(NamedTuple):
     """The best corner of every cell, row by row.
 
     Attributes:
-        points: `(2, c)` pixel coordinates.
+        points: `(2, c)` pixel coordinates, whole numbers; the top-left pixel of a cell that offers no corner.
         score: `(c,)` smaller eigenvalue of the mean gradient matrix; 0 where the cell offers no corner.
     """
 
@@ -22,49 +25,72 @@ class Corners(NamedTuple):
 
 
 def corner_score(image: Image) -> Image:
-    """Smaller eigenvalue of the gradient matrix averaged over 5x5 pixels; 0 within 4 pixels of the edge.
+    """Smaller eigenvalue of the gradient matrix averaged over 5x5 pixels, in squared intensity a squared pixel.
+
+    Zero within 4 pixels of the edge, and where the window or the pixels next to it hold something that is not a
+    number. At equal eigenvalues, where the smaller one has no derivative, that of their mean is given.
 
     Source: Shi and Tomasi, Good Features to Track, CVPR 1994.
     """
-    padded = jnp.pad(image, 1, mode="edge")
-    gu = (padded[1:-1, 2:] - padded[1:-1, :-2]) / 2
-    gv = (padded[2:, 1:-1] - padded[:-2, 1:-1]) / 2
-    uu, uv, vv = (_box_mean(product) for product in (gu * gu, gu * gv, gv * gv))
+    if min(image.shape) <= 2 * _EDGE:
+        return jnp.zeros_like(image)
+    gu = (image[2:-2, 3:-1] - image[2:-2, 1:-3]) / 2
+    gv = (image[3:-1, 2:-2] - image[1:-3, 2:-2]) / 2
+    known = jnp.isfinite(gu) & jnp.isfinite(gv)
+    gu, gv = jnp.where(known, gu, 0), jnp.where(known, gv, 0)
+    uu, uv, vv = (_window_mean(product) for product in (jnp.where(known, gu * gu, jnp.nan), gu * gv, gv * gv))
+    known = jnp.isfinite(uu + vv)
+    uu, uv, vv = (jnp.where(known, mean, 0) for mean in (uu, uv, vv))
     spread = jnp.sqrt(jnp.square(uu - vv) + 4 * jnp.square(uv) + jnp.finfo(uu.dtype).tiny)
-    return jnp.pad(((uu + vv - spread) / 2)[4:-4, 4:-4], 4)
+    return jnp.pad(jnp.where(known, (uu + vv - spread) / 2, 0), _EDGE)
 
 
-def _box_mean(image: Image) -> Image:
-    padded = jnp.pad(image, 2, mode="edge")
-    height, width = image.shape
-    rows = sum((padded[tap : tap + height] for tap in range(5)), start=jnp.zeros((), image.dtype))
-    total = sum((rows[:, tap : tap + width] for tap in range(5)), start=jnp.zeros((), image.dtype))
-    return total / 25
+def _window_mean(image: Image) -> Float[Array, "_h _w"]:
+    """Mean over the window around every pixel at which it fits into the image."""
+    height, width = (side - _WINDOW + 1 for side in image.shape)
+    zero = jnp.zeros((), image.dtype)
+    rows = sum((image[tap : tap + height] for tap in range(_WINDOW)), start=zero)
+    return sum((rows[:, tap : tap + width] for tap in range(_WINDOW)), start=zero) / _WINDOW**2
 
 
 def grid_corners(score: Image, allowed: Bool[Array, "h w"], *, cell: int) -> Corners:
     """The pixel of highest score in every `cell` x `cell` square of a score image.
 
+    Of equals, the first in reading order. A choice, constant for a derivative: neither points nor scores have one.
+
     Args:
-        score: From `corner_score`. Rows and columns past the last whole cell are left out.
+        score: From `corner_score`; a score that is not a number counts as 0. Rows and columns past the last whole
+            cell are left out.
         allowed: Where a corner may be.
         cell: Side of a cell in pixels, static.
     """
     rows, columns = score.shape[0] // cell, score.shape[1] // cell
     usable = jnp.where(allowed & jnp.isfinite(score), score, 0)[: rows * cell, : columns * cell]
-    cells = usable.reshape(rows, cell, columns, cell).transpose(0, 2, 1, 3).reshape(rows * columns, cell * cell)
-    best = jnp.argmax(cells, axis=1)
-    index = jnp.arange(rows * columns)
+    # Down the columns, then along the rows, without argmax, which XLA does not vectorise: a tenth of the time.
+    strips = usable.reshape(rows, cell, columns * cell)
+    top = jnp.max(strips, axis=1)
+    down = jnp.min(jnp.where(strips == top[:, None], jnp.arange(cell)[None, :, None], cell), axis=1)
+    top, down = top.reshape(rows * columns, cell), down.reshape(rows * columns, cell)
+    score_of_cell = jnp.max(top, axis=1)
+    offset = jnp.where(top == score_of_cell[:, None], down * cell + jnp.arange(cell)[None, :], cell * cell)
+    best, index = jnp.min(offset, axis=1), jnp.arange(rows * columns)
     u = index % columns * cell + best % cell
     v = index // columns * cell + best // cell
-    top = jnp.max(cells, axis=1)
-    return Corners(jnp.stack([u, v]).astype(score.dtype), lax.stop_gradient(jnp.maximum(top, 0)))
+    return Corners(jnp.stack([u, v]).astype(score.dtype), lax.stop_gradient(jnp.maximum(score_of_cell, 0)))
 
 
 def occupied_cells(points: Pixels, valid: Mask, shape: tuple[int, int], *, cell: int) -> Bool[Array, " c"]:
-    """Which cells of the grid of `grid_corners` already hold one of the valid `points`; `shape` is `(h, w)`."""
+    """Which cells of the grid of `grid_corners` already hold one of the valid points.
+
+    Args:
+        points: `(2, n)` pixel coordinates; one outside the grid or not a number is in no cell.
+        valid: `(n,)` which of them count.
+        shape: Height and width of the score image, static.
+        cell: Side of a cell in pixels, static; cell `k` of a row spans coordinates from `k * cell` to the next.
+    """
     rows, columns = shape[0] // cell, shape[1] // cell
-    column, row = jnp.floor(jnp.where(valid[None, :], points, -1) / cell).astype(jnp.int32)
-    inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+    u, v = points
+    inside = valid & (u >= 0) & (u < columns * cell) & (v >= 0) & (v < rows * cell)
+    column, row = jnp.floor(jnp.where(inside[None, :], points, 0) / cell).astype(jnp.int32)
     index = jnp.where(inside, row * columns + column, rows * columns)
     return jnp.zeros(rows * columns, bool).at[index].set(True, mode="drop")

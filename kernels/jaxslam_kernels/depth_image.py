@@ -6,9 +6,12 @@ from jax import lax
 
 from jaxslam_kernels.types import DepthImage, Pixels, Scalar, Weights
 
+_NOISE_M = 0.02
+"""A difference that noise alone makes, at any depth."""
+
 
 def believable(depth: DepthImage, nearest: Scalar | float, farthest: Scalar | float) -> DepthImage:
-    """Depth where it is a number within the range of the sensor, 0 elsewhere."""
+    """Depth in metres where it is a number between `nearest` and `farthest`, 0 elsewhere."""
     inside = (depth > nearest) & (depth < farthest)
     return jnp.where(inside, depth, 0)
 
@@ -16,21 +19,23 @@ def believable(depth: DepthImage, nearest: Scalar | float, farthest: Scalar | fl
 def sample_depth(depth: DepthImage, uv: Pixels, *, reach: int = 1, max_step: float = 0.05) -> Weights:
     """Depth at the nearest pixel, or 0 where its surroundings do not agree.
 
+    Differentiable in the depth image; in `uv` the derivative is zero, because the nearest pixel stays the same.
+
     Args:
-        depth: Depth image, 0 where missing.
-        uv: `(2, n)` pixel coordinates; outside the image gives 0.
-        reach: The `2 * reach + 1` pixels around must all have depth, static.
-        max_step: Largest difference of depth among them, as a share of the depth.
+        depth: Depth image in metres, at least as large as the surroundings; 0 or NaN where missing.
+        uv: `(2, n)` pixel coordinates. Where one is not a number, or the surroundings leave the image, the result is 0.
+        reach: The surroundings are `2 * reach + 1` pixels a side, and all must have depth; static.
+        max_step: Largest difference of depth in them, as a share of the depth in the middle; 2 cm are always allowed.
     """
     height, width = depth.shape
     side = 2 * reach + 1
-    finite = jnp.all(jnp.isfinite(uv), axis=0)
-    nearest = jnp.round(lax.stop_gradient(jnp.where(finite[None, :], uv, -1))).astype(jnp.int32)
-    u, v = nearest
-    inside = finite & (u >= reach) & (v >= reach) & (u < width - reach) & (v < height - reach)
-    cut = jax.vmap(lambda u, v: lax.dynamic_slice(depth, (v - reach, u - reach), (side, side)))(u, v)
+    centre = jnp.round(lax.stop_gradient(uv))
+    u, v = centre
+    inside = (u >= reach) & (v >= reach) & (u < width - reach) & (v < height - reach)
+    column, row = jnp.where(inside[None, :], centre, reach).astype(jnp.int32) - reach
+    cut = jax.vmap(lambda row, column: lax.dynamic_slice(depth, (row, column), (side, side)))(row, column)
     around = cut.reshape(-1, side * side)
     low, high = jnp.min(around, axis=1), jnp.max(around, axis=1)
-    centre = around[:, side * side // 2]
-    smooth = (low > 0) & (high - low <= max_step * centre + 0.02)
-    return jnp.where(inside & smooth, centre, 0)
+    middle = around[:, side * side // 2]
+    smooth = (low > 0) & jnp.isfinite(high) & (high - low <= max_step * middle + _NOISE_M)
+    return jnp.where(inside & smooth, middle, 0)

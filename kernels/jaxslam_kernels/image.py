@@ -1,5 +1,7 @@
 """Image pyramids, in a form from which kernels cut patches without bounds checks."""
 
+from functools import reduce
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -36,8 +38,8 @@ def half_size(image: Image) -> Float[Array, "_h _w"]:
     """
     height, width = image.shape
     padded = jnp.pad(image, 2, mode="reflect")
-    rows = sum(weight * padded[tap : tap + height : 2] for tap, weight in enumerate(_BINOMIAL))
-    return sum(weight * rows[:, tap : tap + width : 2] for tap, weight in enumerate(_BINOMIAL))  # pyright: ignore[reportIndexIssue, reportReturnType]
+    rows = reduce(jnp.add, (weight * padded[tap : tap + height : 2] for tap, weight in enumerate(_BINOMIAL)))
+    return reduce(jnp.add, (weight * rows[:, tap : tap + width : 2] for tap, weight in enumerate(_BINOMIAL)))
 
 
 def build_pyramid(image: Image, *, num_levels: int = 4, border: int = 16) -> Pyramid:
@@ -45,9 +47,15 @@ def build_pyramid(image: Image, *, num_levels: int = 4, border: int = 16) -> Pyr
 
     Args:
         image: Grey image, at least 3 pixels a side at the coarsest level but one.
-        num_levels: Number of levels, static.
+        num_levels: Number of levels, static, at least 1.
         border: Padding of each level in pixels, static; `lk_flow` needs `window // 2 + 6`.
+
+    Raises:
+        ValueError: While tracing, if there is no level or the image is too small for that many.
     """
+    smallest = min(image.shape) / 2 ** max(num_levels - 2, 0)
+    if num_levels < 1 or (num_levels > 1 and smallest < 3):
+        raise ValueError(f"num_levels: 1 or more with sides halved no further than 2 pixels, got {num_levels} levels of {image.shape}")
     levels = [image]
     while len(levels) < num_levels:
         levels.append(half_size(levels[-1]))

@@ -2,54 +2,78 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from jaxslam_kernels.types import Mask, Pixels
+
+Measures = PyTree[Float[Array, " n"]]
+
+
+class Found(NamedTuple):
+    """Where a search for positions ended.
+
+    Attributes:
+        positions: `(2, n)`, finite.
+        converged: `(n,)` which of them are solutions.
+        measures: What else is known of them, any number of arrays `(n,)`.
+    """
+
+    positions: Pixels
+    converged: Mask
+    measures: Measures
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def implicit_positions(
-    solve: Callable[[Any], tuple[Pixels, Mask, PyTree]],
-    slope: Callable[[Pixels, Any], Pixels],
+    solve: Callable[[Any], Found],
+    explain: Callable[[Pixels, Any], tuple[Pixels, Measures]],
     inputs: PyTree[Array],
-) -> tuple[Pixels, Mask, PyTree]:
+) -> Found:
     """Positions at which a slope vanishes, differentiable whatever iteration found them.
 
-    The derivative is `-(d slope / d position)^-1 (d slope / d inputs)`, forward and reverse; zero for a position that
-    did not converge or has a singular system, because no solution is there.
+    The derivative of a position is `-(d slope / d position)^-1 (d slope / d inputs)`, forward and reverse; a measure
+    changes with the inputs and with its position. Both are zero for a point that did not converge, or whose system is
+    singular to working precision: no solution is there. The functions must close over nothing that is traced.
 
     Args:
-        solve: Finds `(positions, converged, others)` from the inputs; never differentiated. `others` get no derivative.
-        slope: `(2, n)` slope at positions, zero at a solution; point `i` of it depends on position `i` alone.
-        inputs: Whatever both take.
+        solve: The search; never differentiated.
+        explain: The slope at positions, `(2, n)` and zero at a solution, and the measures there, as plain
+            differentiable functions; those of a point depend on its own position alone. A measure that is to have no
+            derivative is a constant here.
+        inputs: What both take. Numbers in it that are not finite are replaced by 0 for the derivative; a point that
+            has seen one must not count as converged.
     """
     return solve(inputs)
 
 
 @implicit_positions.defjvp
-def _implicit_positions_jvp(solve: Callable, slope: Callable, primals: tuple, tangents: tuple) -> tuple:
+def _implicit_positions_jvp(solve: Callable, explain: Callable, primals: tuple, tangents: tuple) -> tuple[Found, Found]:
     (inputs,), (change,) = primals, tangents
-    position, converged, others = implicit_positions(solve, slope, inputs)
-    at_inputs = lambda where: slope(where, inputs)
-    unit = lambda axis: jnp.zeros_like(position).at[axis].set(1)
-    by_u = jax.jvp(at_inputs, (position,), (unit(0),))[1]
-    by_v = jax.jvp(at_inputs, (position,), (unit(1),))[1]
-    b = jax.jvp(lambda given: slope(position, given), (inputs,), (change,))[1]
-    determinant = by_u[0] * by_v[1] - by_v[0] * by_u[1]
-    regular = converged & (jnp.abs(determinant) > 0) & jnp.isfinite(determinant)
-    inverse = jnp.where(regular, 1 / jnp.where(regular, determinant, 1), 0)[None, :]
-    moved = -inverse * jnp.stack([by_v[1] * b[0] - by_v[0] * b[1], by_u[0] * b[1] - by_u[1] * b[0]])
-    moved = jnp.where(regular[None, :], moved, 0)
-    still = jax.tree.map(_zero_tangent, (converged, others))
-    return (position, converged, others), (moved, *still)
+    found = implicit_positions(solve, explain, inputs)
+    position, finite_inputs = found.positions, jax.tree.map(_finite, inputs)
+
+    def along(axis: int) -> tuple[Pixels, Measures]:
+        unit = jnp.zeros_like(position).at[axis].set(1)
+        return jax.jvp(lambda moved: explain(moved, finite_inputs), (position,), (unit,))[1]
+
+    ((uu, vu), by_u), ((uv, vv), by_v) = along(0), along(1)
+    (u, v), by_inputs = jax.jvp(partial(explain, position), (finite_inputs,), (change,))[1]
+
+    determinant = uu * vv - uv * vu
+    magnitude = jnp.square(uu) + jnp.square(uv) + jnp.square(vu) + jnp.square(vv)
+    regular = found.converged & (jnp.abs(determinant) > 10 * jnp.finfo(position.dtype).eps * magnitude)
+    inverse = jnp.where(regular, 1 / jnp.where(regular, determinant, 1), 0)
+    du, dv = -inverse * (vv * u - uv * v), -inverse * (uu * v - vu * u)
+    total = lambda given, along_u, along_v: jnp.where(regular, given + along_u * du + along_v * dv, 0)
+    measures = jax.tree.map(total, by_inputs, by_u, by_v)
+    not_differentiable = np.zeros(found.converged.shape, jax.dtypes.float0)
+    return found, Found(jnp.stack([du, dv]), not_differentiable, measures)  # pyright: ignore[reportArgumentType]
 
 
-def _zero_tangent(leaf: Array) -> Any:
-    if jnp.issubdtype(leaf.dtype, jnp.inexact):
-        return jnp.zeros_like(leaf)
-    return np.zeros(leaf.shape, jax.dtypes.float0)
+def _finite(leaf: Array) -> Array:
+    return jnp.where(jnp.isfinite(leaf), leaf, 0) if jnp.issubdtype(leaf.dtype, jnp.inexact) else leaf

@@ -41,7 +41,7 @@ class _State(eqx.Module):
     first_step: Flag
     trial: PyTree[Array]
     trial_step: Float[Array, " d"]  # from y to the trial, in units of `unit`
-    model: optx.FunctionInfo.EvalGradHessian  # at y, in units of `unit`
+    model: Any  # an optx.FunctionInfo.EvalGradHessian at y, in units of `unit`
     unit: Float[Array, " d"]
     search: Any
     terminate: Flag
@@ -118,7 +118,7 @@ class ManifoldLevenbergMarquardt(optx.AbstractMinimiser):
         )
         return y, new_state, equations
 
-    def terminate(self, fn, y, args, options, state: _State, tags) -> tuple[Flag, optx.RESULTS]:
+    def terminate(self, fn, y, args, options, state: _State, tags) -> tuple[Flag, Any]:
         """Whether the last step was the last one."""
         del fn, y, args, options, tags
         return state.terminate, optx.RESULTS.successful
@@ -129,7 +129,7 @@ class ManifoldLevenbergMarquardt(optx.AbstractMinimiser):
         return y, aux, {}
 
 
-def _model(cost: Array, gradient: Array, hessian: Array) -> optx.FunctionInfo.EvalGradHessian:
+def _model(cost: Array, gradient: Array, hessian: Array) -> Any:
     operator = lx.MatrixLinearOperator(hessian, lx.positive_semidefinite_tag)
     return optx.FunctionInfo.EvalGradHessian(cost, gradient, operator)
 

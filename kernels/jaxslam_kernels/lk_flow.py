@@ -184,7 +184,7 @@ def _solve_jvp(plan: FlowPlan, primals: tuple, tangents: tuple) -> tuple[Solutio
         jax.jvp(by_position, (solution.position,), (jnp.zeros_like(points).at[axis].set(1),))[1] for axis in range(2)
     ]
     (uu, vu), (uv, vv) = (column.slope for column in columns)
-    by_inputs = lambda *inputs: at(*inputs, solution.position)
+    by_inputs = lambda previous, current, points: at(previous, current, points, solution.position)
     change = jax.jvp(by_inputs, inputs, tangents[:3])[1]
 
     determinant = uu * vv - uv * vu

@@ -54,10 +54,10 @@ class FlowPlan(NamedTuple):
             page faults alone.
     """
 
-    coarsest: LevelPlan = LevelPlan(21, 16, 0.2)
+    coarsest: LevelPlan = LevelPlan(21, 12, 0.2)
     middle: LevelPlan = LevelPlan(11, 5, 0.2)
     finest: LevelPlan = LevelPlan(21, 6, 0.03)
-    chunk: int = 64
+    chunk: int = 32
 
     def level(self, level: int, num_levels: int) -> LevelPlan:
         """The plan of a level, 0 the finest."""
@@ -194,6 +194,22 @@ def iterate(search: Search, template: Template, level: Float[Array, "h w"], bord
     return lax.while_loop(going, body, start)[0]
 
 
+def _move_inside(
+    position: Pixels, flow: Pixels, level: Float[Array, "h w"], border: int, window: Window
+) -> Pixels:
+    """The nearest positions whose windows, there and at `position + flow`, lie in the image.
+
+    A coarse level gives no more than a guess to the next, and that of a neighbour with a whole window is better than
+    a point's own with half a window.
+    """
+    low, high = patches.bounds(level, border)
+    margin = jnp.minimum(window.half, high / 2)
+    low, high = low + margin, high - margin
+    lowest = jnp.minimum(low - jnp.minimum(flow, 0), high)
+    highest = jnp.maximum(high - jnp.maximum(flow, 0), low)
+    return jnp.clip(position, lowest, highest)
+
+
 def _search_chunk(
     points: Pixels,
     guess: Pixels,
@@ -210,8 +226,11 @@ def _search_chunk(
 
     def search_level(level: int, flow: Pixels) -> tuple[Search, Template, Pixels]:
         level_plan = plan.level(level, num_levels)
+        window = Window(level_plan.window)
         start = points / 2**level
-        template = make_template(previous.levels[level], start, border, Window(level_plan.window), once)
+        if level > 0:
+            start = _move_inside(start, flow, previous.levels[level], border, window)
+        template = make_template(previous.levels[level], start, border, window, once)
         active = usable & (template.texture > min_texture)
         search = Search(start + flow, jnp.zeros_like(points[0]), active)
         search = iterate(search, template, current.levels[level], border, level_plan)

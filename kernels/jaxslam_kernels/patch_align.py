@@ -16,9 +16,9 @@ from jaxtyping import Array, Float, Int, Num
 from jaxslam_kernels import _patches as patches
 from jaxslam_kernels._patches import Window
 from jaxslam_kernels.image import Pyramid
-from jaxslam_kernels.implicit import implicit_positions
-from jaxslam_kernels.lk_search import LevelPlan, Search, Template, difference, in_chunks, iterate, look, template_of
-from jaxslam_kernels.types import Mask, Pixels
+from jaxslam_kernels.implicit import Found, implicit_positions
+from jaxslam_kernels.lk_search import LevelPlan, Search, Template, in_chunks, iterate, look, template_of
+from jaxslam_kernels.types import Mask, Pixels, Scalar, Weights
 
 DEFAULT_PLAN = LevelPlan(21, 8, 0.05)
 _CONVERGED_PX = 0.1
@@ -30,11 +30,11 @@ class PatchMatch(NamedTuple):
     Attributes:
         points: `(2, n)` pixel coordinates in the current image.
         correlation: `(n,)` zero-mean normalised cross-correlation of the warped patch and what is there, -1 to 1.
-        converged: `(n,)` whether the search settled.
+        converged: `(n,)` whether the search settled, inside the image.
     """
 
     points: Pixels
-    correlation: Float[Array, " n"]
+    correlation: Weights
     converged: Mask
 
 
@@ -56,8 +56,14 @@ def warped_patches(
         warp: `(2, 2, n)` offset in the picture for an offset in the patch, `[to, from]`.
         side: Rows of the patch, odd, static; its middle row and column `side // 2` is the point.
         stride: Columns of the patch, static.
+
+    Returns:
+        `(n, side * stride)` intensities; past the edge of a picture they repeat it. Around the first pixel of the
+        picture where `centre` or `warp` is not finite.
     """
     height, width = pictures.shape[1:]
+    known = _finite(centre) & _finite(warp)
+    centre, warp = _held(centre, known), _held(warp, known)
     offset = jnp.arange(side * stride)
     du = (offset % stride - side // 2).astype(centre.dtype)[None, :]
     dv = (offset // stride - side // 2).astype(centre.dtype)[None, :]
@@ -74,6 +80,16 @@ def warped_patches(
     return (1 - fv) * ((1 - fu) * at(0) + fu * at(1)) + fv * ((1 - fu) * at(width) + fu * at(width + 1))
 
 
+def _finite(array: Float[Array, "... n"]) -> Mask:
+    """At which points all numbers are finite."""
+    return jnp.all(jnp.isfinite(array), axis=tuple(range(array.ndim - 1)))
+
+
+def _held(array: Float[Array, "... n"], mask: Mask) -> Float[Array, "... n"]:
+    """The array with 0 at points that do not count."""
+    return jnp.where(mask.reshape((1,) * (array.ndim - 1) + (-1,)), array, 0)
+
+
 class _Inputs(NamedTuple):
     pictures: Num[Array, "k h w"]
     picture: Int[Array, " n"]
@@ -82,6 +98,7 @@ class _Inputs(NamedTuple):
     guess: Pixels
     mask: Mask
     current: Float[Array, "h w"]
+    min_texture: Scalar
 
 
 def _template(inputs: _Inputs, window: Window, border: int, once: Callable[[Callable[[], Any]], Any]) -> Template:
@@ -91,19 +108,22 @@ def _template(inputs: _Inputs, window: Window, border: int, once: Callable[[Call
     )
     smooth = jnp.pad(once(sample), ((0, 0), (0, 2)))
     patch = smooth[:, window.stride + 1 : window.stride + 1 + window.length]
-    there = _there(inputs.guess, inputs, window, border, once)
-    gain, offset = _match(patch, there, window)
+    gain, offset = _brightness(patch, _there(inputs.guess, inputs, window, border, once), window)
     counts = jnp.broadcast_to(window.columns()[None, :], patch.shape)
     return template_of(gain * smooth + offset, counts, window, once)
 
 
-def _there(position: Pixels, inputs: _Inputs, window: Window, border: int, once: Callable) -> Float[Array, "n l"]:
+def _there(
+    position: Pixels, inputs: _Inputs, window: Window, border: int, once: Callable[[Callable[[], Any]], Any]
+) -> Float[Array, "n l"]:
     """What the current image shows around positions."""
     sight = once(lambda: look(position, inputs.current, border, window))
-    return difference(sight, jnp.zeros((), sight.fraction.dtype), window)
+    flat = sight.cut.reshape(position.shape[1], -1)
+    return patches.bilinear(flat, sight.fraction, window.stride, window.length)
 
 
 def _moments(patch: Float[Array, "n l"], window: Window) -> tuple[Float[Array, "n 1"], Float[Array, "n 1"]]:
+    """Mean and variance over the window."""
     inside = window.columns().astype(patch.dtype)
     area = window.side**2
     mean = jnp.einsum("nl,l->n", patch, inside)[:, None] / area
@@ -111,41 +131,43 @@ def _moments(patch: Float[Array, "n l"], window: Window) -> tuple[Float[Array, "
     return mean, variance
 
 
-def _match(patch: Float[Array, "n l"], there: Float[Array, "n l"], window: Window):
+def _brightness(
+    patch: Float[Array, "n l"], there: Float[Array, "n l"], window: Window
+) -> tuple[Float[Array, "n 1"], Float[Array, "n 1"]]:
+    """Gain, between a half and 2, and offset that bring patches to the mean and contrast of what is there."""
     mean, variance = _moments(patch, window)
     mean_there, variance_there = _moments(there, window)
-    ratio = (variance_there + 1) / (variance + 1)
-    gain = jnp.sqrt(jnp.clip(ratio, 0.25, 4.0))
+    gain = jnp.sqrt(jnp.clip((variance_there + 1) / (variance + 1), 0.25, 4.0))
     return gain, mean_there - gain * mean
 
 
-def _correlation(patch: Float[Array, "n l"], there: Float[Array, "n l"], window: Window) -> Float[Array, " n"]:
+def _correlation(patch: Float[Array, "n l"], there: Float[Array, "n l"], window: Window) -> Weights:
     inside = window.columns().astype(patch.dtype)[None, :]
-    centred = [(array - _moments(array, window)[0]) * inside for array in (patch, there)]
-    cross = jnp.einsum("nl,nl->n", *centred)
-    power = [jnp.einsum("nl,nl->n", array, array) for array in centred]
-    return cross / jnp.sqrt(power[0] * power[1] + 1)
+    first, second = ((array - _moments(array, window)[0]) * inside for array in (patch, there))
+    dot = lambda a, b: jnp.einsum("nl,nl->n", a, b)
+    return dot(first, second) / jnp.sqrt(dot(first, first) * dot(second, second) + 1)
 
 
-def _solve(
-    inputs: _Inputs, *, plan: LevelPlan, border: int, chunk: int, min_texture: float
-) -> tuple[Pixels, Mask, Float[Array, " n"]]:
-    """Positions, which of them converged, and the correlation there."""
+def _solve(inputs: _Inputs, *, plan: LevelPlan, border: int, chunk: int) -> Found:
+    """Where the search ends, and the correlation there."""
     window = Window(plan.window)
 
-    def search_chunk(inputs: _Inputs) -> tuple[Pixels, Mask, Float[Array, " n"]]:
+    def search_chunk(inputs: _Inputs) -> Found:
         once = partial(patches.at_once, alive=jnp.all(jnp.isfinite(inputs.centre)))
         template = _template(inputs, window, border, once)
-        active = inputs.mask & (template.texture > min_texture)
+        active = inputs.mask & (template.texture > inputs.min_texture)
         begin = Search(inputs.guess, jnp.full_like(inputs.guess[0], jnp.inf), active)
         end = iterate(begin, template, inputs.current, border, plan)
-        there = _there(end.position, inputs, window, border, once)
-        correlation = jnp.where(active, _correlation(template.patch, there, window), -1)
-        return end.position, active & (end.last_step < _CONVERGED_PX**2), correlation
+        correlation = _correlation(template.patch, _there(end.position, inputs, window, border, once), window)
+        known = active & jnp.isfinite(correlation)
+        settled = known & (end.last_step < _CONVERGED_PX**2)
+        low, high = patches.bounds(inputs.current, border)
+        inside = jnp.all((end.position >= low) & (end.position <= high), axis=0)
+        return Found(end.position, settled & inside, jnp.where(known, correlation, -1))
 
     # One of a batch after the other, as in `lk_search.search`, and for the same reasons.
     @jax.custom_batching.sequential_vmap
-    def search_all(inputs: _Inputs) -> tuple[Pixels, Mask, Float[Array, " n"]]:
+    def search_all(inputs: _Inputs) -> Found:
         run = lambda picture, centre, warp, guess, mask: search_chunk(
             inputs._replace(picture=picture, centre=centre, warp=warp, guess=guess, mask=mask)
         )
@@ -154,13 +176,14 @@ def _solve(
     return search_all(inputs)
 
 
-def _slope(position: Pixels, inputs: _Inputs, *, plan: LevelPlan, border: int) -> Pixels:
-    """Of half the squared difference; zero where the search converged."""
+def _explain(position: Pixels, inputs: _Inputs, *, plan: LevelPlan, border: int) -> tuple[Pixels, Weights]:
+    """Slope of half the squared difference, zero where the search converged, and the correlation."""
     window = Window(plan.window)
     directly = lambda compute: compute()
     template = _template(inputs, window, border, directly)
-    error = _there(position, inputs, window, border, directly) - template.patch
-    return jnp.einsum("nkl,nl->kn", template.gradient, error)
+    there = _there(position, inputs, window, border, directly)
+    slope = jnp.einsum("nkl,nl->kn", template.gradient, there - template.patch)
+    return slope, _correlation(template.patch, there, window)
 
 
 def align_patches(
@@ -174,31 +197,41 @@ def align_patches(
     *,
     plan: LevelPlan = DEFAULT_PLAN,
     chunk: int = 64,
-    min_texture: float = 1.0,
+    min_texture: Scalar | float = 1.0,
 ) -> PatchMatch:
     """Look points up in the current image by the patches around them in older pictures.
 
     Differentiable in the pictures (when they are floating point), the current image, `centre` and `warp`, by the
     implicit function theorem; the guess matters only through the brightness around it, which patches are matched to.
+    The derivative of a point that did not converge is zero.
 
     Args:
-        pictures: `k` pictures, of the size of the current image without its border.
+        pictures: `k` pictures, grey, of any number type.
         picture: `(n,)` which of them each point is in.
-        centre: `(2, n)` pixel coordinates there.
+        centre: `(2, n)` pixel coordinates there. A patch that leaves its picture goes on with the picture's edge.
         warp: `(2, 2, n)` offset in the picture for an offset in the current image, `[to, from]`.
-        current: Pyramid of the current image; its finest level is searched.
+        current: Pyramid of the current image, its border at least half the window plus 6; its finest level is
+            searched.
         guess: `(2, n)` where to start; it must be within a few pixels.
         mask: `(n,)` which points to look up.
         plan: Window and steps, static.
         chunk: Points searched together, static.
         min_texture: As for `lk_flow`.
+
+    Returns:
+        Where each point was found. A point that is not looked up (masked, or a number given for it is not finite) is
+        at 0 with correlation -1; one whose patch lacks texture is at its guess with correlation -1; one that met a
+        pixel that is not a number is where the search stopped, with correlation -1. None of them has converged.
+
+    Raises:
+        ValueError: While tracing, if the border is too narrow for the plan.
     """
-    finite = jnp.all(jnp.isfinite(guess) & jnp.isfinite(centre), axis=0) & jnp.all(jnp.isfinite(warp), axis=(0, 1))
-    usable = mask & finite
-    held = lambda array: jnp.where(usable.reshape((1,) * (array.ndim - 1) + (-1,)), array, 0)
-    inputs = _Inputs(pictures, picture, held(centre), held(warp), held(guess), usable, current.levels[0])
+    if current.border < Window(plan.window).border:
+        raise ValueError(f"border: at least {Window(plan.window).border} pixels needed, got {current.border}")
+    usable = mask & _finite(guess) & _finite(centre) & _finite(warp)
+    placed = [_held(array, usable) for array in (centre, warp, guess)]
+    threshold = jnp.asarray(min_texture, centre.dtype)
+    inputs = _Inputs(pictures, picture, *placed, usable, current.levels[0], threshold)
     settings = {"plan": plan, "border": current.border}
-    solve = partial(_solve, chunk=chunk, min_texture=min_texture, **settings)
-    position, converged, correlation = implicit_positions(solve, partial(_slope, **settings), inputs)
-    fine = usable & jnp.all(jnp.isfinite(position), axis=0)
-    return PatchMatch(jnp.where(fine, position, 0), jnp.where(fine, correlation, -1), converged & fine)
+    found = implicit_positions(partial(_solve, chunk=chunk, **settings), partial(_explain, **settings), inputs)
+    return PatchMatch(found.positions, found.measures, found.converged)

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 from jaxslam_kernels.camera import MIN_DEPTH, Intrinsics, normalise
 from jaxslam_kernels.levenberg_marquardt import NormalEquations
 from jaxslam_kernels.robust import Loss, loss_value, loss_weight
-from jaxslam_kernels.types import Flag, Pixels, Points, Scalar, Weights
+from jaxslam_kernels.types import Flag, Mask, Pixels, Points, Scalar, Weights
 
 UNKNOWN_CHI2 = 1e4
 """Squared residual of a point behind the camera or without a value: 100 standard deviations, and no derivative."""
@@ -78,9 +78,7 @@ def pose_problem(
     dtype, n = X_world.dtype, X_world.shape[1]
     weights = jnp.ones(n, dtype) if weights is None else weights
     depth = jnp.zeros(n, dtype) if depth is None else depth
-    sigma_px, sigma_depth = (
-        jnp.broadcast_to(jnp.asarray(sigma, dtype), (n,)) for sigma in (sigma_px, sigma_depth)
-    )
+    sigma_px, sigma_depth = (jnp.broadcast_to(jnp.asarray(sigma, dtype), (n,)) for sigma in (sigma_px, sigma_depth))
     has_depth = _positive(depth) & _positive(sigma_depth)
     known = jnp.isfinite(X_world).all(axis=0) & jnp.isfinite(uv).all(axis=0)
     known = known & _positive(sigma_px) & _positive(weights) & _usable(intrinsics)
@@ -104,15 +102,30 @@ def retract(T_world_cam: SE3, tangent: Float[Array, "6"]) -> SE3:
         return (T_world_cam @ SE3.exp(tangent)).normalize()
 
 
-def normal_equations(T_world_cam: SE3, problem: PoseProblem, loss: Loss) -> tuple[Scalar, NormalEquations]:
-    """The cost, its exact gradient, and the Hessian of iteratively reweighted least squares.
+class PoseCost(NamedTuple):
+    """The cost at one pose.
 
-    The reweighted Hessian leaves out the curvature of the loss. Triggs' correction puts it back, and was tried: with
-    20 % outliers it needs 16 to 20 steps where this needs 6 to 8, as its indefinite part must be damped away.
+    Attributes:
+        cost: `½ Σ w ρ(s)` and the prior's share.
+        equations: Its exact gradient, and the Hessian of iteratively reweighted least squares. That leaves out the
+            curvature of the loss. Triggs' correction puts it back, and was tried: with 20 % outliers it takes 16 to 20
+            steps where this takes 6 to 8, as its indefinite part must be damped away.
+        chi2: Squared whitened residual s of each point, `UNKNOWN_CHI2` behind the camera.
+        robust_weights: `ρ'(s)` of each point, 0 behind the camera.
     """
+
+    cost: Scalar
+    equations: NormalEquations
+    chi2: Weights
+    robust_weights: Weights
+
+
+def pose_cost(T_world_cam: SE3, problem: PoseProblem, loss: Loss) -> PoseCost:
+    """Evaluates the cost and its derivatives along `T_world_cam @ exp(tangent)`."""
     residuals, rows, front = _linearise(T_world_cam, problem)
     chi2 = jnp.where(front, sum(jnp.square(r) for r in residuals), UNKNOWN_CHI2)
-    weights = jnp.where(front, problem.weights * loss_weight(chi2, problem.scale, loss), 0.0)
+    robust_weights = jnp.where(front, loss_weight(chi2, problem.scale, loss), 0.0)
+    weights = problem.weights * robust_weights
     cost = 0.5 * jnp.sum(problem.weights * loss_value(chi2, problem.scale, loss))
     gram = jnp.zeros((7, 7), chi2.dtype)
     for row, residual in zip(rows, residuals, strict=True):
@@ -124,23 +137,16 @@ def normal_equations(T_world_cam: SE3, problem: PoseProblem, loss: Loss) -> tupl
         pull = jacobian.T @ problem.prior.information
         cost = cost + 0.5 * error @ problem.prior.information @ error
         gradient, hessian = gradient + pull @ error, hessian + pull @ jacobian
-    return cost, NormalEquations(gradient, hessian)
+    return PoseCost(cost, NormalEquations(gradient, hessian), chi2, robust_weights)
 
 
-def squared_residuals(T_world_cam: SE3, problem: PoseProblem) -> tuple[Weights, Array]:
-    """The squared whitened residual of each point, `UNKNOWN_CHI2` behind the camera, and which are in front."""
-    residuals, _, front = _linearise(T_world_cam, problem)
-    return jnp.where(front, sum(jnp.square(r) for r in residuals), UNKNOWN_CHI2), front
-
-
-def _linearise(T_world_cam: SE3, problem: PoseProblem) -> tuple[list[Array], list[list[Array]], Array]:
+def _linearise(T_world_cam: SE3, problem: PoseProblem) -> tuple[list[Array], list[list[Array]], Mask]:
     """Whitened residuals, their derivatives along the tangent, and which points are in front of the camera.
 
     With X' = X - v - ω × X in the camera's frame, a residual of gradient a along X has the row (-a, a × X).
     """
     R, t = T_world_cam.rotation().as_matrix(), T_world_cam.translation()
-    dx, dy, dz = (problem.X_world[i] - t[i] for i in range(3))
-    X, Y, Z = (R[0, i] * dx + R[1, i] * dy + R[2, i] * dz for i in range(3))
+    X, Y, Z = R.T @ (problem.X_world - t[:, None])
     front = Z > MIN_DEPTH
     inverse_z = 1.0 / jnp.where(front, Z, 1.0)
     x, y = X * inverse_z, Y * inverse_z
@@ -184,6 +190,4 @@ def _usable_prior(prior: PosePrior | None) -> PosePrior | None:
     parameters = prior.T_world_cam.wxyz_xyz
     known = jnp.isfinite(parameters).all() & jnp.isfinite(prior.information).all()
     identity = jnp.zeros_like(parameters).at[0].set(1.0)
-    return PosePrior(
-        SE3(jnp.where(known, parameters, identity)).normalize(), jnp.where(known, prior.information, 0.0)
-    )
+    return PosePrior(SE3(jnp.where(known, parameters, identity)).normalize(), jnp.where(known, prior.information, 0.0))

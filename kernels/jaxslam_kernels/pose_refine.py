@@ -19,16 +19,15 @@ from jaxlie import SE3
 from jaxtyping import Array, Float, Int
 
 from jaxslam_kernels.camera import Intrinsics
-from jaxslam_kernels.levenberg_marquardt import ManifoldLevenbergMarquardt
+from jaxslam_kernels.levenberg_marquardt import ManifoldLevenbergMarquardt, NormalEquations
 from jaxslam_kernels.pose_cost import (
     PosePrior,
     PoseProblem,
-    normal_equations,
+    pose_cost,
     pose_problem,
     retract,
-    squared_residuals,
 )
-from jaxslam_kernels.robust import Loss, loss_weight
+from jaxslam_kernels.robust import Loss
 from jaxslam_kernels.types import Code, Flag, Pixels, Points, Scalar, Weights
 
 MIN_POINTS = 3
@@ -81,6 +80,14 @@ class PoseRefinement(NamedTuple):
     chi2: Weights
 
 
+class SolverReport(NamedTuple):
+    """How a solve went: the reweighted Hessian where it ended (up to scale), steps, and if it converged."""
+
+    hessian: Float[Array, "6 6"]
+    num_steps: Int[Array, ""]
+    converged: Flag
+
+
 def refine_pose(
     T_world_cam: SE3,
     X_world: Points,
@@ -118,45 +125,50 @@ def refine_pose(
     Returns:
         A `PoseRefinement`; everything in it is finite, and so are its derivatives.
     """
-    problem = pose_problem(
-        X_world, uv, intrinsics, weights, depth, sigma_px, sigma_depth, scale, prior
-    )
+    problem = pose_problem(X_world, uv, intrinsics, weights, depth, sigma_px, sigma_depth, scale, prior)
     return refine_problem(T_world_cam, problem, loss, max_steps)
 
 
 def refine_problem(T_world_cam: SE3, problem: PoseProblem, loss: Loss, max_steps: int) -> PoseRefinement:
     """`refine_pose` on a problem that is already clean."""
-    initial, finite_initial = _usable_pose(T_world_cam)
-    optimum, num_steps, converged = solve_pose(initial, problem, loss, max_steps)
+    initial, finite_initial = usable_pose(T_world_cam)
+    optimum, solver = solve_pose(initial, problem, loss, max_steps)
     optimum = retract(optimum, _optimum_shift(optimum, problem, loss))
-    _, equations = normal_equations(optimum, problem, loss)
-    determined = _is_determined(equations.hessian)
-    num_valid = _num_valid(optimum, problem)
     status = jnp.select(
-        [~finite_initial, num_valid < MIN_POINTS, ~determined, ~converged],
+        [
+            ~finite_initial,
+            jnp.sum(problem.weights > 0) < MIN_POINTS,
+            ~_is_determined(solver.hessian),
+            ~solver.converged,
+        ],
         [PoseStatus.BAD_INITIAL, PoseStatus.TOO_FEW_POINTS, PoseStatus.DEGENERATE, PoseStatus.NOT_CONVERGED],
         PoseStatus.OK,
     ).astype(jnp.int32)
     found = status <= PoseStatus.NOT_CONVERGED
     pose = SE3(jnp.where(found, optimum.wxyz_xyz, initial.wxyz_xyz))
-    return _report(pose, problem, loss, status, num_steps)
+    return _report(pose, problem, loss, status, solver.num_steps)
 
 
-def solve_pose(initial: SE3, problem: PoseProblem, loss: Loss, max_steps: int) -> tuple[SE3, Int[Array, ""], Flag]:
-    """The optimum, the steps it took and whether it converged; constant for differentiation."""
+def solve_pose(initial: SE3, problem: PoseProblem, loss: Loss, max_steps: int) -> tuple[SE3, SolverReport]:
+    """The optimum from a finite initial pose; constant for differentiation."""
     initial, problem = lax.stop_gradient((initial, problem))
     epsilon = float(jnp.finfo(problem.xy.dtype).eps)
-    solver = ManifoldLevenbergMarquardt(retract=retract, atol=float(epsilon**0.5), rtol=2.0 * epsilon)
+
+    def cost(T_world_cam: SE3, problem: PoseProblem) -> tuple[Scalar, NormalEquations]:
+        return pose_cost(T_world_cam, problem, loss)[:2]
+
     solution = optx.minimise(
-        lambda T, p: normal_equations(T, p, loss),
-        solver,
+        cost,
+        ManifoldLevenbergMarquardt(retract=retract, atol=3.0 * epsilon**0.5, rtol=8.0 * epsilon),
         initial,
         problem,
         has_aux=True,
         max_steps=max_steps,
         throw=False,
     )
-    return solution.value, solution.stats["num_steps"], solution.result == optx.RESULTS.successful
+    converged = solution.result == optx.RESULTS.successful
+    hessian = solution.state.model.hessian.as_matrix()
+    return solution.value, SolverReport(hessian, solution.stats["num_steps"], converged)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(2,))
@@ -175,13 +187,13 @@ def _optimum_shift_jvp(loss: Loss, primals: tuple, tangents: tuple) -> tuple[Arr
     optimum, problem = primals
 
     def gradient(tangent: Array, problem: PoseProblem) -> Array:
-        return normal_equations(retract(optimum, tangent), problem, loss)[1].gradient
+        return pose_cost(retract(optimum, tangent), problem, loss).equations.gradient
 
     zero = jnp.zeros(6, optimum.wxyz_xyz.dtype)
     _, gradient_change = jax.jvp(partial(gradient, zero), (problem,), (tangents[1],))
     exact = jax.jacfwd(gradient)(zero, problem)
     exact = 0.5 * (exact + exact.T)
-    reweighted = normal_equations(optimum, problem, loss)[1].hessian
+    reweighted = pose_cost(optimum, problem, loss).equations.hessian
     # The exact Hessian is positive definite at a strict minimum. Where the solver stopped short of one the
     # reweighted one stands in, and where the pose is undetermined the derivative is zero.
     hessian = jnp.where(_is_determined(exact), exact, reweighted)
@@ -192,35 +204,29 @@ def _optimum_shift_jvp(loss: Loss, primals: tuple, tangents: tuple) -> tuple[Arr
 
 def _report(pose: SE3, problem: PoseProblem, loss: Loss, status: Array, num_steps: Array) -> PoseRefinement:
     """Everything that is said of the final pose, evaluated there."""
-    cost, equations = normal_equations(pose, problem, loss)
-    chi2, front = squared_residuals(pose, problem)
-    robust_weights = jnp.where(front, loss_weight(chi2, problem.scale, loss), 0.0)
-    total = problem.weights * robust_weights
+    at_pose = pose_cost(pose, problem, loss)
+    total = problem.weights * at_pose.robust_weights
     residuals_a_point = jnp.where(problem.precision[2] > 0, 3.0, 2.0)
     freedom = jnp.sum(total * residuals_a_point)
-    variance = jnp.sum(total * chi2) / jnp.where(freedom > 0, freedom, 1.0)
-    determined = _is_determined(equations.hessian) & (status <= PoseStatus.NOT_CONVERGED)
-    unknown = UNKNOWN_VARIANCE * jnp.eye(6, dtype=chi2.dtype)
-    covariance = _solve(equations.hessian, determined, jnp.eye(6, dtype=chi2.dtype))
+    variance = jnp.sum(total * at_pose.chi2) / jnp.where(freedom > 0, freedom, 1.0)
+    hessian, identity = at_pose.equations.hessian, jnp.eye(6, dtype=total.dtype)
+    determined = _is_determined(hessian) & (status <= PoseStatus.NOT_CONVERGED)
+    covariance = jnp.where(determined, _solve(hessian, determined, identity), UNKNOWN_VARIANCE * identity)
     return PoseRefinement(
         T_world_cam=pose,
-        covariance=jnp.where(determined, covariance, unknown),
+        covariance=covariance,
         residual_scale=jnp.where(variance > 0, jnp.sqrt(jnp.where(variance > 0, variance, 1.0)), 0.0),
-        cost=cost,
-        num_valid=_num_valid(pose, problem),
+        cost=at_pose.cost,
+        num_valid=jnp.sum(total > 0, dtype=jnp.int32),
         status=status,
         num_steps=num_steps,
-        robust_weights=robust_weights,
-        chi2=chi2,
+        robust_weights=at_pose.robust_weights,
+        chi2=at_pose.chi2,
     )
 
 
-def _num_valid(pose: SE3, problem: PoseProblem) -> Array:
-    return jnp.sum(squared_residuals(pose, problem)[1] & (problem.weights > 0), dtype=jnp.int32)
-
-
-def _usable_pose(T: SE3) -> tuple[SE3, Flag]:
-    """The pose with a unit quaternion, or the identity if it is not finite."""
+def usable_pose(T: SE3) -> tuple[SE3, Flag]:
+    """The pose with a unit quaternion, or the identity and false if it is not finite."""
     parameters = T.wxyz_xyz
     usable = jnp.isfinite(parameters).all() & (jnp.sum(jnp.square(parameters[:4])) > 1e-6)
     identity = jnp.zeros_like(parameters).at[0].set(1.0)
@@ -231,7 +237,7 @@ def _is_determined(hessian: Float[Array, "6 6"]) -> Flag:
     """Whether no direction is free: the pivots of the Hessian scaled to unit diagonal stand clear of rounding."""
     factor, _ = cho_factor(_scaled(lax.stop_gradient(hessian))[0])
     pivots = jnp.square(jnp.diagonal(factor))
-    return jnp.isfinite(factor).all() & (pivots.min() > 50.0 * jnp.finfo(hessian.dtype).eps)
+    return jnp.isfinite(factor).all() & (pivots.min() > float(jnp.finfo(hessian.dtype).eps) ** 0.75)
 
 
 def _solve(hessian: Float[Array, "6 6"], determined: Flag, right: Array) -> Array:

@@ -22,6 +22,7 @@ Loss: TypeAlias = Literal["squared", "huber", "cauchy", "geman_mcclure"]
 SquaredResiduals: TypeAlias = Float[Array, "*batch"]
 
 _MAD_TO_SIGMA = 1.482602218505602  # 1 / Φ⁻¹(3/4): the deviation of a Gaussian per median absolute deviation
+_LARGEST = 1e16  # its square and its ratios to its inverse are finite in float32
 
 
 def loss_value(squared: SquaredResiduals, scale: Scalar | float, loss: Loss) -> SquaredResiduals:
@@ -44,7 +45,7 @@ def loss_value(squared: SquaredResiduals, scale: Scalar | float, loss: Loss) -> 
         case "cauchy":
             value = c2 * jnp.log1p(s / c2)
         case "geman_mcclure":
-            value = s / (1.0 + s / c2)
+            value = s * (c2 / (c2 + s))
         case _:
             assert_never(loss)
     return jnp.where(known, value, 0.0)
@@ -66,9 +67,9 @@ def loss_weight(squared: SquaredResiduals, scale: Scalar | float, loss: Loss) ->
         case "huber":
             weight = jnp.sqrt(c2 / jnp.maximum(s, c2))
         case "cauchy":
-            weight = 1.0 / (1.0 + s / c2)
+            weight = c2 / (c2 + s)
         case "geman_mcclure":
-            weight = 1.0 / jnp.square(1.0 + s / c2)
+            weight = jnp.square(c2 / (c2 + s))
         case _:
             assert_never(loss)
     return jnp.where(known, weight, 0.0)
@@ -104,11 +105,12 @@ def robust_scale(residuals: Weights, weights: Weights) -> Scalar:
 
 
 def _known(squared: SquaredResiduals) -> tuple[Array, Array]:
+    """The squared residuals without what is not finite, kept in the range of single precision."""
     known = jnp.isfinite(squared)
-    return jnp.where(known, squared, 0.0), known
+    return jnp.minimum(jnp.where(known, squared, 0.0), _LARGEST), known
 
 
 def _squared_scale(scale: Scalar | float, like: Array) -> Array:
-    """`c²`, kept off zero so that a vanishing scale gives vanishing weights and no NaN."""
-    c2 = jnp.square(jnp.asarray(scale, like.dtype))
-    return jnp.maximum(c2, jnp.finfo(like.dtype).tiny * 1e8)
+    """`c²`, kept off zero so that a scale of zero, or none at all, gives vanishing weights and no NaN."""
+    c = jnp.asarray(scale, like.dtype)
+    return jnp.maximum(jnp.square(jnp.where(jnp.isfinite(c), c, 0.0)), 1.0 / _LARGEST)

@@ -55,7 +55,8 @@ def cast(path: str, people: int, boxes: int, seed: int) -> list[Actor]:
     """The actors of a scene.
 
     The first two cross the view of the camera close in front of it and in front of the desk, the others go round
-    behind the desk; where the camera goes round the desk, all go round it too. Who shares a lane keeps a distance.
+    behind the desk; where the camera goes round the desk, all go round it too. Those who share a lane are spread
+    evenly over it; many of them walk through each other.
 
     Args:
         path: The camera's path.

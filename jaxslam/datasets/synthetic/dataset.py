@@ -115,8 +115,8 @@ class SyntheticDataset:
         elapsed_us = np.round(np.arange(config.frames) * (1e6 / config.fps)).astype(np.int64)
         self.timestamps_ns = _START_NS + 1000 * elapsed_us
         self._time_s = 1e-6 * elapsed_us
-        self.T_world_cam = camera_path(config.path, self._time_s, config.seed)
-        self.ground_truth = Trajectory(self.timestamps_ns, self.T_world_cam)
+        self.ground_truth = Trajectory(self.timestamps_ns, camera_path(config.path, self._time_s, config.seed))
+        self.T_world_cam = self.ground_truth.T_world_cam
         self.camera = Camera(
             self.name,
             self.width,
@@ -165,7 +165,7 @@ class SyntheticDataset:
         )
         return SyntheticFrame(
             timestamp_ns=int(self.timestamps_ns[index]),
-            # Interleaving the channels takes XLA as long as rendering does.
+            # XLA needs as long to interleave the channels as to render a moment.
             rgb=cv2.merge(list(np.asarray(channels))),
             depth_m=np.asarray(depth_m),
             exact_depth_m=np.asarray(own.depth_m),

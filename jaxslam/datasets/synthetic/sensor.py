@@ -155,7 +155,7 @@ def _lit(depth_m: Float[Array, "h w"], fx: float, baseline_m: float) -> Bool[Arr
 
     def step(leftmost: Array, places: Array) -> tuple[Array, Array]:
         leftmost = jnp.minimum(leftmost, places)
-        return leftmost, places <= leftmost + 0.5
+        return leftmost, places <= leftmost
 
     # From right to left, all rows at once: a quarter of the time of `lax.cummin`.
     return jax.lax.scan(step, from_projector[-1], from_projector, reverse=True)[1].T

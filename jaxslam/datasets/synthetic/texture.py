@@ -12,11 +12,12 @@ from typing import NamedTuple, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, UInt
+from jaxtyping import Array, UInt
+
+from jaxslam.datasets.synthetic.raycast import Plane
 
 Rgb: TypeAlias = tuple[float, float, float]
-Plane: TypeAlias = Float[Array, " n"]
-Bits: TypeAlias = UInt[Array, " n"]
+Bits: TypeAlias = UInt[Array, " p"]
 
 N_OCTAVES = 7
 N_PATCH_LAYERS = 3
@@ -62,21 +63,21 @@ class Material(NamedTuple):
 class Surface(NamedTuple):
     """The texture of what each pixel shows, one plane a number: a `Material` made ready to do without divisions."""
 
-    colour: tuple[Array, Array, Array]
-    second: tuple[Array, Array, Array]
-    dark: tuple[Array, Array, Array]
-    bright: tuple[Array, Array, Array]
-    noise: Float[Array, " n"]
-    noise_per_m: tuple[Array, Array]
-    cells_per_m: tuple[Array, Array]
-    cell_m: tuple[Array, Array]
-    joint_m: Float[Array, " n"]
-    cell_contrast: Float[Array, " n"]
-    patches_per_m: Float[Array, " n"]
-    patch_m: Float[Array, " n"]
-    cells_per_patch: Float[Array, " n"]
-    patch_contrast: Float[Array, " n"]
-    seed: UInt[Array, " n"]
+    colour: tuple[Plane, Plane, Plane]
+    second: tuple[Plane, Plane, Plane]
+    dark: tuple[Plane, Plane, Plane]
+    bright: tuple[Plane, Plane, Plane]
+    noise: Plane
+    noise_per_m: tuple[Plane, Plane]
+    cells_per_m: tuple[Plane, Plane]
+    cell_m: tuple[Plane, Plane]
+    joint_m: Plane
+    cell_contrast: Plane
+    patches_per_m: Plane
+    patch_m: Plane
+    cells_per_patch: Plane
+    patch_contrast: Plane
+    seed: Bits
 
 
 N_WORDS = 12
@@ -108,14 +109,14 @@ def surface_row(material: Material, seed: int) -> np.ndarray:
     return np.concatenate([packed_colours, halves[::2] << 16 | halves[1::2], [seed]]).astype(np.uint32)
 
 
-def as_surface(words: UInt[Array, "12 n"]) -> Surface:
+def as_surface(words: UInt[Array, "12 p"]) -> Surface:
     """Unpack the `surface_row` of each pixel."""
 
-    def rgb(word: UInt[Array, " n"]) -> tuple[Array, Array, Array]:
+    def rgb(word: Bits) -> tuple[Plane, Plane, Plane]:
         red, green, blue = ((word >> shift) & jnp.uint32(255) for shift in (0, 8, 16))
         return _scaled(red, 255), _scaled(green, 255), _scaled(blue, 255)
 
-    def number(index: int) -> Float[Array, " n"]:
+    def number(index: int) -> Plane:
         word = words[4 + index // 2]
         half = word << 16 if index % 2 else word & jnp.uint32(0xFFFF0000)
         return jax.lax.bitcast_convert_type(half, jnp.float32)

@@ -1,0 +1,228 @@
+"""The command line: `jaxslam demo`, `run`, `eval`, `doctor`."""
+
+import itertools
+import logging
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from jaxslam.config import Config, load_config
+from jaxslam.datasets import Dataset, Subset, dataset_kinds, open_dataset
+from jaxslam.errors import ConfigError, DatasetError, JaxSlamError, nearest
+
+if TYPE_CHECKING:
+    from jaxslam.evaluation import Evaluation
+
+_console = Console(soft_wrap=True)
+_Settings: TypeAlias = Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction]
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Render a room with walking people, track the camera through it, and evaluate.
+
+    Needs no data. Leaves the files of `run` in `--out`.
+    """
+
+    out: Path = Path("results/demo")
+    """Folder for the results."""
+    frames: int = 150
+    """Frames to render."""
+    path: Literal["xyz", "rpy", "halfsphere", "static", "loop"] = "xyz"
+    """How the camera moves."""
+    people: int = 2
+    """People walking through the room."""
+    seed: int = 0
+    """Seed of room, people, path and noise."""
+
+    def main(self) -> None:
+        """Run the command."""
+        from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset  # noqa: PLC0415 (loads JAX)
+
+        scene = SyntheticConfig(frames=self.frames, path=self.path, people=self.people, seed=self.seed)
+        _console.print(f"Rendering a room with {self.people} people, the camera moving as in '{self.path}'.")
+        _track(SyntheticDataset(scene), load_config(), "default", self.out)
+
+
+@dataclass(frozen=True)
+class Run:
+    """Track a recording and, if it has ground truth, evaluate.
+
+    The dataset kind and the cameras of TUM (fr1, fr2, fr3) and Bonn are recognised from the folder.
+    """
+
+    recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
+    """Folder of the recording."""
+    dataset: str = "auto"
+    """Kind of the recording: auto, tum, bonn."""
+    camera: str | None = None
+    """Known camera or camera file (jaxslam, ORB-SLAM2, ORB-SLAM3)."""
+    preset: str = "default"
+    """Preset to start from."""
+    config: Path | None = None
+    """YAML file of settings that differ from the preset."""
+    out: Path | None = None
+    """Folder for the results; results/NAME if not given."""
+    max_frames: int | None = None
+    """Track at most this many frames."""
+    start: int = 0
+    """First frame to track."""
+    deterministic: bool = True
+    """Run everything in turn: two runs give the same bytes."""
+    set: _Settings = ()
+    """Settings, as in `--set track.num_points=400 run.seed=3`; may be given again."""
+
+    def main(self) -> None:
+        """Run the command."""
+        if self.dataset not in ("auto", *dataset_kinds()):
+            raise ConfigError(
+                f"--dataset: unknown kind '{self.dataset}'{nearest(self.dataset, ['auto', *dataset_kinds()])}"
+            )
+        if self.max_frames is not None and self.max_frames < 1:
+            raise ConfigError(f"--max-frames: expected at least 1, got {self.max_frames}")
+        override = f"run.deterministic={str(self.deterministic).lower()}"
+        config = load_config(self.preset, self.config, (override, *itertools.chain(*self.set)))
+        dataset = open_dataset(self.recording, self.dataset, self.camera)
+        if self.start or self.max_frames is not None:
+            stop = None if self.max_frames is None else self.start + self.max_frames
+            dataset = Subset(dataset, self.start, stop)
+        _track(dataset, config, self.preset, self.out or Path("results") / self.recording.resolve().name)
+
+
+@dataclass(frozen=True)
+class Eval:
+    """Compare an estimated trajectory with the truth: ATE and RPE. Formats (TUM, KITTI) are recognised."""
+
+    estimate: tyro.conf.Positional[Path]
+    """The estimate."""
+    groundtruth: tyro.conf.Positional[Path]
+    """The truth."""
+    align: Literal["se3", "sim3", "none"] = "se3"
+    """What to fit before comparing positions."""
+    max_gap: float = 0.02
+    """Poses further apart in time than this do not match, seconds."""
+    plot: Path | None = None
+    """Also draw both to this PNG."""
+
+    def main(self) -> None:
+        """Run the command."""
+        from jaxslam.evaluation import evaluate  # noqa: PLC0415 (loads JAX)
+        from jaxslam.trajectory import read  # noqa: PLC0415
+
+        estimate, truth = read(self.estimate), read(self.groundtruth)
+        evaluation = evaluate(estimate, truth, align=self.align, max_gap_s=self.max_gap)
+        _console.print(str(evaluation), highlight=False)
+        if self.plot is not None:
+            from jaxslam.visualize import plot_trajectory  # noqa: PLC0415
+
+            plot_trajectory(estimate, truth, evaluation, self.plot)
+            _console.print(f"Plot: {self.plot}")
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Look a recording over before tracking it: files, times, calibration, depth scale, picture quality."""
+
+    recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
+    """Folder of the recording."""
+    dataset: str = "auto"
+    """Kind of the recording: auto, tum, bonn."""
+    camera: str | None = None
+    """Known camera or camera file."""
+
+    def main(self) -> None:
+        """Run the command."""
+        from jaxslam.doctor import diagnose  # noqa: PLC0415
+
+        diagnosis = diagnose(self.recording, self.dataset, self.camera)
+        _console.print(str(diagnosis), highlight=False, markup=False)
+        if not diagnosis.ok:
+            raise DatasetError(f"{self.recording}: not fit to be tracked, see above")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The `jaxslam` command: known errors are one line and exit code 1."""
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
+    command: Any = tyro.cli(Demo | Run | Eval | Doctor, prog="jaxslam", args=arguments, description=_DESCRIPTION)
+    try:
+        command.main()
+    except JaxSlamError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        print("error: interrupted", file=sys.stderr)
+        sys.exit(130)
+
+
+_DESCRIPTION = "Real-time visual SLAM for dynamic scenes. Start with: jaxslam demo"
+
+
+@dataclass
+class _Meter:
+    """A progress bar that also says how tracking goes."""
+
+    progress: Progress
+    task: Any
+    snapshots: Any
+    statuses: dict[str, int] = field(default_factory=dict)
+
+    def __call__(self, frame: Any, result: Any) -> None:
+        self.snapshots(frame, result)
+        self.statuses[result.status.name] = self.statuses.get(result.status.name, 0) + 1
+        text = "  ".join(f"{name.lower()} {count}" for name, count in self.statuses.items())
+        self.progress.update(self.task, advance=1, status=text)
+
+
+def _track(dataset: Dataset, config: Config, preset: str, out: Path) -> None:
+    """Track, write the results, print them."""
+    from jaxslam.results import RunInfo, Snapshots, write_results  # noqa: PLC0415 (loads JAX)
+    from jaxslam.slam import Slam  # noqa: PLC0415
+
+    began = time.perf_counter()
+    slam = Slam(dataset.camera, config)
+    with _console.status("Compiling the tracker (a minute at the first start on a machine, then seconds) ..."):
+        slam.warm_up()
+    _console.print(f"Tracker ready after {slam.compile_s:.1f} s.")
+    columns = (
+        TextColumn("Tracking"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[status]}"),
+    )
+    snapshots = Snapshots(len(dataset))
+    with Progress(*columns, console=_console) as progress:
+        meter = _Meter(progress, progress.add_task("track", total=len(dataset), status=""), snapshots)
+        records = slam.run(dataset, meter)
+    info = RunInfo(dataset, preset, time.perf_counter() - began)
+    summary, evaluation = write_results(out, slam, records, info, snapshots.kept)
+    _print_summary(summary, evaluation, out)
+
+
+def _print_summary(summary: dict[str, Any], evaluation: "Evaluation | None", out: Path) -> None:
+    table = Table("figure", "value", "unit", title=summary["dataset"], title_justify="left")
+    statuses = ", ".join(f"{name} {count}" for name, count in summary["status_counts"].items())
+    table.add_row("tracked", f"{summary['tracked']} of {summary['frames']}", f"frames ({statuses})")
+    table.add_row("ATE (SE(3) aligned)", _number(summary["ate_rmse_m"], 4), "m RMSE")
+    table.add_row("ATE (Sim(3) aligned)", _number(summary["ate_sim3_rmse_m"], 4), "m RMSE")
+    table.add_row("RPE over 1 s", _number(summary["rpe_trans_m_per_s"], 4), "m/s RMSE")
+    table.add_row("RPE over 1 s, rotation", _number(summary["rpe_rot_deg_per_s"], 3), "deg/s RMSE")
+    if summary["track_ms"] is not None:
+        for name in ("median", "p95", "max"):
+            table.add_row(f"tracking time, {name}", _number(summary["track_ms"][name], 1), "ms a frame")
+    _console.print(table)
+    if evaluation is None:
+        _console.print(f"Not evaluated: {summary['evaluation_problem']}.")
+    _console.print(f"Results in {out}: trajectory.txt, trajectory_online.txt, summary.json, config.yaml, plot.png")
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"

@@ -1,0 +1,64 @@
+"""Pairs of images with known motion: a real picture, warped by homographies, with noise."""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from skimage.data import camera, stereo_motorcycle
+
+
+class Warp(NamedTuple):
+    """Two grey images and the homography from pixels of the first to pixels of the second."""
+
+    previous: np.ndarray
+    current: np.ndarray
+    homography: np.ndarray
+
+    def move(self, points):
+        """Where `(2, n)` points of the first image are in the second."""
+        moved = self.homography @ np.vstack([points, np.ones_like(points[:1])])
+        return moved[:2] / moved[2]
+
+    def visible(self, points):
+        """Which points stay inside the image."""
+        height, width = self.current.shape
+        u, v = self.move(points)
+        return (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
+
+
+def picture(width, height):
+    """A real picture, part of scikit-image; it is not downloaded."""
+    if width > 256:
+        source = cv2.cvtColor(stereo_motorcycle()[0], cv2.COLOR_RGB2GRAY)
+    else:
+        source = cv2.resize(camera(), (256, 256), interpolation=cv2.INTER_AREA)
+    top, left = (source.shape[0] - height) // 2, (source.shape[1] - width) // 2
+    return np.ascontiguousarray(source[top : top + height, left : left + width])
+
+
+def homography(rng, width, height, shift_px):
+    """A rotation of up to 2.5 degrees, a scale of up to 3 %, some perspective, and a shift of `shift_px`."""
+    angle, scale = rng.uniform(-0.045, 0.045), rng.uniform(0.97, 1.03)
+    cos, sin = scale * np.cos(angle), scale * np.sin(angle)
+    direction = rng.uniform(0, 2 * np.pi)
+    shift = shift_px * np.array([np.cos(direction), np.sin(direction)])
+    about_centre = np.array([[cos, -sin, shift[0]], [sin, cos, shift[1]], [*rng.uniform(-3e-5, 3e-5, 2), 1]])
+    to_centre = np.array([[1, 0, -width / 2], [0, 1, -height / 2], [0, 0, 1]])
+    return np.linalg.inv(to_centre) @ about_centre @ to_centre
+
+
+def warp(image, shift_px, seed, noise=2.0):
+    """`image` moved by a random homography, both 8 bit."""
+    rng = np.random.default_rng(seed)
+    height, width = image.shape
+    H = homography(rng, width, height, shift_px)
+    moved = cv2.warpPerspective(image, H, (width, height), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    noisy = np.clip(moved + rng.normal(0, noise, moved.shape), 0, 255)
+    return Warp(image, noisy.round().astype(np.uint8), H)
+
+
+def corners(image, n, distance=7):
+    """The `n` best corners as `(2, n)`; the weaker ones are textured just enough."""
+    found = cv2.goodFeaturesToTrack(image, n, 0.001, distance)[:, 0].T
+    assert found.shape == (2, n)
+    return np.ascontiguousarray(found)
