@@ -10,6 +10,7 @@ from jaxslam_kernels.depth_image import sample_depth
 from jaxslam_kernels.image import Pyramid
 from jaxslam_kernels.patch_align import align_patches
 from jaxslam_kernels.rolling_shutter import image_velocity, row_time
+from jaxslam_kernels.transform import to_camera
 from jaxslam_kernels.types import Mask, Pixels, Points, Scalar, Weights
 from jaxtyping import Array, Bool, Float, Int, Num
 
@@ -49,12 +50,6 @@ def empty_keyframes(height: int, width: int, sizes: TrackSizes, image_dtype: jnp
     )
 
 
-def to_camera(T_world_cam: SE3, X_world: Points) -> Points:
-    """World points in the axes of the camera."""
-    T_cam_world = T_world_cam.inverse()
-    return T_cam_world.rotation().as_matrix() @ X_world + T_cam_world.translation()[:, None]
-
-
 def predict_pixels(X_cam: Points, twist: Float[Array, "6"], height: int, params: TrackParams) -> Pixels:
     """Where points appear in a frame of a rolling shutter, while the camera moves with `twist`."""
     depth = jnp.maximum(X_cam[2], params.min_depth_m / 2)
@@ -91,13 +86,13 @@ def look_up(
     predicted = predict_pixels(X_cam, twist, height, params)
     visible = _visible(predicted, X_cam[2], height, width) & valid.reshape(-1)
     shown = jnp.sum(visible.reshape(k, n), axis=1)
-    overlap = jnp.max(shown / jnp.maximum(jnp.sum(valid, axis=1), 1))
+    overlap = jnp.max((shown / jnp.maximum(jnp.sum(valid, axis=1), 1)).astype(predicted.dtype))
     _, sources = jax.lax.top_k(shown, sizes.num_sources)
     chosen = jax.vmap(lambda s: jnp.nonzero(visible.reshape(k, n)[s], size=sizes.points_per_source, fill_value=n)[0])(
         sources
     )
     real = (chosen < n).reshape(-1)
-    index = (sources[:, None] * n + jnp.minimum(chosen, n - 1)).reshape(-1)
+    index = (sources[:, None] * n + jnp.minimum(chosen, n - 1).astype(sources.dtype)).reshape(-1)
     take = lambda array: jnp.take(array, index, axis=-1, mode="clip")
     guess, X_there = take(predicted), take(X_cam)
     seen_depth = sample_depth(depth, jax.lax.stop_gradient(guess), reach=0)
@@ -132,7 +127,9 @@ def _warp(
     focal = jnp.stack([intrinsics.fx, intrinsics.fy])
 
     def ray_in_keyframe(source: Float[Array, "7"], x: Scalar, y: Scalar, z: Scalar) -> Float[Array, "2"]:
-        point = SE3(source).inverse() @ (T_world_cam @ jnp.stack([x * z, y * z, z]))
+        X_cam = jnp.stack([x * z, y * z, z])[:, None]
+        X_world = T_world_cam.rotation().as_matrix() @ X_cam + T_world_cam.translation()[:, None]
+        point = to_camera(SE3(source), X_world)[:, 0]
         return focal * point[:2] / jnp.maximum(point[2], 0.1)
 
     step = 1.0

@@ -7,6 +7,7 @@ from jaxslam_kernels.corners import corner_score, grid_corners, occupied_cells
 from jaxslam_kernels.depth_image import sample_depth
 from jaxslam_kernels.image import Pyramid
 from jaxslam_kernels.rolling_shutter import image_velocity, row_time
+from jaxslam_kernels.transform import to_world
 from jaxtyping import Array, Bool, Float
 
 from jaxslam.state import TrackedPoints, TrackParams, TrackSizes
@@ -51,7 +52,7 @@ def refill(
     measured = sample_depth(depth, uv + focal * speed * depth_delay_s, reach=2)
     seen = xy - speed * row_time(uv[1], height, params.readout_s)[None, :]
     X_cam = jnp.concatenate([seen, jnp.ones_like(seen[:1])]) * measured[None, :]
-    X_world = T_world_cam.rotation().as_matrix() @ X_cam + T_world_cam.translation()[:, None]
+    X_world = to_world(T_world_cam, X_cam)
     sigma = params.depth_sigma_m + params.depth_sigma_per_m2 * jnp.square(measured)
 
     good = (corners.score > _MIN_SCORE) & ~taken & (rough > 0) & (measured > 0)

@@ -21,10 +21,11 @@ from jaxslam_kernels.pnp import ransac_pnp
 from jaxslam_kernels.pose_refine import PoseRefinement, refine_pose
 from jaxslam_kernels.robust import weighted_median
 from jaxslam_kernels.rolling_shutter import image_velocity, row_time
+from jaxslam_kernels.transform import displacement, moved, to_camera, to_world
 from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Points, Scalar, Weights
 from jaxtyping import Array, Float
 
-from jaxslam.keyframes import LookedUp, empty_keyframes, look_up, predict_pixels, to_camera, with_keyframe
+from jaxslam.keyframes import LookedUp, empty_keyframes, look_up, predict_pixels, with_keyframe
 from jaxslam.refill import refill
 from jaxslam.state import (
     FrameArrays,
@@ -153,7 +154,7 @@ def _prepare(state: TrackState, frame: FrameArrays, params: TrackParams, sizes: 
 
 def _predict(state: TrackState, view: _View) -> SE3:
     """Constant velocity."""
-    return state.T_world_cam @ SE3.exp(state.twist * jnp.clip(view.elapsed_s, 0, _MAX_PREDICTION_S))
+    return moved(state.T_world_cam, state.twist * jnp.clip(view.elapsed_s, 0, _MAX_PREDICTION_S))
 
 
 def _follow(state: TrackState, view: _View, predicted: SE3, params: TrackParams) -> tuple[Pixels, Mask]:
@@ -203,7 +204,7 @@ def _coarse_pose(
 ) -> tuple[SE3, Mask]:
     """The pose most points agree with, and which do."""
     seen = _see(state.points.X_world, uv, predicted, state.twist, view, params)
-    usable = followed * _trust(state.points, params)
+    usable = jnp.where(followed, _trust(state.points, params), 0)
     result = ransac_pnp(
         jax.random.fold_in(state.key, state.frame),
         seen.X_world,
@@ -221,7 +222,7 @@ def _coarse_pose(
 def _twist(before: SE3, after: SE3, elapsed_s: Scalar) -> Float[Array, "6"]:
     """Velocity of the camera in its own axes."""
     known = elapsed_s > 1e-4
-    return jnp.where(known, (before.inverse() @ after).log() / jnp.where(known, elapsed_s, 1), 0)
+    return jnp.where(known, displacement(before, after) / jnp.where(known, elapsed_s, 1), 0)
 
 
 def _refine(
@@ -237,7 +238,7 @@ def _refine(
     """The pose that fits followed points and points of keyframes together."""
     X_world = jnp.concatenate([state.points.X_world, looked_up.X_world], axis=1)
     seen = _see(X_world, jnp.concatenate([uv, looked_up.uv], axis=1), coarse, twist, view, params)
-    weights = jnp.concatenate([agreeing * _trust(state.points, params), looked_up.weight])
+    weights = jnp.concatenate([jnp.where(agreeing, _trust(state.points, params), 0), looked_up.weight])
     refined = refine_pose(
         coarse,
         seen.X_world,
@@ -270,8 +271,8 @@ def _judge(
     state: TrackState, view: _View, refined: PoseRefinement, followed: Mask, inliers: Mask, params: TrackParams
 ) -> _Verdict:
     """Lost, weak or fine, and why."""
-    num_followed, num_inliers = jnp.sum(followed), jnp.sum(inliers)
-    ratio = (num_inliers / jnp.maximum(num_followed, 1)).astype(state.twist.dtype)
+    num_followed, num_inliers = (jnp.sum(mask, dtype=state.twist.dtype) for mask in (followed, inliers))
+    ratio = num_inliers / jnp.maximum(num_followed, 1)
     twist = _twist(state.T_world_cam, refined.T_world_cam, view.elapsed_s)
     speed, turn = jnp.linalg.norm(twist[:3]), jnp.linalg.norm(twist[3:])
     causes = (
@@ -311,7 +312,7 @@ def _update_points(
     xy = (seen.uv - _centre(params.intrinsics)) / _focal(params.intrinsics)
     measured = jnp.concatenate([xy, jnp.ones_like(xy[:1])]) * seen.depth[None, :]
     fused = X_cam + (information / total)[None, :] * (measured - X_cam)
-    X_world = T_world_cam.rotation().as_matrix() @ fused + T_world_cam.translation()[:, None]
+    X_world = to_world(T_world_cam, fused)
     cap = _MAX_FUSED * information
     return TrackedPoints(
         uv=jnp.where(inliers[None, :], uv, points.uv),
@@ -343,7 +344,7 @@ def _conclude(
 ) -> tuple[TrackState, TrackOutput]:
     """The new state, and the output: tracked, held, or started anew."""
     lost_frames = jnp.where(verdict.lost, state.lost_frames + 1, 0)
-    start = verdict.lost & (lost_frames > params.restart_after)
+    start = verdict.lost & (lost_frames.astype(params.restart_after.dtype) > params.restart_after)
     held = verdict.lost & ~start
     choose = lambda when_lost, when_tracked: jax.tree.map(
         lambda a, b: jnp.where(verdict.lost, a, b), when_lost, when_tracked
@@ -352,7 +353,7 @@ def _conclude(
     twist = choose(jnp.zeros_like(state.twist), _twist(state.T_world_cam, pose, view.elapsed_s))
     points = choose(state.points._replace(valid=state.points.valid & held), kept)
 
-    alive = jnp.sum(points.valid)
+    alive = jnp.sum(points.valid, dtype=twist.dtype)
     few = alive < params.refill_below * sizes.num_points
     points = lax.cond(
         start | (few & ~verdict.lost),
@@ -362,7 +363,7 @@ def _conclude(
         lambda p: p,
         points,
     )
-    failed = start & (jnp.sum(points.valid) < params.min_inliers)
+    failed = start & (jnp.sum(points.valid, dtype=twist.dtype) < params.min_inliers)
     started = start & ~failed
     make = started | (~verdict.lost & (looked_up.overlap < params.keyframe_below))
     keyframes = with_keyframe(state.keyframes, make, view.frame.image, pose, points, _trust(points, params))

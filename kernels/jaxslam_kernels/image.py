@@ -55,7 +55,9 @@ def build_pyramid(image: Image, *, num_levels: int = 4, border: int = 16) -> Pyr
     """
     smallest = min(image.shape) / 2 ** max(num_levels - 2, 0)
     if num_levels < 1 or (num_levels > 1 and smallest < 3):
-        raise ValueError(f"num_levels: 1 or more with sides halved no further than 2 pixels, got {num_levels} levels of {image.shape}")
+        raise ValueError(
+            f"num_levels: 1 or more expected, sides halved no further than 2; got {num_levels} levels of {image.shape}"
+        )
     levels = [image]
     while len(levels) < num_levels:
         levels.append(half_size(levels[-1]))

@@ -4,23 +4,14 @@ import enum
 from functools import partial
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxslam_kernels._patches import Window
 from jaxslam_kernels.image import Pyramid
-from jaxslam_kernels.lk_search import (
-    FlowPlan,
-    LevelPlan,
-    Solution,
-    difference,
-    look,
-    make_template,
-    mean_absolute,
-    search,
-)
+from jaxslam_kernels.implicit import Found, implicit_positions
+from jaxslam_kernels.lk_search import FlowPlan, LevelPlan, difference, look, make_template, mean_absolute, search
 from jaxslam_kernels.types import Mask, Pixels, Scalar
 
 __all__ = ["Flow", "FlowPlan", "FlowStatus", "LevelPlan", "lk_flow", "lk_flow_forward_backward"]
@@ -81,7 +72,8 @@ def lk_flow(
 
     Differentiable in both images and in `points`, forward and reverse, by the implicit function theorem at the
     solution (not through the iterations, so the guess has no influence). The derivative of a point that was not
-    tracked is zero.
+    tracked is zero. Bilinear interpolation bends between pixels: at a point with whole coordinates, the derivative is
+    that towards greater ones.
 
     Args:
         previous: Pyramid of the image the points are in; its border at least half the largest window plus 6.
@@ -107,21 +99,21 @@ def lk_flow(
     usable = finite & wanted & _inside(points, previous)
     held, start = (jnp.where(usable[None, :], pixels, 0) for pixels in (points, guess))
     threshold = jnp.asarray(min_texture, points.dtype)
-    solution = _solve(previous, current, held, start, usable, threshold, plan)
+    inputs = _Inputs(previous, current, held, start, usable, threshold)
+    found = implicit_positions(partial(_solve, plan=plan), partial(_explain, plan=plan), inputs)
+    end = found.measures
     reasons = (
         (~wanted, FlowStatus.MASKED),
-        (~finite | ~jnp.isfinite(solution.last_step) | ~jnp.isfinite(solution.texture), FlowStatus.BAD_INPUT),
-        (~usable | ~_inside(solution.position, current), FlowStatus.OUTSIDE),
-        (~(solution.texture > threshold), FlowStatus.NO_TEXTURE),
-        (~(solution.last_step < _CONVERGED_PX**2), FlowStatus.NOT_CONVERGED),
+        (~finite | ~jnp.isfinite(end.last_step) | ~jnp.isfinite(end.texture), FlowStatus.BAD_INPUT),
+        (~usable | ~_inside(found.positions, current), FlowStatus.OUTSIDE),
+        (~(end.texture > threshold), FlowStatus.NO_TEXTURE),
+        (~found.converged, FlowStatus.NOT_CONVERGED),
     )
     conditions, codes = zip(*reasons, strict=True)
     status = jnp.select(conditions, [jnp.full(usable.shape, code, jnp.int32) for code in codes], FlowStatus.OK)
     unsearched = lax.stop_gradient(jnp.where(jnp.isfinite(guess), guess, 0))
-    position = jnp.where(usable[None, :], solution.position, unsearched)
-    residual, texture = (
-        jnp.where(usable & jnp.isfinite(array), array, 0) for array in (solution.residual, solution.texture)
-    )
+    position = jnp.where(usable[None, :], found.positions, unsearched)
+    residual, texture = (jnp.where(usable & jnp.isfinite(array), array, 0) for array in (end.residual, end.texture))
     return Flow(position, status, residual, texture)
 
 
@@ -151,70 +143,35 @@ def lk_flow_forward_backward(
     return forward._replace(status=status)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(6,))
-def _solve(
-    previous: Pyramid,
-    current: Pyramid,
-    points: Pixels,
-    guess: Pixels,
-    usable: Mask,
-    min_texture: Scalar,
-    plan: FlowPlan,
-) -> Solution:
-    return search(previous, current, points, guess, usable, min_texture, plan=plan)
+class _Inputs(NamedTuple):
+    previous: Pyramid
+    current: Pyramid
+    points: Pixels
+    guess: Pixels
+    usable: Mask
+    min_texture: Scalar
 
 
-@_solve.defjvp
-def _solve_jvp(plan: FlowPlan, primals: tuple, tangents: tuple) -> tuple[Solution, Solution]:
-    """Implicit function theorem at the solution, where the slope of the squared difference is zero.
-
-    Points that were not tracked have no such solution: their derivative is zero. That of the others holds at pixels
-    with a finite value, so the rest may as well be zero.
-    """
-    previous, current, points, guess, usable, min_texture = primals
-    solution = _solve(previous, current, points, guess, usable, min_texture, plan)
-    tracked = usable & (solution.texture > min_texture) & (solution.last_step < _CONVERGED_PX**2)
-    tracked &= _inside(solution.position, current)
-
-    finite = lambda array: jnp.where(jnp.isfinite(array), array, 0)
-    inputs = (jax.tree.map(finite, previous), jax.tree.map(finite, current), points)
-    at = partial(_at_solution, window=Window(plan.finest.window))
-    by_position = lambda position: at(*inputs, position)
-    columns = [
-        jax.jvp(by_position, (solution.position,), (jnp.zeros_like(points).at[axis].set(1),))[1] for axis in range(2)
-    ]
-    (uu, vu), (uv, vv) = (column.slope for column in columns)
-    by_inputs = lambda previous, current, points: at(previous, current, points, solution.position)
-    change = jax.jvp(by_inputs, inputs, tangents[:3])[1]
-
-    determinant = uu * vv - uv * vu
-    magnitude = jnp.square(uu) + jnp.square(uv) + jnp.square(vu) + jnp.square(vv)
-    regular = tracked & (jnp.abs(determinant) > 10 * jnp.finfo(points.dtype).eps * magnitude)
-    inverse = jnp.where(regular, 1 / jnp.where(regular, determinant, 1), 0)
-    u, v = change.slope
-    d_position = -inverse[None, :] * jnp.stack([vv * u - uv * v, uu * v - vu * u])
-    d_residual = change.residual + sum(column.residual * d for column, d in zip(columns, d_position, strict=True))
-    keep = lambda array: jnp.where(regular, array, 0)
-    tangent = Solution(d_position, jnp.zeros_like(solution.last_step), keep(d_residual), keep(change.texture))
-    return solution, tangent
-
-
-class _AtSolution(NamedTuple):
-    slope: Pixels
+class _End(NamedTuple):
     residual: Float[Array, " n"]
     texture: Float[Array, " n"]
+    last_step: Float[Array, " n"]
 
 
-def _at_solution(previous: Pyramid, current: Pyramid, points: Pixels, position: Pixels, window: Window) -> _AtSolution:
-    """What the solution is defined by, as a plain function to differentiate.
+def _solve(inputs: _Inputs, *, plan: FlowPlan) -> Found:
+    end = search(*inputs, plan=plan)
+    tracked = inputs.usable & (end.texture > inputs.min_texture) & (end.last_step < _CONVERGED_PX**2)
+    tracked &= _inside(end.position, inputs.current)
+    return Found(end.position, tracked, _End(end.residual, end.texture, end.last_step))
 
-    The slope of half the squared difference at the finest level (zero at a solution), the residual, and the texture.
-    """
-    border = previous.border
-    template = make_template(previous.levels[0], points, border, window, once=lambda compute: compute())
-    error = difference(look(position, current.levels[0], border, window), template.patch, window)
+
+def _explain(position: Pixels, inputs: _Inputs, *, plan: FlowPlan) -> tuple[Pixels, _End]:
+    """The slope of half the squared difference at the finest level, zero where the search ends, and the measures."""
+    window, border = Window(plan.finest.window), inputs.previous.border
+    template = make_template(inputs.previous.levels[0], inputs.points, border, window, once=lambda compute: compute())
+    error = difference(look(position, inputs.current.levels[0], border, window), template.patch, window)
     slope = jnp.einsum("nkl,nl->kn", template.gradient, error)
-    return _AtSolution(slope, mean_absolute(error, window), template.texture)
+    return slope, _End(mean_absolute(error, window), template.texture, jnp.zeros_like(position[0]))
 
 
 def _check(previous: Pyramid, current: Pyramid, plan: FlowPlan) -> None:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jaxslam_kernels import _patches as patches
 from jaxslam_kernels._patches import Window
@@ -121,24 +121,19 @@ def make_template(
     stride, length = window.stride, window.length
     cut = once(lambda: patches.cut(level, corner, window.side + 4, stride)).reshape(position.shape[1], -1)
     smooth = once(lambda: patches.bilinear(cut, fraction, stride, length + 2 * stride + 2))
-    return template_of(smooth, patches.in_image(position, level, border, window), window, once)
+    counts = patches.in_image(position, level, border, window).astype(smooth.dtype)
+    gradient = once(lambda: patches.gradients(smooth, window) * counts[:, None, :])
+    return template_with(smooth[:, stride + 1 : stride + 1 + length], gradient, window)
 
 
-def template_of(
-    smooth: Float[Array, "n m"],
-    counts: Bool[Array, "n l"],
-    window: Window,
-    once: Callable[[Callable[[], Any]], Any],
-) -> Template:
-    """The templates of flat patches with a margin of one pixel; `counts` says which pixels of the window do."""
-    stride, length = window.stride, window.length
-    gradient = once(lambda: patches.gradients(smooth, window) * counts.astype(smooth.dtype)[:, None, :])
+def template_with(patch: Float[Array, "n l"], gradient: Float[Array, "n 2 l"], window: Window) -> Template:
+    """The templates of flat patches with gradients that are zero where a pixel does not count."""
     (xx, xy), (_, yy) = (jnp.einsum("nkl,nl->kn", gradient, gradient[:, axis]) for axis in range(2))
     spread = jnp.sqrt(jnp.square(xx - yy) + 4 * jnp.square(xy) + jnp.finfo(xx.dtype).tiny)
     determinant = xx * yy - xy * xy
     safe = jnp.where(determinant > 0, determinant, jnp.ones_like(determinant))
     return Template(
-        patch=smooth[:, stride + 1 : stride + 1 + length],
+        patch=patch,
         gradient=gradient,
         inverse=jnp.stack([yy, -xy, xx]) / safe[None, :],
         texture=(xx + yy - spread) / (2 * window.side**2),
@@ -194,9 +189,7 @@ def iterate(search: Search, template: Template, level: Float[Array, "h w"], bord
     return lax.while_loop(going, body, start)[0]
 
 
-def _move_inside(
-    position: Pixels, flow: Pixels, level: Float[Array, "h w"], border: int, window: Window
-) -> Pixels:
+def _move_inside(position: Pixels, flow: Pixels, level: Float[Array, "h w"], border: int, window: Window) -> Pixels:
     """The nearest positions whose windows, there and at `position + flow`, lie in the image.
 
     A coarse level gives no more than a guess to the next, and that of a neighbour with a whole window is better than

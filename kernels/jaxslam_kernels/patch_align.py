@@ -7,21 +7,26 @@ and SVO do), matched in brightness, and aligned by Lucas-Kanade steps on one lev
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, Num
+from jaxtyping import Array, Bool, Float, Int, Num
 
 from jaxslam_kernels import _patches as patches
 from jaxslam_kernels._patches import Window
 from jaxslam_kernels.image import Pyramid
 from jaxslam_kernels.implicit import Found, implicit_positions
-from jaxslam_kernels.lk_search import LevelPlan, Search, Template, in_chunks, iterate, look, template_of
+from jaxslam_kernels.lk_search import LevelPlan, Search, Template, in_chunks, iterate, look, template_with
 from jaxslam_kernels.types import Mask, Pixels, Scalar, Weights
 
 DEFAULT_PLAN = LevelPlan(21, 8, 0.05)
 _CONVERGED_PX = 0.1
+_GAIN_SQUARED = (0.25, 4.0)
+"""Smallest and largest; it only scales the steps."""
+
+_Once: TypeAlias = Callable[[Callable[[], Any]], Any]
+"""Runs a part that XLA must not fuse with the rest, see `patches.at_once`."""
 
 
 class PatchMatch(NamedTuple):
@@ -46,7 +51,7 @@ def warped_patches(
     *,
     side: int,
     stride: int,
-) -> Float[Array, "n l"]:
+) -> tuple[Float[Array, "n l"], Bool[Array, "n l"]]:
     """Patches of `side` rows of `stride` pixels around points, sampled through an affine map, as flat rows.
 
     Args:
@@ -58,8 +63,8 @@ def warped_patches(
         stride: Columns of the patch, static.
 
     Returns:
-        `(n, side * stride)` intensities; past the edge of a picture they repeat it. Around the first pixel of the
-        picture where `centre` or `warp` is not finite.
+        `(n, side * stride)` intensities, and which of them lie in the picture; past its edge it repeats. None does
+        where `centre` or `warp` is not finite.
     """
     height, width = pictures.shape[1:]
     known = _finite(centre) & _finite(warp)
@@ -70,6 +75,7 @@ def warped_patches(
     column = lambda array: array[:, None]
     u = column(centre[0]) + column(warp[0, 0]) * du + column(warp[0, 1]) * dv
     v = column(centre[1]) + column(warp[1, 0]) * du + column(warp[1, 1]) * dv
+    inside = column(known) & (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
     # Held one pixel inside, so that the neighbours right and below exist.
     u, v = jnp.clip(u, 0, width - 1.001), jnp.clip(v, 0, height - 1.001)
     left, top = jnp.floor(u), jnp.floor(v)
@@ -77,7 +83,8 @@ def warped_patches(
     index = (column(picture) * height + top.astype(jnp.int32)) * width + left.astype(jnp.int32)
     flat = pictures.reshape(-1)
     at = lambda shift: jnp.take(flat, index + shift, mode="clip").astype(centre.dtype)
-    return (1 - fv) * ((1 - fu) * at(0) + fu * at(1)) + fv * ((1 - fu) * at(width) + fu * at(width + 1))
+    upper, lower = (1 - fu) * at(0) + fu * at(1), (1 - fu) * at(width) + fu * at(width + 1)
+    return (1 - fv) * upper + fv * lower, inside
 
 
 def _finite(array: Float[Array, "... n"]) -> Mask:
@@ -101,51 +108,61 @@ class _Inputs(NamedTuple):
     min_texture: Scalar
 
 
-def _template(inputs: _Inputs, window: Window, border: int, once: Callable[[Callable[[], Any]], Any]) -> Template:
-    """The warped patches, brought to the mean and the contrast of the current image around the guess."""
+def _template(inputs: _Inputs, window: Window, border: int, once: _Once) -> tuple[Template, Float[Array, "n l"]]:
+    """The templates, and 1 for each of their pixels that counts, 0 for the others.
+
+    The gradient is freed of what a change of brightness would explain, so that the solution does not depend on how
+    well gain and offset are known; those at the guess are good enough for the steps.
+    """
     sample = lambda: warped_patches(
         inputs.pictures, inputs.picture, inputs.centre, inputs.warp, side=window.side + 2, stride=window.stride
     )
-    smooth = jnp.pad(once(sample), ((0, 0), (0, 2)))
-    patch = smooth[:, window.stride + 1 : window.stride + 1 + window.length]
-    gain, offset = _brightness(patch, _there(inputs.guess, inputs, window, border, once), window)
-    counts = jnp.broadcast_to(window.columns()[None, :], patch.shape)
-    return template_of(gain * smooth + offset, counts, window, once)
+    smooth, inside = (jnp.pad(array, ((0, 0), (0, 2))) for array in once(sample))
+    middle = slice(window.stride + 1, window.stride + 1 + window.length)
+    counts = (inside[:, middle] & window.columns()[None, :]).astype(smooth.dtype)
+    there = _there(inputs.guess, inputs, window, border, once)
+
+    def matched() -> tuple[Float[Array, "n l"], Float[Array, "n 2 l"]]:
+        (centred, _), (centred_there, mean_there) = _centred(smooth[:, middle], counts), _centred(there, counts)
+        area, power = _area(counts), _dot(centred, centred)
+        ratio = (_dot(centred_there, centred_there) + area) / (power + area)
+        gain = jnp.sqrt(jnp.clip(ratio, *_GAIN_SQUARED))
+        gradient = patches.gradients(smooth, window) * counts[:, None, :]
+        mean = jnp.sum(gradient, axis=2, keepdims=True) / area[:, :, None]
+        share = jnp.einsum("nkl,nl->nk", gradient, centred) / jnp.maximum(power, 1)
+        free = gradient - mean * counts[:, None, :] - share[:, :, None] * centred[:, None, :]
+        return gain * centred + mean_there, gain[:, :, None] * free
+
+    patch, gradient = once(matched)
+    return template_with(patch, gradient, window), counts
 
 
-def _there(
-    position: Pixels, inputs: _Inputs, window: Window, border: int, once: Callable[[Callable[[], Any]], Any]
-) -> Float[Array, "n l"]:
+def _there(position: Pixels, inputs: _Inputs, window: Window, border: int, once: _Once) -> Float[Array, "n l"]:
     """What the current image shows around positions."""
     sight = once(lambda: look(position, inputs.current, border, window))
     flat = sight.cut.reshape(position.shape[1], -1)
     return patches.bilinear(flat, sight.fraction, window.stride, window.length)
 
 
-def _moments(patch: Float[Array, "n l"], window: Window) -> tuple[Float[Array, "n 1"], Float[Array, "n 1"]]:
-    """Mean and variance over the window."""
-    inside = window.columns().astype(patch.dtype)
-    area = window.side**2
-    mean = jnp.einsum("nl,l->n", patch, inside)[:, None] / area
-    variance = jnp.einsum("nl,l->n", jnp.square(patch - mean), inside)[:, None] / area
-    return mean, variance
+def _dot(a: Float[Array, "n l"], b: Float[Array, "n l"]) -> Float[Array, "n 1"]:
+    return jnp.einsum("nl,nl->n", a, b)[:, None]
 
 
-def _brightness(
-    patch: Float[Array, "n l"], there: Float[Array, "n l"], window: Window
-) -> tuple[Float[Array, "n 1"], Float[Array, "n 1"]]:
-    """Gain, between a half and 2, and offset that bring patches to the mean and contrast of what is there."""
-    mean, variance = _moments(patch, window)
-    mean_there, variance_there = _moments(there, window)
-    gain = jnp.sqrt(jnp.clip((variance_there + 1) / (variance + 1), 0.25, 4.0))
-    return gain, mean_there - gain * mean
+def _area(counts: Float[Array, "n l"]) -> Float[Array, "n 1"]:
+    return jnp.maximum(jnp.sum(counts, axis=1, keepdims=True), 1)
 
 
-def _correlation(patch: Float[Array, "n l"], there: Float[Array, "n l"], window: Window) -> Weights:
-    inside = window.columns().astype(patch.dtype)[None, :]
-    first, second = ((array - _moments(array, window)[0]) * inside for array in (patch, there))
-    dot = lambda a, b: jnp.einsum("nl,nl->n", a, b)
-    return dot(first, second) / jnp.sqrt(dot(first, first) * dot(second, second) + 1)
+def _centred(
+    patch: Float[Array, "n l"], counts: Float[Array, "n l"]
+) -> tuple[Float[Array, "n l"], Float[Array, "n 1"]]:
+    """Patches less their mean, 0 where a pixel does not count, and the mean."""
+    mean = _dot(patch, counts) / _area(counts)
+    return (patch - mean) * counts, mean
+
+
+def _correlation(patch: Float[Array, "n l"], there: Float[Array, "n l"], counts: Float[Array, "n l"]) -> Weights:
+    first, second = (_centred(array, counts)[0] for array in (patch, there))
+    return (_dot(first, second) / jnp.sqrt(_dot(first, first) * _dot(second, second) + 1))[:, 0]
 
 
 def _solve(inputs: _Inputs, *, plan: LevelPlan, border: int, chunk: int) -> Found:
@@ -154,11 +171,11 @@ def _solve(inputs: _Inputs, *, plan: LevelPlan, border: int, chunk: int) -> Foun
 
     def search_chunk(inputs: _Inputs) -> Found:
         once = partial(patches.at_once, alive=jnp.all(jnp.isfinite(inputs.centre)))
-        template = _template(inputs, window, border, once)
+        template, counts = _template(inputs, window, border, once)
         active = inputs.mask & (template.texture > inputs.min_texture)
         begin = Search(inputs.guess, jnp.full_like(inputs.guess[0], jnp.inf), active)
         end = iterate(begin, template, inputs.current, border, plan)
-        correlation = _correlation(template.patch, _there(end.position, inputs, window, border, once), window)
+        correlation = _correlation(template.patch, _there(end.position, inputs, window, border, once), counts)
         known = active & jnp.isfinite(correlation)
         settled = known & (end.last_step < _CONVERGED_PX**2)
         low, high = patches.bounds(inputs.current, border)
@@ -180,10 +197,10 @@ def _explain(position: Pixels, inputs: _Inputs, *, plan: LevelPlan, border: int)
     """Slope of half the squared difference, zero where the search converged, and the correlation."""
     window = Window(plan.window)
     directly = lambda compute: compute()
-    template = _template(inputs, window, border, directly)
+    template, counts = _template(inputs, window, border, directly)
     there = _there(position, inputs, window, border, directly)
     slope = jnp.einsum("nkl,nl->kn", template.gradient, there - template.patch)
-    return slope, _correlation(template.patch, there, window)
+    return slope, _correlation(template.patch, there, counts)
 
 
 def align_patches(
@@ -208,7 +225,7 @@ def align_patches(
     Args:
         pictures: `k` pictures, grey, of any number type.
         picture: `(n,)` which of them each point is in.
-        centre: `(2, n)` pixel coordinates there. A patch that leaves its picture goes on with the picture's edge.
+        centre: `(2, n)` pixel coordinates there. Pixels of a patch outside its picture do not count.
         warp: `(2, 2, n)` offset in the picture for an offset in the current image, `[to, from]`.
         current: Pyramid of the current image, its border at least half the window plus 6; its finest level is
             searched.
@@ -229,9 +246,9 @@ def align_patches(
     if current.border < Window(plan.window).border:
         raise ValueError(f"border: at least {Window(plan.window).border} pixels needed, got {current.border}")
     usable = mask & _finite(guess) & _finite(centre) & _finite(warp)
-    placed = [_held(array, usable) for array in (centre, warp, guess)]
+    centre, warp, guess = (_held(array, usable) for array in (centre, warp, guess))
     threshold = jnp.asarray(min_texture, centre.dtype)
-    inputs = _Inputs(pictures, picture, *placed, usable, current.levels[0], threshold)
+    inputs = _Inputs(pictures, picture, centre, warp, guess, usable, current.levels[0], threshold)
     settings = {"plan": plan, "border": current.border}
     found = implicit_positions(partial(_solve, chunk=chunk, **settings), partial(_explain, **settings), inputs)
     return PatchMatch(found.positions, found.measures, found.converged)

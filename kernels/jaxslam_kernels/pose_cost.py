@@ -74,16 +74,22 @@ def pose_problem(
     scale: Scalar | float,
     prior: PosePrior | None,
 ) -> PoseProblem:
-    """Cleans what came in: any value that is not finite takes its point (or only its depth) out of the problem."""
+    """Cleans what came in: any value that is not finite takes its point (or only its depth) out of the problem.
+
+    A camera or a scale that means nothing takes all of them out.
+    """
     dtype, n = X_world.dtype, X_world.shape[1]
     weights = jnp.ones(n, dtype) if weights is None else weights
     depth = jnp.zeros(n, dtype) if depth is None else depth
     sigma_px, sigma_depth = (jnp.broadcast_to(jnp.asarray(sigma, dtype), (n,)) for sigma in (sigma_px, sigma_depth))
+    scale = jnp.asarray(scale, dtype)
+    usable = _usable(intrinsics) & _positive(scale)
+    intrinsics, scale = jax.tree.map(lambda x: jnp.where(usable, x, 1.0), (intrinsics, scale))
     has_depth = _positive(depth) & _positive(sigma_depth)
     known = jnp.isfinite(X_world).all(axis=0) & jnp.isfinite(uv).all(axis=0)
-    known = known & _positive(sigma_px) & _positive(weights) & _usable(intrinsics)
+    known = known & _positive(sigma_px) & _positive(weights) & usable
     safe_sigma = jnp.where(known, sigma_px, 1.0)
-    focal = jnp.where(_usable(intrinsics), jnp.stack([intrinsics.fx, intrinsics.fy]), 1.0)
+    focal = jnp.stack([intrinsics.fx, intrinsics.fy])
     inverse_depth_sigma = jnp.where(has_depth, 1.0 / jnp.where(has_depth, sigma_depth, 1.0), 0.0)
     return PoseProblem(
         X_world=jnp.where(known[None, :], X_world, 0.0),
@@ -91,7 +97,7 @@ def pose_problem(
         depth=jnp.where(has_depth, depth, 0.0),
         precision=jnp.concatenate([focal[:, None] / safe_sigma[None, :], inverse_depth_sigma[None, :]]),
         weights=jnp.where(known, weights, 0.0),
-        scale=jnp.asarray(scale, dtype),
+        scale=scale,
         prior=_usable_prior(prior),
     )
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from equinox.debug import assert_max_traces
 from jax.test_util import check_grads
-
 from jaxslam_kernels.image import build_pyramid, half_size
 
 
@@ -17,7 +16,7 @@ def x64():
         yield
 
 
-def _image(height, width, dtype=np.float64, seed=0):
+def _image(height, width, dtype: type = np.float64, seed=0):
     return np.random.default_rng(seed).uniform(0, 255, (height, width)).astype(dtype)
 
 

@@ -1,0 +1,50 @@
+"""Rigid transforms: jaxlie's, for callers that run JAX with strict promotion of types and ranks.
+
+jaxlie (1.5) multiplies quaternions with integer signs and relies on both promotions; here, and only here, they are
+allowed while it works.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import jax
+from jaxlie import SE3
+from jaxtyping import Array, Float
+
+from jaxslam_kernels.types import Points
+
+
+@contextmanager
+def lenient_promotion() -> Iterator[None]:
+    """Allow implicit promotion of types and ranks, as jaxlie needs."""
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        yield
+
+
+def moved(T_a_b: SE3, tangent_b: Float[Array, "6"]) -> SE3:
+    """`T_a_b @ exp(tangent_b)`: a pose moved in its own axes, translation first."""
+    with lenient_promotion():
+        return T_a_b @ SE3.exp(tangent_b)
+
+
+def between(T_world_a: SE3, T_world_b: SE3) -> SE3:
+    """`T_a_b`: the second pose seen from the first."""
+    with lenient_promotion():
+        return T_world_a.inverse() @ T_world_b
+
+
+def displacement(T_world_a: SE3, T_world_b: SE3) -> Float[Array, "6"]:
+    """The tangent in the axes of the first pose that leads to the second, translation first."""
+    with lenient_promotion():
+        return between(T_world_a, T_world_b).log()
+
+
+def to_camera(T_world_cam: SE3, X_world: Points) -> Points:
+    """World points in the axes of the camera."""
+    R = T_world_cam.rotation().as_matrix()
+    return R.T @ (X_world - T_world_cam.translation()[:, None])
+
+
+def to_world(T_world_cam: SE3, X_cam: Points) -> Points:
+    """Points in the axes of the camera, in the world."""
+    return T_world_cam.rotation().as_matrix() @ X_cam + T_world_cam.translation()[:, None]

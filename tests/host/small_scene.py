@@ -1,0 +1,105 @@
+"""A small picture of the synthetic room and a small tracker, for tests of the tracker as a whole."""
+
+import functools
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam.config import Config, TrackConfig
+from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
+from jaxslam.frame import Frame, to_grey
+from jaxslam.slam import track_params, track_sizes
+from jaxslam.state import FrameArrays, TrackParams, TrackState
+from jaxslam.track import init_state
+from jaxslam.trajectory import Trajectory
+
+WIDTH, HEIGHT = 160, 120
+TRACK = TrackConfig(
+    num_points=128,
+    num_levels=3,
+    num_keyframes=3,
+    num_sources=1,
+    points_per_source=64,
+    num_hypotheses=32,
+    cell_px=10,
+)
+CONFIG = Config(track=TRACK)
+SIZES = track_sizes(TRACK)
+QUICK_COMPILE = {"xla_backend_optimization_level": 0}
+"""Options of `jax.jit` for what runs a few times only: half the time to compile, the same arithmetic."""
+
+
+class Clip:
+    """A rendered recording held in memory, whose frames a test may replace: a `Dataset`."""
+
+    def __init__(self, source: SyntheticDataset, frames: Sequence[Frame], name: str = "clip") -> None:
+        self.name, self.camera, self.ground_truth = name, source.camera, source.ground_truth
+        self.frames = list(frames)
+        self.timestamps_ns = np.array([frame.timestamp_ns for frame in frames], np.int64)
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, index: int) -> Frame:
+        return self.frames[index]
+
+
+@functools.cache
+def _source(people: int, frames: int) -> SyntheticDataset:
+    return SyntheticDataset(SyntheticConfig(width=WIDTH, height=HEIGHT, frames=frames, people=people))
+
+
+@functools.cache
+def _frames(people: int, frames: int) -> tuple[Frame, ...]:
+    source = _source(people, frames)
+    return tuple(source[index] for index in range(frames))
+
+
+def clip(people: int = 0, frames: int = 60) -> Clip:
+    """The first frames of the room, rendered once a process; the list of frames is the caller's own."""
+    return Clip(_source(people, frames), _frames(people, frames))
+
+
+def truth_from_start(trajectory: Trajectory) -> np.ndarray:
+    """`(n, 4, 4)` true poses with the first one as the world, which is the world of the tracker."""
+    matrices = pose_matrices(trajectory.T_world_cam)
+    return np.linalg.inv(matrices[0]) @ matrices
+
+
+def pose_matrices(wxyz_xyz: np.ndarray) -> np.ndarray:
+    """`(n, 4, 4)` of `(n, 7)`."""
+    w, x, y, z = (wxyz_xyz[:, :4] / np.linalg.norm(wxyz_xyz[:, :4], axis=1, keepdims=True)).T
+    result = np.tile(np.eye(4), (len(wxyz_xyz), 1, 1))
+    result[:, 0, :3] = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], axis=1)
+    result[:, 1, :3] = np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], axis=1)
+    result[:, 2, :3] = np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1)
+    result[:, :3, 3] = wxyz_xyz[:, 4:]
+    return result
+
+
+def new_state(dtype: type[np.floating] = np.float32, image_dtype: type = np.uint8, seed: int = 0) -> TrackState:
+    return init_state(HEIGHT, WIDTH, SIZES, seed=seed, image_dtype=jnp.dtype(image_dtype), dtype=jnp.dtype(dtype))
+
+
+def params(dtype: type[np.floating] = np.float32) -> TrackParams:
+    return track_params(_source(0, 60).camera, TRACK, dtype)
+
+
+def stacked(frames: Sequence[Frame], dtype: type[np.floating] = np.float32, image_dtype: type = np.uint8) -> FrameArrays:
+    """Frames as arrays with the time as the first axis, as `lax.scan` takes them."""
+    stamps = np.array([frame.timestamp_ns for frame in frames])
+    steps = np.diff(stamps, prepend=stamps[0] - 33_333_000) * 1e-9
+    return FrameArrays(
+        image=jnp.asarray(np.stack([to_grey(frame.image) for frame in frames]).astype(image_dtype)),
+        depth=jnp.asarray(np.stack([frame.depth_m for frame in frames]).astype(dtype)),
+        ignore=jnp.zeros((len(frames), HEIGHT, WIDTH), bool),
+        dt_s=jnp.asarray(steps.astype(dtype)),
+        depth_delay_s=jnp.zeros(len(frames), dtype),
+    )
+
+
+def at(frames: FrameArrays, index: int) -> FrameArrays:
+    """One frame of those `stacked`."""
+    return jax.tree.map(lambda array: array[index], frames)
