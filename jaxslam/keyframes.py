@@ -5,15 +5,15 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jaxlie import SE3
-from jaxslam_kernels.camera import Intrinsics, distort, normalise, to_pixels
+from jaxslam_kernels.camera import Intrinsics, normalise
 from jaxslam_kernels.depth_image import sample_depth
 from jaxslam_kernels.image import Pyramid
 from jaxslam_kernels.patch_align import align_patches
-from jaxslam_kernels.rolling_shutter import image_velocity, row_time
 from jaxslam_kernels.transform import to_camera
 from jaxslam_kernels.types import Mask, Pixels, Points, Scalar, Weights
 from jaxtyping import Array, Bool, Float, Int, Num
 
+from jaxslam.observe import predict_pixels
 from jaxslam.state import Keyframes, TrackedPoints, TrackParams, TrackSizes
 
 _MARGIN_PX = 8
@@ -48,15 +48,6 @@ def empty_keyframes(height: int, width: int, sizes: TrackSizes, image_dtype: jnp
         weight=jnp.zeros((k, n), dtype),
         made=jnp.zeros((), jnp.int32),
     )
-
-
-def predict_pixels(X_cam: Points, twist: Float[Array, "6"], height: int, params: TrackParams) -> Pixels:
-    """Where points appear in a frame of a rolling shutter, while the camera moves with `twist`."""
-    depth = jnp.maximum(X_cam[2], params.min_depth_m / 2)
-    xy = X_cam[:2] / depth[None, :]
-    v = to_pixels(params.intrinsics, distort(params.intrinsics, xy))[1]
-    moved = xy + image_velocity(xy, depth, twist) * row_time(v, height, params.readout_s)[None, :]
-    return to_pixels(params.intrinsics, distort(params.intrinsics, moved))
 
 
 def look_up(

@@ -2,14 +2,13 @@
 
 import jax.numpy as jnp
 from jaxlie import SE3
-from jaxslam_kernels.camera import normalise
 from jaxslam_kernels.corners import corner_score, grid_corners, occupied_cells
 from jaxslam_kernels.depth_image import sample_depth
 from jaxslam_kernels.image import Pyramid
-from jaxslam_kernels.rolling_shutter import image_velocity, row_time
 from jaxslam_kernels.transform import to_world
 from jaxtyping import Array, Bool, Float
 
+from jaxslam.observe import depth_sigma, observe
 from jaxslam.state import TrackedPoints, TrackParams, TrackSizes
 
 _MIN_SCORE = 2.0
@@ -33,7 +32,6 @@ def refill(
     Corners are sought on the second level of the pyramid: a quarter of the work, and less noise. A new point has the
     depth measured at it, the rolling shutter and the delay of the depth image taken into account.
     """
-    height = pyramid.size()[0]
     border, cell = pyramid.border, sizes.cell_px // 2
     image = pyramid.levels[1][border:-border, border:-border]
     v, u = jnp.mgrid[: image.shape[0], : image.shape[1]]
@@ -45,17 +43,12 @@ def refill(
     taken = occupied_cells(points.uv / 2, points.valid, (image.shape[0], image.shape[1]), cell=cell)
     uv = corners.points * 2
 
-    xy = normalise(params.intrinsics, uv)
     rough = sample_depth(depth, uv, reach=2)
-    speed = image_velocity(xy, rough, twist)
-    focal = jnp.stack([params.intrinsics.fx, params.intrinsics.fy])[:, None]
-    measured = sample_depth(depth, uv + focal * speed * depth_delay_s, reach=2)
-    seen = xy - speed * row_time(uv[1], height, params.readout_s)[None, :]
-    X_cam = jnp.concatenate([seen, jnp.ones_like(seen[:1])]) * measured[None, :]
-    X_world = to_world(T_world_cam, X_cam)
-    sigma = params.depth_sigma_m + params.depth_sigma_per_m2 * jnp.square(measured)
+    seen = observe(uv, rough, twist, depth, depth_delay_s, params, reach=2)
+    X_world = to_world(T_world_cam, seen.in_camera())
+    sigma = depth_sigma(seen.depth, params)
 
-    good = (corners.score > _MIN_SCORE) & ~taken & (rough > 0) & (measured > 0)
+    good = (corners.score > _MIN_SCORE) & ~taken & (rough > 0) & (seen.depth > 0)
     order = jnp.argsort(jnp.where(good, -corners.score, jnp.inf))
     rank = jnp.cumsum(~points.valid) - 1
     candidate = order[jnp.clip(rank, 0, order.shape[0] - 1)]

@@ -13,19 +13,19 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxlie import SE3
-from jaxslam_kernels.camera import Intrinsics, normalise, to_pixels
-from jaxslam_kernels.depth_image import believable, sample_depth
+from jaxslam_kernels.camera import Intrinsics, to_pixels
+from jaxslam_kernels.depth_image import believable
 from jaxslam_kernels.image import Pyramid, build_pyramid
 from jaxslam_kernels.lk_flow import FlowPlan, lk_flow
 from jaxslam_kernels.pnp import ransac_pnp
 from jaxslam_kernels.pose_refine import PoseRefinement, refine_pose
 from jaxslam_kernels.robust import weighted_median
-from jaxslam_kernels.rolling_shutter import image_velocity, row_time
 from jaxslam_kernels.transform import displacement, moved, to_camera, to_world
 from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Points, Scalar, Weights
 from jaxtyping import Array, Float
 
-from jaxslam.keyframes import LookedUp, empty_keyframes, look_up, predict_pixels, with_keyframe
+from jaxslam.keyframes import LookedUp, empty_keyframes, look_up, with_keyframe
+from jaxslam.observe import Observed, depth_sigma, observe, predict_pixels
 from jaxslam.refill import refill
 from jaxslam.state import (
     FrameArrays,
@@ -54,14 +54,6 @@ class _View(NamedTuple):
     depth: Float[Array, "h w"]
     elapsed_s: Scalar
     """Seconds since the last good frame."""
-
-
-class _Seen(NamedTuple):
-    """Map points as seen in the frame, corrected to one time and an ideal camera."""
-
-    X_world: Points
-    uv: Pixels
-    depth: Weights
 
 
 class _Verdict(NamedTuple):
@@ -139,8 +131,7 @@ def track_step(
     coarse, agreeing = _coarse_pose(state, view, uv, followed, predicted, params, sizes)
     twist = _twist(state.T_world_cam, coarse, view.elapsed_s)
     looked_up = look_up(state.keyframes, coarse, twist, view.pyramid, view.depth, params, sizes)
-    seen, refined = _refine(state, view, uv, agreeing, looked_up, coarse, twist, params)
-    inliers = agreeing & _close(refined, seen, params)[: sizes.num_points]
+    refined, inliers = _refine(state, view, uv, agreeing, looked_up, coarse, twist, params)
     verdict = _judge(state, view, refined, followed, inliers, params)
     kept = _update_points(state, view, uv, inliers, refined.T_world_cam, params)
     return _conclude(state, view, kept, refined, looked_up, verdict, params, sizes)
@@ -179,18 +170,12 @@ def _widened(params: TrackParams, before: Pixels, after: Pixels, followed: Mask)
     return params._replace(ransac_px=params.ransac_px + extra, outlier_px=params.outlier_px + extra)
 
 
-def _see(X_world: Points, uv: Pixels, pose: SE3, twist: Float[Array, "6"], view: _View, params: TrackParams) -> _Seen:
-    """Remove distortion, rolling shutter and the delay of the depth image from observations."""
-    height = view.depth.shape[0]
-    xy = normalise(params.intrinsics, uv)
-    speed = image_velocity(xy, jnp.maximum(to_camera(pose, X_world)[2], params.min_depth_m), twist)
-    depth = sample_depth(view.depth, uv + _focal(params.intrinsics) * speed * view.frame.depth_delay_s)
-    middle = xy - speed * row_time(uv[1], height, params.readout_s)[None, :]
-    return _Seen(X_world, to_pixels(params.intrinsics, middle), depth)
-
-
-def _depth_sigma(depth: Weights, params: TrackParams) -> Weights:
-    return params.depth_sigma_m + params.depth_sigma_per_m2 * jnp.square(depth)
+def _see(
+    X_world: Points, uv: Pixels, pose: SE3, twist: Float[Array, "6"], view: _View, params: TrackParams
+) -> Observed:
+    """What the frame says of map points, seen from about `pose`."""
+    expected = jnp.maximum(to_camera(pose, X_world)[2], params.min_depth_m)
+    return observe(uv, expected, twist, view.depth, view.frame.depth_delay_s, params)
 
 
 def _trust(points: TrackedPoints, params: TrackParams) -> Weights:
@@ -207,8 +192,8 @@ def _coarse_pose(
     usable = jnp.where(followed, _trust(state.points, params), 0)
     result = ransac_pnp(
         jax.random.fold_in(state.key, state.frame),
-        seen.X_world,
-        seen.uv,
+        state.points.X_world,
+        to_pixels(params.intrinsics, seen.xy),
         _ideal(params.intrinsics),
         weights=usable,
         depth=seen.depth,
@@ -234,36 +219,37 @@ def _refine(
     coarse: SE3,
     twist: Float[Array, "6"],
     params: TrackParams,
-) -> tuple[_Seen, PoseRefinement]:
-    """The pose that fits followed points and points of keyframes together."""
+) -> tuple[PoseRefinement, Mask]:
+    """The pose that fits followed points and points of keyframes together, and which followed points it fits."""
     X_world = jnp.concatenate([state.points.X_world, looked_up.X_world], axis=1)
     seen = _see(X_world, jnp.concatenate([uv, looked_up.uv], axis=1), coarse, twist, view, params)
     weights = jnp.concatenate([jnp.where(agreeing, _trust(state.points, params), 0), looked_up.weight])
     refined = refine_pose(
         coarse,
-        seen.X_world,
-        seen.uv,
+        X_world,
+        to_pixels(params.intrinsics, seen.xy),
         _ideal(params.intrinsics),
         weights=weights,
         depth=seen.depth,
         sigma_px=params.pixel_sigma,
-        sigma_depth=_depth_sigma(seen.depth, params),
+        sigma_depth=depth_sigma(seen.depth, params),
         loss="cauchy",
         scale=params.loss_scale,
     )
-    return seen, refined
+    close = _close(refined.T_world_cam, X_world, seen.xy, params)
+    return refined, agreeing & close[: agreeing.shape[0]]
 
 
 def _ideal(intrinsics: Intrinsics) -> Intrinsics:
     return intrinsics._replace(distortion=jnp.zeros_like(intrinsics.distortion))
 
 
-def _close(refined: PoseRefinement, seen: _Seen, params: TrackParams) -> Mask:
-    """Which observations lie within the outlier threshold of the refined pose."""
-    X_cam = to_camera(refined.T_world_cam, seen.X_world)
+def _close(T_world_cam: SE3, X_world: Points, xy: Pixels, params: TrackParams) -> Mask:
+    """Which points are seen within the outlier threshold of where the pose puts them."""
+    X_cam = to_camera(T_world_cam, X_world)
     front = X_cam[2] > params.min_depth_m / 2
-    xy = X_cam[:2] / jnp.where(front, X_cam[2], 1)[None, :]
-    error = to_pixels(params.intrinsics, xy) - seen.uv
+    predicted = X_cam[:2] / jnp.where(front, X_cam[2], 1)[None, :]
+    error = to_pixels(params.intrinsics, predicted) - to_pixels(params.intrinsics, xy)
     return front & (jnp.sum(jnp.square(error), axis=0) < jnp.square(params.outlier_px))
 
 
@@ -305,13 +291,11 @@ def _update_points(
     twist = _twist(state.T_world_cam, T_world_cam, view.elapsed_s)
     seen = _see(points.X_world, uv, T_world_cam, twist, view, params)
     X_cam = to_camera(T_world_cam, points.X_world)
-    sigma = _depth_sigma(seen.depth, params)
+    sigma = depth_sigma(seen.depth, params)
     agrees = inliers & (seen.depth > 0) & (jnp.abs(seen.depth - X_cam[2]) < 3 * sigma)
     information = jnp.where(agrees, 1 / jnp.square(sigma), 0)
     total = jnp.where(agrees, points.information + information, 1)
-    xy = (seen.uv - _centre(params.intrinsics)) / _focal(params.intrinsics)
-    measured = jnp.concatenate([xy, jnp.ones_like(xy[:1])]) * seen.depth[None, :]
-    fused = X_cam + (information / total)[None, :] * (measured - X_cam)
+    fused = X_cam + (information / total)[None, :] * (seen.in_camera() - X_cam)
     X_world = to_world(T_world_cam, fused)
     cap = _MAX_FUSED * information
     return TrackedPoints(
@@ -322,14 +306,6 @@ def _update_points(
         age=points.age + inliers.astype(jnp.int32),
         valid=points.valid & inliers,
     )
-
-
-def _centre(intrinsics: Intrinsics) -> Float[Array, "2 1"]:
-    return jnp.stack([intrinsics.cx, intrinsics.cy])[:, None]
-
-
-def _focal(intrinsics: Intrinsics) -> Float[Array, "2 1"]:
-    return jnp.stack([intrinsics.fx, intrinsics.fy])[:, None]
 
 
 def _conclude(

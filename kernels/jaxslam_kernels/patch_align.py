@@ -213,7 +213,7 @@ def align_patches(
     mask: Mask,
     *,
     plan: LevelPlan = DEFAULT_PLAN,
-    chunk: int = 64,
+    chunk: int = 32,
     min_texture: Scalar | float = 1.0,
 ) -> PatchMatch:
     """Look points up in the current image by the patches around them in older pictures.

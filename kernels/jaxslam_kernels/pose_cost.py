@@ -82,9 +82,9 @@ def pose_problem(
     weights = jnp.ones(n, dtype) if weights is None else weights
     depth = jnp.zeros(n, dtype) if depth is None else depth
     sigma_px, sigma_depth = (jnp.broadcast_to(jnp.asarray(sigma, dtype), (n,)) for sigma in (sigma_px, sigma_depth))
-    scale = jnp.asarray(scale, dtype)
-    usable = _usable(intrinsics) & _positive(scale)
-    intrinsics, scale = jax.tree.map(lambda x: jnp.where(usable, x, 1.0), (intrinsics, scale))
+    loss_scale = jnp.asarray(scale, dtype)
+    usable = _usable(intrinsics) & _positive(loss_scale)
+    intrinsics, loss_scale = jax.tree.map(lambda x: jnp.where(usable, x, 1.0), (intrinsics, loss_scale))
     has_depth = _positive(depth) & _positive(sigma_depth)
     known = jnp.isfinite(X_world).all(axis=0) & jnp.isfinite(uv).all(axis=0)
     known = known & _positive(sigma_px) & _positive(weights) & usable
@@ -97,15 +97,22 @@ def pose_problem(
         depth=jnp.where(has_depth, depth, 0.0),
         precision=jnp.concatenate([focal[:, None] / safe_sigma[None, :], inverse_depth_sigma[None, :]]),
         weights=jnp.where(known, weights, 0.0),
-        scale=scale,
+        scale=loss_scale,
         prior=_usable_prior(prior),
     )
 
 
+def tangent_basis(T_world_cam: SE3) -> Float[Array, "7 6"]:
+    """The derivative of the parameters `wxyz_xyz` of `T_world_cam @ exp(tangent)` at tangent zero."""
+    R, Q = T_world_cam.rotation().as_matrix(), _quaternion_basis(T_world_cam)
+    return jnp.block([[jnp.zeros_like(Q), 0.5 * Q], [R, jnp.zeros_like(R)]])
+
+
 def retract(T_world_cam: SE3, tangent: Float[Array, "6"]) -> SE3:
-    """`T_world_cam @ exp(tangent)`, the quaternion normalised again."""
-    with jax.numpy_dtype_promotion("standard"):  # jaxlie multiplies quaternions with integer signs
-        return (T_world_cam @ SE3.exp(tangent)).normalize()
+    """A step along the right tangent: `T_world_cam @ exp(tangent)` to first order, with a unit quaternion."""
+    parameters = T_world_cam.wxyz_xyz + tangent_basis(T_world_cam) @ tangent
+    q = parameters[:4]
+    return SE3(jnp.concatenate([q * jax.lax.rsqrt(jnp.sum(q * q)), parameters[4:]]))
 
 
 class PoseCost(NamedTuple):
@@ -169,15 +176,20 @@ def _linearise(T_world_cam: SE3, problem: PoseProblem) -> tuple[list[Array], lis
 
 def _prior_error(T_world_cam: SE3, prior: PosePrior) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
     """The deviation from the prior and its derivative along the right tangent, both exact."""
-    with jax.numpy_dtype_promotion("standard"):
-        T_prior_cam = prior.T_world_cam.inverse() @ T_world_cam
-    q = T_prior_cam.rotation().wxyz
-    q = q * jnp.where(q[0] < 0, -1.0, 1.0)
-    w, x, y, z = q
-    rotation_rows = jnp.stack([w, -z, y, z, w, -x, -y, x, w]).reshape(3, 3)
-    zeros = jnp.zeros_like(rotation_rows)
-    jacobian = jnp.block([[T_prior_cam.rotation().as_matrix(), zeros], [zeros, rotation_rows]])
-    return jnp.concatenate([T_prior_cam.translation(), 2.0 * q[1:]]), jacobian
+    R, Q, q = T_world_cam.rotation().as_matrix(), _quaternion_basis(T_world_cam), T_world_cam.wxyz_xyz[:4]
+    predicted = prior.T_world_cam
+    R_prior, Q_prior, q_prior = predicted.rotation().as_matrix(), _quaternion_basis(predicted), predicted.wxyz_xyz[:4]
+    sign = jnp.where(jnp.dot(q_prior, q) < 0, -1.0, 1.0)  # q and -q are the same rotation
+    offset = R_prior.T @ (T_world_cam.translation() - predicted.translation())
+    error = jnp.concatenate([offset, 2.0 * sign * (Q_prior.T @ q)])
+    zeros = jnp.zeros_like(R)
+    return error, jnp.block([[R_prior.T @ R, zeros], [zeros, sign * (Q_prior.T @ Q)]])
+
+
+def _quaternion_basis(T: SE3) -> Float[Array, "4 3"]:
+    """The quaternion q of a pose times i, j and k. Against another quaternion p it gives the vector part of `q⁻¹ p`."""
+    w, x, y, z = T.wxyz_xyz[:4]
+    return jnp.stack([-x, -y, -z, w, -z, y, z, w, -x, -y, x, w]).reshape(4, 3)
 
 
 def _positive(values: Array) -> Array:

@@ -26,6 +26,7 @@ from jaxslam_kernels.pose_cost import (
     pose_cost,
     pose_problem,
     retract,
+    tangent_basis,
 )
 from jaxslam_kernels.robust import Loss
 from jaxslam_kernels.types import Code, Flag, Pixels, Points, Scalar, Weights
@@ -133,7 +134,7 @@ def refine_problem(T_world_cam: SE3, problem: PoseProblem, loss: Loss, max_steps
     """`refine_pose` on a problem that is already clean."""
     initial, finite_initial = usable_pose(T_world_cam)
     optimum, solver = solve_pose(initial, problem, loss, max_steps)
-    optimum = retract(optimum, _optimum_shift(optimum, problem, loss))
+    optimum = SE3(optimum.wxyz_xyz + tangent_basis(optimum) @ _optimum_shift(optimum, problem, loss))
     status = jnp.select(
         [
             ~finite_initial,
@@ -186,8 +187,11 @@ def _optimum_shift(optimum: SE3, problem: PoseProblem, loss: Loss) -> Float[Arra
 def _optimum_shift_jvp(loss: Loss, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     optimum, problem = primals
 
+    basis = tangent_basis(optimum)
+
     def gradient(tangent: Array, problem: PoseProblem) -> Array:
-        return pose_cost(retract(optimum, tangent), problem, loss).equations.gradient
+        moved = SE3(optimum.wxyz_xyz + basis @ tangent)
+        return pose_cost(moved, problem, loss).equations.gradient
 
     zero = jnp.zeros(6, optimum.wxyz_xyz.dtype)
     _, gradient_change = jax.jvp(partial(gradient, zero), (problem,), (tangents[1],))

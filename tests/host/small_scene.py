@@ -35,7 +35,7 @@ class Clip:
     """A rendered recording held in memory, whose frames a test may replace: a `Dataset`."""
 
     def __init__(self, source: SyntheticDataset, frames: Sequence[Frame], name: str = "clip") -> None:
-        self.name, self.camera, self.ground_truth = name, source.camera, source.ground_truth
+        self.source, self.name, self.camera, self.ground_truth = source, name, source.camera, source.ground_truth
         self.frames = list(frames)
         self.timestamps_ns = np.array([frame.timestamp_ns for frame in frames], np.int64)
 
@@ -54,7 +54,8 @@ def _source(people: int, frames: int) -> SyntheticDataset:
 @functools.cache
 def _frames(people: int, frames: int) -> tuple[Frame, ...]:
     source = _source(people, frames)
-    return tuple(source[index] for index in range(frames))
+    with jax.enable_x64(False):  # the same pictures for tests in float64
+        return tuple(source[index] for index in range(frames))
 
 
 def clip(people: int = 0, frames: int = 60) -> Clip:

@@ -123,6 +123,10 @@ def _direction(inputs: Inputs, seed: int) -> Inputs:
     )
 
 
+def _pairs(a, b):
+    return zip(*map(jax.tree.leaves, (a, b)), strict=True)
+
+
 def _scipy_optimum(scene: Scene, inputs: Inputs, loss: Loss, with_prior: bool) -> np.ndarray:
     """`wxyz_xyz` from `scipy.optimize.least_squares` on whitened residuals scaled to give the robust cost."""
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 1000, 1e-15)
@@ -249,8 +253,8 @@ class TestGradient:
         with jax.enable_x64(True):
             inputs = _inputs(scene)
             T, direction = pose_of(scene.initial), _direction(inputs, 5)
-            result, change, gradient = _run(T, inputs, direction)
-            reverse = sum(jnp.sum(g * t) for g, t in zip(*map(jax.tree.leaves, (gradient, direction)), strict=True))
+            result, (forward, _), gradient = _run(T, inputs, direction)
+            reverse = sum(jnp.sum(g * t) for g, t in _pairs(gradient, direction))
             h = 1e-5
             after, before = (
                 _summary(_run(T, jax.tree.map(lambda x, t, h=h: x + h * t, inputs, direction))[0]) for h in (h, -h)
@@ -333,7 +337,7 @@ def test_single_trace():
     for seed in range(3):
         scene = make_scene(seed, N)
         inputs = _inputs(scene, seed)
-        _run(pose_of(scene.initial), inputs._replace(scale=inputs.scale + seed, depth=inputs.depth * (seed > 0)))
+        _run(pose_of(scene.initial), inputs._replace(scale=inputs.scale + seed, depth=inputs.depth * float(seed > 0)))
 
 
 def _degenerate(change: str) -> tuple[SE3, Inputs]:

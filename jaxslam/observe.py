@@ -1,0 +1,71 @@
+"""From pixels to geometry and back: distortion, the rolling shutter, and depth taken at another time."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxslam_kernels.camera import distort, normalise, to_pixels
+from jaxslam_kernels.depth_image import sample_depth
+from jaxslam_kernels.rolling_shutter import as_if_at_once, image_velocity, row_time
+from jaxslam_kernels.types import DepthImage, Pixels, Points, Scalar, Weights
+from jaxtyping import Array, Float
+
+from jaxslam.state import TrackParams
+
+
+class Observed(NamedTuple):
+    """Points as an ideal camera would have seen them at the time of the frame.
+
+    Attributes:
+        xy: `(2, n)` normalised coordinates.
+        depth: `(n,)` measured depth in metres, 0 where there is none to believe.
+    """
+
+    xy: Pixels
+    depth: Weights
+
+    def in_camera(self) -> Points:
+        """`(3, n)` where the points are in the axes of the camera; at its centre without depth."""
+        return jnp.concatenate([self.xy, jnp.ones_like(self.xy[:1])]) * self.depth[None, :]
+
+
+def observe(
+    uv: Pixels,
+    expected_depth: Weights,
+    twist: Float[Array, "6"],
+    depth: DepthImage,
+    depth_delay_s: Scalar,
+    params: TrackParams,
+    *,
+    reach: int = 1,
+) -> Observed:
+    """Remove distortion, rolling shutter and the delay of the depth image from what was seen.
+
+    Args:
+        uv: `(2, n)` pixels as seen.
+        expected_depth: `(n,)` metres, about; it scales the part of the image motion that translation causes.
+        twist: Velocity of the camera in its own axes.
+        depth: Depth image, 0 where missing.
+        depth_delay_s: Seconds from the time of the image to that of the depth.
+        params: Camera and its readout time.
+        reach: As for `sample_depth`, static.
+    """
+    xy = normalise(params.intrinsics, uv)
+    focal = jnp.stack([params.intrinsics.fx, params.intrinsics.fy])[:, None]
+    velocity = image_velocity(xy, expected_depth, twist)
+    at_once = as_if_at_once(xy, velocity, uv[1], depth.shape[0], params.readout_s)
+    later = uv + focal * velocity * depth_delay_s
+    return Observed(at_once, sample_depth(depth, later, reach=reach))
+
+
+def predict_pixels(X_cam: Points, twist: Float[Array, "6"], height: int, params: TrackParams) -> Pixels:
+    """Where points appear in a frame of a rolling shutter, while the camera moves with `twist`."""
+    depth = jnp.maximum(X_cam[2], params.min_depth_m / 2)
+    xy = X_cam[:2] / depth[None, :]
+    v = to_pixels(params.intrinsics, distort(params.intrinsics, xy))[1]
+    late = xy + image_velocity(xy, depth, twist) * row_time(v, height, params.readout_s)[None, :]
+    return to_pixels(params.intrinsics, distort(params.intrinsics, late))
+
+
+def depth_sigma(depth: Weights, params: TrackParams) -> Weights:
+    """Standard deviation of measured depth, metres."""
+    return params.depth_sigma_m + params.depth_sigma_per_m2 * jnp.square(depth)
