@@ -1,7 +1,7 @@
 """Rigid transforms: jaxlie's, for callers that run JAX with strict promotion of types and ranks.
 
 jaxlie (1.5) multiplies quaternions with integer signs and relies on both promotions; here, and only here, they are
-allowed while it works.
+allowed while it works. Where float64 is enabled it also turns float32 into it; here results keep the type they had.
 """
 
 from collections.abc import Iterator
@@ -24,19 +24,19 @@ def lenient_promotion() -> Iterator[None]:
 def moved(T_a_b: SE3, tangent_b: Float[Array, "6"]) -> SE3:
     """`T_a_b @ exp(tangent_b)`: a pose moved in its own axes, translation first."""
     with lenient_promotion():
-        return T_a_b @ SE3.exp(tangent_b)
+        return _typed(T_a_b @ SE3.exp(tangent_b), T_a_b)
 
 
 def between(T_world_a: SE3, T_world_b: SE3) -> SE3:
     """`T_a_b`: the second pose seen from the first."""
     with lenient_promotion():
-        return T_world_a.inverse() @ T_world_b
+        return _typed(T_world_a.inverse() @ T_world_b, T_world_b)
 
 
 def displacement(T_world_a: SE3, T_world_b: SE3) -> Float[Array, "6"]:
     """The tangent in the axes of the first pose that leads to the second, translation first."""
     with lenient_promotion():
-        return between(T_world_a, T_world_b).log()
+        return between(T_world_a, T_world_b).log().astype(T_world_b.wxyz_xyz.dtype)
 
 
 def to_camera(T_world_cam: SE3, X_world: Points) -> Points:
@@ -48,3 +48,7 @@ def to_camera(T_world_cam: SE3, X_world: Points) -> Points:
 def to_world(T_world_cam: SE3, X_cam: Points) -> Points:
     """Points in the axes of the camera, in the world."""
     return T_world_cam.rotation().as_matrix() @ X_cam + T_world_cam.translation()[:, None]
+
+
+def _typed(T: SE3, like: SE3) -> SE3:
+    return SE3(T.wxyz_xyz.astype(like.wxyz_xyz.dtype))

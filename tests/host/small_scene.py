@@ -88,7 +88,9 @@ def params(dtype: type[np.floating] = np.float32) -> TrackParams:
     return track_params(_source(0, 60).camera, TRACK, dtype)
 
 
-def stacked(frames: Sequence[Frame], dtype: type[np.floating] = np.float32, image_dtype: type = np.uint8) -> FrameArrays:
+def stacked(
+    frames: Sequence[Frame], dtype: type[np.floating] = np.float32, image_dtype: type = np.uint8
+) -> FrameArrays:
     """Frames as arrays with the time as the first axis, as `lax.scan` takes them."""
     stamps = np.array([frame.timestamp_ns for frame in frames])
     steps = np.diff(stamps, prepend=stamps[0] - 33_333_000) * 1e-9

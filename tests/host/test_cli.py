@@ -1,0 +1,133 @@
+"""The command line: help, one-line errors with hints, and `eval` and `doctor` on small files."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_recording import CAMERA, write_recording
+
+from jaxslam.cli import main
+from jaxslam.trajectory import Trajectory, write_tum
+
+
+def fails(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """The message of a command that must end with code 1 and say one line."""
+    with pytest.raises(SystemExit) as stop:
+        main(arguments)
+    assert stop.value.code == 1
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("error: ")
+    return lines[0].removeprefix("error: ")
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    return write_recording(tmp_path / "walk")
+
+
+@pytest.fixture
+def trajectories(tmp_path: Path) -> tuple[str, str]:
+    """A path, and the same shifted sideways by 1 cm on every second pose."""
+    stamps = np.arange(60, dtype=np.int64) * 33_000_000 + 10**15
+    poses = np.zeros((60, 7))
+    poses[:, 0], poses[:, 4], poses[:, 5] = 1, np.linspace(0, 2, 60), np.sin(np.linspace(0, 6, 60))
+    write_tum(tmp_path / "truth.txt", Trajectory(stamps, poses))
+    poses[::2, 6] += 0.01
+    write_tum(tmp_path / "estimate.txt", Trajectory(stamps, poses))
+    return str(tmp_path / "estimate.txt"), str(tmp_path / "truth.txt")
+
+
+class TestHelp:
+    @pytest.mark.parametrize("command", ["demo", "run", "eval", "doctor"])
+    def test_of_a_command(self, capsys: pytest.CaptureFixture[str], command: str) -> None:
+        with pytest.raises(SystemExit) as stop:
+            main([command, "--help"])
+        assert stop.value.code == 0
+        assert f"usage: jaxslam {command}" in " ".join(capsys.readouterr().out.split())
+
+    def test_lists_the_commands(self, capsys: pytest.CaptureFixture[str]) -> None:
+        with pytest.raises(SystemExit) as stop:
+            main(["--help"])
+        assert stop.value.code == 0
+        out = capsys.readouterr().out
+        assert all(command in out for command in ("demo", "run", "eval", "doctor"))
+
+
+class TestErrors:
+    @pytest.mark.parametrize(
+        ("arguments", "expected"),
+        [
+            (("--set", "track.num_pionts=300"), "track.num_pionts: unknown key (did you mean 'num_points'?)"),
+            (("--set", "trak.num_points=300"), "trak: unknown key (did you mean 'track'?)"),
+            (("--set", "track.num_points=many"), "num_points"),
+            (("--set", "track.num_points"), "expected key=value"),
+            (("--preset", "defualt"), "expected a known preset, got 'defualt' (did you mean 'default'?)"),
+            (("--dataset", "tmu"), "--dataset: unknown kind 'tmu' (did you mean 'tum'?)"),
+            (("--camera", "tum_fr11"), "expected a known name or a YAML file, got 'tum_fr11' (did you mean"),
+            (("--max-frames", "0"), "--max-frames: expected at least 1, got 0"),
+            (("--camera", "tum_fr1", "--start", "99"), "expected a part of 6 frames"),
+            (("--config", "nowhere.yaml"), "nowhere.yaml: cannot be read"),
+            ((), "its name does not tell the camera"),
+        ],
+    )
+    def test_of_run(
+        self, capsys: pytest.CaptureFixture[str], recording: Path, arguments: tuple[str, ...], expected: str
+    ) -> None:
+        assert expected in fails(capsys, "run", str(recording), *arguments)
+        assert not Path("results").exists()
+
+    @pytest.mark.parametrize("command", ["run", "doctor"])
+    def test_missing_folder(self, capsys: pytest.CaptureFixture[str], tmp_path: Path, command: str) -> None:
+        missing = tmp_path / "nowhere"
+        assert (
+            fails(capsys, command, str(missing)) == f"{missing}: expected the folder of a recording, got nothing there"
+        )
+
+    def test_folder_without_a_recording(self, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+        assert "rgb.txt and depth.txt" in fails(capsys, "run", str(tmp_path))
+
+    def test_eval_of_a_missing_file(
+        self, capsys: pytest.CaptureFixture[str], trajectories: tuple[str, str], tmp_path: Path
+    ) -> None:
+        missing = str(tmp_path / "nowhere.txt")
+        assert missing in fails(capsys, "eval", missing, trajectories[1])
+        assert missing in fails(capsys, "eval", trajectories[0], missing)
+
+    def test_eval_of_no_trajectory(
+        self, capsys: pytest.CaptureFixture[str], trajectories: tuple[str, str], tmp_path: Path
+    ) -> None:
+        (tmp_path / "words.txt").write_text("once upon a time\n")
+        assert "words.txt" in fails(capsys, "eval", str(tmp_path / "words.txt"), trajectories[1])
+
+    def test_unknown_option_is_a_usage_error(self, recording: Path) -> None:
+        with pytest.raises(SystemExit) as stop:
+            main(["run", str(recording), "--presett", "default"])
+        assert stop.value.code == 2
+
+
+class TestEval:
+    def test_prints_the_figures(self, capsys: pytest.CaptureFixture[str], trajectories: tuple[str, str]) -> None:
+        main(["eval", *trajectories, "--align", "none"])
+        out = capsys.readouterr().out
+        assert "ATE w.r.t. translation (without alignment, gap 20 ms)" in out
+        assert "0.007071" in out  # 1 cm on every second pose
+
+    def test_draws(self, capsys: pytest.CaptureFixture[str], trajectories: tuple[str, str], tmp_path: Path) -> None:
+        main(["eval", *trajectories, "--plot", str(tmp_path / "both.png")])
+        assert (tmp_path / "both.png").read_bytes()[:4] == b"\x89PNG"
+        assert "ATE" in capsys.readouterr().out
+
+
+class TestDoctor:
+    def test_of_a_recording(self, capsys: pytest.CaptureFixture[str], recording: Path) -> None:
+        CAMERA.save(recording / "camera.yaml")
+        main(["doctor", str(recording)])
+        assert "6" in capsys.readouterr().out
+
+    def test_unfit_recording_is_an_error(self, capsys: pytest.CaptureFixture[str], recording: Path) -> None:
+        CAMERA.save(recording / "camera.yaml")
+        shutil.rmtree(recording / "depth")
+        (recording / "depth").mkdir()
+        assert str(recording) in fails(capsys, "doctor", str(recording))

@@ -1,0 +1,31 @@
+"""Notebooks are committed without outputs, and run from the first cell to the last."""
+
+from pathlib import Path
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+
+ROOT = Path(__file__).resolve().parents[2]
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+
+
+def test_there_are_notebooks() -> None:
+    assert NOTEBOOKS
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_holds_no_outputs(path: Path) -> None:
+    kept = [
+        cell for cell in nbformat.read(path, as_version=4).cells if cell.get("outputs") or cell.get("execution_count")
+    ]
+    assert not kept, f"{len(kept)} cells of {path.name} hold outputs: clear them before committing"
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_runs(path: Path, tmp_path: Path) -> None:
+    """What a notebook claims, it asserts; a failing cell fails the test with its traceback."""
+    notebook = nbformat.read(path, as_version=4)
+    NotebookClient(
+        notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}
+    ).execute()

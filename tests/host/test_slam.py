@@ -1,0 +1,138 @@
+"""`Slam`: accuracy on the small scene, determinism, compiling once, flat memory, and what `run` reports."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from small_scene import CONFIG, Clip, clip
+
+from jaxslam.evaluation import evaluate
+from jaxslam.slam import FrameRecord, Slam
+from jaxslam.state import TrackStatus
+from jaxslam.trajectory import write_tum
+
+COMPILED = "/jax/core/compile/backend_compile_duration"
+
+
+@pytest.fixture(scope="module")
+def slam() -> Slam:
+    """One tracker for all tests, reset before each use."""
+    slam = Slam(clip().camera, CONFIG)
+    slam.warm_up()
+    return slam
+
+
+def run(slam: Slam, recording: Clip) -> list[FrameRecord]:
+    slam.reset()
+    return slam.run(recording)
+
+
+class TestAccuracy:
+    @pytest.mark.parametrize(("people", "limit_m"), [(0, 0.025), (2, 0.03)])
+    def test_ate(self, slam: Slam, people: int, limit_m: float) -> None:
+        recording = clip(people)
+        records = run(slam, recording)
+        assert records[0].status is TrackStatus.STARTED
+        assert all(record.status in (TrackStatus.OK, TrackStatus.WEAK) for record in records[1:])
+        assert evaluate(slam.trajectory, recording.ground_truth).ate_rmse_m < limit_m
+
+
+class TestReports:
+    def test_every_frame_once_in_order(self, slam: Slam) -> None:
+        recording = clip()
+        seen: list[int] = []
+        slam.reset()
+        records = slam.run(recording, lambda frame, result: seen.append(result.timestamp_ns))
+        assert seen == [record.timestamp_ns for record in records] == recording.timestamps_ns.tolist()
+        assert records[0].is_keyframe
+        assert all(record.track_ms is not None and record.track_ms > 0 for record in records)
+
+    def test_trajectory_is_what_was_given_out(self, slam: Slam) -> None:
+        slam.reset()
+        results = [slam.track(frame) for frame in clip().frames[:10]]
+        trajectory = slam.online_trajectory
+        np.testing.assert_allclose(
+            trajectory.T_world_cam, np.array([result.T_world_cam for result in results]), atol=1e-6
+        )
+        np.testing.assert_array_equal(trajectory.timestamps_ns, [result.timestamp_ns for result in results])
+
+    def test_empty_trajectory(self, slam: Slam) -> None:
+        slam.reset()
+        assert len(slam.trajectory) == 0
+
+
+class TestDeterminism:
+    def test_two_runs(self, slam: Slam, tmp_path: Path) -> None:
+        for name, tracker in (("a", slam), ("b", Slam(clip().camera, CONFIG))):
+            run(tracker, clip(2))
+            write_tum(tmp_path / name, tracker.trajectory)
+        assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+    def test_two_processes(self, slam: Slam, tmp_path: Path) -> None:
+        """Another process, that compiles or loads from the cache for itself, writes the same bytes."""
+        script = (
+            "import sys; sys.path.insert(0, sys.argv[1])\n"
+            "import jax; jax.config.update('jax_numpy_dtype_promotion', 'strict')\n"
+            "jax.config.update('jax_numpy_rank_promotion', 'raise')\n"
+            "from small_scene import CONFIG, clip\n"
+            "from jaxslam.slam import Slam\n"
+            "from jaxslam.trajectory import write_tum\n"
+            "slam = Slam(clip(2).camera, CONFIG); slam.run(clip(2)); write_tum(sys.argv[2], slam.trajectory)\n"
+        )
+        run(slam, clip(2))
+        write_tum(tmp_path / "here", slam.trajectory)
+        subprocess.run(
+            [sys.executable, "-c", script, str(Path(__file__).parent), str(tmp_path / "there")], check=True, timeout=600
+        )
+        assert (tmp_path / "here").read_bytes() == (tmp_path / "there").read_bytes()
+
+
+class TestCompiling:
+    def test_nothing_compiles_after_warm_up(self, slam: Slam) -> None:
+        """Not for a frame without a mask or with one, in colour or grey, nor in a tracker reset or made anew."""
+        frames = clip(2).frames
+        compiled: list[str] = []
+        listener = lambda event, duration, **_: compiled.append(event) if event == COMPILED else None
+        Slam(clip().camera, CONFIG).warm_up()
+        jax.monitoring.register_event_duration_secs_listener(listener)
+        try:
+            slam.reset()
+            for frame in frames[:20]:
+                slam.track(frame)
+            again = Slam(clip().camera, CONFIG)
+            for frame in frames[:5]:
+                again.track(frame)
+            assert compiled == []
+            jax.jit(lambda x: x + len(compiled))(1.5)
+            assert compiled  # the listener does listen
+        finally:
+            jax.monitoring.unregister_event_duration_listener(listener)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+class TestMemory:
+    def test_is_flat(self, slam: Slam) -> None:
+        frames = clip().frames
+        track_round_trip(slam, frames, 300)
+        before = resident_mb()
+        track_round_trip(slam, frames, 600)
+        assert resident_mb() < 1.02 * before
+
+
+def track_round_trip(slam: Slam, frames: list, steps: int) -> None:
+    """Track the frames forward and backward again and again, each later than the one before."""
+    slam.reset()
+    order = [*range(len(frames)), *range(len(frames) - 2, 0, -1)]
+    for index in range(steps):
+        frame = frames[order[index % len(order)]]
+        slam.track(type(frame)(index * 33_333_000, frame.image, frame.depth_m))
+
+
+def resident_mb() -> float:
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("VmRSS:"):
+            return int(line.split()[1]) / 1e3
+    raise AssertionError("no VmRSS in /proc/self/status")
