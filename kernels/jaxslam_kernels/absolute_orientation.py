@@ -28,20 +28,20 @@ def absolute_orientation(
 
     Returns:
         R as rows and columns first, t, and whether both triangles span a plane. Where they do not (corners on a line,
-        in one place, or not finite) the motion is finite and means nothing.
+        in one place, or not finite) the motion is the identity.
     """
-    source, source_known = _finite(source)
-    target, target_known = _finite(target)
+    valid = _spans_plane(source) & _spans_plane(target)
+    unit_triangle = jnp.eye(3, dtype=source.dtype).reshape(3, 3, *(1,) * (source.ndim - 2))
+    source, target = jnp.where(valid, source, unit_triangle), jnp.where(valid, target, unit_triangle)
     source_centre, target_centre = source.mean(axis=1), target.mean(axis=1)
-    source_axes, source_spans = _plane_axes(source)
-    target_axes, target_spans = _plane_axes(target)
+    source_axes, target_axes = _plane_axes(source), _plane_axes(target)
     cosine, sine = jnp.zeros_like(source[0, 0]), jnp.zeros_like(source[0, 0])
     for corner in range(3):
         px, py = (_dot(axis, source[:, corner] - source_centre) for axis in source_axes[:2])
         qx, qy = (_dot(axis, target[:, corner] - target_centre) for axis in target_axes[:2])
         cosine = cosine + px * qx + py * qy
         sine = sine + px * qy - py * qx
-    norm = lax.rsqrt(jnp.maximum(cosine * cosine + sine * sine, jnp.finfo(source.dtype).tiny))
+    norm = lax.rsqrt(cosine * cosine + sine * sine + jnp.finfo(source.dtype).tiny)
     cosine, sine = cosine * norm, sine * norm
     first, second, normal = target_axes
     turned = [
@@ -54,25 +54,27 @@ def absolute_orientation(
         for row in range(3)
     ]
     t = [target_centre[row] - _dot(R[row], source_centre) for row in range(3)]
-    valid = source_known & target_known & source_spans & target_spans
     return jnp.stack([jnp.stack(row) for row in R]), jnp.stack(t), valid
 
 
-def _plane_axes(triangle: Array) -> tuple[list[_Vector], Array]:
-    """Two orthonormal axes in the plane of the triangle and its normal; false if there is no plane."""
-    tiny = jnp.finfo(triangle.dtype).tiny
+def _spans_plane(triangle: Array) -> Array:
+    """Whether the corners are finite and the sine of the angle at the first one is above 1e-4."""
+    triangle = lax.stop_gradient(triangle)
     edge, other = triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0]
     normal = _cross(edge, other)
-    edge2, other2, normal2 = (_dot(v, v) for v in (edge, other, normal))
-    spans = normal2 > 1e-8 * edge2 * other2 + tiny  # the sine of the angle at the first corner above 1e-4
-    first = [e * lax.rsqrt(jnp.maximum(edge2, tiny)) for e in edge]
-    normal = [n * lax.rsqrt(jnp.maximum(normal2, tiny)) for n in normal]
-    return [first, _cross(normal, first), normal], spans
+    return _dot(normal, normal) > 1e-8 * _dot(edge, edge) * _dot(other, other)  # false for NaN
 
 
-def _finite(points: Array) -> tuple[Array, Array]:
-    known = jnp.isfinite(points).all(axis=(0, 1))
-    return jnp.where(known, points, 0.0), known
+def _plane_axes(triangle: Array) -> list[_Vector]:
+    """Two orthonormal axes in the plane of the triangle, and its normal."""
+    edge, other = triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0]
+    first, normal = _unit([edge[0], edge[1], edge[2]]), _unit(_cross(edge, other))
+    return [first, _cross(normal, first), normal]
+
+
+def _unit(v: _Vector) -> _Vector:
+    inverse = lax.rsqrt(_dot(v, v))
+    return [x * inverse for x in v]
 
 
 def _dot(u: Array | _Vector, v: Array | _Vector) -> Array:

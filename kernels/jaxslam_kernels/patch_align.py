@@ -2,7 +2,7 @@
 
 Where `lk_flow` follows a point from frame to frame, this looks a point up again after any time: the patch is cut from
 the picture the point was first seen in, warped by the affine map that the relative pose and the depth predict (as PTAM
-and SVO do), matched in brightness, and aligned by Lucas-Kanade steps on one level.
+and SVO do), and aligned by Lucas-Kanade steps on one level, whatever the brightness.
 """
 
 from collections.abc import Callable
@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Num
 
 from jaxslam_kernels import _patches as patches
@@ -23,7 +24,7 @@ from jaxslam_kernels.types import Mask, Pixels, Scalar, Weights
 DEFAULT_PLAN = LevelPlan(21, 8, 0.05)
 _CONVERGED_PX = 0.1
 _GAIN_SQUARED = (0.25, 4.0)
-"""Smallest and largest; it only scales the steps."""
+"""Smallest and largest."""
 
 _Once: TypeAlias = Callable[[Callable[[], Any]], Any]
 """Runs a part that XLA must not fuse with the rest, see `patches.at_once`."""
@@ -35,7 +36,7 @@ class PatchMatch(NamedTuple):
     Attributes:
         points: `(2, n)` pixel coordinates in the current image.
         correlation: `(n,)` zero-mean normalised cross-correlation of the warped patch and what is there, -1 to 1.
-        converged: `(n,)` whether the search settled, inside the image.
+        converged: `(n,)` whether the search settled, inside the image and at a correlation above 0.
     """
 
     points: Pixels
@@ -109,32 +110,41 @@ class _Inputs(NamedTuple):
 
 
 def _template(inputs: _Inputs, window: Window, border: int, once: _Once) -> tuple[Template, Float[Array, "n l"]]:
-    """The templates, and 1 for each of their pixels that counts, 0 for the others.
-
-    The gradient is freed of what a change of brightness would explain, so that the solution does not depend on how
-    well gain and offset are known; those at the guess are good enough for the steps.
-    """
+    """The templates, and 1 for each of their pixels that counts, 0 for the others."""
     sample = lambda: warped_patches(
         inputs.pictures, inputs.picture, inputs.centre, inputs.warp, side=window.side + 2, stride=window.stride
     )
     smooth, inside = (jnp.pad(array, ((0, 0), (0, 2))) for array in once(sample))
-    middle = slice(window.stride + 1, window.stride + 1 + window.length)
-    counts = (inside[:, middle] & window.columns()[None, :]).astype(smooth.dtype)
-    there = _there(inputs.guess, inputs, window, border, once)
-
-    def matched() -> tuple[Float[Array, "n l"], Float[Array, "n 2 l"]]:
-        (centred, _), (centred_there, mean_there) = _centred(smooth[:, middle], counts), _centred(there, counts)
-        area, power = _area(counts), _dot(centred, centred)
-        ratio = (_dot(centred_there, centred_there) + area) / (power + area)
-        gain = jnp.sqrt(jnp.clip(ratio, *_GAIN_SQUARED))
-        gradient = patches.gradients(smooth, window) * counts[:, None, :]
-        mean = jnp.sum(gradient, axis=2, keepdims=True) / area[:, :, None]
-        share = jnp.einsum("nkl,nl->nk", gradient, centred) / jnp.maximum(power, 1)
-        free = gradient - mean * counts[:, None, :] - share[:, :, None] * centred[:, None, :]
-        return gain * centred + mean_there, gain[:, :, None] * free
-
-    patch, gradient = once(matched)
+    counts = (inside[:, _middle(window)] & window.columns()[None, :]).astype(smooth.dtype)
+    there = lax.stop_gradient(_there(inputs.guess, inputs, window, border, once))
+    patch, gradient = once(lambda: _matched(smooth, there, counts, window))
     return template_with(patch, gradient, window), counts
+
+
+def _middle(window: Window) -> slice:
+    """The window in flat patches that have a margin of one pixel."""
+    return slice(window.stride + 1, window.stride + 1 + window.length)
+
+
+def _matched(
+    smooth: Float[Array, "n m"], there: Float[Array, "n l"], counts: Float[Array, "n l"], window: Window
+) -> tuple[Float[Array, "n l"], Float[Array, "n 2 l"]]:
+    """Patches with the mean and the contrast of what is `there`, and gradients that know no brightness.
+
+    The part of a gradient that a change of gain or offset would explain is taken out of it. The solution therefore
+    does not depend on how well they are known; otherwise they would be off wherever the guess is, and the result too,
+    by a fifth of that.
+
+    Source: Hager and Belhumeur, Efficient Region Tracking With Parametric Models of Geometry and Illumination, 1998.
+    """
+    (centred, _), (centred_there, mean_there) = _centred(smooth[:, _middle(window)], counts), _centred(there, counts)
+    area, power = _area(counts), _dot(centred, centred)
+    gain = jnp.sqrt(jnp.clip((_dot(centred_there, centred_there) + area) / (power + area), *_GAIN_SQUARED))
+    gradient = patches.gradients(smooth, window) * counts[:, None, :]
+    mean = jnp.sum(gradient, axis=2, keepdims=True) / area[:, :, None]
+    share = jnp.einsum("nkl,nl->nk", gradient, centred) / jnp.maximum(power, 1)
+    free = gradient - mean * counts[:, None, :] - share[:, :, None] * centred[:, None, :]
+    return gain * centred + mean_there, gain[:, :, None] * free
 
 
 def _there(position: Pixels, inputs: _Inputs, window: Window, border: int, once: _Once) -> Float[Array, "n l"]:
@@ -172,12 +182,13 @@ def _solve(inputs: _Inputs, *, plan: LevelPlan, border: int, chunk: int) -> Foun
     def search_chunk(inputs: _Inputs) -> Found:
         once = partial(patches.at_once, alive=jnp.all(jnp.isfinite(inputs.centre)))
         template, counts = _template(inputs, window, border, once)
-        active = inputs.mask & (template.texture > inputs.min_texture)
+        enough = 2 * jnp.sum(counts, axis=1) > window.side**2
+        active = inputs.mask & enough & (template.texture > inputs.min_texture)
         begin = Search(inputs.guess, jnp.full_like(inputs.guess[0], jnp.inf), active)
         end = iterate(begin, template, inputs.current, border, plan)
         correlation = _correlation(template.patch, _there(end.position, inputs, window, border, once), counts)
         known = active & jnp.isfinite(correlation)
-        settled = known & (end.last_step < _CONVERGED_PX**2)
+        settled = known & (correlation > 0) & (end.last_step < _CONVERGED_PX**2)
         low, high = patches.bounds(inputs.current, border)
         inside = jnp.all((end.position >= low) & (end.position <= high), axis=0)
         return Found(end.position, settled & inside, jnp.where(known, correlation, -1))
@@ -219,13 +230,14 @@ def align_patches(
     """Look points up in the current image by the patches around them in older pictures.
 
     Differentiable in the pictures (when they are floating point), the current image, `centre` and `warp`, by the
-    implicit function theorem; the guess matters only through the brightness around it, which patches are matched to.
-    The derivative of a point that did not converge is zero.
+    implicit function theorem; neither guess nor brightness has an influence. The derivative of a point that did not
+    converge is zero.
 
     Args:
         pictures: `k` pictures, grey, of any number type.
         picture: `(n,)` which of them each point is in.
-        centre: `(2, n)` pixel coordinates there. Pixels of a patch outside its picture do not count.
+        centre: `(2, n)` pixel coordinates there. Pixels of a patch outside its picture do not count, and half of them
+            must.
         warp: `(2, 2, n)` offset in the picture for an offset in the current image, `[to, from]`.
         current: Pyramid of the current image, its border at least half the window plus 6; its finest level is
             searched.
@@ -233,12 +245,13 @@ def align_patches(
         mask: `(n,)` which points to look up.
         plan: Window and steps, static.
         chunk: Points searched together, static.
-        min_texture: As for `lk_flow`.
+        min_texture: Smallest accepted eigenvalue of the mean gradient matrix, less what brightness explains, in
+            squared intensity a squared pixel; positive.
 
     Returns:
         Where each point was found. A point that is not looked up (masked, or a number given for it is not finite) is
-        at 0 with correlation -1; one whose patch lacks texture is at its guess with correlation -1; one that met a
-        pixel that is not a number is where the search stopped, with correlation -1. None of them has converged.
+        at 0; one whose patch has too little texture or too few pixels is at its guess; one that met a pixel that is
+        not a number is where its search stopped. Those have correlation -1, and none has converged.
 
     Raises:
         ValueError: While tracing, if the border is too narrow for the plan.

@@ -34,7 +34,8 @@ class PosePrior(NamedTuple):
 
     Attributes:
         T_world_cam: The predicted pose.
-        information: Inverse covariance Λ in its right tangent (translation in metres, rotation in radians).
+        information: Inverse covariance Λ in its right tangent (translation in metres, rotation in radians), of which
+            the symmetric part counts.
     """
 
     T_world_cam: SE3

@@ -1,5 +1,7 @@
 """Optical flow of 1000 points beside `cv2.calcOpticalFlowPyrLK`: time, and error on known warps."""
 
+import os
+
 import cv2
 import jax
 import jax.numpy as jnp
@@ -11,6 +13,10 @@ from jaxslam_kernels.lk_flow import lk_flow
 from known_warps import corners, picture, warp
 
 pytestmark = pytest.mark.benchmark
+
+# One thread for XLA, as for OpenCV; read when JAX makes its first array. A pool of two pinned to one core afterwards
+# costs 40 %: XLA then splits every cutting of patches in two and waits for both halves.
+os.environ.setdefault("NPROC", "1")
 
 COUNT_AND_EPS = cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS
 CRITERIA = {"10 iterations, 0.03 px": (COUNT_AND_EPS, 10, 0.03), "30 iterations, 0.01 px": (COUNT_AND_EPS, 30, 0.01)}

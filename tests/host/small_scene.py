@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Sequence
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ import numpy as np
 from jaxslam.config import Config, TrackConfig
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.frame import Frame, to_grey
-from jaxslam.slam import track_params, track_sizes
+from jaxslam.slam import Slam, track_params, track_sizes
 from jaxslam.state import FrameArrays, TrackParams, TrackState
 from jaxslam.track import init_state
 from jaxslam.trajectory import Trajectory
@@ -35,7 +36,8 @@ class Clip:
     """A rendered recording held in memory, whose frames a test may replace: a `Dataset`."""
 
     def __init__(self, source: SyntheticDataset, frames: Sequence[Frame], name: str = "clip") -> None:
-        self.source, self.name, self.camera, self.ground_truth = source, name, source.camera, source.ground_truth
+        self.source, self.name, self.camera = source, name, source.camera
+        self.ground_truth: Trajectory | None = source.ground_truth
         self.frames = list(frames)
         self.timestamps_ns = np.array([frame.timestamp_ns for frame in frames], np.int64)
 
@@ -106,3 +108,19 @@ def stacked(
 def at(frames: FrameArrays, index: int) -> FrameArrays:
     """One frame of those `stacked`."""
     return jax.tree.map(lambda array: array[index], frames)
+
+
+def track_round_trip(slam: Slam, frames: Sequence[Frame], steps: int) -> None:
+    """Track the frames forward and backward again and again, each later than the one before."""
+    slam.reset()
+    order = [*range(len(frames)), *range(len(frames) - 2, 0, -1)]
+    for index in range(steps):
+        frame = frames[order[index % len(order)]]
+        slam.track(type(frame)(index * 33_333_000, frame.image, frame.depth_m))
+
+
+def resident_mb() -> float:
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("VmRSS:"):
+            return int(line.split()[1]) / 1e3
+    raise AssertionError("no VmRSS in /proc/self/status")

@@ -1,0 +1,90 @@
+"""The files of a run: on the small scene, and on real recordings through the command line."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from evo.tools import file_interface
+from small_scene import CONFIG, clip
+
+from jaxslam.cli import main
+from jaxslam.config import load_config
+from jaxslam.results import RunInfo, Snapshots, write_results
+from jaxslam.slam import Slam
+from jaxslam.trajectory import Trajectory, read_tum
+
+FILES = {"trajectory.txt", "trajectory_online.txt", "summary.json", "config.yaml", "plot.png"}
+PROMISED = {
+    *("frames", "tracked", "tracked_percent", "ate_rmse_m", "ate_sim3_rmse_m", "rpe_trans_m_per_s"),
+    *("rpe_rot_deg_per_s", "track_ms", "compile_s", "wall_s", "peak_rss_mb", "preset", "deterministic", "versions"),
+    *("cpu", "threads", "commit"),
+}
+
+
+def check_summary(summary: dict[str, Any]) -> None:
+    assert set(summary) >= PROMISED
+    assert set(summary["track_ms"]) == {"mean", "median", "p95", "max"}
+    times = summary["track_ms"]
+    assert 0 < times["median"] <= times["p95"] <= times["max"]
+    assert summary["tracked_percent"] == pytest.approx(100 * summary["tracked"] / summary["frames"], abs=1e-3)
+    assert summary["deterministic"] is True
+    assert {"python", "jaxslam", "jax", "jaxlib", "numpy"} <= set(summary["versions"])
+    assert summary["peak_rss_mb"] > 100
+    assert summary["wall_s"] > 0
+    assert summary["threads"] >= 1
+    assert summary["cpu"]
+
+
+def check_against_evo(path: Path) -> Trajectory:
+    """What evo reads is what was written: positions, `xyzw` quaternions and seconds."""
+    ours, theirs = read_tum(path), file_interface.read_tum_trajectory_file(path)
+    np.testing.assert_allclose(theirs.positions_xyz, ours.T_world_cam[:, 4:], atol=1e-9)
+    np.testing.assert_allclose(theirs.orientations_quat_wxyz, ours.T_world_cam[:, :4], atol=1e-6)
+    np.testing.assert_allclose(theirs.timestamps, ours.timestamps_ns * 1e-9, rtol=0, atol=1e-6)
+    return ours
+
+
+class TestSmallScene:
+    def test_files_and_summary(self, tmp_path: Path) -> None:
+        recording, slam = clip(), Slam(clip().camera, CONFIG)
+        snapshots = Snapshots(len(recording))
+        records = slam.run(recording, snapshots)
+        info = RunInfo(recording, "default", 1.5)
+        summary, evaluation = write_results(tmp_path / "out", slam, records, info, snapshots.kept)
+        assert {path.name for path in (tmp_path / "out").iterdir()} == FILES
+        assert json.loads((tmp_path / "out/summary.json").read_text()) == summary
+        check_summary(summary)
+        assert evaluation is not None
+        assert summary["ate_rmse_m"] == evaluation.ate_rmse_m
+        assert (summary["frames"], summary["tracked"], summary["first_loss_s"]) == (60, 60, None)
+        assert len(snapshots.kept) == 4
+        assert load_config(file=tmp_path / "out/config.yaml") == CONFIG
+        written = check_against_evo(tmp_path / "out/trajectory.txt")
+        np.testing.assert_array_equal(written.timestamps_ns, slam.trajectory.timestamps_ns)
+        np.testing.assert_allclose(written.T_world_cam, slam.trajectory.T_world_cam, atol=1e-8)
+
+    def test_nothing_tracked_and_no_truth(self, tmp_path: Path) -> None:
+        recording, slam = clip(), Slam(clip().camera, CONFIG)
+        recording.ground_truth = None
+        summary, evaluation = write_results(tmp_path, slam, [], RunInfo(recording, "default", 0.1))
+        assert evaluation is None
+        assert summary["evaluation_problem"] == "no ground truth"
+        assert (summary["frames"], summary["tracked_percent"], summary["track_ms"]) == (0, 0, None)
+        assert {path.name for path in tmp_path.iterdir()} == FILES - {"plot.png"}
+
+
+class TestRealRecordings:
+    @pytest.mark.parametrize(
+        ("recording", "frames", "limit_m"),
+        [("tum/rgbd_dataset_freiburg1_rpy_excerpt", 160, 0.040), ("bonn/rgbd_bonn_crowd", 220, 0.025)],
+    )
+    def test_run(self, data_dir: Path, tmp_path: Path, recording: str, frames: int, limit_m: float) -> None:
+        main(["run", str(data_dir / recording), "--out", str(tmp_path), "--max-frames", str(frames)])
+        assert {path.name for path in tmp_path.iterdir()} == FILES
+        summary = json.loads((tmp_path / "summary.json").read_text())
+        check_summary(summary)
+        assert (summary["frames"], summary["tracked"]) == (frames, frames)
+        assert summary["ate_rmse_m"] <= limit_m
+        assert len(check_against_evo(tmp_path / "trajectory.txt")) == frames
