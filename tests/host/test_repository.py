@@ -14,8 +14,3 @@ def test_notebook_holds_no_outputs(path: Path) -> None:
     cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
     kept = [cell for cell in cells if cell.get("outputs") or cell.get("execution_count")]
     assert not kept, f"{len(kept)} cells of {path.name} hold outputs: clear them before committing"
-
-
-def test_wheel_takes_the_configs_along() -> None:
-    pyproject = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
-    assert '"configs" = "jaxslam/_configs"' in pyproject  # where configs_dir() looks for them once installed

@@ -129,7 +129,7 @@ class TestAbsoluteOrientation:
 
             @_compile
             def values(pair, direction, h):
-                after, before = (f(*jax.tree.map(lambda x, d: x + k * d, pair, direction)) for k in (h, -h))
+                after, before = (f(*jax.tree.map(lambda x, d, k=k: x + k * d, pair, direction)) for k in (h, -h))
                 _, forward = jax.jvp(f, pair, direction)
                 gradient = jax.grad(f, argnums=(0, 1))(*pair)
                 reverse = sum(jnp.sum(g * d) for g, d in zip(gradient, direction, strict=True))
@@ -201,29 +201,33 @@ def _solve(key: jax.Array, initial: SE3, inputs: Inputs) -> PnpResult:
     )
 
 
-def _graded(key: jax.Array, initial: SE3, inputs: Inputs) -> tuple[PnpResult, Inputs]:
-    """The result, and the gradient of a mixture of the pose's parameters."""
+def _mixture(result: PnpResult) -> jax.Array:
+    return result.T_world_cam.wxyz_xyz @ jnp.arange(1.0, 8.0, dtype=result.score.dtype)
+
+
+def _differentiate(key: jax.Array, initial: SE3, inputs: Inputs, direction: Inputs | None):
+    """The result, the gradient of its mixture and, if asked for, the mixture's change along a direction."""
 
     def f(inputs):
         result = _solve(key, initial, inputs)
         return _mixture(result), result
 
     (_, result), gradient = jax.value_and_grad(f, has_aux=True)(inputs)
-    return result, gradient
+    if direction is None:
+        return result, gradient, jnp.zeros(())
+    return result, gradient, jax.jvp(lambda i: f(i)[0], (inputs,), (direction,))[1]
 
 
-def _mixture(result: PnpResult) -> jax.Array:
-    return result.T_world_cam.wxyz_xyz @ jnp.arange(1.0, 8.0, dtype=result.score.dtype)
+# Compiled once for float32 and once, with a direction, for float64, whatever changes from call to call.
+_differentiated = _compile(eqx.debug.assert_max_traces(_differentiate, max_traces=2))
 
 
-# Compiled once a precision for the whole file, whatever changes from call to call: `test_single_trace`.
-_graded_compiled = _compile(eqx.debug.assert_max_traces(_graded, max_traces=2))
-
-
-def _run(seed: int, inputs: Inputs, initial: SE3 | None = None) -> tuple[PnpResult, Inputs]:
-    """Runs without an initial pose by passing one that is not finite."""
+def _run(seed: int, inputs: Inputs, initial: SE3 | None = None, direction: Inputs | None = None):
+    """The result, a gradient and a directional derivative; without initial pose by passing one that is not finite."""
     initial = pose_of(np.full(7, np.nan)) if initial is None else initial
-    return jax.tree.map(np.asarray, _graded_compiled(jax.random.key(seed), initial, inputs))
+    if inputs.uv.dtype == jnp.float64 and direction is None:
+        direction = jax.tree.map(jnp.zeros_like, inputs)
+    return jax.tree.map(np.asarray, _differentiated(jax.random.key(seed), initial, inputs, direction))
 
 
 def _opencv(scene: Scene) -> np.ndarray | None:
@@ -259,7 +263,7 @@ class TestRansac:
         for seed in range(30):
             scene = make_scene(seed, N, outliers=0.5)
             inputs = _inputs(scene)
-            result, _ = _run(seed, inputs._replace(depth=jnp.zeros_like(inputs.depth)))
+            result, *_ = _run(seed, inputs._replace(depth=jnp.zeros_like(inputs.depth)))
             assert result.status <= PoseStatus.NOT_CONVERGED
             assert not result.inliers[scene.outlier].sum() > 2
             assert result.inliers[~scene.outlier].mean() > 0.85
@@ -315,13 +319,11 @@ class TestRansac:
         scene = make_scene(4, N, noise_px=0.5, outliers=0.5)
         rng = np.random.default_rng(5)
         with jax.enable_x64(True):
-            inputs, key, initial = _inputs(scene), jax.random.key(0), pose_of(scene.initial)
+            inputs, initial = _inputs(scene), pose_of(scene.initial)
             direction = jax.tree.map(
                 lambda x: jnp.asarray(rng.normal(size=x.shape)) * (0.1 * jnp.abs(x) + 1e-3), inputs
             )
-            result, gradient = _run(0, inputs, initial)
-            pushed = _compile(lambda i, d: jax.jvp(lambda i: _mixture(_solve(key, initial, i)), (i,), (d,))[1])
-            forward = float(pushed(inputs, direction))
+            result, gradient, forward = _run(0, inputs, initial, direction)
             h = 1e-5
             moved = (jax.tree.map(lambda x, d, h=h: x + h * d, inputs, direction) for h in (h, -h))
             after, before = (_run(0, i, initial)[0] for i in moved)
@@ -341,7 +343,7 @@ class TestRansac:
         initial = SE3(jnp.stack([pose_of(s.initial).wxyz_xyz for s in scenes]))
         batched = _compile(jax.vmap(_solve))(keys, initial, batch)
         for k, scene in enumerate(scenes):
-            one, _ = _graded_compiled(keys[k], pose_of(scene.initial), _inputs(scene))
+            one, *_ = _differentiated(keys[k], pose_of(scene.initial), _inputs(scene), None)
             assert max(pose_error(batched.T_world_cam.wxyz_xyz[k], one.T_world_cam.wxyz_xyz)) < 1e-4
             np.testing.assert_array_equal(batched.inliers[k], one.inliers)
 
@@ -385,7 +387,7 @@ class TestDegenerate:
         original = _inputs(scene)
         inputs = jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), change(original), original)
         T = pose_of(scene.initial) if initial else None
-        result, gradient = _run(0, inputs, T)
+        result, gradient, _ = _run(0, inputs, T)
         allowed = {status} | ({PoseStatus.NO_CONSENSUS} if initial else set())
         assert PoseStatus(int(result.status)) in allowed
         assert all(np.isfinite(x).all() for x in jax.tree.leaves((result, gradient)))
@@ -403,7 +405,7 @@ class TestDegenerate:
             depth=inputs.depth.at[52].set(jnp.nan),
             weights=inputs.weights.at[53].set(jnp.nan),
         )
-        result, gradient = _run(1, inputs)
+        result, gradient, _ = _run(1, inputs)
         assert result.status <= PoseStatus.NOT_CONVERGED
         assert max(pose_error(result.T_world_cam.wxyz_xyz, scene.pose)) < 0.02
         assert not result.inliers[[50, 51, 53]].any()
@@ -412,7 +414,7 @@ class TestDegenerate:
     def test_degenerate_zero_motion(self):
         """Perfect observations, and the true pose as the initial one."""
         scene = make_scene(22, N, noise_px=0.0, noise_depth=0.0, outliers=0.0)
-        result, gradient = _run(0, _inputs(scene), pose_of(scene.pose))
+        result, gradient, _ = _run(0, _inputs(scene), pose_of(scene.pose))
         assert result.status == PoseStatus.OK
         assert result.inliers.all()
         assert max(pose_error(result.T_world_cam.wxyz_xyz, scene.pose)) < 1e-5
@@ -434,8 +436,8 @@ class TestInvariance:
         scene = self._scene(seed)
         with jax.enable_x64(True):
             inputs = _inputs(scene)
-            before, _ = _run(seed, inputs)
-            after, _ = _run(seed, inputs._replace(X_world=jnp.asarray(turn.apply(scene.X_world.T).T + shift[:, None])))
+            before, *_ = _run(seed, inputs)
+            after, *_ = _run(seed, inputs._replace(X_world=jnp.asarray(turn.apply(scene.X_world.T).T + shift[:, None])))
         pose = before.T_world_cam.wxyz_xyz.copy()
         expected = to_wxyz_xyz(turn * Rotation.from_quat(np.roll(pose[:4], -1)), turn.apply(pose[4:]) + shift)
         assert max(pose_error(after.T_world_cam.wxyz_xyz, expected)) < 1e-7
@@ -448,8 +450,8 @@ class TestInvariance:
         with jax.enable_x64(True):
             inputs = _inputs(self._scene(seed))
             names = ("X_world", "uv", "weights", "depth", "threshold_depth")
-            before, _ = _run(seed, inputs)
-            after, _ = _run(seed, inputs._replace(**{name: getattr(inputs, name)[..., order] for name in names}))
+            before, *_ = _run(seed, inputs)
+            after, *_ = _run(seed, inputs._replace(**{name: getattr(inputs, name)[..., order] for name in names}))
         assert max(pose_error(after.T_world_cam.wxyz_xyz, before.T_world_cam.wxyz_xyz)) < 1e-7
         np.testing.assert_array_equal(after.inliers, before.inliers[order])
 

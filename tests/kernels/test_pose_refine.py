@@ -89,39 +89,33 @@ def _summary(result: PoseRefinement) -> jax.Array:
     )
 
 
-def _graded(T: SE3, inputs: Inputs) -> tuple[PoseRefinement, Inputs]:
-    """The result, and the gradient of its summary by everything that went in."""
+def _differentiate(T: SE3, inputs: Inputs, direction: Inputs | None):
+    """The result, the gradient of its summary and, if asked for, the change of summary and pose along a direction."""
 
     def f(inputs):
         result = _refine(T, inputs)
         return _summary(result), result
 
     (_, result), gradient = jax.value_and_grad(f, has_aux=True)(inputs)
-    return result, gradient
+    if direction is None:
+        return result, gradient, None
 
-
-def _pushed(T: SE3, inputs: Inputs, direction: Inputs) -> tuple[jax.Array, jax.Array]:
-    """The change of the summary and of the pose along a direction, by forward differentiation."""
-
-    def f(inputs):
+    def summary_and_pose(inputs):
         result = _refine(T, inputs)
         return _summary(result), result.T_world_cam.wxyz_xyz
 
-    return jax.jvp(f, (inputs,), (direction,))[1]
+    return result, gradient, jax.jvp(summary_and_pose, (inputs,), (direction,))[1]
 
 
-# Compiled once a precision for the whole file, whatever changes from call to call: `test_single_trace`.
-_graded_compiled = _compile(eqx.debug.assert_max_traces(_graded, max_traces=2))
-_pushed_compiled = _compile(eqx.debug.assert_max_traces(_pushed, max_traces=1))
+# Compiled once for float32 and once, with a direction, for float64, whatever changes from call to call.
+_differentiated = _compile(eqx.debug.assert_max_traces(_differentiate, max_traces=2))
 
 
-def _run(T: SE3, inputs: Inputs) -> tuple[PoseRefinement, Inputs]:
-    return jax.tree.map(np.asarray, _graded_compiled(T, inputs))
-
-
-def _push(T: SE3, inputs: Inputs, direction: Inputs) -> tuple[np.ndarray, np.ndarray]:
-    summary, pose = _pushed_compiled(T, inputs, direction)
-    return np.asarray(summary), np.asarray(pose)
+def _run(T: SE3, inputs: Inputs, direction: Inputs | None = None):
+    """The result, a gradient and (in float64) a directional derivative, as NumPy arrays."""
+    if inputs.uv.dtype == jnp.float64 and direction is None:
+        direction = jax.tree.map(jnp.zeros_like, inputs)
+    return jax.tree.map(np.asarray, _differentiated(T, inputs, direction))
 
 
 def _direction(inputs: Inputs, seed: int) -> Inputs:
@@ -206,8 +200,8 @@ class TestReference:
         scene = make_scene(2, N)
         with jax.enable_x64(True):
             inputs = _inputs(scene)
-            result, _ = _run(pose_of(scene.initial), inputs)
-            free, _ = _run(pose_of(scene.initial), inputs._replace(prior=_no_prior(inputs)))
+            result, *_ = _run(pose_of(scene.initial), inputs)
+            free, *_ = _run(pose_of(scene.initial), inputs._replace(prior=_no_prior(inputs)))
         expected = _scipy_optimum(scene, inputs, "cauchy", with_prior=True)
         assert max(pose_error(result.T_world_cam.wxyz_xyz, expected)) < 1e-6
         assert max(pose_error(free.T_world_cam.wxyz_xyz, expected)) > 1e-5  # the prior has its say
@@ -219,7 +213,7 @@ class TestReference:
             scene = make_scene(100 + seed, N, noise_px=SIGMA_PX, outliers=0.0)
             inputs = _inputs(scene)
             inputs = inputs._replace(weights=jnp.ones(N), scale=25.0 * inputs.scale, prior=_no_prior(inputs))
-            result, _ = _run(pose_of(scene.initial), inputs)
+            result, *_ = _run(pose_of(scene.initial), inputs)
             error = _tangent(np.asarray(result.T_world_cam.wxyz_xyz), scene.pose)
             normalised.append(error @ np.linalg.solve(np.asarray(result.covariance, np.float64), error))
             assert 0.7 < float(result.residual_scale) < 1.3
@@ -227,9 +221,9 @@ class TestReference:
 
     def test_float32_is_within_a_hundredth_of_a_deviation(self):
         scene = make_scene(3, N)
-        single, _ = _run(pose_of(scene.initial), _inputs(scene))
+        single, *_ = _run(pose_of(scene.initial), _inputs(scene))
         with jax.enable_x64(True):
-            double, _ = _run(pose_of(scene.initial), _inputs(scene))
+            double, *_ = _run(pose_of(scene.initial), _inputs(scene))
         error = _tangent(np.asarray(single.T_world_cam.wxyz_xyz), np.asarray(double.T_world_cam.wxyz_xyz))
         assert np.sqrt(error @ np.linalg.solve(np.asarray(double.covariance), error)) < 0.01
         assert all(np.isfinite(x).all() for x in jax.tree.leaves(single))
@@ -268,8 +262,7 @@ class TestGradient:
         with jax.enable_x64(True):
             inputs = _inputs(scene)
             T, direction = pose_of(scene.initial), _direction(inputs, 5)
-            result, gradient = _run(T, inputs)
-            forward, _ = _push(T, inputs, direction)
+            result, gradient, (forward, _) = _run(T, inputs, direction)
             reverse = sum(jnp.sum(g * t) for g, t in _pairs(gradient, direction))
             h = 1e-5
             after, before = (
@@ -298,8 +291,7 @@ class TestGradient:
 
             jvp = _compile(lambda i, d: jax.jvp(unrolled, (i,), (d,)))
             expected, expected_change = map(np.asarray, jvp(inputs, direction))
-            result, _ = _run(T, inputs)
-            _, change = _push(T, inputs, direction)
+            result, _, (_, change) = _run(T, inputs, direction)
         np.testing.assert_allclose(result.T_world_cam.wxyz_xyz, expected, atol=1e-8)
         np.testing.assert_allclose(change, expected_change, atol=1e-6 * np.abs(expected_change).max())
 
@@ -320,7 +312,7 @@ class TestGradient:
             shifts = np.array([0.0, 0.5])
             through = np.asarray(_compile(jax.vmap(jax.grad(chain)))(jnp.asarray(shifts)))
             along_uv = jax.tree.map(jnp.zeros_like, last)._replace(uv=jnp.ones_like(last.uv))
-            changes = [_push(T, last._replace(uv=last.uv + shift), along_uv)[1][4:].sum() for shift in shifts]
+            changes = [_run(T, last._replace(uv=last.uv + shift), along_uv)[2][1][4:].sum() for shift in shifts]
         np.testing.assert_allclose(through, changes, rtol=1e-6)
 
 
@@ -343,7 +335,7 @@ def test_vmap_equals_loop():
     batch = jax.tree.map(lambda *x: jnp.stack(x), *(_inputs(s) for s in scenes))
     batched = _compile(jax.vmap(_refine))(SE3(jnp.stack([T.wxyz_xyz for T in poses])), batch)
     for k, (T, scene) in enumerate(zip(poses, scenes, strict=True)):
-        looped, _ = _run(T, _inputs(scene))
+        looped, *_ = _run(T, _inputs(scene))
         one = jax.tree.map(lambda x, k=k: x[k], batched)
         assert max(pose_error(one.T_world_cam.wxyz_xyz, looped.T_world_cam.wxyz_xyz)) < 2e-5
         np.testing.assert_allclose(one.robust_weights, looped.robust_weights, atol=2e-3)
@@ -421,7 +413,7 @@ class TestDegenerate:
     def test_degenerate(self, change, status):
         """The pose stays where it was, and everything is finite, derivatives too."""
         T, inputs = _degenerate(change)
-        result, gradient = _run(T, inputs)
+        result, gradient, _ = _run(T, inputs)
         assert PoseStatus(int(result.status)) == status
         assert all(np.isfinite(x).all() for x in jax.tree.leaves((result, gradient)))
         if status == PoseStatus.BAD_INITIAL:
@@ -434,7 +426,7 @@ class TestDegenerate:
     def test_degenerate_in_part(self, change):
         """What is not finite does not count, and the rest goes on."""
         T, inputs = _degenerate(change)
-        result, gradient = _run(T, inputs)
+        result, gradient, _ = _run(T, inputs)
         assert PoseStatus(int(result.status)) == PoseStatus.OK
         assert all(np.isfinite(x).all() for x in jax.tree.leaves((result, gradient)))
         assert max(pose_error(result.T_world_cam.wxyz_xyz, make_scene(20, N).pose)) < 0.01
@@ -445,7 +437,7 @@ class TestDegenerate:
         """Perfect observations from the true pose: nothing moves, nothing is divided by the residual of zero."""
         scene = make_scene(21, N, noise_px=0.0, noise_depth=0.0, outliers=0.0)
         inputs = _inputs(scene)
-        result, gradient = _run(pose_of(scene.pose), inputs._replace(prior=_no_prior(inputs)))
+        result, gradient, _ = _run(pose_of(scene.pose), inputs._replace(prior=_no_prior(inputs)))
         assert result.status == PoseStatus.OK
         assert max(pose_error(result.T_world_cam.wxyz_xyz, scene.pose)) < 2e-6
         assert float(result.residual_scale) < 1e-2
@@ -469,8 +461,8 @@ class TestInvariance:
 
     @staticmethod
     def _compare(inputs: Inputs, changed: Inputs, T: SE3, T_changed: SE3, expected=lambda pose: pose):
-        before, _ = _run(T, inputs)
-        after, _ = _run(T_changed, changed)
+        before, *_ = _run(T, inputs)
+        after, *_ = _run(T_changed, changed)
         assert before.status == after.status == PoseStatus.OK
         assert max(pose_error(after.T_world_cam.wxyz_xyz, expected(np.asarray(before.T_world_cam.wxyz_xyz)))) < 1e-8
         np.testing.assert_allclose(after.covariance, before.covariance, rtol=1e-4, atol=1e-12)
