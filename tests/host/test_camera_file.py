@@ -170,7 +170,9 @@ class TestOrbSlam2:
     def test_loads(self, tmp_path: Path) -> None:
         camera, known = load(tmp_path, ORB_SLAM2), Camera.load("tum_fr1")
         baseline = 40.0 / 517.306408
-        assert camera == dataclasses.replace(known, name="some_camera", baseline_m=baseline, far_depth_m=40 * baseline)
+        assert camera == dataclasses.replace(
+            known, name="some_camera", baseline_m=baseline, far_depth_m=40 * baseline, readout_s=0.0
+        )
 
     @pytest.mark.parametrize("key", ["Camera.fx", "Camera.cy", "Camera.width"])
     def test_missing_key(self, tmp_path: Path, key: str) -> None:
@@ -200,7 +202,7 @@ class TestOrbSlam3:
     def test_loads(self, tmp_path: Path) -> None:
         camera, known = load(tmp_path, ORB_SLAM3), Camera.load("tum_fr1")
         assert camera == dataclasses.replace(
-            known, name="some_camera", baseline_m=0.07732, far_depth_m=40 * 0.07732, color_order="bgr"
+            known, name="some_camera", baseline_m=0.07732, far_depth_m=40 * 0.07732, color_order="bgr", readout_s=0.0
         )
 
     def test_missing_key(self, tmp_path: Path) -> None:

@@ -196,10 +196,10 @@ class TestRefusals:
             ("track.num_pionts=400", "override: track.num_pionts: unknown key (did you mean 'num_points'?)"),
             ("trak.num_points=400", "override: trak: unknown key (did you mean 'track'?)"),
             ("track.num_points.x=4", "override: track.num_points: expected an integer"),
-            ("track.num_points=many", "override: track.num_points: expected an integer >= 16"),
+            ("track.num_points=many", "override: track.num_points: expected an integer >= 32"),
             (
                 "track.num_points=3",
-                "override: track.num_points: expected an integer >= 16 and <= 8192, got 3",
+                "override: track.num_points: expected an integer >= 32 and <= 4096, got 3",
             ),
             ("track.num_points=[1", "override track.num_points:1: not readable as YAML"),
             (
