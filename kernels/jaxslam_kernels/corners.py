@@ -47,10 +47,10 @@ def corner_score(image: Image) -> Image:
 
 def _window_mean(image: Image) -> Float[Array, "_h _w"]:
     """Mean over the window around every pixel at which it fits into the image."""
-    height, width = (side - _WINDOW + 1 for side in image.shape)
-    zero = jnp.zeros((), image.dtype)
-    rows = sum((image[tap : tap + height] for tap in range(_WINDOW)), start=zero)
-    return sum((rows[:, tap : tap + width] for tap in range(_WINDOW)), start=zero) / _WINDOW**2
+    total = image
+    for window in ((_WINDOW, 1), (1, _WINDOW)):
+        total = lax.reduce_window(total, image.dtype.type(0), lax.add, window, (1, 1), "VALID")
+    return total / _WINDOW**2
 
 
 def grid_corners(score: Image, allowed: Bool[Array, "h w"], *, cell: int) -> Corners:

@@ -105,6 +105,7 @@ class ManifoldLevenbergMarquardt(optx.AbstractMinimiser):
             (state.trial, trial_model, unit),
             (y, state.model, state.unit),
         )
+        damping = damping.astype(cost.dtype)  # optimistix starts it in JAX's default precision
         trial_step, _ = self.descent.step(damping, self.descent.query(y, model, self.descent.init(y, model)))
         short = -jnp.dot(model.grad, trial_step) <= self.atol**2
         new_state = _State(

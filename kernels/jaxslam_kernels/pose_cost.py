@@ -209,4 +209,5 @@ def _usable_prior(prior: PosePrior | None) -> PosePrior | None:
     parameters = prior.T_world_cam.wxyz_xyz
     known = jnp.isfinite(parameters).all() & jnp.isfinite(prior.information).all()
     identity = jnp.zeros_like(parameters).at[0].set(1.0)
-    return PosePrior(SE3(jnp.where(known, parameters, identity)).normalize(), jnp.where(known, prior.information, 0.0))
+    information = jnp.where(known, 0.5 * (prior.information + prior.information.T), 0.0)
+    return PosePrior(SE3(jnp.where(known, parameters, identity)).normalize(), information)

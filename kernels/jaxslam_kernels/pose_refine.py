@@ -169,7 +169,7 @@ def solve_pose(initial: SE3, problem: PoseProblem, loss: Loss, max_steps: int) -
     )
     converged = solution.result == optx.RESULTS.successful
     hessian = solution.state.model.hessian.as_matrix()
-    return solution.value, SolverReport(hessian, solution.stats["num_steps"], converged)
+    return solution.value, SolverReport(hessian, solution.stats["num_steps"].astype(jnp.int32), converged)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(2,))

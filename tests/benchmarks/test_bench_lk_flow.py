@@ -1,27 +1,36 @@
 """Optical flow of 1000 points beside `cv2.calcOpticalFlowPyrLK`: time, and error on known warps."""
 
-import os
-
 import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from benchmarks.timing import compare
+from jax.extend.backend import clear_backends
 from jaxslam_kernels.image import build_pyramid
 from jaxslam_kernels.lk_flow import lk_flow
 from known_warps import corners, picture, warp
 
 pytestmark = pytest.mark.benchmark
 
-# One thread for XLA, as for OpenCV; read when JAX makes its first array. A pool of two pinned to one core afterwards
-# costs 40 %: XLA then splits every cutting of patches in two and waits for both halves.
-os.environ.setdefault("NPROC", "1")
-
 COUNT_AND_EPS = cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS
 CRITERIA = {"10 iterations, 0.03 px": (COUNT_AND_EPS, 10, 0.03), "30 iterations, 0.01 px": (COUNT_AND_EPS, 30, 0.01)}
 """The fastest in common use, which we compare with, and OpenCV's default."""
 SHIFTS_PX = (5, 8, 10, 10, 10, 12, 15, 15, 18, 20, 20, 25)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """One thread for XLA, as for OpenCV.
+
+    A pool of two that is pinned to one core afterwards costs 40 %: XLA then splits every cutting of patches in two and
+    waits for both halves.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("NPROC", "1")  # XLA reads it when JAX makes its first array
+        clear_backends()
+        yield
+    clear_backends()
 
 
 @jax.jit

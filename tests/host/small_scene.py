@@ -28,7 +28,7 @@ TRACK = TrackConfig(
 )
 CONFIG = Config(track=TRACK)
 SIZES = track_sizes(TRACK)
-QUICK_COMPILE = {"xla_backend_optimization_level": 0}
+QUICK_COMPILE: dict[str, str | bool] = {"xla_backend_optimization_level": "0"}
 """Options of `jax.jit` for what runs a few times only: half the time to compile, the same arithmetic."""
 
 

@@ -80,7 +80,7 @@ class TestCompiled:
 
     def test_single_trace(self, counted: Counted, frames: FrameArrays) -> None:
         track(counted.step, frames)
-        track(counted.step, frames, seed=7, loss_scale=jnp.asarray(2.0), readout_s=jnp.asarray(0.01))
+        track(counted.step, frames, seed=7, loss_scale=jnp.float32(2.0), readout_s=jnp.float32(0.01))
         assert counted.traces == 1
 
     def test_same_bytes_again(self, counted: Counted, frames: FrameArrays) -> None:

@@ -1,5 +1,7 @@
 """Corner scores against OpenCV and NumPy in float64; the best pixel of every cell against a loop."""
 
+from typing import Any
+
 import cv2
 import equinox as eqx
 import jax
@@ -32,7 +34,7 @@ def x64():
         yield
 
 
-def _image(seed=0, shape=(H, W), dtype=np.float64):
+def _image(seed=0, shape=(H, W), dtype: Any = np.float64):
     noise = np.random.default_rng(seed).uniform(0, 255, shape)
     return cv2.GaussianBlur(noise, (0, 0), 1.0).astype(dtype)
 
@@ -236,7 +238,7 @@ class TestOccupiedCells:
         """Points that are masked, outside, infinite or not numbers occupy nothing."""
         points = np.zeros((2, 40), np.float32)
         assert not _occupied(points, np.zeros(40, bool)).any()
-        points[:] = np.resize(np.float32([np.nan, np.inf, -np.inf, 1e30, -1e30, -0.1, COLUMNS * CELL]), 40)
+        points[:] = np.resize([np.nan, np.inf, -np.inf, 1e30, -1e30, -0.1, COLUMNS * CELL], 40)
         assert not _occupied(points, np.ones(40, bool)).any()
 
     def test_vmap_equals_loop(self):

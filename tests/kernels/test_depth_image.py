@@ -1,5 +1,7 @@
 """Depth sampled at points against a loop; edges, holes, borders and numbers that are none."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -26,7 +28,7 @@ def x64():
         yield
 
 
-def _depth(seed=0, dtype=np.float64):
+def _depth(seed=0, dtype: Any = np.float64):
     """A gentle slope, a step at column 9, and holes."""
     v, u = np.mgrid[:H, :W]
     depth = 2 + 0.02 * u + 0.01 * v + 2.0 * (u >= 9)
@@ -34,7 +36,7 @@ def _depth(seed=0, dtype=np.float64):
     return depth.astype(dtype)
 
 
-def _points(seed=0, dtype=np.float64):
+def _points(seed=0, dtype: Any = np.float64):
     return np.random.default_rng(seed).uniform([[-2.0], [-2.0]], [[W + 1], [H + 1]], (2, N)).astype(dtype)
 
 
@@ -144,8 +146,8 @@ class TestSampleDepth:
 
 class TestBelievable:
     def test_matches_reference(self):
-        depth = np.float32([[0.2, 0.3, 0.31, 7.9, 8.0, 9.0], [0.0, -1.0, np.nan, np.inf, -np.inf, 5.0]])
-        expected = np.float32([[0, 0, 0.31, 7.9, 0, 0], [0, 0, 0, 0, 0, 5.0]])
+        depth = np.array([[0.2, 0.3, 0.31, 7.9, 8.0, 9.0], [0.0, -1.0, np.nan, np.inf, -np.inf, 5.0]], np.float32)
+        expected = np.array([[0, 0, 0.31, 7.9, 0, 0], [0, 0, 0, 0, 0, 5.0]], np.float32)
         result = believable(jnp.asarray(depth), jnp.float32(0.3), 8.0)
         assert result.dtype == np.float32
         np.testing.assert_array_equal(result, expected)

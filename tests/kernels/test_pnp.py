@@ -245,14 +245,18 @@ def _opencv(scene: Scene) -> np.ndarray | None:
 
 
 class TestRansac:
-    def test_shapes(self):
-        X_world, uv, depth, _ = make_scene(0, 9).arrays()
-        result = jax.eval_shape(partial(ransac_pnp, depth=depth), jax.random.key(0), X_world, uv, camera())
+    @pytest.mark.parametrize("x64", [False, True])
+    def test_shapes(self, x64):
+        """The type follows the input, also where float64 is enabled."""
+        with jax.enable_x64(x64):
+            X_world, uv, depth, _ = make_scene(0, 9).arrays(jnp.float32)
+            solve = partial(ransac_pnp, depth=depth)
+            result = jax.eval_shape(solve, jax.random.key(0), X_world, uv, camera(jnp.float32))
         assert result.T_world_cam.wxyz_xyz.shape == (7,)
         assert result.inliers.shape == (9,)
         assert result.inliers.dtype == jnp.bool_
         assert result.status.dtype == result.num_inliers.dtype == jnp.int32
-        assert result.score.dtype == jnp.float32
+        assert result.score.dtype == result.T_world_cam.wxyz_xyz.dtype == jnp.float32
 
     def test_matches_reference(self):
         """Half of the points wrong: found every time, and as accurately as OpenCV does where it finds the pose.

@@ -240,16 +240,20 @@ def _tangent(estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.concatenate([before.inv().apply(estimate[4:] - truth[4:]), (before.inv() * after).as_rotvec()])
 
 
-def test_shapes():
+@pytest.mark.parametrize("x64", [False, True])
+def test_shapes(x64):
+    """The type follows the input, also where float64 is enabled."""
     scene = make_scene(0, 7)
-    T, (X_world, uv, _, _) = pose_of(scene.initial), scene.arrays()
-    result = jax.eval_shape(refine_pose, T, X_world, uv, camera())
+    with jax.enable_x64(x64):
+        X_world, uv, depth, _ = scene.arrays(jnp.float32)
+        T = SE3(jnp.asarray(scene.initial, jnp.float32))
+        prior = PosePrior(T, jnp.eye(6, dtype=jnp.float32))
+        result = jax.eval_shape(partial(refine_pose, depth=depth, prior=prior), T, X_world, uv, camera(jnp.float32))
     assert result.T_world_cam.wxyz_xyz.shape == (7,)
     assert result.covariance.shape == (6, 6)
     assert result.chi2.shape == result.robust_weights.shape == (7,)
-    assert result.status.dtype == result.num_valid.dtype == jnp.int32
     assert all(x.shape == () for x in (result.cost, result.residual_scale, result.status, result.num_steps))
-    assert result.cost.dtype == jnp.float32
+    assert {x.dtype for x in jax.tree.leaves(result)} == {jnp.dtype("float32"), jnp.dtype("int32")}
 
 
 class TestGradient:

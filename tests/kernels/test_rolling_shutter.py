@@ -1,5 +1,7 @@
 """Image velocity and rolling shutter against exact motion of the camera, in float64."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -49,7 +51,7 @@ def _scene(seed=0):
     return (uv - np.array([[W - 1], [H - 1]]) / 2) / FOCAL, rng.uniform(0.5, 5, N), rng.normal(size=6)
 
 
-def _inputs(seed=0, dtype=np.float64):
+def _inputs(seed=0, dtype: Any = np.float64):
     xy, depth, twist = _scene(seed)
     v = FOCAL * xy[1] + (H - 1) / 2
     return tuple(np.asarray(a, dtype) for a in (xy, v, depth, twist, 0.03))
@@ -58,10 +60,11 @@ def _inputs(seed=0, dtype=np.float64):
 def _rolling(xy, depth, twist, readout_s):
     """What a rolling shutter sees of points that are at `xy` and `depth` when the middle row is taken."""
     X_cam, v = np.vstack([xy, np.ones(N)]) * depth, FOCAL * xy[1] + (H - 1) / 2
+    seen = depth_then = np.empty(0)
     for _ in range(30):
-        seen, depth_then = _seen_at(np.asarray((v / (H - 1) - 0.5) * readout_s), X_cam, twist)
-        v = FOCAL * np.asarray(seen[1]) + (H - 1) / 2
-    return np.asarray(seen), v, np.asarray(depth_then)
+        seen, depth_then = map(np.asarray, _seen_at((v / (H - 1) - 0.5) * readout_s, X_cam, twist))
+        v = FOCAL * seen[1] + (H - 1) / 2
+    return seen, v, depth_then
 
 
 class TestImageVelocity:
@@ -173,8 +176,8 @@ class TestAsIfAtOnce:
             np.testing.assert_allclose(batched[k], _corrected(*inputs[k]), rtol=1e-12, atol=1e-14)
 
     def test_single_trace(self):
-        traced = eqx.debug.assert_max_traces(lambda *a: as_if_at_once(a[0], a[0], a[1], H, a[2]), max_traces=1)
-        compute = jax.jit(traced)
+        correct = lambda xy, v, readout_s: as_if_at_once(xy, xy, v, H, readout_s)
+        compute = jax.jit(eqx.debug.assert_max_traces(correct, max_traces=1))
         for seed in range(3):
             xy, v, _, _, readout_s = _inputs(seed, np.float32)
             compute(xy, v, readout_s)
