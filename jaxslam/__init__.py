@@ -15,11 +15,11 @@ from jaxslam.frame import Frame as Frame
 from jaxslam.slam import Slam as Slam
 from jaxslam.slam import Tracked as Tracked
 from jaxslam.slam import track_params as track_params
-from jaxslam.slam import track_sizes as track_sizes
+from jaxslam.slam import track_plan as track_plan
 from jaxslam.state import FrameArrays as FrameArrays
 from jaxslam.state import TrackOutput as TrackOutput
 from jaxslam.state import TrackParams as TrackParams
-from jaxslam.state import TrackSizes as TrackSizes
+from jaxslam.state import TrackPlan as TrackPlan
 from jaxslam.state import TrackState as TrackState
 from jaxslam.state import TrackStatus as TrackStatus
 from jaxslam.track import init_state as init_state

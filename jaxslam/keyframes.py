@@ -14,7 +14,7 @@ from jaxslam_kernels.types import Mask, Pixels, Points, Scalar, Weights
 from jaxtyping import Array, Bool, Float, Int, Num
 
 from jaxslam.observe import predict_pixels
-from jaxslam.state import Keyframes, TrackedPoints, TrackParams, TrackSizes
+from jaxslam.state import Keyframes, TrackedPoints, TrackParams, TrackPlan
 
 _MARGIN_PX = 8
 _MAX_SHIFT_PX = 12.0
@@ -37,9 +37,9 @@ class LookedUp(NamedTuple):
     overlap: Scalar
 
 
-def empty_keyframes(height: int, width: int, sizes: TrackSizes, image_dtype: jnp.dtype, dtype: jnp.dtype) -> Keyframes:
+def empty_keyframes(height: int, width: int, plan: TrackPlan, image_dtype: jnp.dtype, dtype: jnp.dtype) -> Keyframes:
     """A ring without keyframes."""
-    k, n = sizes.num_keyframes, sizes.num_points
+    k, n = plan.num_keyframes, plan.num_points
     return Keyframes(
         images=jnp.zeros((k, height, width), image_dtype),
         T_world_cam=jnp.tile(SE3.identity().wxyz_xyz.astype(dtype), (k, 1)),
@@ -57,7 +57,7 @@ def look_up(
     pyramid: Pyramid,
     depth: Float[Array, "h w"],
     params: TrackParams,
-    sizes: TrackSizes,
+    plan: TrackPlan,
 ) -> LookedUp:
     """Look points of the best keyframes up in the current frame, around where the pose predicts them.
 
@@ -68,7 +68,7 @@ def look_up(
         pyramid: Of the current frame.
         depth: Of the current frame, to drop points that something covers.
         params: Thresholds and camera.
-        sizes: Static.
+        plan: Static.
     """
     height, width = pyramid.size()
     k, n = keyframes.weight.shape
@@ -78,8 +78,8 @@ def look_up(
     visible = _visible(predicted, X_cam[2], height, width) & valid.reshape(-1)
     shown = jnp.sum(visible.reshape(k, n), axis=1)
     overlap = jnp.max((shown / jnp.maximum(jnp.sum(valid, axis=1), 1)).astype(predicted.dtype))
-    _, sources = jax.lax.top_k(shown, sizes.num_sources)
-    chosen = jax.vmap(lambda s: jnp.nonzero(visible.reshape(k, n)[s], size=sizes.points_per_source, fill_value=n)[0])(
+    _, sources = jax.lax.top_k(shown, plan.num_sources)
+    chosen = jax.vmap(lambda s: jnp.nonzero(visible.reshape(k, n)[s], size=plan.points_per_source, fill_value=n)[0])(
         sources
     )
     real = (chosen < n).reshape(-1)
@@ -98,6 +98,7 @@ def look_up(
         pyramid,
         guess,
         real & ~covered,
+        plan=plan.look_up,
     )
     shift = jnp.sum(jnp.square(match.points - guess), axis=0)
     found = match.converged & (match.correlation > params.min_correlation) & (shift < _MAX_SHIFT_PX**2)

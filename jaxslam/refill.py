@@ -9,7 +9,7 @@ from jaxslam_kernels.transform import to_world
 from jaxtyping import Array, Bool, Float
 
 from jaxslam.observe import depth_sigma, observe
-from jaxslam.state import TrackedPoints, TrackParams, TrackSizes
+from jaxslam.state import TrackedPoints, TrackParams, TrackPlan
 
 _MIN_SCORE = 2.0
 """Smallest eigenvalue of a corner worth tracking, in squared intensity a squared pixel, on the second level."""
@@ -25,14 +25,14 @@ def refill(
     T_world_cam: SE3,
     twist: Float[Array, "6"],
     params: TrackParams,
-    sizes: TrackSizes,
+    plan: TrackPlan,
 ) -> TrackedPoints:
     """Put the best corners of empty grid cells into free slots.
 
     Corners are sought on the second level of the pyramid: a quarter of the work, and less noise. A new point has the
     depth measured at it, the rolling shutter and the delay of the depth image taken into account.
     """
-    border, cell = pyramid.border, sizes.cell_px // 2
+    border, cell = pyramid.border, plan.cell_px // 2
     image = pyramid.levels[1][border:-border, border:-border]
     v, u = jnp.mgrid[: image.shape[0], : image.shape[1]]
     edge = _EDGE_PX // 2

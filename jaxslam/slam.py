@@ -17,7 +17,7 @@ from jaxslam.config import Config, TrackConfig
 from jaxslam.datasets import Dataset, prefetch
 from jaxslam.errors import DatasetError, FrameError, JaxSlamError
 from jaxslam.frame import Frame, check_frame, to_grey
-from jaxslam.state import FrameArrays, TrackOutput, TrackParams, TrackReason, TrackSizes, TrackState, TrackStatus
+from jaxslam.state import FrameArrays, TrackOutput, TrackParams, TrackPlan, TrackReason, TrackState, TrackStatus
 from jaxslam.track import init_state, track_step
 from jaxslam.trajectory import Trajectory
 
@@ -79,11 +79,11 @@ class Rejected:
         return str(self.error)
 
 
-@partial(jax.jit, static_argnames="sizes", donate_argnums=0)
+@partial(jax.jit, static_argnames="plan", donate_argnums=0)
 def _step(
-    state: TrackState, frame: FrameArrays, params: TrackParams, sizes: TrackSizes
+    state: TrackState, frame: FrameArrays, params: TrackParams, plan: TrackPlan
 ) -> tuple[TrackState, TrackOutput]:
-    return track_step(state, frame, params, sizes)
+    return track_step(state, frame, params, plan)
 
 
 @dataclass(frozen=True)
@@ -121,13 +121,13 @@ class Slam:
         self.config = config or Config()
         self.compile_s = 0.0
         self._params = track_params(camera, self.config.track)
-        self._sizes = track_sizes(self.config.track)
+        self._plan = track_plan(self.config.track)
         self._ready = False
         self.reset()
 
     def reset(self) -> None:
         """Forget everything; the next frame starts a new world."""
-        self._state = init_state(self.camera.height, self.camera.width, self._sizes, seed=self.config.run.seed)
+        self._state = init_state(self.camera.height, self.camera.width, self._plan, seed=self.config.run.seed)
         self._last_ns: int | None = None
         self._times_ns: list[int] = []
         self._poses: list[np.ndarray] = []
@@ -137,10 +137,10 @@ class Slam:
         if not self._ready:
             enable_compile_cache()
             began = time.perf_counter()
-            blank = init_state(self.camera.height, self.camera.width, self._sizes)
+            blank = init_state(self.camera.height, self.camera.width, self._plan)
             shape = (self.camera.height, self.camera.width)
             nothing = _arrays(Frame(0, np.zeros(shape, np.uint8), np.zeros(shape, np.float32)), 0.0)
-            jax.block_until_ready(_step(blank, nothing, self._params, self._sizes))
+            jax.block_until_ready(_step(blank, nothing, self._params, self._plan))
             self.compile_s = time.perf_counter() - began
             self._ready = True
         return self.compile_s
@@ -163,7 +163,7 @@ class Slam:
         self.warm_up()
         began = time.perf_counter()
         dt_s = 1 / self.camera.fps if self._last_ns is None else (frame.timestamp_ns - self._last_ns) * 1e-9
-        self._state, output = _step(self._state, _arrays(frame, dt_s), self._params, self._sizes)
+        self._state, output = _step(self._state, _arrays(frame, dt_s), self._params, self._plan)
         output: TrackOutput = jax.device_get(output)
         tracked = _tracked(frame.timestamp_ns, output, (time.perf_counter() - began) * 1e3)
         self._last_ns = frame.timestamp_ns
@@ -211,9 +211,9 @@ class Slam:
         return self.online_trajectory
 
 
-def track_sizes(config: TrackConfig) -> TrackSizes:
+def track_plan(config: TrackConfig) -> TrackPlan:
     """The static part of the tracker's settings."""
-    return TrackSizes(**{name: getattr(config, name) for name in TrackSizes._fields})
+    return TrackPlan(**{name: getattr(config, name) for name in TrackPlan._fields if hasattr(config, name)})
 
 
 def track_params(camera: Camera, config: TrackConfig, dtype: type[np.floating] = np.float32) -> TrackParams:

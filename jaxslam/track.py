@@ -16,7 +16,7 @@ from jaxlie import SE3
 from jaxslam_kernels.camera import Intrinsics, to_pixels
 from jaxslam_kernels.depth_image import believable
 from jaxslam_kernels.image import Pyramid, build_pyramid
-from jaxslam_kernels.lk_flow import FlowPlan, lk_flow
+from jaxslam_kernels.lk_flow import lk_flow
 from jaxslam_kernels.pnp import ransac_pnp
 from jaxslam_kernels.pose_refine import PoseRefinement, refine_pose
 from jaxslam_kernels.robust import weighted_median
@@ -32,14 +32,13 @@ from jaxslam.state import (
     TrackedPoints,
     TrackOutput,
     TrackParams,
+    TrackPlan,
     TrackReason,
-    TrackSizes,
     TrackState,
     TrackStatus,
 )
 
-DEFAULT_SIZES = TrackSizes()
-_FLOW_PLAN = FlowPlan()
+DEFAULT_PLAN = TrackPlan()
 _MAX_PREDICTION_S = 0.1
 """A constant velocity says nothing about longer gaps."""
 _MAX_FUSED = 4
@@ -68,7 +67,7 @@ class _Verdict(NamedTuple):
 def init_state(
     height: int,
     width: int,
-    sizes: TrackSizes = DEFAULT_SIZES,
+    plan: TrackPlan = DEFAULT_PLAN,
     *,
     T_world_cam: SE3 | None = None,
     seed: int = 0,
@@ -80,14 +79,14 @@ def init_state(
     Args:
         height: Rows of the frames.
         width: Columns of the frames.
-        sizes: Capacities, static.
+        plan: Capacities, static.
         T_world_cam: Pose of the camera at the first frame; the world's origin if not given.
         seed: Of every random choice.
         image_dtype: Type of the images given later; floating point to differentiate with respect to them.
         dtype: Floating-point type of everything else.
     """
-    n = sizes.num_points
-    blank = build_pyramid(jnp.zeros((height, width), dtype), num_levels=sizes.num_levels)
+    n = plan.num_points
+    blank = build_pyramid(jnp.zeros((height, width), dtype), num_levels=plan.num_levels)
     pose = SE3.identity() if T_world_cam is None else T_world_cam
     return TrackState(
         pyramid=blank,
@@ -99,7 +98,7 @@ def init_state(
             age=jnp.zeros(n, jnp.int32),
             valid=jnp.zeros(n, bool),
         ),
-        keyframes=empty_keyframes(height, width, sizes, image_dtype, dtype),
+        keyframes=empty_keyframes(height, width, plan, image_dtype, dtype),
         T_world_cam=SE3(pose.wxyz_xyz.astype(dtype)),
         twist=jnp.zeros(6, dtype),
         elapsed_s=jnp.zeros((), dtype),
@@ -110,7 +109,7 @@ def init_state(
 
 
 def track_step(
-    state: TrackState, frame: FrameArrays, params: TrackParams, sizes: TrackSizes = DEFAULT_SIZES
+    state: TrackState, frame: FrameArrays, params: TrackParams, plan: TrackPlan = DEFAULT_PLAN
 ) -> tuple[TrackState, TrackOutput]:
     """Track one frame.
 
@@ -118,27 +117,27 @@ def track_step(
         state: From `init_state` or the step before.
         frame: Image, depth and time.
         params: Camera and thresholds, traced.
-        sizes: Capacities, static; those the state was made with.
+        plan: Capacities, static; those the state was made with.
 
     Returns:
         The new state and what is known of the frame. Nothing raises: a frame that cannot be used leaves points and
         pose as they were and says so in `status` and `reason`.
     """
-    view = _prepare(state, frame, params, sizes)
+    view = _prepare(state, frame, params, plan)
     predicted = _predict(state, view)
-    uv, followed = _follow(state, view, predicted, params)
+    uv, followed = _follow(state, view, predicted, params, plan)
     params = _widened(params, state.points.uv, uv, followed)
-    coarse, agreeing = _coarse_pose(state, view, uv, followed, predicted, params, sizes)
+    coarse, agreeing = _coarse_pose(state, view, uv, followed, predicted, params, plan)
     twist = _twist(state.T_world_cam, coarse, view.elapsed_s)
-    looked_up = look_up(state.keyframes, coarse, twist, view.pyramid, view.depth, params, sizes)
+    looked_up = look_up(state.keyframes, coarse, twist, view.pyramid, view.depth, params, plan)
     refined, inliers = _refine(state, view, uv, agreeing, looked_up, coarse, twist, params)
     verdict = _judge(state, view, refined, followed, inliers, params)
     kept = _update_points(state, view, uv, inliers, refined.T_world_cam, params)
-    return _conclude(state, view, kept, refined, looked_up, verdict, params, sizes)
+    return _conclude(state, view, kept, refined, looked_up, verdict, params, plan)
 
 
-def _prepare(state: TrackState, frame: FrameArrays, params: TrackParams, sizes: TrackSizes) -> _View:
-    pyramid = build_pyramid(frame.image.astype(state.twist.dtype), num_levels=sizes.num_levels)
+def _prepare(state: TrackState, frame: FrameArrays, params: TrackParams, plan: TrackPlan) -> _View:
+    pyramid = build_pyramid(frame.image.astype(state.twist.dtype), num_levels=plan.num_levels)
     depth = believable(frame.depth, params.min_depth_m, params.max_depth_m)
     return _View(frame, pyramid, depth, state.elapsed_s + frame.dt_s)
 
@@ -148,7 +147,9 @@ def _predict(state: TrackState, view: _View) -> SE3:
     return moved(state.T_world_cam, state.twist * jnp.clip(view.elapsed_s, 0, _MAX_PREDICTION_S))
 
 
-def _follow(state: TrackState, view: _View, predicted: SE3, params: TrackParams) -> tuple[Pixels, Mask]:
+def _follow(
+    state: TrackState, view: _View, predicted: SE3, params: TrackParams, plan: TrackPlan
+) -> tuple[Pixels, Mask]:
     """Follow the points into the frame by optical flow, starting where the prediction puts them."""
     points = state.points
     height, width = view.pyramid.size()
@@ -157,15 +158,19 @@ def _follow(state: TrackState, view: _View, predicted: SE3, params: TrackParams)
     guess = points.uv + lax.stop_gradient(after - before)
     inside = jnp.all((guess > 0) & (guess < jnp.array([[width - 1], [height - 1]], guess.dtype)), axis=0)
     guess = jnp.where(inside[None, :], guess, points.uv)
-    flow = lk_flow(state.pyramid, view.pyramid, points.uv, guess, points.valid, plan=_FLOW_PLAN)
+    flow = lk_flow(state.pyramid, view.pyramid, points.uv, guess, points.valid, plan=plan.flow)
     column, row = jnp.round(lax.stop_gradient(flow.points)).astype(jnp.int32)
     ignored = view.frame.ignore.at[row, column].get(mode="fill", fill_value=True)
     return flow.points, flow.ok & ~ignored & (points.weight > 0)
 
 
 def _widened(params: TrackParams, before: Pixels, after: Pixels, followed: Mask) -> TrackParams:
-    """Thresholds on reprojection errors, widened by the motion in the image."""
-    length = jnp.sqrt(jnp.sum(jnp.square(lax.stop_gradient(after - before)), axis=0))
+    """Thresholds on reprojection errors, widened by the motion in the image.
+
+    They are scales of robust losses too, and so have a derivative.
+    """
+    squared = jnp.sum(jnp.square(after - before), axis=0)
+    length = jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1)), 0)
     extra = params.error_per_flow * weighted_median(length, followed.astype(length.dtype))
     return params._replace(ransac_px=params.ransac_px + extra, outlier_px=params.outlier_px + extra)
 
@@ -185,7 +190,7 @@ def _trust(points: TrackedPoints, params: TrackParams) -> Weights:
 
 
 def _coarse_pose(
-    state: TrackState, view: _View, uv: Pixels, followed: Mask, predicted: SE3, params: TrackParams, sizes: TrackSizes
+    state: TrackState, view: _View, uv: Pixels, followed: Mask, predicted: SE3, params: TrackParams, plan: TrackPlan
 ) -> tuple[SE3, Mask]:
     """The pose most points agree with, and which do."""
     seen = _see(state.points.X_world, uv, predicted, state.twist, view, params)
@@ -198,7 +203,7 @@ def _coarse_pose(
         weights=usable,
         depth=seen.depth,
         threshold_px=params.ransac_px,
-        num_hypotheses=sizes.num_hypotheses,
+        num_hypotheses=plan.num_hypotheses,
         initial=predicted,
     )
     return result.T_world_cam, result.inliers & followed
@@ -316,7 +321,7 @@ def _conclude(
     looked_up: LookedUp,
     verdict: _Verdict,
     params: TrackParams,
-    sizes: TrackSizes,
+    plan: TrackPlan,
 ) -> tuple[TrackState, TrackOutput]:
     """The new state, and the output: tracked, held, or started anew."""
     lost_frames = jnp.where(verdict.lost, state.lost_frames + 1, 0)
@@ -330,11 +335,11 @@ def _conclude(
     points = choose(state.points._replace(valid=state.points.valid & held), kept)
 
     alive = jnp.sum(points.valid, dtype=twist.dtype)
-    few = alive < params.refill_below * sizes.num_points
+    few = alive < params.refill_below * plan.num_points
     points = lax.cond(
         start | (few & ~verdict.lost),
         lambda p: refill(
-            p, view.pyramid, view.depth, view.frame.ignore, view.frame.depth_delay_s, pose, twist, params, sizes
+            p, view.pyramid, view.depth, view.frame.ignore, view.frame.depth_delay_s, pose, twist, params, plan
         ),
         lambda p: p,
         points,

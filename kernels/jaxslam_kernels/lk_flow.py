@@ -17,7 +17,6 @@ from jaxslam_kernels.types import Mask, Pixels, Scalar
 __all__ = ["Flow", "FlowPlan", "FlowStatus", "LevelPlan", "lk_flow", "lk_flow_forward_backward"]
 
 DEFAULT_PLAN = FlowPlan()
-_CONVERGED_PX = 0.1
 
 
 class FlowStatus(enum.IntEnum):
@@ -30,7 +29,7 @@ class FlowStatus(enum.IntEnum):
     NO_TEXTURE = 3
     """Its window has too little gradient in some direction."""
     NOT_CONVERGED = 4
-    """The last step was still larger than a tenth of a pixel."""
+    """The last step was still longer than the plan accepts, a tenth of a pixel if it does not say."""
     BAD_INPUT = 5
     """A coordinate, or a pixel near it, was not a number."""
     INCONSISTENT = 6
@@ -160,7 +159,7 @@ class _End(NamedTuple):
 
 def _solve(inputs: _Inputs, *, plan: FlowPlan) -> Found:
     end = search(*inputs, plan=plan)
-    tracked = inputs.usable & (end.texture > inputs.min_texture) & (end.last_step < _CONVERGED_PX**2)
+    tracked = inputs.usable & (end.texture > inputs.min_texture) & (end.last_step < plan.finest.accepted**2)
     tracked &= _inside(end.position, inputs.current)
     return Found(end.position, tracked, _End(end.residual, end.texture, end.last_step))
 

@@ -27,11 +27,15 @@ class LevelPlan(NamedTuple):
         window: Side of the window in pixels, odd.
         iterations: Most steps a point may take.
         tolerance: A point is done when its step is shorter than this, in pixels of the level.
+        accepted: A point whose last step was longer than this has not been found; it matters where the result is
+            one. A few searches go round in circles, of up to a tenth of a pixel, in the bends of bilinear
+            interpolation: their result is good enough to track with, but no smooth function of the images.
     """
 
     window: int
     iterations: int
     tolerance: float
+    accepted: float = 0.1
 
 
 class FlowPlan(NamedTuple):

@@ -22,7 +22,6 @@ from jaxslam_kernels.lk_search import LevelPlan, Search, Template, in_chunks, it
 from jaxslam_kernels.types import Mask, Pixels, Scalar, Weights
 
 DEFAULT_PLAN = LevelPlan(21, 8, 0.05)
-_CONVERGED_PX = 0.1
 _GAIN_SQUARED = (0.25, 4.0)
 """Smallest and largest."""
 
@@ -188,7 +187,7 @@ def _solve(inputs: _Inputs, *, plan: LevelPlan, border: int, chunk: int) -> Foun
         end = iterate(begin, template, inputs.current, border, plan)
         correlation = _correlation(template.patch, _there(end.position, inputs, window, border, once), counts)
         known = active & jnp.isfinite(correlation)
-        settled = known & (correlation > 0) & (end.last_step < _CONVERGED_PX**2)
+        settled = known & (correlation > 0) & (end.last_step < plan.accepted**2)
         low, high = patches.bounds(inputs.current, border)
         inside = jnp.all((end.position >= low) & (end.position <= high), axis=0)
         return Found(end.position, settled & inside, jnp.where(known, correlation, -1))

@@ -11,7 +11,7 @@ import numpy as np
 from jaxslam.config import Config, TrackConfig
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.frame import Frame, to_grey
-from jaxslam.slam import Slam, track_params, track_sizes
+from jaxslam.slam import Slam, track_params, track_plan
 from jaxslam.state import FrameArrays, TrackParams, TrackState
 from jaxslam.track import init_state
 from jaxslam.trajectory import Trajectory
@@ -27,7 +27,7 @@ TRACK = TrackConfig(
     cell_px=10,
 )
 CONFIG = Config(track=TRACK)
-SIZES = track_sizes(TRACK)
+PLAN = track_plan(TRACK)
 QUICK_COMPILE: dict[str, str | bool] = {"xla_backend_optimization_level": "0"}
 """Options of `jax.jit` for what runs a few times only: half the time to compile, the same arithmetic."""
 
@@ -83,7 +83,7 @@ def pose_matrices(wxyz_xyz: np.ndarray) -> np.ndarray:
 
 
 def new_state(dtype: type[np.floating] = np.float32, image_dtype: type = np.uint8, seed: int = 0) -> TrackState:
-    return init_state(HEIGHT, WIDTH, SIZES, seed=seed, image_dtype=jnp.dtype(image_dtype), dtype=jnp.dtype(dtype))
+    return init_state(HEIGHT, WIDTH, PLAN, seed=seed, image_dtype=jnp.dtype(image_dtype), dtype=jnp.dtype(dtype))
 
 
 def params(dtype: type[np.floating] = np.float32) -> TrackParams:

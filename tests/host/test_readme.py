@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import pytest
 
-from jaxslam import Camera, TrackParams, TrackSizes, TrackStatus
+from jaxslam import Camera, TrackParams, TrackPlan, TrackStatus
 from jaxslam.compile_cache import cache_dir
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -93,7 +93,7 @@ def test_table_of_traced_and_static_settings_is_complete() -> None:
     rows = {row.split(",")[0]: row for row in README.read_text(encoding="utf-8").splitlines() if row.startswith("| ")}
     named = lambda kind: re.findall(r"`(\w+)`", rows[kind].split("|")[2])
     assert named("| traced") == list(TrackParams._fields)
-    assert named("| static") == list(TrackSizes._fields)
+    assert named("| static") == list(TrackPlan._fields)
 
 
 def test_table_of_statuses_is_complete() -> None:

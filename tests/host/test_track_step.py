@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
-from small_scene import QUICK_COMPILE, SIZES, at, clip, new_state, params, stacked
+from small_scene import QUICK_COMPILE, PLAN, at, clip, new_state, params, stacked
 
 from jaxslam.state import FrameArrays, TrackOutput, TrackParams, TrackState, TrackStatus
 from jaxslam.track import track_step
@@ -27,7 +27,7 @@ class Counted:
 
     def _trace(self, state: TrackState, frame: FrameArrays, params: TrackParams) -> tuple[TrackState, TrackOutput]:
         self.traces += 1
-        return track_step(state, frame, params, SIZES)
+        return track_step(state, frame, params, PLAN)
 
 
 @pytest.fixture(scope="module")
@@ -63,12 +63,12 @@ class TestShapes:
         with jax.enable_x64(dtype is np.float64):
             state = new_state(dtype)
             frame = at(stacked(recording.frames[:1], dtype), 0)
-            after, output = jax.eval_shape(lambda s, f, p: track_step(s, f, p, SIZES), state, frame, params(dtype))
+            after, output = jax.eval_shape(lambda s, f, p: track_step(s, f, p, PLAN), state, frame, params(dtype))
             assert jax.tree.structure(after) == jax.tree.structure(state)
             assert described(after) == described(state)
             assert output.T_world_cam.wxyz_xyz.dtype == dtype
             assert output.covariance.shape == (6, 6)
-            assert output.uv.shape == (2, SIZES.num_points)
+            assert output.uv.shape == (2, PLAN.num_points)
 
 
 class TestCompiled:
@@ -90,7 +90,7 @@ class TestCompiled:
     def test_scan_equals_loop(self, counted: Counted, frames: FrameArrays) -> None:
         _, outputs = track(counted.step, frames)
         scan = jax.jit(
-            lambda state, frames, given: lax.scan(lambda s, f: track_step(s, f, given, SIZES), state, frames),
+            lambda state, frames, given: lax.scan(lambda s, f: track_step(s, f, given, PLAN), state, frames),
             compiler_options=QUICK_COMPILE,
         )
         state, scanned = scan(new_state(), frames, params())
@@ -100,7 +100,7 @@ class TestCompiled:
     def test_vmap_equals_loop(self, counted: Counted, frames: FrameArrays) -> None:
         """Two recordings side by side, one of them a frame ahead."""
         batched = jax.jit(
-            jax.vmap(lambda s, f, p: track_step(s, f, p, SIZES), in_axes=(0, 0, None)), compiler_options=QUICK_COMPILE
+            jax.vmap(lambda s, f, p: track_step(s, f, p, PLAN), in_axes=(0, 0, None)), compiler_options=QUICK_COMPILE
         )
         both = lambda *trees: jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
         singles, states = [new_state(), new_state()], both(new_state(), new_state())
