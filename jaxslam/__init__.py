@@ -12,11 +12,13 @@ from jaxslam.errors import JaxSlamError as JaxSlamError
 from jaxslam.evaluation import Evaluation as Evaluation
 from jaxslam.evaluation import evaluate as evaluate
 from jaxslam.frame import Frame as Frame
+from jaxslam.frame_arrays import FrameArrays as FrameArrays
+from jaxslam.frame_arrays import frame_arrays as frame_arrays
+from jaxslam.frame_arrays import stack_frames as stack_frames
 from jaxslam.slam import Slam as Slam
 from jaxslam.slam import Tracked as Tracked
 from jaxslam.slam import track_params as track_params
 from jaxslam.slam import track_plan as track_plan
-from jaxslam.state import FrameArrays as FrameArrays
 from jaxslam.state import TrackOutput as TrackOutput
 from jaxslam.state import TrackParams as TrackParams
 from jaxslam.state import TrackPlan as TrackPlan

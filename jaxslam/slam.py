@@ -5,7 +5,6 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,8 +15,9 @@ from jaxslam.compile_cache import enable_compile_cache
 from jaxslam.config import Config, TrackConfig
 from jaxslam.datasets import Dataset, prefetch
 from jaxslam.errors import DatasetError, FrameError, JaxSlamError
-from jaxslam.frame import Frame, check_frame, to_grey
-from jaxslam.state import FrameArrays, TrackOutput, TrackParams, TrackPlan, TrackReason, TrackState, TrackStatus
+from jaxslam.frame import Frame, check_frame
+from jaxslam.frame_arrays import FrameArrays, frame_arrays
+from jaxslam.state import TrackOutput, TrackParams, TrackPlan, TrackReason, TrackState, TrackStatus
 from jaxslam.track import init_state, track_step
 from jaxslam.trajectory import Trajectory
 
@@ -139,7 +139,7 @@ class Slam:
             began = time.perf_counter()
             blank = init_state(self.camera.height, self.camera.width, self._plan)
             shape = (self.camera.height, self.camera.width)
-            nothing = _arrays(Frame(0, np.zeros(shape, np.uint8), np.zeros(shape, np.float32)), 0.0)
+            nothing = frame_arrays(Frame(0, np.zeros(shape, np.uint8), np.zeros(shape, np.float32)), 0.0)
             jax.block_until_ready(_step(blank, nothing, self._params, self._plan))
             self.compile_s = time.perf_counter() - began
             self._ready = True
@@ -163,7 +163,7 @@ class Slam:
         self.warm_up()
         began = time.perf_counter()
         dt_s = 1 / self.camera.fps if self._last_ns is None else (frame.timestamp_ns - self._last_ns) * 1e-9
-        self._state, output = _step(self._state, _arrays(frame, dt_s), self._params, self._plan)
+        self._state, output = _step(self._state, frame_arrays(frame, dt_s), self._params, self._plan)
         output: TrackOutput = jax.device_get(output)
         tracked = _tracked(frame.timestamp_ns, output, (time.perf_counter() - began) * 1e3)
         self._last_ns = frame.timestamp_ns
@@ -221,14 +221,6 @@ def track_params(camera: Camera, config: TrackConfig, dtype: type[np.floating] =
     traced = (name for name in TrackParams._fields if name not in ("intrinsics", "readout_s"))
     settings = {name: jnp.asarray(getattr(config, name), dtype) for name in traced}
     return TrackParams(intrinsics=camera.intrinsics(dtype), readout_s=jnp.asarray(camera.readout_s, dtype), **settings)
-
-
-def _arrays(frame: Frame, dt_s: float) -> FrameArrays:
-    ignore = np.zeros(frame.depth_m.shape, bool) if frame.dynamic_mask is None else frame.dynamic_mask
-    delay_ns = 0 if frame.depth_timestamp_ns is None else frame.depth_timestamp_ns - frame.timestamp_ns
-    # Left to the call of the compiled step to convert: a separate copy of every image would cost 0.3 ms.
-    arrays: Any = (to_grey(frame.image), frame.depth_m, ignore, np.float32(dt_s), np.float32(delay_ns * 1e-9))
-    return FrameArrays(*arrays)
 
 
 def _tracked(timestamp_ns: int, output: TrackOutput, track_ms: float) -> Tracked:

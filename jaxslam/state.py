@@ -9,7 +9,7 @@ from jaxslam_kernels.image import Pyramid
 from jaxslam_kernels.lk_flow import FlowPlan, LevelPlan
 from jaxslam_kernels.patch_align import DEFAULT_PLAN as LEVEL_PLAN
 from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Points, Scalar, Weights
-from jaxtyping import Array, Bool, Float, Int, Key, Num
+from jaxtyping import Array, Float, Int, Key, Num
 
 
 class TrackStatus(enum.IntEnum):
@@ -144,24 +144,6 @@ class TrackParams(NamedTuple):
     restart_after: Scalar
     max_speed_m_per_s: Scalar
     max_turn_rad_per_s: Scalar
-
-
-class FrameArrays(NamedTuple):
-    """One frame as the compiled step takes it; NumPy arrays will do.
-
-    Attributes:
-        image: `(h, w)` grey, 0 to 255; `uint8`, or floating point to differentiate with respect to it.
-        depth: `(h, w)` metres, floating point; 0 or not finite where missing.
-        ignore: `(h, w)` true where nothing is to be trusted (people, the robot itself).
-        dt_s: Seconds since the frame before.
-        depth_delay_s: Seconds from the time of the image to the time of the depth.
-    """
-
-    image: Num[Array, "h w"]
-    depth: Float[Array, "h w"]
-    ignore: Bool[Array, "h w"]
-    dt_s: Float[Array, ""]
-    depth_delay_s: Float[Array, ""]
 
 
 class TrackedPoints(NamedTuple):

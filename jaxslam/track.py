@@ -24,11 +24,11 @@ from jaxslam_kernels.transform import displacement, moved, to_camera, to_world
 from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Points, Scalar, Weights
 from jaxtyping import Array, Float
 
+from jaxslam.frame_arrays import FrameArrays
 from jaxslam.keyframes import LookedUp, empty_keyframes, look_up, with_keyframe
 from jaxslam.observe import Observed, depth_sigma, observe, predict_pixels
 from jaxslam.refill import refill
 from jaxslam.state import (
-    FrameArrays,
     TrackedPoints,
     TrackOutput,
     TrackParams,

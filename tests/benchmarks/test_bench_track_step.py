@@ -3,11 +3,10 @@
 import cv2
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
 from benchmarks.timing import compare
 
-from jaxslam import FrameArrays, Slam, open_dataset, track_params, track_plan, track_step
+from jaxslam import Slam, frame_arrays, open_dataset, track_params, track_plan, track_step
 from jaxslam.config import TrackConfig
 from jaxslam.frame import to_grey
 
@@ -23,9 +22,7 @@ def test_step_is_not_slower_than_opencv_flow(data_dir, capsys):
         slam.track(dataset[index])
     state = jax.tree.map(jnp.copy, slam._state)
     before, frame = dataset[59], dataset[60]
-    arrays = FrameArrays(
-        to_grey(frame.image), frame.depth_m, np.zeros(frame.depth_m.shape, bool), np.float32(1 / 30), np.float32(0)
-    )
+    arrays = frame_arrays(frame, 1 / 30)
     step = jax.jit(track_step, static_argnames="plan")
     previous, current = to_grey(before.image), to_grey(frame.image)
     corners = cv2.goodFeaturesToTrack(previous, 1000, 0.001, 7)

@@ -10,9 +10,10 @@ import numpy as np
 
 from jaxslam.config import Config, TrackConfig
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
-from jaxslam.frame import Frame, to_grey
+from jaxslam.frame import Frame
+from jaxslam.frame_arrays import FrameArrays, stack_frames
 from jaxslam.slam import Slam, track_params, track_plan
-from jaxslam.state import FrameArrays, TrackParams, TrackState
+from jaxslam.state import TrackParams, TrackState
 from jaxslam.track import init_state
 from jaxslam.trajectory import Trajectory
 
@@ -94,15 +95,8 @@ def stacked(
     frames: Sequence[Frame], dtype: type[np.floating] = np.float32, image_dtype: type = np.uint8
 ) -> FrameArrays:
     """Frames as arrays with the time as the first axis, as `lax.scan` takes them."""
-    stamps = np.array([frame.timestamp_ns for frame in frames])
-    steps = np.diff(stamps, prepend=stamps[0] - 33_333_000) * 1e-9
-    return FrameArrays(
-        image=jnp.asarray(np.stack([to_grey(frame.image) for frame in frames]).astype(image_dtype)),
-        depth=jnp.asarray(np.stack([frame.depth_m for frame in frames]).astype(dtype)),
-        ignore=jnp.zeros((len(frames), HEIGHT, WIDTH), bool),
-        dt_s=jnp.asarray(steps.astype(dtype)),
-        depth_delay_s=jnp.zeros(len(frames), dtype),
-    )
+    arrays = stack_frames(frames, frames[0].timestamp_ns - 33_333_000, dtype)
+    return jax.tree.map(jnp.asarray, arrays._replace(image=arrays.image.astype(image_dtype)))
 
 
 def at(frames: FrameArrays, index: int) -> FrameArrays:

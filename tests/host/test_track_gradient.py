@@ -15,7 +15,8 @@ from jax import lax
 from jaxtyping import Array
 from small_scene import PLAN, QUICK_COMPILE, Clip, at, clip, new_state, params, stacked, truth_from_start
 
-from jaxslam.state import FrameArrays, TrackState
+from jaxslam.frame_arrays import FrameArrays
+from jaxslam.state import TrackState
 from jaxslam.track import track_step
 
 BEFORE, STEPS = 10, 10

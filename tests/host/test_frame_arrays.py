@@ -1,0 +1,57 @@
+"""Frames as the compiled step takes them."""
+
+import numpy as np
+import pytest
+
+from jaxslam import Frame, frame_arrays, stack_frames
+from jaxslam.errors import FrameError
+
+MS = 1_000_000
+
+
+def frame(time_ms: int, size: tuple[int, int] = (6, 4), **fields) -> Frame:
+    image = np.full((*size[::-1], 3), time_ms % 256, np.uint8)
+    return Frame(time_ms * MS, image, np.full(size[::-1], 1.5, np.float32), **fields)
+
+
+class TestFrameArrays:
+    def test_colour_becomes_grey_and_nothing_is_ignored(self) -> None:
+        arrays = frame_arrays(frame(100), 0.1)
+        np.testing.assert_array_equal(arrays.image, np.full((4, 6), 100, np.uint8))
+        assert not np.any(arrays.ignore)
+        assert [array.dtype for array in arrays] == [np.uint8, np.float32, bool, np.float32, np.float32]
+        assert (float(arrays.dt_s), float(arrays.depth_delay_s)) == (pytest.approx(0.1), 0)
+
+    def test_mask_and_delay(self) -> None:
+        mask = np.eye(4, 6, dtype=bool)
+        arrays = frame_arrays(frame(100, dynamic_mask=mask, depth_timestamp_ns=92 * MS), 0.1)
+        np.testing.assert_array_equal(arrays.ignore, mask)
+        assert float(arrays.depth_delay_s) == pytest.approx(-0.008)
+
+    def test_depth_is_not_copied(self) -> None:
+        given = frame(100)
+        assert frame_arrays(given, 0.1).depth is given.depth_m
+
+    def test_double_precision(self) -> None:
+        arrays = frame_arrays(frame(100), 0.1, np.float64)
+        assert {array.dtype for array in arrays} == {np.dtype("uint8"), np.dtype("bool"), np.dtype("float64")}
+
+
+class TestStackFrames:
+    def test_time_is_the_first_axis(self) -> None:
+        clip = stack_frames([frame(100), frame(130), frame(190)])
+        assert clip.image.shape == clip.depth.shape == clip.ignore.shape == (3, 4, 6)
+        np.testing.assert_allclose(clip.dt_s, [0.03, 0.03, 0.06], rtol=1e-6)
+        np.testing.assert_array_equal(clip.image[:, 0, 0], [100, 130, 190])
+
+    def test_goes_on_after_a_clip(self) -> None:
+        clip = stack_frames([frame(100), frame(130)], previous_ns=60 * MS)
+        np.testing.assert_allclose(clip.dt_s, [0.04, 0.03], rtol=1e-6)
+
+    @pytest.mark.parametrize(
+        ("frames", "message"),
+        [([], "at least one"), ([frame(1), frame(2, (8, 4))], r"one size, got \[\(6, 4\), \(8, 4\)\]")],
+    )
+    def test_bad_frames_are_refused(self, frames: list[Frame], message: str) -> None:
+        with pytest.raises(FrameError, match=message):
+            stack_frames(frames)
