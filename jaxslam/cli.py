@@ -221,6 +221,8 @@ def _print_summary(summary: dict[str, Any], evaluation: "Evaluation | None", out
     _console.print(table)
     if evaluation is None:
         _console.print(f"Not evaluated: {summary['evaluation_problem']}.")
+    for note in evaluation.notes if evaluation is not None else ():
+        _console.print(f"Note: {note}.")
     _console.print(f"Results in {out}: trajectory.txt, trajectory_online.txt, summary.json, config.yaml, plot.png")
 
 

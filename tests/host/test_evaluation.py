@@ -313,6 +313,33 @@ class TestHardCases:
             evaluate(estimate, reference, **setting)
 
 
+class TestOtherBody:
+    """Ground truth of a marker on the camera, as Bonn RGB-D Dynamic has it."""
+
+    def test_is_noted(self):
+        estimate, _ = make_pair(noise=0.001, scale=1.0)
+        mounted = Rotation.from_rotvec([2.0, -1.0, 0.5])
+        turned = Rotation.from_quat(estimate.T_world_cam[:, :4], scalar_first=True) * mounted
+        poses = np.hstack([turned.as_quat(scalar_first=True), estimate.positions])
+        result = evaluate(estimate, Trajectory(estimate.timestamps_ns, poses))
+        assert result.rpe_rot_deg_per_s > 3
+        assert any("another body" in note for note in result.notes)
+        assert "another body" in str(result)
+
+    @pytest.mark.parametrize("noise", [0.001, 0.3])
+    def test_is_not_suspected_without_reason(self, noise):
+        estimate, reference = make_pair(noise=noise, scale=1.0)
+        assert evaluate(estimate, reference).notes == ()
+
+    def test_bonn(self, data_dir):
+        reference = read(data_dir / "bonn" / "rgbd_bonn_crowd" / "groundtruth.txt")
+        turned = Rotation.from_quat(reference.T_world_cam[:, :4], scalar_first=True)
+        back = turned * Rotation.from_rotvec([-0.46, 2.889, -1.453]).inv()  # to the camera, from a run of the tracker
+        poses = np.hstack([back.as_quat(scalar_first=True), reference.positions])
+        result = evaluate(Trajectory(reference.timestamps_ns, poses), reference)
+        assert any("another body" in note for note in result.notes)
+
+
 class TestReport:
     def test_names_what_was_done(self):
         result = evaluate(*make_pair(), align="sim3", max_gap_s=0.01)
