@@ -3,7 +3,6 @@
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from decimal import Context, Decimal, InvalidOperation
 from pathlib import Path
 from typing import TypeAlias
 
@@ -12,18 +11,16 @@ import numpy as np
 from jaxslam.errors import TrajectoryError
 from jaxslam.files import write_atomically
 from jaxslam.rotation import matrices, quaternions, slerp
+from jaxslam.timestamp import decimal_seconds, nanoseconds
 
 PathLike: TypeAlias = str | os.PathLike[str]
 
 _Rows: TypeAlias = Sequence[tuple[int, list[str]]]
 """The line number and the words of every line that counts."""
 
-_LAST_STAMP_S = 9_200_000_000  # int64 nanoseconds end in the year 2262
-_UNITS = ((10**11, "milliseconds"), (10**14, "microseconds"), (10**17, "nanoseconds"))
 _KITTI_RATE_HZ = 10.0
 _LONGEST_YEARS = 30
 _NOT_FINITE = "holds a number that is not finite"
-_EXACT = Context(prec=60)
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +172,7 @@ def write_tum(path: PathLike, trajectory: Trajectory) -> None:
     """
     poses = trajectory.T_world_cam[:, [4, 5, 6, 1, 2, 3, 0]]
     lines = (
-        f"{_seconds(stamp)} {_numbers(pose)}\n"
+        f"{decimal_seconds(stamp)} {_numbers(pose)}\n"
         for stamp, pose in zip(trajectory.timestamps_ns.tolist(), poses.tolist(), strict=True)
     )
     write_atomically(path, "".join(lines).encode(), TrajectoryError)
@@ -303,35 +300,17 @@ def _table(path: PathLike, rows: _Rows, columns: int, meaning: str) -> np.ndarra
 
 def _stamps(path: PathLike, rows: _Rows) -> np.ndarray:
     """`(n,)` int64 nanoseconds of the first words."""
-    stamps = np.array([_nanoseconds(path, number, words[0]) for number, words in rows])
+    stamps = np.array([nanoseconds(words[0], f"{path}:{number}", TrajectoryError) for number, words in rows])
     years = np.ptp(stamps / 1e9) / 31_557_600
     if years > _LONGEST_YEARS:
         raise TrajectoryError(f"{path}: the timestamps span {years:.0f} years; are they all in seconds?")
     return stamps
 
 
-def _nanoseconds(path: PathLike, number: int, word: str) -> int:
-    """Exact nanoseconds of decimal seconds, rounded to even below one nanosecond."""
-    try:
-        seconds = Decimal(word)
-    except InvalidOperation:  # an exponent that fits a float, as zero, but not a decimal
-        raise TrajectoryError(f"{path}:{number}: the timestamp '{word}' is not a number") from None
-    if abs(seconds) > _LAST_STAMP_S:
-        units = [f", but {name}" for bound, name in _UNITS if abs(seconds) > bound]
-        guess = units[-1] if units else ""
-        raise TrajectoryError(f"{path}:{number}: the timestamp {word} cannot be seconds{guess}")
-    return int(seconds.scaleb(9, _EXACT).to_integral_value(context=_EXACT))
-
-
 def _checked(path: PathLike, rows: _Rows, stamps: np.ndarray, poses: np.ndarray) -> Trajectory:
     if problem := _first_problem(stamps, poses):
         raise TrajectoryError(f"{path}:{rows[problem[0]][0]}: {problem[1]}")
     return Trajectory(stamps, poses)
-
-
-def _seconds(stamp_ns: int) -> str:
-    whole, rest = divmod(abs(stamp_ns), 10**9)
-    return f"{'-' if stamp_ns < 0 else ''}{whole}.{rest:09d}"
 
 
 def _numbers(values: Sequence[float]) -> str:

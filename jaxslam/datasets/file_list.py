@@ -1,14 +1,13 @@
 """Lists of images with their times, such as `rgb.txt`: one `timestamp file` a line, seconds, `#` comments."""
 
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
 
 from jaxslam.errors import DatasetError
+from jaxslam.timestamp import nanoseconds
 
-_MOST_SECONDS = 10**10  # the year 2286; a larger number counts milli-, micro- or nanoseconds
 _LONGEST_PAUSE_STEPS = 10**6  # nine hours at 30 frames a second; a longer one is a change of unit
 
 
@@ -43,7 +42,7 @@ def read_file_list(path: Path) -> FileList:
         fields = line.replace(",", " ").split()
         if len(fields) != 2:
             raise DatasetError(f"{path}:{number}: expected `timestamp file`, got '{line.strip()}'")
-        timestamps.append(_nanoseconds(fields[0], f"{path}:{number}"))
+        timestamps.append(nanoseconds(fields[0], f"{path}:{number}", DatasetError, least_s=0))
         files.append(path.parent / fields[1])
         lines.append(number)
     if not files:
@@ -60,17 +59,6 @@ def _read_lines(path: Path) -> list[str]:
         raise DatasetError(f"{path}: cannot be read: {problem.strerror}") from None
     except UnicodeDecodeError:
         raise DatasetError(f"{path}: expected text in UTF-8, got something else") from None
-
-
-def _nanoseconds(text: str, place: str) -> int:
-    """Exact: a float would lose the last digits of epoch seconds."""
-    try:
-        seconds = Decimal(text)
-    except InvalidOperation:
-        raise DatasetError(f"{place}: expected a timestamp in seconds, got '{text}'") from None
-    if not seconds.is_finite() or not 0 <= seconds < _MOST_SECONDS:
-        raise DatasetError(f"{place}: expected a timestamp in seconds, got '{text}' (another unit?)")
-    return int((seconds * 10**9).to_integral_value())
 
 
 def _check_order(path: Path, stamps: np.ndarray, lines: list[int]) -> None:

@@ -1,13 +1,28 @@
-"""The rigid motion between two triangles, in closed form, for many pairs at once."""
+"""The rigid motion between two triangles, in closed form, for many pairs at once.
+
+Three points span a plane. The best rotation brings the two planes together and then turns within the plane by the
+angle that maximises the correlation of the centred corners: no eigenvalue problem, no iteration, and exact for
+congruent triangles. Of the two ways in which planes coincide it is always the one with normal on normal, as both
+normals see the corners in the same order.
+
+Source: Horn, "Closed-form solution of absolute orientation using unit quaternions", 1987, section 5 (coplanar points).
+"""
+
+from typing import TypeAlias
 
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-Triangles = Float[Array, "3 3 *h"]
+Triangles: TypeAlias = Float[Array, "3 3 *h"]
 """Coordinate, corner, and any number of further axes: one triangle an entry, metres."""
 
-_Vector = list[Array]
+_MIN_SINE = 1e-4
+"""Of the angle at the first corner; below it the corners count as on a line."""
+
+_Vector: TypeAlias = list[Array]
+"""Three coordinates apart, each `(*h,)`."""
+_Axes: TypeAlias = tuple[_Vector, _Vector, _Vector]
 
 
 def absolute_orientation(
@@ -15,34 +30,24 @@ def absolute_orientation(
 ) -> tuple[Float[Array, "3 3 *h"], Float[Array, " 3 *h"], Bool[Array, " *h"]]:
     """The least-squares rotation R and translation t with `target = R source + t`, three points each.
 
-    Three points span a plane. The best rotation brings the two planes together, normal on normal, and then turns
-    within the plane by the angle that maximises the correlation of the centred corners: no eigenvalue problem, no
-    iteration, and exact for congruent triangles.
-
-    Source: Horn, "Closed-form solution of absolute orientation using unit quaternions", 1987, section 5 (coplanar
-    points).
+    Differentiable; where there is no plane the gradient is zero.
 
     Args:
-        source: Corners before the motion.
-        target: The same corners after it.
+        source: `(3, 3, *h)` corners (coordinate, corner, ...) before the motion, metres.
+        target: `(3, 3, *h)` the same corners after it.
 
     Returns:
-        R as rows and columns first, t, and whether both triangles span a plane. Where they do not (corners on a line,
-        in one place, or not finite) the motion is the identity.
+        R `(3, 3, *h)` (row, column, ...), t `(3, *h)` metres, and `(*h,)` whether both triangles span a plane. Where
+        they do not (corners on a line, in one place, or not finite) the motion is the identity.
     """
     valid = _spans_plane(source) & _spans_plane(target)
     unit_triangle = jnp.eye(3, dtype=source.dtype).reshape(3, 3, *(1,) * (source.ndim - 2))
-    source, target = jnp.where(valid, source, unit_triangle), jnp.where(valid, target, unit_triangle)
+    source, target = (jnp.where(valid[None, None], corners, unit_triangle) for corners in (source, target))
     source_centre, target_centre = source.mean(axis=1), target.mean(axis=1)
     source_axes, target_axes = _plane_axes(source), _plane_axes(target)
-    cosine, sine = jnp.zeros_like(source[0, 0]), jnp.zeros_like(source[0, 0])
-    for corner in range(3):
-        px, py = (_dot(axis, source[:, corner] - source_centre) for axis in source_axes[:2])
-        qx, qy = (_dot(axis, target[:, corner] - target_centre) for axis in target_axes[:2])
-        cosine = cosine + px * qx + py * qy
-        sine = sine + px * qy - py * qx
-    norm = lax.rsqrt(cosine * cosine + sine * sine + jnp.finfo(source.dtype).tiny)
-    cosine, sine = cosine * norm, sine * norm
+    cosine, sine = _turn_in_plane(
+        _in_plane(source, source_centre, source_axes), _in_plane(target, target_centre, target_axes)
+    )
     first, second, normal = target_axes
     turned = [
         [cosine * a + sine * b for a, b in zip(first, second, strict=True)],
@@ -57,19 +62,43 @@ def absolute_orientation(
     return jnp.stack([jnp.stack(row) for row in R]), jnp.stack(t), valid
 
 
+def _turn_in_plane(source: list[tuple[Array, Array]], target: list[tuple[Array, Array]]) -> tuple[Array, Array]:
+    """Cosine and sine of the angle that maximises `Σ qᵀ R(angle) p` over corners p and q in the plane.
+
+    The sum is never zero there, as both triangles go round the same way; `tiny` is for the rounded one.
+    """
+    cosine, sine = jnp.zeros_like(source[0][0]), jnp.zeros_like(source[0][0])
+    for (px, py), (qx, qy) in zip(source, target, strict=True):
+        cosine = cosine + px * qx + py * qy
+        sine = sine + px * qy - py * qx
+    inverse = lax.rsqrt(cosine * cosine + sine * sine + jnp.finfo(cosine.dtype).tiny)
+    return cosine * inverse, sine * inverse
+
+
 def _spans_plane(triangle: Array) -> Array:
-    """Whether the corners are finite and the sine of the angle at the first one is above 1e-4."""
-    triangle = lax.stop_gradient(triangle)
-    edge, other = triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0]
+    """Whether the corners are finite and not on a line; false for NaN, as no comparison with it is true."""
+    edge, other = _edges(triangle)
     normal = _cross(edge, other)
-    return _dot(normal, normal) > 1e-8 * _dot(edge, edge) * _dot(other, other)  # false for NaN
+    return _dot(normal, normal) > _MIN_SINE**2 * _dot(edge, edge) * _dot(other, other)
 
 
-def _plane_axes(triangle: Array) -> list[_Vector]:
-    """Two orthonormal axes in the plane of the triangle, and its normal."""
+def _plane_axes(triangle: Array) -> _Axes:
+    """Two orthonormal axes in the plane of the triangle, and its normal, about which the corners turn left."""
+    edge, other = _edges(triangle)
+    first, normal = _unit(edge), _unit(_cross(edge, other))
+    return first, _cross(normal, first), normal
+
+
+def _in_plane(triangle: Array, centre: Array, axes: _Axes) -> list[tuple[Array, Array]]:
+    """Each corner relative to the centre along the two axes in the plane."""
+    corners = [triangle[:, corner] - centre for corner in range(3)]
+    return [(_dot(axes[0], corner), _dot(axes[1], corner)) for corner in corners]
+
+
+def _edges(triangle: Array) -> tuple[_Vector, _Vector]:
+    """From the first corner to the two others."""
     edge, other = triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0]
-    first, normal = _unit([edge[0], edge[1], edge[2]]), _unit(_cross(edge, other))
-    return [first, _cross(normal, first), normal]
+    return list(edge), list(other)
 
 
 def _unit(v: _Vector) -> _Vector:
@@ -81,5 +110,5 @@ def _dot(u: Array | _Vector, v: Array | _Vector) -> Array:
     return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
 
 
-def _cross(u: Array | _Vector, v: Array | _Vector) -> _Vector:
+def _cross(u: _Vector, v: _Vector) -> _Vector:
     return [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]

@@ -16,6 +16,7 @@ from jax import lax
 from jaxlie import SE3, SO3
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxslam_kernels.transform import lenient_promotion
 from jaxslam_kernels.types import Code, Mask, Points, Scalar, Weights
 
 AlignmentKind: TypeAlias = Literal["none", "se3", "sim3"]
@@ -327,13 +328,14 @@ def _motion(T: SE3, first: Int[Array, " m"], second: Int[Array, " m"]) -> tuple[
     wxyz, xyz = T.wxyz_xyz[:, :4], T.wxyz_xyz[:, 4:]
     R_first = SO3(wxyz[first])
     step = xyz[second] - xyz[first]
-    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):  # jaxlie relies on both
-        return R_first.inverse() @ step, R_first.inverse() @ SO3(wxyz[second])
+    with lenient_promotion():
+        translation, rotation = R_first.inverse() @ step, R_first.inverse() @ SO3(wxyz[second])
+    return translation.astype(xyz.dtype), SO3(rotation.wxyz.astype(wxyz.dtype))
 
 
 def _between(R_a: SO3, R_b: SO3) -> SO3:
-    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        return R_a.inverse() @ R_b
+    with lenient_promotion():
+        return SO3((R_a.inverse() @ R_b).wxyz.astype(R_b.wxyz.dtype))
 
 
 def _angle(R: SO3) -> Float[Array, " m"]:

@@ -1,29 +1,51 @@
 """Perspective-three-point: how far away three known points are, from the directions they are seen in.
 
-Many triples at once, in single precision, without a branch. The law of cosines gives one quadratic form a pair of
-points in the three distances λ. Two combinations of them are homogeneous: conics, which meet in up to four λ. The
-pencil of the two conics holds a degenerate one, a pair of lines, at the root of a cubic; each line meets a conic in
-two points. Newton's method on the three forms then takes every candidate to full precision, and the candidates that
-leave a residual are discarded, so no decision hangs on the sign of a rounded discriminant.
+Many triples at once, in single precision, without a branch. With the distances λ along unit bearings y, the law of
+cosines says for each two of the points
+
+    λᵢ² + λⱼ² - 2 cᵢⱼ λᵢ λⱼ = dᵢⱼ,    cᵢⱼ = yᵢ · yⱼ,    dᵢⱼ = |Xᵢ - Xⱼ|²,
+
+in short `λᵀ Mᵢⱼ λ = dᵢⱼ`. Two combinations are homogeneous, and so conics on which the direction of λ lies:
+
+    λᵀ D₁ λ = λᵀ D₂ λ = 0,    D₁ = d₂₃ M₁₂ - d₁₂ M₂₃,    D₂ = d₂₃ M₁₃ - d₁₃ M₂₃.
+
+They meet in up to four points. The pencil `D₁ + γ D₂` holds a degenerate conic, a pair of lines, at the root of a
+cubic in γ; each line meets a conic in two points. Newton's method on the three laws of cosines then takes every
+candidate to full precision, and those that leave a residual are discarded, so no decision hangs on the sign of a
+rounded discriminant.
 
 Source: Persson and Nordberg, "Lambda Twist: An Accurate Fast Robust Perspective Three Point (P3P) Solver", ECCV
-2018, for the pencil and the cubic; Richter-Gebert, "Perspectives on Projective Geometry", 2011, section 11, for
-splitting a degenerate conic into lines.
+2018, section 3, for the pencil, the cubic and the refinement; Richter-Gebert, "Perspectives on Projective Geometry",
+2011, section 11, for splitting a degenerate conic into lines.
 """
 
 from collections.abc import Sequence
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-_Planes: TypeAlias = tuple[Array, ...]
-"""Coordinates apart: three of a vector, or the upper triangle `00 01 02 11 12 22` of a symmetric form (a conic)."""
+_Vector: TypeAlias = tuple[Array, Array, Array]
+"""Three coordinates apart: of λ, or of a line in the plane of its directions."""
+_Pairs: TypeAlias = tuple[Array, Array, Array]
+"""One number for each two of the points: 1-2, 1-3, 2-3."""
 
-_CUBIC_STEPS = 2
+
+class _Conic(NamedTuple):
+    """A symmetric 3 x 3 form, entry by entry."""
+
+    xx: Array
+    xy: Array
+    xz: Array
+    yy: Array
+    yz: Array
+    zz: Array
+
+
+_CUBIC_STEPS = 2  # after the closed form, which float32 leaves short of a few digits
 _NEWTON_STEPS = 4
-_RESIDUAL = 1e-3  # of the squared distances, relative: a root stands at rounding, a miss at a few per cent or more
+_RESIDUAL = 1e-3  # summed, of the mean squared side: a root stands at rounding, a miss at a few per cent or more
 
 
 def p3p(
@@ -32,118 +54,126 @@ def p3p(
     """Distances from the camera to three points, up to four solutions a triple.
 
     With these, `distance * bearing` are the points in the camera's frame and the pose follows from
-    `absolute_orientation`. Not meant for differentiation.
+    `absolute_orientation`. Not meant for differentiation: which solution stands in which place may jump.
 
     Args:
-        bearings: Unit vectors towards the points, (coordinate, point, triple), camera frame.
-        X_world: The points, (coordinate, point, triple), metres.
+        bearings: `(3, 3, h)` (coordinate, point, triple) unit vectors towards the points, camera frame.
+        X_world: `(3, 3, h)` (coordinate, point, triple) the points, metres; in any frame, only distances count.
 
     Returns:
-        Distances in metres, (point, solution, triple), and which solutions are real, with all points in front. The
-        same solution may come twice. All finite, whatever came in.
+        `(3, 4, h)` (point, solution, triple) distances in metres, 0 where there is no solution, and `(4, h)` which
+        solutions are real with all distances positive. The same solution may come twice. None for a triple that is
+        not finite or in one place. All finite, whatever came in.
     """
     known = jnp.isfinite(bearings).all(axis=(0, 1)) & jnp.isfinite(X_world).all(axis=(0, 1))
     bearings, X_world = (jnp.where(known[None, None, :], a, 0.0) for a in (bearings, X_world))
-    squared = _squared_sides(X_world)
-    size = (squared[0] + squared[1] + squared[2]) / 3.0
+    d12, d13, d23 = _squared_sides(X_world)
+    size = (d12 + d13 + d23) / 3.0
     spread = size > 0
-    squared = tuple(d / jnp.where(spread, size, 1.0) for d in squared)
-    versines = tuple(0.5 * s for s in _squared_sides(bearings))  # 1 - cos, without cancellation
+    unit = jnp.where(spread, size, 1.0)
+    squared = (d12 / unit, d13 / unit, d23 / unit)
+    e12, e13, e23 = _squared_sides(bearings)
+    versines = (0.5 * e12, 0.5 * e13, 0.5 * e23)  # 1 - cos, without cancellation
     lines, conic = _split_pencil(squared, versines)
-    distances = _intersect(lines, conic)
-    distances, valid = _polish(distances, squared, versines)
-    distances = jnp.stack(distances) * jnp.sqrt(size)[None, None, :]
+    candidates, valid = _polish(_intersect(lines, conic), squared, versines)
+    distances = jnp.stack(candidates) * jnp.sqrt(size)[None, None, :]
     valid = valid & (known & spread)[None, :] & jnp.isfinite(distances).all(axis=0)
     return jnp.where(valid[None, :, :], distances, 0.0), valid
 
 
-def _squared_sides(corners: Array) -> _Planes:
-    """Squared distances between corners 0-1, 0-2 and 1-2."""
+def _squared_sides(corners: Array) -> _Pairs:
+    """Squared distances between the corners (coordinate, corner, triple) of triangles."""
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    return tuple(jnp.square(u - v).sum(axis=0) for u, v in ((a, b), (a, c), (b, c)))
+    return jnp.square(a - b).sum(axis=0), jnp.square(a - c).sum(axis=0), jnp.square(b - c).sum(axis=0)
 
 
-def _split_pencil(squared: _Planes, versines: _Planes) -> tuple[_Planes, _Planes]:
-    """Two lines `(2, h)` through the common points of the conics, and the conic to cut them with."""
+def _split_pencil(squared: _Pairs, versines: _Pairs) -> tuple[_Vector, _Conic]:
+    """Two lines `(2, h)` through the common points of D₁ and D₂, and the one of these conics to cut them with."""
     d12, d13, d23 = squared
     c12, c13, c23 = (1.0 - e for e in versines)
     zero = jnp.zeros_like(d12)
-    first = (d23, -d23 * c12, zero, d23 - d12, d12 * c23, -d12)
-    second = (d23, zero, -d23 * c13, -d13, d13 * c23, d23 - d13)
+    first = _Conic(d23, -d23 * c12, zero, d23 - d12, d12 * c23, -d12)
+    second = _Conic(d23, zero, -d23 * c13, -d13, d13 * c23, d23 - d13)
     first_adjugate, second_adjugate = _adjugate(first), _adjugate(second)
+    # det(D₁ + γ D₂) = k0 + k1 γ + k2 γ² + k3 γ³
     k0 = _inner(first, first_adjugate) / 3.0
     k1 = _inner(second, first_adjugate)
     k2 = _inner(first, second_adjugate)
     k3 = _inner(second, second_adjugate) / 3.0
-    swap = jnp.abs(k3) < jnp.abs(k0)  # the pencil's parameter counts from the conic that is further from degenerate
+    # γ multiplies the conic that is further from degenerate, so that the leading coefficient is the larger one.
+    swap = jnp.abs(k3) < jnp.abs(k0)
     root = _steepest_root(*(jnp.where(swap, a, b) for a, b in ((k0, k3), (k1, k2), (k2, k1), (k3, k0))))
     of_first, of_second = jnp.where(swap, root, 1.0), jnp.where(swap, 1.0, root)
-    degenerate = _combine(of_first, first, of_second, second)
+    degenerate = _Conic(*(of_first * a + of_second * b for a, b in zip(first, second, strict=True)))
     near_second = jnp.abs(of_first) < jnp.abs(of_second)
-    other = tuple(jnp.where(near_second, a, b) for a, b in zip(first, second, strict=True))
+    other = _Conic(*(jnp.where(near_second, a, b) for a, b in zip(first, second, strict=True)))
     return _split(degenerate), other
 
 
-def _split(conic: _Planes) -> _Planes:
-    """The two lines of a degenerate conic, stacked: `C + [p]ₓ = l mᵀ` with p where the lines meet."""
-    adjugate = _adjugate(conic)
-    columns = [tuple(-adjugate[i] for i in column) for column in ((0, 1, 2), (1, 3, 4), (2, 4, 5))]
-    diagonal = (columns[0][0], columns[1][1], columns[2][2])
-    (*column, weight) = _where_largest(diagonal, [(*c, w) for c, w in zip(columns, diagonal, strict=True)])
-    scale = lax.rsqrt(jnp.maximum(weight, jnp.finfo(weight.dtype).tiny))
-    p0, p1, p2 = (-c * scale for c in column)
-    a00, a01, a02, a11, a12, a22 = conic
-    rows = ((a00, a01 - p2, a02 + p1), (a01 + p2, a11, a12 - p0), (a02 - p1, a12 + p0, a22))
-    row, column = (
-        _where_largest([v[0] ** 2 + v[1] ** 2 + v[2] ** 2 for v in vectors], vectors)
-        for vectors in (rows, list(zip(*rows, strict=True)))
-    )
-    return tuple(jnp.stack(pair) for pair in zip(row, column, strict=True))
+def _split(conic: _Conic) -> _Vector:
+    """The two lines of a degenerate conic, stacked: `C + [p]ₓ = l mᵀ` with p where they meet, `p pᵀ = -adj(C)`.
+
+    Every column of the adjugate is p up to scale, and every row and column of `l mᵀ` is one of the lines: the largest
+    are taken.
+    """
+    xx, xy, xz, yy, yz, zz = _adjugate(conic)
+    squares = (-xx, -yy, -zz)
+    *p, square = _where_largest(squares, [(xx, xy, xz, squares[0]), (xy, yy, yz, squares[1]), (xz, yz, zz, squares[2])])
+    scale = lax.rsqrt(jnp.maximum(square, jnp.finfo(square.dtype).tiny))
+    px, py, pz = (x * scale for x in p)
+    xx, xy, xz, yy, yz, zz = conic
+    rows = ((xx, xy - pz, xz + py), (xy + pz, yy, yz - px), (xz - py, yz + px, zz))
+    columns = tuple(zip(*rows, strict=True))
+    line, other = (_where_largest([x**2 + y**2 + z**2 for x, y, z in lines], lines) for lines in (rows, columns))
+    x, y, z = (jnp.stack(pair) for pair in zip(line, other, strict=True))
+    return x, y, z
 
 
-def _intersect(lines: _Planes, conic: _Planes) -> _Planes:
-    """Where each of the two lines meets the conic: `(4, h)` points, up to scale.
+def _intersect(lines: _Vector, conic: _Conic) -> _Vector:
+    """Where each of the two lines `(2, h)` meets the conic: `(4, h)` points, up to scale.
 
     The coordinate with the largest factor in the line is eliminated, `c = α a + β b`, and with a = 1 (distances are
     never 0) a quadratic in b remains. A negative discriminant counts as zero: `_polish` rejects what is not a root.
     """
     sizes = [jnp.abs(x) for x in lines]
-    c00, c01, c02, c11, c12, c22 = (x[None, :] for x in conic)
-    l0, l1, l2 = lines
-    la, lb, lc = _where_largest(sizes, [(l1, l2, l0), (l0, l2, l1), (l0, l1, l2)])
+    xx, xy, xz, yy, yz, zz = (x[None, :] for x in conic)
+    lx, ly, lz = lines
+    la, lb, lc = _where_largest(sizes, [(ly, lz, lx), (lx, lz, ly), (lx, ly, lz)])
     aa, bb, cc, ab, ac, bc = _where_largest(
-        sizes,
-        [(c11, c22, c00, c12, c01, c02), (c00, c22, c11, c02, c01, c12), (c00, c11, c22, c01, c02, c12)],
+        sizes, [(yy, zz, xx, yz, xy, xz), (xx, zz, yy, xz, xy, yz), (xx, yy, zz, xy, xz, yz)]
     )
     alpha, beta = -la / _nonzero(lc), -lb / _nonzero(lc)
     quadratic = bb + 2.0 * bc * beta + cc * beta * beta
     half_linear = ab + ac * beta + bc * alpha + cc * alpha * beta
     constant = aa + 2.0 * ac * alpha + cc * alpha * alpha
     root = jnp.sqrt(jnp.maximum(half_linear * half_linear - quadratic * constant, 0.0))
-    stable = -(half_linear + jnp.where(half_linear < 0, -root, root))
+    stable = -(half_linear + jnp.where(half_linear < 0, -root, root))  # a sum of equal signs: nothing cancels
     b = jnp.concatenate([stable / _nonzero(quadratic), constant / _nonzero(stable)])
     alpha, beta, *sizes = (jnp.concatenate([x, x]) for x in (alpha, beta, *sizes))
     a, c = jnp.ones_like(b), alpha + beta * b
-    return _where_largest(sizes, [(c, a, b), (a, c, b), (a, b, c)])
+    x, y, z = _where_largest(sizes, [(c, a, b), (a, c, b), (a, b, c)])
+    return x, y, z
 
 
-def _polish(distances: _Planes, squared: _Planes, versines: _Planes) -> tuple[_Planes, Array]:
-    """Newton's method on the three laws of cosines from a direction `(4, h)`; which ends are roots."""
+def _polish(directions: _Vector, squared: _Pairs, versines: _Pairs) -> tuple[_Vector, Bool[Array, "4 h"]]:
+    """Newton's method on the laws of cosines from directions `(4, h)` of λ: where it ends, and whether at a root."""
     d12, d13, d23 = (d[None, :] for d in squared)
     e12, e13, e23 = (e[None, :] for e in versines)
 
-    def sides(x: Array, y: Array, z: Array) -> _Planes:
+    def sides(x: Array, y: Array, z: Array) -> _Pairs:
+        """Squared sides of the triangle so far away: `x² + y² - 2 c x y = (x - y)² + 2 (1 - c) x y`."""
         return (
             jnp.square(x - y) + 2.0 * e12 * x * y,
             jnp.square(x - z) + 2.0 * e13 * x * z,
             jnp.square(y - z) + 2.0 * e23 * y * z,
         )
 
-    def step(_: Array, xyz: _Planes) -> _Planes:
+    def step(_: Array, xyz: _Vector) -> _Vector:
         x, y, z = xyz
         s12, s13, s23 = sides(x, y, z)
         f12, f13, f23 = 0.5 * (s12 - d12), 0.5 * (s13 - d13), 0.5 * (s23 - d23)
-        a, b = x - y + e12 * y, y - x + e12 * x  # the Jacobian: [a b 0], [c 0 d], [0 e g]
+        # The Jacobian has the rows [a b 0], [c 0 d], [0 e g]; its inverse is written out.
+        a, b = x - y + e12 * y, y - x + e12 * x
         c, d = x - z + e13 * z, z - x + e13 * x
         e, g = y - z + e23 * z, z - y + e23 * y
         inverse = -1.0 / _nonzero(a * d * e + b * c * g)
@@ -153,11 +183,11 @@ def _polish(distances: _Planes, squared: _Planes, versines: _Planes) -> tuple[_P
             z + (a * e * f13 - c * e * f12 + b * c * f23) * inverse,
         )
 
-    s12, s13, s23 = sides(*distances)
+    x, y, z = directions
+    s12, s13, s23 = sides(x, y, z)
     total = s12 + s13 + s23
     scale = jnp.sqrt((d12 + d13 + d23) / jnp.maximum(total, jnp.finfo(total.dtype).tiny))
-    start = tuple(scale * x for x in distances)
-    x, y, z = lax.fori_loop(0, _NEWTON_STEPS, step, start)
+    x, y, z = lax.fori_loop(0, _NEWTON_STEPS, step, (scale * x, scale * y, scale * z))
     s12, s13, s23 = sides(x, y, z)
     error = jnp.abs(s12 - d12) + jnp.abs(s13 - d13) + jnp.abs(s23 - d23)
     return (x, y, z), (error < _RESIDUAL) & (jnp.minimum(jnp.minimum(x, y), z) > 0)
@@ -174,6 +204,7 @@ def _steepest_root(k3: Array, k2: Array, k1: Array, k0: Array) -> Array:
     third = b / 3.0
     p, q = c - b * third, 2.0 * third * third * third - third * c + d  # x = t - b/3, t³ + p t + q = 0
     tiny = jnp.finfo(b.dtype).tiny
+    # Three roots: the trigonometric form. One: Cardano's, its cube root being the one in which nothing cancels.
     radius = jnp.sqrt(jnp.abs(p) / 3.0)
     ratio = jnp.abs(q) / jnp.maximum(2.0 * radius * radius * radius, tiny)
     three_roots = (p < 0) & (ratio <= 1.0)
@@ -190,28 +221,24 @@ def _steepest_root(k3: Array, k2: Array, k1: Array, k0: Array) -> Array:
     return lax.fori_loop(0, _CUBIC_STEPS, newton, root)
 
 
-def _adjugate(conic: _Planes) -> _Planes:
-    a00, a01, a02, a11, a12, a22 = conic
-    return (
-        a11 * a22 - a12 * a12,
-        a02 * a12 - a01 * a22,
-        a01 * a12 - a02 * a11,
-        a00 * a22 - a02 * a02,
-        a01 * a02 - a00 * a12,
-        a00 * a11 - a01 * a01,
+def _adjugate(conic: _Conic) -> _Conic:
+    xx, xy, xz, yy, yz, zz = conic
+    return _Conic(
+        xx=yy * zz - yz * yz,
+        xy=xz * yz - xy * zz,
+        xz=xy * yz - xz * yy,
+        yy=xx * zz - xz * xz,
+        yz=xy * xz - xx * yz,
+        zz=xx * yy - xy * xy,
     )
 
 
-def _inner(a: _Planes, b: _Planes) -> Array:
+def _inner(a: _Conic, b: _Conic) -> Array:
     """The trace of the product of two symmetric matrices."""
-    return a[0] * b[0] + a[3] * b[3] + a[5] * b[5] + 2.0 * (a[1] * b[1] + a[2] * b[2] + a[4] * b[4])
+    return a.xx * b.xx + a.yy * b.yy + a.zz * b.zz + 2.0 * (a.xy * b.xy + a.xz * b.xz + a.yz * b.yz)
 
 
-def _combine(alpha: Array, a: _Planes, beta: Array, b: _Planes) -> _Planes:
-    return tuple(alpha * x + beta * y for x, y in zip(a, b, strict=True))
-
-
-def _where_largest(sizes: Sequence[Array], choices: Sequence[_Planes]) -> _Planes:
+def _where_largest(sizes: Sequence[Array], choices: Sequence[Sequence[Array]]) -> tuple[Array, ...]:
     """Of three choices, each a sequence of arrays, the one whose size is the largest, entry by entry."""
     first = (sizes[0] >= sizes[1]) & (sizes[0] >= sizes[2])
     second = sizes[1] >= sizes[2]
@@ -219,4 +246,5 @@ def _where_largest(sizes: Sequence[Array], choices: Sequence[_Planes]) -> _Plane
 
 
 def _nonzero(x: Array) -> Array:
+    """A divisor: itself, or 1 where it is too small to divide by."""
     return jnp.where(jnp.abs(x) > jnp.finfo(x.dtype).tiny, x, 1.0)

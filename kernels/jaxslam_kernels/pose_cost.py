@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 from jaxslam_kernels.camera import MIN_DEPTH, Intrinsics, normalise
 from jaxslam_kernels.levenberg_marquardt import NormalEquations
 from jaxslam_kernels.robust import Loss, loss_value, loss_weight
+from jaxslam_kernels.transform import to_camera
 from jaxslam_kernels.types import Flag, Mask, Pixels, Points, Scalar, Weights
 
 UNKNOWN_CHI2 = 1e4
@@ -159,8 +160,7 @@ def _linearise(T_world_cam: SE3, problem: PoseProblem) -> tuple[list[Array], lis
 
     With X' = X - v - ω × X in the camera's frame, a residual of gradient a along X has the row (-a, a × X).
     """
-    R, t = T_world_cam.rotation().as_matrix(), T_world_cam.translation()
-    X, Y, Z = R.T @ (problem.X_world - t[:, None])
+    X, Y, Z = to_camera(T_world_cam, problem.X_world)
     front = Z > MIN_DEPTH
     inverse_z = 1.0 / jnp.where(front, Z, 1.0)
     x, y = X * inverse_z, Y * inverse_z

@@ -32,7 +32,7 @@ def test_step_is_not_slower_than_opencv_flow(data_dir, capsys):
     result = compare(
         lambda: step(state, arrays, params, plan),
         lambda: cv2.calcOpticalFlowPyrLK(
-            previous, current, corners, None, winSize=(21, 21), maxLevel=3, criteria=criteria
+            previous, current, corners, corners.copy(), winSize=(21, 21), maxLevel=3, criteria=criteria
         ),
     )
     with capsys.disabled():

@@ -109,6 +109,11 @@ class TestRepeatability:
         backward = [fields_of(again.render(index)) for index in (20, 1, 0)][::-1]
         assert forward == backward
 
+    def test_same_bytes_where_float64_is_enabled(self, small):
+        with jax.enable_x64(True):
+            frame = SyntheticDataset(SMALL).render(1)
+        assert fields_of(frame) == fields_of(small.render(1))
+
     def test_frame_does_not_depend_on_their_number(self, small):
         longer = SyntheticDataset(dataclasses.replace(SMALL, frames=400))
         assert fields_of(longer.render(7)) == fields_of(small.render(7))

@@ -366,6 +366,11 @@ class TestRpe:
         assert errors.translations.dtype == errors.rotations.dtype == errors.rotation.rmse.dtype == np.float32
         assert errors.num_pairs == N - 2
 
+    def test_type_follows_the_input_where_float64_is_enabled(self, x64):
+        P, Q = (_poses(seed).astype(np.float32) for seed in (0, 1))
+        errors = jax.eval_shape(_rpe, P, Q, *_PAIRS)
+        assert errors.translations.dtype == errors.rotations.dtype == errors.rotation.rmse.dtype == np.float32
+
     def test_matches_reference(self, x64):
         P, Q, mask = _poses(0), _poses(1), np.arange(N - 2) % 3 > 0
         errors = _rpe(P, Q, _FIRST, _SECOND, mask)

@@ -10,7 +10,7 @@ from jaxslam_kernels.transform import between, displacement, moved, to_camera, t
 from scipy.linalg import expm
 
 
-def random_pose(seed, dtype=np.float64):
+def random_pose(seed, dtype: type = np.float64):
     values = np.random.default_rng(seed).normal(size=7)
     values[:4] /= np.linalg.norm(values[:4])
     return SE3(jnp.asarray(values, dtype))

@@ -9,9 +9,10 @@ from typing import Protocol
 
 import numpy as np
 
-from jaxslam.datasets.synthetic import rigid
+from jaxslam.datasets.synthetic.rigid import transform
 from jaxslam.datasets.synthetic.solids import Solid, box, capsule, pill
 from jaxslam.datasets.synthetic.texture import Material
+from jaxslam.rotation import axis_rotation, matrices
 
 
 class Actor(Protocol):
@@ -110,7 +111,7 @@ class Person:
         """Poses of the point on the floor under the hips, x forward: `(t, 7)`, wxyz_xyz."""
         position, heading, _ = _walk(self._lane, self._start, time_s)
         floor = np.zeros((len(position), 1))
-        return np.concatenate([rigid.axis_rotation(2, heading), position, floor], axis=1)
+        return np.concatenate([axis_rotation(2, heading), position, floor], axis=1)
 
     def parts(self, time_s: np.ndarray) -> np.ndarray:
         """Placements of the body's solids in its frame: `(t, 15, 4, 4)`."""
@@ -202,12 +203,12 @@ def _below(angle: np.ndarray, length: float) -> np.ndarray:
 
 
 def _bone(first: np.ndarray, second: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    rotation = rigid.rotation_matrix(rigid.axis_rotation(1, angle))
-    return rigid.transform(rotation, 0.5 * (first + second))
+    rotation = matrices(axis_rotation(1, angle))
+    return transform(rotation, 0.5 * (first + second))
 
 
 def _still(time_s: np.ndarray, place: tuple[float, float, float]) -> np.ndarray:
-    return np.broadcast_to(rigid.transform(np.eye(3), np.array(place)), (len(time_s), 4, 4))
+    return np.broadcast_to(transform(np.eye(3), np.array(place)), (len(time_s), 4, 4))
 
 
 class CarriedBox:
@@ -234,7 +235,7 @@ class CarriedBox:
         position, _, _ = _walk(self._lane, self._start, time_s)
         height = 1.1 + 0.18 * np.sin(0.7 * time_s + 2.0 * self._start)
         turn = 0.5 * np.sin(0.45 * time_s + self._start)
-        return np.concatenate([rigid.axis_rotation(2, turn), position, height[:, None]], axis=1)
+        return np.concatenate([axis_rotation(2, turn), position, height[:, None]], axis=1)
 
     def parts(self, time_s: np.ndarray) -> np.ndarray:
         """The box lies along the axes of its frame: `(t, 1, 4, 4)` identities."""

@@ -9,8 +9,8 @@ from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 
-from jaxslam.datasets.synthetic import rigid
 from jaxslam.errors import ConfigError, nearest
+from jaxslam.rotation import axis_rotation, multiply
 
 CameraPathKind: TypeAlias = Literal["xyz", "rpy", "halfsphere", "static", "loop"]
 """`xyz` moves along the axes, `rpy` turns in place, `halfsphere` sweeps half a sphere of one metre diameter,
@@ -111,6 +111,6 @@ def _looking_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 def _poses(position: np.ndarray, angles: np.ndarray) -> np.ndarray:
     yaw, pitch, roll = angles.T
-    body = rigid.multiply(rigid.axis_rotation(2, yaw), rigid.axis_rotation(1, pitch))
-    rotation = rigid.multiply(rigid.multiply(body, rigid.axis_rotation(0, roll)), _BODY_FROM_CAMERA)
+    body = multiply(axis_rotation(2, yaw), axis_rotation(1, pitch))
+    rotation = multiply(multiply(body, axis_rotation(0, roll)), _BODY_FROM_CAMERA)
     return np.concatenate([rotation, position], axis=1)

@@ -131,7 +131,7 @@ def render(scene: Scene, view: View, *, height: int, width: int) -> Rendering:
     n_boxes = scene.box_size.shape[0]
     rows, columns = -(-height // TILE_HEIGHT), -(-width // TILE_WIDTH)
     size = jnp.concatenate([scene.box_size, scene.capsule_size])
-    stem = jnp.concatenate([jnp.zeros(n_boxes), scene.capsule_stem])
+    stem = jnp.concatenate([jnp.zeros(n_boxes, scene.capsule_stem.dtype), scene.capsule_stem])
     shapes = Shapes(view.solid_from_cam / size[:, :, None], stem)
     reaches = solids_in_tiles(_corners(view, size, stem), view.intrinsics, rows, columns) & scene.used[None]
     boxes, capsules = compact(reaches[:, 1:n_boxes], 1), compact(reaches[:, n_boxes:], n_boxes)

@@ -118,13 +118,15 @@ def measure(
     Returns:
         Red, green and blue of eight bits, and depth in metres, 0 where missing.
     """
+    # All in the depth's type: a recording is the same bytes where float64 is enabled.
+    fx, gain, params = jax.tree.map(lambda number: jnp.asarray(number, depth_m.dtype), (fx, gain, params))
     colour_key, depth_key = jax.random.split(key)
     mean = sum(map(unpack_colour, exposures[1:]), start=unpack_colour(exposures[0])) / len(exposures)
-    noise = params.image_noise * jax.random.normal(colour_key, mean.shape)
+    noise = params.image_noise * jax.random.normal(colour_key, mean.shape, mean.dtype)
     rgb = jnp.clip(jnp.round(255.0 * gain * mean + noise), 0.0, 255.0).astype(jnp.uint8)
     kept = _inside_limits(depth_m, incidence, params) & _lit(depth_m, fx, params.shadow_baseline_m)
     kept = kept & ~_on_edge(depth_m, params.edge_jump)
-    measured = _noisy_depth(depth_m, jax.random.normal(depth_key, depth_m.shape), params)
+    measured = _noisy_depth(depth_m, jax.random.normal(depth_key, depth_m.shape, depth_m.dtype), params)
     return rgb, jnp.where(kept, measured, 0.0)
 
 

@@ -4,8 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxslam.datasets.synthetic import rigid
+from jaxslam.datasets.synthetic.rigid import transform
 from jaxslam.datasets.synthetic.texture import Material, surface_row
+from jaxslam.rotation import axis_rotation, matrices
 
 
 class Solid(NamedTuple):
@@ -46,8 +47,8 @@ def pill(radii_m: tuple[float, float, float], length_m: float, look: Material, r
 
 def upright(x: float, y: float, z: float, yaw_deg: float = 0.0) -> np.ndarray:
     """`(4, 4)` transform of something that stands upright at a place, turned about the vertical."""
-    turn = rigid.rotation_matrix(rigid.axis_rotation(2, np.deg2rad(yaw_deg)))
-    return rigid.transform(turn, np.array([x, y, z]))
+    turn = matrices(axis_rotation(2, np.deg2rad(yaw_deg)))
+    return transform(turn, np.array([x, y, z]))
 
 
 def _surface(look: Material | list[Material], rng: np.random.Generator) -> np.ndarray:

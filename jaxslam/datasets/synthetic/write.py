@@ -10,6 +10,9 @@ import numpy as np
 from jaxslam import trajectory
 from jaxslam.datasets.synthetic.dataset import DEPTH_COUNTS_PER_M, SyntheticDataset, SyntheticFrame
 from jaxslam.errors import DatasetError
+from jaxslam.timestamp import decimal_seconds
+
+_DIGITS = 6  # of a second, as in TUM RGB-D; the recording's times are whole microseconds
 
 
 def write_tum(
@@ -52,7 +55,7 @@ def write_tum(
 
 
 def _write_images(folder: Path, frame: SyntheticFrame) -> None:
-    name = f"{_seconds(frame.timestamp_ns)}.png"
+    name = f"{decimal_seconds(frame.timestamp_ns, _DIGITS)}.png"
     counts = np.clip(np.round(frame.depth_m * DEPTH_COUNTS_PER_M), 0.0, 65535.0).astype(np.uint16)
     images = {"rgb": frame.rgb[..., ::-1], "depth": counts, "mask": frame.instance_mask.astype(np.uint8)}
     for kind, image in images.items():
@@ -61,14 +64,10 @@ def _write_images(folder: Path, frame: SyntheticFrame) -> None:
 
 
 def _write_lists(folder: Path, dataset: SyntheticDataset) -> None:
-    times = [_seconds(int(timestamp_ns)) for timestamp_ns in dataset.timestamps_ns]
+    times = [decimal_seconds(int(timestamp_ns), _DIGITS) for timestamp_ns in dataset.timestamps_ns]
     for kind, title in (("rgb", "color images"), ("depth", "depth maps"), ("mask", "masks of moving objects")):
         rows = [f"{time} {kind}/{time}.png" for time in times]
         heading = [f"# {title}", f"# file: '{dataset.name}'", "# timestamp filename"]
         (folder / f"{kind}.txt").write_text("\n".join([*heading, *rows]) + "\n", encoding="utf-8")
     trajectory.write_tum(folder / "groundtruth.txt", dataset.ground_truth)
     dataset.camera.save(folder / "camera.yaml")
-
-
-def _seconds(timestamp_ns: int) -> str:
-    return f"{timestamp_ns // 10**9}.{timestamp_ns % 10**9 // 1000:06d}"

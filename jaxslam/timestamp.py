@@ -1,0 +1,40 @@
+"""Times as text: decimal seconds in files, int64 nanoseconds inside, and nothing lost in between."""
+
+from decimal import Context, Decimal, InvalidOperation
+
+from jaxslam.errors import JaxSlamError
+
+_LAST_S = 9_200_000_000  # int64 nanoseconds end in the year 2262
+_UNITS = ((10**17, "nanoseconds"), (10**14, "microseconds"), (10**11, "milliseconds"))
+"""From how many seconds on, in the year 5138 or later, a time rather counts something smaller."""
+_EXACT = Context(prec=60)
+
+
+def nanoseconds(text: str, place: str, error: type[JaxSlamError], *, least_s: int = -_LAST_S) -> int:
+    """Nanoseconds of decimal seconds: exact, rounded to even below one nanosecond. A float would lose digits.
+
+    Args:
+        text: Decimal seconds, with or without an exponent.
+        place: Where the text stands, for the message: `file:line`.
+        error: Class of the error to raise.
+        least_s: The earliest time that is taken for one, seconds.
+
+    Raises:
+        JaxSlamError: Of class `error`, if the text is not a number, not finite, too early, or too late for int64;
+            the message guesses another unit.
+    """
+    problem = f"{place}: expected a timestamp in seconds, got '{text}'"
+    try:
+        seconds = Decimal(text)
+    except InvalidOperation:  # also an exponent of twenty digits, which a float reads as zero
+        raise error(problem) from None
+    if not seconds.is_finite() or not least_s <= seconds <= _LAST_S:
+        guesses = [f" ({unit}?)" for least, unit in _UNITS if seconds.is_finite() and seconds >= least]
+        raise error(problem + "".join(guesses[:1]))
+    return int(seconds.scaleb(9, _EXACT).to_integral_value(context=_EXACT))
+
+
+def decimal_seconds(stamp_ns: int, digits: int = 9) -> str:
+    """Seconds with so many decimals, 1 to 9; what is finer is cut off."""
+    whole, rest = divmod(abs(stamp_ns), 10**9)
+    return f"{'-' if stamp_ns < 0 else ''}{whole}.{rest:09d}"[: digits - 9 or None]
