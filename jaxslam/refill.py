@@ -14,6 +14,8 @@ from jaxslam.state import TrackedPoints, TrackParams, TrackPlan
 _MIN_SCORE = 2.0
 """Smallest eigenvalue of a corner worth tracking, in squared intensity a squared pixel, on the second level."""
 _EDGE_PX = 12
+_DEPTH_STEP = 0.3
+"""Largest difference of depth in the window of a point that counts as one surface, as a share of its depth."""
 
 
 def refill(
@@ -31,6 +33,12 @@ def refill(
 
     Corners are sought on the second level of the pyramid: a quarter of the work, and less noise. A new point has the
     depth measured at it, the rolling shutter and the delay of the depth image taken into account.
+
+    Corners on one surface come first: where a window also shows what is behind, flow follows neither. Mixed, ATE was
+    1.4 mm instead of 0.3 on the synthetic room (camera path xyz, nobody in it), 3.9 instead of 2.1 with two people,
+    16.6 instead of 11.7 on the start of Bonn `crowd`, but 8.3 instead of 9.2 on TUM `fr1_rpy`. Refusing mixed windows
+    leaves too few points (`fr1_rpy` 10.2); giving them a fifth of the weight hands the scene to people, who are one
+    surface (two people 145).
     """
     border, cell = pyramid.border, plan.cell_px // 2
     image = pyramid.levels[1][border:-border, border:-border]
@@ -49,7 +57,8 @@ def refill(
     sigma = depth_sigma(seen.depth, params)
 
     good = (corners.score > _MIN_SCORE) & ~taken & (rough > 0) & (seen.depth > 0)
-    order = jnp.argsort(jnp.where(good, -corners.score, jnp.inf))
+    one_surface = sample_depth(depth, uv, reach=plan.flow.finest.window // 2, max_step=_DEPTH_STEP) > 0
+    order = jnp.lexsort((-corners.score, ~one_surface, ~good))
     rank = jnp.cumsum(~points.valid) - 1
     candidate = order[jnp.clip(rank, 0, order.shape[0] - 1)]
     new = ~points.valid & (rank < jnp.sum(good))
