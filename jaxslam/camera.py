@@ -4,19 +4,17 @@ import dataclasses
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
+from jax.typing import DTypeLike
+from jaxslam_kernels.camera import Intrinsics, make_intrinsics
 
 from jaxslam.camera_file import read_camera_fields
 from jaxslam.checked import Checked, Range
 from jaxslam.config import configs_dir
 from jaxslam.errors import CameraError, JaxSlamError, nearest
 from jaxslam.files import write_atomically
-
-if TYPE_CHECKING:
-    from jax.typing import DTypeLike
-    from jaxslam_kernels.camera import Intrinsics
 
 _UNITS = {
     "width": "pixels",
@@ -115,10 +113,8 @@ class Camera(Checked):
         lines = [_line(key, value) for key, value in dataclasses.asdict(self).items() if value is not None]
         write_atomically(path, ("\n".join(lines) + "\n").encode(), CameraError)
 
-    def intrinsics(self, dtype: "DTypeLike" = np.float32) -> "Intrinsics":
+    def intrinsics(self, dtype: DTypeLike = np.float32) -> Intrinsics:
         """The part of the calibration that the kernels compute with, as arrays of `dtype`."""
-        from jaxslam_kernels.camera import make_intrinsics  # noqa: PLC0415 (JAX takes a second to import)
-
         return make_intrinsics(self.fx, self.fy, self.cx, self.cy, self.distortion, dtype)
 
 

@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import tyro
 from rich.console import Console
@@ -16,10 +16,15 @@ from rich.table import Table
 
 from jaxslam.config import Config, load_config
 from jaxslam.datasets import Dataset, Subset, dataset_kinds, open_dataset
+from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
+from jaxslam.doctor import diagnose
 from jaxslam.errors import ConfigError, DatasetError, JaxSlamError, nearest
-
-if TYPE_CHECKING:
-    from jaxslam.evaluation import Evaluation
+from jaxslam.evaluation import Evaluation, evaluate
+from jaxslam.results import RunInfo, Snapshots, write_results
+from jaxslam.slam import Slam
+from jaxslam.trajectory import read
+from jaxslam.visualize import plot_trajectory
+from jaxslam.xla import prefer_one_thread
 
 _console = Console(soft_wrap=True)
 _Settings: TypeAlias = Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction]
@@ -45,8 +50,6 @@ class Demo:
 
     def main(self) -> None:
         """Run the command."""
-        from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset  # noqa: PLC0415 (loads JAX)
-
         scene = SyntheticConfig(frames=self.frames, path=self.path, people=self.people, seed=self.seed)
         _console.print(f"Rendering a room with {self.people} people, the camera moving as in '{self.path}'.")
         _track(SyntheticDataset(scene), load_config(), "default", self.out)
@@ -91,6 +94,7 @@ class Run:
         override = f"run.deterministic={str(self.deterministic).lower()}"
         config = load_config(self.preset, self.config, (override, *itertools.chain(*self.set)))
         dataset = open_dataset(self.recording, self.dataset, self.camera)
+        prefer_one_thread()  # nothing else computes while a recording is tracked
         if self.start or self.max_frames is not None:
             stop = None if self.max_frames is None else self.start + self.max_frames
             dataset = Subset(dataset, self.start, stop)
@@ -114,15 +118,10 @@ class Eval:
 
     def main(self) -> None:
         """Run the command."""
-        from jaxslam.evaluation import evaluate  # noqa: PLC0415 (loads JAX)
-        from jaxslam.trajectory import read  # noqa: PLC0415
-
         estimate, truth = read(self.estimate), read(self.groundtruth)
         evaluation = evaluate(estimate, truth, align=self.align, max_gap_s=self.max_gap)
         _console.print(str(evaluation), highlight=False)
         if self.plot is not None:
-            from jaxslam.visualize import plot_trajectory  # noqa: PLC0415
-
             plot_trajectory(estimate, truth, evaluation, self.plot)
             _console.print(f"Plot: {self.plot}")
 
@@ -140,8 +139,6 @@ class Doctor:
 
     def main(self) -> None:
         """Run the command."""
-        from jaxslam.doctor import diagnose  # noqa: PLC0415
-
         diagnosis = diagnose(self.recording, self.dataset, self.camera)
         _console.print(str(diagnosis), highlight=False, markup=False)
         if not diagnosis.ok:
@@ -183,9 +180,6 @@ class _Meter:
 
 def _track(dataset: Dataset, config: Config, preset: str, out: Path) -> None:
     """Track, write the results, print them."""
-    from jaxslam.results import RunInfo, Snapshots, write_results  # noqa: PLC0415 (loads JAX)
-    from jaxslam.slam import Slam  # noqa: PLC0415
-
     began = time.perf_counter()
     slam = Slam(dataset.camera, config)
     with _console.status("Compiling the tracker (a minute at the first start on a machine, then seconds) ..."):
@@ -207,7 +201,7 @@ def _track(dataset: Dataset, config: Config, preset: str, out: Path) -> None:
     _print_summary(summary, evaluation, out)
 
 
-def _print_summary(summary: dict[str, Any], evaluation: "Evaluation | None", out: Path) -> None:
+def _print_summary(summary: dict[str, Any], evaluation: Evaluation | None, out: Path) -> None:
     table = Table("figure", "value", "unit", title=summary["dataset"], title_justify="left")
     statuses = ", ".join(f"{name} {count}" for name, count in summary["status_counts"].items())
     table.add_row("tracked", f"{summary['tracked']} of {summary['frames']}", f"frames ({statuses})")

@@ -1,7 +1,6 @@
 """What a run leaves behind: trajectories, a summary, the settings in effect, and a picture."""
 
 import json
-import os
 import platform
 import resource
 import subprocess
@@ -25,6 +24,7 @@ from jaxslam.slam import FrameRecord, Rejected, Slam, Tracked
 from jaxslam.state import TrackStatus
 from jaxslam.trajectory import write_tum
 from jaxslam.visualize import Snapshot, plot_trajectory
+from jaxslam.xla import threads, usable_cores
 
 _PACKAGES = ("jaxslam", "jax", "jaxlib", "jaxlie", "equinox", "optimistix", "numpy", "opencv-python-headless")
 _NUM_SNAPSHOTS = 4
@@ -117,7 +117,8 @@ def _summary(
         "peak_rss_mb": round(_peak_rss_mb(), 1),
         "versions": {"python": platform.python_version(), **{name: version(name) for name in _PACKAGES}},
         "cpu": _cpu_model(),
-        "threads": _usable_cores(),
+        "cores": usable_cores(),
+        "threads": threads(),
         "commit": _commit(),
     }
 
@@ -138,10 +139,6 @@ def _distribution(milliseconds: Sequence[float]) -> dict[str, float] | None:
 def _peak_rss_mb() -> float:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (1e6 if sys.platform == "darwin" else 1e3)  # bytes there, kilobytes elsewhere
-
-
-def _usable_cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _cpu_model() -> str:

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.camera import Camera
-from jaxslam.compile_cache import enable_compile_cache
 from jaxslam.config import Config, TrackConfig
 from jaxslam.datasets import Dataset, prefetch
 from jaxslam.errors import DatasetError, FrameError, JaxSlamError
@@ -20,6 +19,7 @@ from jaxslam.frame_arrays import FrameArrays, frame_arrays
 from jaxslam.state import TrackOutput, TrackParams, TrackPlan, TrackReason, TrackState, TrackStatus
 from jaxslam.track import init_state, track_step
 from jaxslam.trajectory import Trajectory
+from jaxslam.xla import enable_compile_cache
 
 _log = logging.getLogger(__name__)
 

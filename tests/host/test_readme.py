@@ -15,7 +15,7 @@ from typing import NamedTuple
 import pytest
 
 from jaxslam import Camera, TrackParams, TrackPlan, TrackStatus
-from jaxslam.compile_cache import cache_dir
+from jaxslam.xla import cache_dir
 
 ROOT = Path(__file__).resolve().parents[2]
 README = ROOT / "README.md"

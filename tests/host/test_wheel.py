@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from jaxslam.camera import known_cameras
-from jaxslam.compile_cache import cache_dir
+from jaxslam.xla import cache_dir
 
 ROOT = Path(__file__).resolve().parents[2]
 
