@@ -61,16 +61,21 @@ class Diagnosis:
 
 
 def diagnose(path: str | Path, kind: str = "auto", camera: Camera | str | Path | None = None) -> Diagnosis:
-    """Look over a recording, decoding a few frames of it; bad input becomes a finding, never an exception.
+    """Look over a recording, decoding a few frames of it; whatever is wrong inside the folder becomes a finding.
 
     Args:
         path: The folder, as for `open_dataset`.
         kind: The kind of recording, as for `open_dataset`.
         camera: The camera, as for `open_dataset`.
+
+    Raises:
+        DatasetError: If there is no such folder, and so nothing to look over.
     """
     try:
         dataset = open_dataset(path, kind, camera)
     except JaxSlamError as error:
+        if not Path(path).expanduser().is_dir():
+            raise
         return Diagnosis((Finding(Level.ERROR, "recording", str(error)),))
     frames, unreadable = _sample(dataset)
     return Diagnosis(

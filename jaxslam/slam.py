@@ -79,6 +79,10 @@ class Rejected:
         return str(self.error)
 
 
+_new_state = jax.jit(init_state, static_argnames=("height", "width", "plan"))
+"""One program instead of some fifty."""
+
+
 @partial(jax.jit, static_argnames="plan", donate_argnums=0)
 def _step(
     state: TrackState, frame: FrameArrays, params: TrackParams, plan: TrackPlan
@@ -127,7 +131,7 @@ class Slam:
 
     def reset(self) -> None:
         """Forget everything; the next frame starts a new world."""
-        self._state = init_state(self.camera.height, self.camera.width, self._plan, seed=self.config.run.seed)
+        self._state = _new_state(self.camera.height, self.camera.width, self._plan, seed=self.config.run.seed)
         self._last_ns: int | None = None
         self._times_ns: list[int] = []
         self._poses: list[np.ndarray] = []
@@ -137,7 +141,7 @@ class Slam:
         if not self._ready:
             enable_compile_cache()
             began = time.perf_counter()
-            blank = init_state(self.camera.height, self.camera.width, self._plan)
+            blank = _new_state(self.camera.height, self.camera.width, self._plan, seed=self.config.run.seed)
             shape = (self.camera.height, self.camera.width)
             nothing = frame_arrays(Frame(0, np.zeros(shape, np.uint8), np.zeros(shape, np.float32)), 0.0)
             jax.block_until_ready(_step(blank, nothing, self._params, self._plan))

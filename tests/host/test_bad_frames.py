@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_scene import CONFIG, HEIGHT, WIDTH, Clip, clip, pose_matrices, truth_from_start
+from small_scene import CONFIG, HEIGHT, WIDTH, Clip, clip, truth_from_start
 
 from jaxslam.errors import DatasetError, FrameError
 from jaxslam.frame import Frame
@@ -14,8 +14,10 @@ from jaxslam.state import TrackStatus
 
 BAD = slice(20, 24)
 RECOVERED = 30
-WORST_ERROR_M = 0.08
-"""Without a bad frame the distance reaches 6 cm in this clip; a bad frame must not add a jump."""
+MOVED_BY_BAD_FRAMES_M = 0.006
+"""How far bad frames may move the poses after them; measured: 3.9 mm frozen, 3.6 mm blind, 1.0 mm without depth."""
+ADDED_BY_DROPS_M = 0.012
+"""What dropping half of the frames may add to the errors of those left; measured: 0 to 9.8 mm over 12 choices."""
 
 Spoil = Callable[[Frame, Frame], Frame]
 """Makes a bad frame of a good one and the last good one before it."""
@@ -57,7 +59,18 @@ def assert_finite(result: Tracked) -> None:
 
 @pytest.fixture(scope="module")
 def undisturbed(slam: Slam) -> list[Tracked]:
-    return track(slam, clip().frames[:12])
+    """The whole clip without a bad frame: what every other run is compared with."""
+    return track(slam, clip().frames)
+
+
+def positions(results: list[Tracked]) -> np.ndarray:
+    return np.array([result.T_world_cam[4:] for result in results])
+
+
+def moved_m(results: list[Tracked], undisturbed: list[Tracked]) -> np.ndarray:
+    """Distance of each pose from that of the same frame in the undisturbed run; no smaller than the error added."""
+    same = {result.timestamp_ns: result for result in undisturbed}
+    return np.linalg.norm(positions(results) - positions([same[result.timestamp_ns] for result in results]), axis=1)
 
 
 def errors_m(results: list[Tracked], recording: Clip) -> np.ndarray:
@@ -69,16 +82,14 @@ def errors_m(results: list[Tracked], recording: Clip) -> np.ndarray:
             strict=True,
         )
     )
-    poses = pose_matrices(np.array([result.T_world_cam for result in results]))
-    positions = np.array([truth[result.timestamp_ns][:3, 3] for result in results])
-    return np.linalg.norm(poses[:, :3, 3] - positions, axis=1)
+    true = np.array([truth[result.timestamp_ns][:3, 3] for result in results])
+    return np.linalg.norm(positions(results) - true, axis=1)
 
 
 class TestBadImages:
     @pytest.mark.parametrize("kind", SPOILED)
-    def test_is_reported_and_survived(self, slam: Slam, kind: str) -> None:
-        recording = clip()
-        frames = recording.frames[:45]
+    def test_is_reported_and_survived(self, slam: Slam, undisturbed: list[Tracked], kind: str) -> None:
+        frames = clip().frames
         last_good = frames[BAD.start - 1]
         frames[BAD] = [SPOILED[kind](frame, last_good) for frame in frames[BAD]]
         results = track(slam, frames)
@@ -91,24 +102,27 @@ class TestBadImages:
             assert all(result.reason for result in during)
             np.testing.assert_allclose(during[-1].T_world_cam, held, atol=1e-6)
         assert {result.status for result in after} == {TrackStatus.OK}
-        assert errors_m(after, recording).max() < WORST_ERROR_M
+        assert moved_m(after, undisturbed).max() < MOVED_BY_BAD_FRAMES_M
 
-    def test_single_frame_of_noise(self, slam: Slam) -> None:
-        recording = clip()
-        frames = recording.frames[:40]
+    def test_single_frame_of_noise(self, slam: Slam, undisturbed: list[Tracked]) -> None:
+        frames = clip().frames
         frames[20] = SPOILED["noise"](frames[20], frames[19])
         results = track(slam, frames)
         assert results[20].status is TrackStatus.LOST
         assert {result.status for result in results[22:]} == {TrackStatus.OK}
-        assert errors_m(results[22:], recording).max() < WORST_ERROR_M
+        assert moved_m(results[22:], undisturbed).max() < MOVED_BY_BAD_FRAMES_M
 
-    def test_half_of_the_frames_dropped(self, slam: Slam) -> None:
+    @pytest.mark.parametrize("choice", [5, 10, 11])
+    def test_half_of_the_frames_dropped(self, slam: Slam, undisturbed: list[Tracked], choice: int) -> None:
+        """The last two choices are the worst of the first twelve. Errors are compared, not poses: drift differs."""
         recording = clip()
-        keep = np.random.default_rng(5).random(len(recording)) < 0.5
-        frames = [frame for frame, kept in zip(recording.frames, keep | (np.arange(60) == 0), strict=True) if kept]
-        results = track(slam, frames)
+        keep = np.random.default_rng(choice).random(len(recording)) < 0.5
+        keep[0] = True
+        results = track(slam, [frame for frame, kept in zip(recording.frames, keep, strict=True) if kept])
         assert {result.status for result in results[1:]} == {TrackStatus.OK}
-        assert errors_m(results, recording).max() < WORST_ERROR_M
+        without_drops = [result for result, kept in zip(undisturbed, keep, strict=True) if kept]
+        added = errors_m(results, recording) - errors_m(without_drops, recording)
+        assert added.max() < ADDED_BY_DROPS_M
 
     def test_bad_from_the_start(self, slam: Slam) -> None:
         """Nothing starts on a black frame; the first good one starts the world."""

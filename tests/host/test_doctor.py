@@ -1,6 +1,7 @@
 """`doctor` finds what was broken on purpose, and nothing in what is sound."""
 
 import dataclasses
+import re
 import shutil
 from pathlib import Path
 
@@ -10,7 +11,9 @@ import pytest
 from tiny_recording import CAMERA, HEIGHT, WIDTH, times, write_ground_truth, write_recording
 
 from jaxslam.camera import Camera
+from jaxslam.cli import main
 from jaxslam.doctor import Diagnosis, Finding, Level, diagnose
+from jaxslam.errors import DatasetError
 
 COUNT = 8
 
@@ -50,10 +53,25 @@ def test_sound_real_recording(data_dir: Path, path: str) -> None:
 
 
 class TestErrors:
-    def test_no_recording(self, tmp_path: Path) -> None:
-        diagnosis = diagnose(tmp_path / "none")
+    @pytest.mark.parametrize(
+        ("name", "what"),
+        [("missing", "nothing there"), ("walk.tgz", "a file (an archive must be unpacked first)")],
+    )
+    def test_no_folder(self, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, what: str) -> None:
+        """Nothing to look over: one line that names the folder, and exit code 1."""
+        (tmp_path / "walk.tgz").touch()
+        message = f"{tmp_path / name}: expected the folder of a recording, got {what}"
+        with pytest.raises(DatasetError, match=re.escape(message)):
+            diagnose(tmp_path / name)
+        with pytest.raises(SystemExit) as stop:
+            main(["doctor", str(tmp_path / name)])
+        assert stop.value.code == 1
+        assert capsys.readouterr() == ("", f"error: {message}\n")
+
+    def test_folder_without_a_recording(self, tmp_path: Path) -> None:
+        diagnosis = diagnose(tmp_path)
         assert not diagnosis.ok
-        assert "nothing there" in found(diagnosis, "recording").text
+        assert "rgb.txt and depth.txt" in found(diagnosis, "recording").text
 
     def test_unknown_camera(self, sound: Path) -> None:
         assert "--camera" in found(diagnose(sound), "recording").text
