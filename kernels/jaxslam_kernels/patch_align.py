@@ -21,7 +21,7 @@ from jaxslam_kernels.implicit import Found, implicit_positions
 from jaxslam_kernels.lk_search import LevelPlan, Search, Template, in_chunks, iterate, look, template_with
 from jaxslam_kernels.types import Mask, Pixels, Scalar, Weights
 
-DEFAULT_PLAN = LevelPlan(17, 8, 0.05)
+DEFAULT_PLAN = LevelPlan(21, 8, 0.05)
 _GAIN_SQUARED = (0.25, 4.0)
 """Smallest and largest."""
 

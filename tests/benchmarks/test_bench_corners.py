@@ -1,7 +1,5 @@
 """The best corner of every grid cell beside `cv2.goodFeaturesToTrack` asked for as many."""
 
-import os
-
 import cv2
 import jax
 import jax.numpy as jnp
@@ -12,8 +10,6 @@ from jaxslam_kernels.corners import corner_score, grid_corners
 from known_warps import picture
 
 pytestmark = pytest.mark.benchmark
-
-os.environ.setdefault("NPROC", "1")  # one thread for XLA, as for OpenCV; see test_bench_lk_flow
 
 
 @pytest.mark.parametrize(("width", "height", "cell"), [(320, 240, 10), (640, 480, 20)])
