@@ -8,7 +8,7 @@ import pytest
 from benchmarks.timing import compare
 
 from jaxslam import Slam, frame_arrays, open_dataset, track_params, track_plan, track_step
-from jaxslam.config import TrackConfig
+from jaxslam.config import Config, TrackConfig
 from jaxslam.frame import to_grey
 
 pytestmark = pytest.mark.benchmark
@@ -20,8 +20,9 @@ CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.03)
 def test_step_is_not_slower_than_opencv_flow(data_dir, capsys):
     """Both go through the recording frame by frame: new points and keyframes are part of the step where they fall."""
     dataset = open_dataset(data_dir / "tum" / "rgbd_dataset_freiburg1_rpy_excerpt")
-    params, plan = track_params(dataset.camera, TrackConfig()), track_plan(TrackConfig())
-    slam = Slam(dataset.camera)
+    config = Config(track=TrackConfig(num_points=500))
+    params, plan = track_params(dataset.camera, config.track), track_plan(config.track)
+    slam = Slam(dataset.camera, config)
     for index in range(FIRST):
         slam.track(dataset[index])
     step = jax.jit(track_step, static_argnames="plan", donate_argnames="state")
