@@ -30,8 +30,8 @@ def enable_compile_cache() -> Path:
 def prefer_one_thread() -> None:
     """Compute with one thread, unless `NPROC` in the environment says otherwise; to be called before the first array.
 
-    XLA splits work that is too small for it and waits for the parts. On two cores, a frame takes 9.6 ms with one
-    thread and 12.2 with two, and 10 ms of processor time instead of 22. Not for processes that compute with JAX in
+    XLA splits work that is too small for it and waits for the parts. On two cores, a frame takes 9.3 ms with one
+    thread and 10.0 with two, and 9.9 ms of processor time instead of 12.0. Not for processes that compute with JAX in
     several Python threads, which then queue for the one: in the demo, which renders ahead, a frame would take 76 ms.
     """
     os.environ.setdefault("NPROC", "1")
