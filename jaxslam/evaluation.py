@@ -211,7 +211,7 @@ def _errors(estimate: Trajectory, truth: np.ndarray, align: AlignmentKind, delta
     count, capacity = len(estimate), _SMALLEST_CAPACITY
     while capacity < count:
         capacity *= 4
-    later = np.searchsorted(estimate.timestamps_ns, estimate.timestamps_ns + round(delta_s * 1e9))
+    later = _later(estimate.timestamps_ns, delta_s)
     pad = lambda values, fill: np.concatenate([values, np.repeat(fill, capacity - count, axis=0)])
     nowhere = np.array([[1.0, 0, 0, 0, 0, 0, 0]])
     with jax.enable_x64(True):
@@ -281,7 +281,7 @@ def _notes_on_frames(estimate: Trajectory, truth: np.ndarray, errors: _Errors, d
     error_rad = float(errors.per_second.rotation.rmse)
     if not errors.per_second.num_pairs or error_rad < _SAME_FRAME_RAD:
         return ()
-    later = np.searchsorted(estimate.timestamps_ns, estimate.timestamps_ns + round(delta_s * 1e9))
+    later = _later(estimate.timestamps_ns, delta_s)
     first = np.flatnonzero(later < len(estimate))
     turned, true = (_angles(wxyz[first], wxyz[later[first]]) for wxyz in (estimate.T_world_cam[:, :4], truth[:, :4]))
     if np.sqrt(np.mean(np.square(turned - true))) > _SAME_ANGLES * error_rad:
@@ -290,6 +290,11 @@ def _notes_on_frames(estimate: Trajectory, truth: np.ndarray, errors: _Errors, d
         "estimate and reference turn by the same angles about different axes: the reference is another body on the"
         " camera (a marker?), so the RPE says nothing and the ATE includes the lever arm",
     )
+
+
+def _later(timestamps_ns: np.ndarray, delta_s: float) -> np.ndarray:
+    """`(n,)` index of the first pose at least so much later than each; `n` where there is none."""
+    return np.searchsorted(timestamps_ns, timestamps_ns + round(delta_s * 1e9))
 
 
 def _angles(first: np.ndarray, second: np.ndarray) -> np.ndarray:

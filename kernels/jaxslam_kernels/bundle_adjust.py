@@ -34,6 +34,7 @@ from jaxslam_kernels.bundle_cost import (
 )
 from jaxslam_kernels.bundle_schur import Reduced, eliminate, is_determined, points_determined, solve_reduced
 from jaxslam_kernels.pose_cost import UNKNOWN_CHI2, retract, tangent_basis
+from jaxslam_kernels.pose_refine import usable_pose
 from jaxslam_kernels.robust import Loss
 from jaxslam_kernels.types import Code, Flag, Mask, Points, Scalar, Weights
 
@@ -288,14 +289,12 @@ def _report(
 
 def _usable(poses: Poses, X_world: Points, observations: Observations) -> tuple[Poses, Points, Observations]:
     """Finite poses with unit quaternions and finite points; what observes others is no longer valid."""
-    usable = jnp.isfinite(poses).all(axis=1) & (jnp.sum(jnp.square(poses[:, :4]), axis=1) > 1e-6)
+    clean, usable = jax.vmap(usable_pose)(SE3(poses))
     finite = jnp.isfinite(X_world).all(axis=0)
-    identity = jnp.zeros_like(poses).at[:, 0].set(1.0)
-    clean = jax.vmap(lambda pose: SE3(pose).normalize().wxyz_xyz)(jnp.where(usable[:, None], poses, identity))
     camera = jnp.clip(observations.camera, 0, poses.shape[0] - 1)
     point = jnp.clip(observations.point, 0, X_world.shape[1] - 1)
     valid = observations.valid & usable[camera] & finite[point]
-    return clean, jnp.where(finite[None, :], X_world, 0.0), observations._replace(valid=valid)
+    return clean.wxyz_xyz, jnp.where(finite[None, :], X_world, 0.0), observations._replace(valid=valid)
 
 
 def _predicted_decrease(

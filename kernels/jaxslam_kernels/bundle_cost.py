@@ -19,7 +19,7 @@ from jaxlie import SE3
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam_kernels.camera import MIN_DEPTH, Intrinsics, normalise
-from jaxslam_kernels.pose_cost import UNKNOWN_CHI2, tangent_basis
+from jaxslam_kernels.pose_cost import UNKNOWN_CHI2, positive, tangent_basis
 from jaxslam_kernels.robust import Loss, loss_value, loss_weight
 from jaxslam_kernels.types import Mask, Pixels, Points, Scalar, Weights
 
@@ -126,7 +126,7 @@ def bundle_problem(
     slot = jnp.where(owner[slot] == rank, slot, k * n)
     known, source = (owner[:-1] >= 0).reshape(k, n), (jnp.maximum(owner[:-1], 0) % m).reshape(k, n)
     gather = lambda values: jnp.where(known, values[source], 0.0)
-    has_depth = _positive(observations.depth) & _positive(observations.precision[2])
+    has_depth = positive(observations.depth) & positive(observations.precision[2])
     precision = [*observations.precision[:2], jnp.where(has_depth, observations.precision[2], 0.0)]
     problem = BundleProblem(
         xy=jnp.stack([gather(observations.xy[0]), gather(observations.xy[1])]),
@@ -297,14 +297,10 @@ def _known(observations: Observations, k: int, n: int) -> Bool[Array, " m"]:
     inside = (
         (observations.camera >= 0) & (observations.camera < k) & (observations.point >= 0) & (observations.point < n)
     )
-    pixel = jnp.isfinite(observations.xy).all(axis=0) & _positive(observations.precision[:2]).all(axis=0)
+    pixel = jnp.isfinite(observations.xy).all(axis=0) & positive(observations.precision[:2]).all(axis=0)
     return observations.valid & inside & pixel
 
 
 def _clean_weights(weights: Array) -> Array:
     """What is not a weight is 0; a weight of 0 keeps its derivative, which says what letting it back in would do."""
     return jnp.where(jnp.isfinite(weights) & (weights >= 0), weights, 0.0)
-
-
-def _positive(values: Array) -> Array:
-    return jnp.isfinite(values) & (values > 0)

@@ -85,11 +85,11 @@ def pose_problem(
     depth = jnp.zeros(n, dtype) if depth is None else depth
     sigma_px, sigma_depth = (jnp.broadcast_to(jnp.asarray(sigma, dtype), (n,)) for sigma in (sigma_px, sigma_depth))
     loss_scale = jnp.asarray(scale, dtype)
-    usable = _usable(intrinsics) & _positive(loss_scale)
+    usable = _usable(intrinsics) & positive(loss_scale)
     intrinsics, loss_scale = jax.tree.map(lambda x: jnp.where(usable, x, 1.0), (intrinsics, loss_scale))
-    has_depth = _positive(depth) & _positive(sigma_depth)
+    has_depth = positive(depth) & positive(sigma_depth)
     known = jnp.isfinite(X_world).all(axis=0) & jnp.isfinite(uv).all(axis=0)
-    known = known & _positive(sigma_px) & _positive(weights) & usable
+    known = known & positive(sigma_px) & positive(weights) & usable
     safe_sigma = jnp.where(known, sigma_px, 1.0)
     focal = jnp.stack([intrinsics.fx, intrinsics.fy])
     inverse_depth_sigma = jnp.where(has_depth, 1.0 / jnp.where(has_depth, sigma_depth, 1.0), 0.0)
@@ -193,7 +193,8 @@ def _quaternion_basis(T: SE3) -> Float[Array, "4 3"]:
     return jnp.stack([-x, -y, -z, w, -z, y, z, w, -x, -y, x, w]).reshape(4, 3)
 
 
-def _positive(values: Array) -> Array:
+def positive(values: Array) -> Array:
+    """Where values are finite and above zero."""
     return jnp.isfinite(values) & (values > 0)
 
 
