@@ -137,7 +137,7 @@ def track_step(
 
 
 def _prepare(state: TrackState, frame: FrameArrays, params: TrackParams, plan: TrackPlan) -> _View:
-    pyramid = build_pyramid(frame.image.astype(state.twist.dtype), num_levels=plan.num_levels)
+    pyramid = build_pyramid(frame.image, num_levels=plan.num_levels, dtype=state.twist.dtype)
     depth = believable(frame.depth, params.min_depth_m, params.max_depth_m)
     return _View(frame, pyramid, depth, state.elapsed_s + frame.dt_s)
 

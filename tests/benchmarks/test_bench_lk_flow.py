@@ -35,7 +35,7 @@ def one_thread():
 
 @jax.jit
 def _pyramid(image):
-    return build_pyramid(image.astype(jnp.float32))
+    return build_pyramid(image)
 
 
 @jax.jit

@@ -33,6 +33,16 @@ def test_shapes(dtype):
     assert [pyramid.size(level) for level in range(3)] == [(37, 52), (19, 26), (10, 13)]
 
 
+@pytest.mark.parametrize(("given", "expected"), [(None, np.float32), (np.float64, np.float64)])
+def test_whole_numbers_equal_the_same_in_floating_point(x64, given, expected):
+    image = _image(*SIZE).astype(np.uint8)
+    pyramid = build_pyramid(jnp.asarray(image), num_levels=3, dtype=given)
+    same = build_pyramid(jnp.asarray(image, expected), num_levels=3)
+    for level, reference in zip(pyramid.levels, same.levels, strict=True):
+        assert level.dtype == expected
+        np.testing.assert_array_equal(level, reference)
+
+
 @pytest.mark.parametrize("size", [SIZE, (36, 52), (3, 4)])
 def test_matches_reference(x64, size):
     image = _image(*size)
