@@ -2,7 +2,6 @@
 
 import cv2
 import jax
-import jax.numpy as jnp
 import pytest
 from benchmarks.timing import compare
 from jaxslam_kernels.image import build_pyramid
