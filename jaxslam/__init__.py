@@ -16,7 +16,6 @@ from jaxslam.frame_arrays import FrameArrays as FrameArrays
 from jaxslam.frame_arrays import frame_arrays as frame_arrays
 from jaxslam.frame_arrays import stack_frames as stack_frames
 from jaxslam.slam import Slam as Slam
-from jaxslam.slam import Tracked as Tracked
 from jaxslam.slam import track_params as track_params
 from jaxslam.slam import track_plan as track_plan
 from jaxslam.state import TrackOutput as TrackOutput
@@ -26,6 +25,7 @@ from jaxslam.state import TrackState as TrackState
 from jaxslam.state import TrackStatus as TrackStatus
 from jaxslam.track import init_state as init_state
 from jaxslam.track import track_step as track_step
+from jaxslam.tracked import Tracked as Tracked
 from jaxslam.trajectory import Trajectory as Trajectory
 
 __version__ = "0.1.0"

@@ -182,7 +182,7 @@ def _track(dataset: Dataset, config: Config, preset: str, out: Path) -> None:
     """Track, write the results, print them."""
     began = time.perf_counter()
     slam = Slam(dataset.camera, config)
-    with _console.status("Compiling the tracker (a minute at the first start on a machine, then seconds) ..."):
+    with _console.status("Compiling the tracker (some 15 s at the first start on a machine, then 2) ..."):
         slam.warm_up()
     _console.print(f"Tracker ready after {slam.compile_s:.1f} s.")
     columns = (

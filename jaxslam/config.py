@@ -7,7 +7,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import yaml
 
@@ -31,7 +31,9 @@ class TrackConfig(Checked):
     num_levels: Annotated[int, Range(at_least=2, at_most=6)] = 4
     """Levels of the image pyramid; one more follows motions twice as fast."""
     num_keyframes: Annotated[int, Range(at_least=1, at_most=64)] = 12
-    """Past pictures kept to look points up in again."""
+    """Latest keyframes kept to look points up in again."""
+    num_recalled: Annotated[int, Range(at_least=0, at_most=64)] = 4
+    """Further keyframes to look into, recalled from the map where the camera comes back."""
     num_sources: Annotated[int, Range(at_least=1, at_most=8)] = 2
     """How many of the keyframes are looked into in a frame."""
     points_per_source: Annotated[int, Range(at_least=16, at_most=2048)] = 192
@@ -70,7 +72,13 @@ class TrackConfig(Checked):
     refill_below: Annotated[float, Share] = 0.8
     """New points are sought when fewer than this share of `num_points` is alive."""
     keyframe_below: Annotated[float, Share] = 0.8
-    """A keyframe is made when no kept one shows more than this share of its points."""
+    """A keyframe is made when no kept one shows more than this share of its points,"""
+    keyframe_followed_below: Annotated[float, Share] = 0.1
+    """when less than this share of the followed points was there at the last keyframe,"""
+    keyframe_after_s: Annotated[float, Positive] = 10.0
+    """when the last one was made so many seconds ago,"""
+    keyframe_weak_after_s: Annotated[float, Positive] = 0.3
+    """or so many while tracking is weak."""
     probation_frames: Annotated[float, Range(at_least=1)] = 8
     """Frames after which a point counts in full: what moves on its own is an outlier before that."""
     restart_after: Annotated[float, Range(at_least=0)] = 15
@@ -82,6 +90,32 @@ class TrackConfig(Checked):
 
 
 @dataclass(frozen=True)
+class MappingConfig(Checked):
+    """The map: what becomes of keyframes, beside tracking. Whole numbers are sizes or counts."""
+
+    num_features: Annotated[int, Range(at_least=100, at_most=8000)] = 1000
+    """ORB features of a keyframe."""
+    num_levels: Annotated[int, Range(at_least=1, at_most=12)] = 8
+    """Levels of the scale pyramid they are found in."""
+    scale_factor: Annotated[float, Range(above=1, at_most=2)] = 1.2
+    """From one of these levels to the next."""
+    fast_threshold: Annotated[int, Range(at_least=1, at_most=255)] = 20
+    """Contrast of a corner, grey values."""
+    min_fast_threshold: Annotated[int, Range(at_least=1, at_most=255)] = 7
+    """The same where there is no such corner."""
+    search_px: Annotated[float, Positive] = 3.0
+    """How far from where the pose puts a point of the map its feature is sought, pixels."""
+    track_sigma_px: Annotated[float, Positive] = 0.3
+    """Standard deviation of a tracked point in the adjustment; that of a feature is the size of its level."""
+    window: Annotated[int, Range(at_least=2, at_most=32)] = 8
+    """Keyframes that a local adjustment moves."""
+    max_steps: Annotated[int, Range(at_least=1, at_most=100)] = 10
+    """Steps of a local adjustment."""
+    latency_frames: Annotated[int, Range(at_least=0, at_most=100)] = 3
+    """Frames after which a deterministic run has the map of a keyframe."""
+
+
+@dataclass(frozen=True)
 class RunConfig(Checked):
     """How a recording or a live stream is run."""
 
@@ -89,6 +123,10 @@ class RunConfig(Checked):
     """Run every module in turn, so that two runs give the same bytes; `False` gives each its thread."""
     seed: Annotated[int, Range(at_least=0, at_most=2**32 - 1)] = 0
     """Seed of every random choice."""
+    on_loss: Literal["hold", "predict", "submap"] = "submap"
+    """What to do while lost, until the place is recognised: `hold` the last pose, `predict` it with constant velocity
+    for a second, or hold it and after `track.restart_after` frames start a new `submap` there, which becomes one with
+    the map when a place of it is recognised."""
     prefetch_frames: Annotated[int, Range(at_least=1, at_most=64)] = 4
     """Frames of a recording decoded ahead of the tracker."""
 
@@ -98,6 +136,7 @@ class Config(Checked):
     """Everything that can be set."""
 
     track: TrackConfig = field(default_factory=TrackConfig)
+    mapping: MappingConfig = field(default_factory=MappingConfig)
     run: RunConfig = field(default_factory=RunConfig)
 
 

@@ -28,6 +28,10 @@ class TrajectoryError(JaxSlamError):
     """A trajectory file that is unreadable, or two trajectories that cannot be compared."""
 
 
+class MapFileError(JaxSlamError):
+    """A map file that is missing, damaged, of another format or version, or that cannot be written."""
+
+
 def nearest(name: str, valid: Iterable[str]) -> str:
     """A hint for a misspelt name: ` (did you mean 'x'?)` or, when nothing is close, the valid names."""
     choices = sorted(valid)

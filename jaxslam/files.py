@@ -2,13 +2,15 @@
 
 import contextlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 from jaxslam.errors import JaxSlamError
 
 
-def write_atomically(path: str | os.PathLike[str], data: bytes, error: type[JaxSlamError] = JaxSlamError) -> None:
-    """Write a file under a temporary name beside its place, then move it there.
+@contextlib.contextmanager
+def replacing(path: str | os.PathLike[str], error: type[JaxSlamError] = JaxSlamError) -> Iterator[Path]:
+    """A temporary name beside a file, to be written under; the file is moved to its place when the block ends well.
 
     A crash leaves the old file as it was. The folder must exist; the file gets the usual permissions.
 
@@ -18,10 +20,20 @@ def write_atomically(path: str | os.PathLike[str], data: bytes, error: type[JaxS
     target = Path(path)
     temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
     try:
-        temporary.write_bytes(data)
+        yield temporary
         os.replace(temporary, target)
     except OSError as failure:
         raise error(f"{target}: cannot be written: {failure}") from failure
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink()
+
+
+def write_atomically(path: str | os.PathLike[str], data: bytes, error: type[JaxSlamError] = JaxSlamError) -> None:
+    """Write a file as `replacing` does.
+
+    Raises:
+        JaxSlamError: Of class `error`, if the file cannot be written.
+    """
+    with replacing(path, error) as temporary:
+        temporary.write_bytes(data)

@@ -1,51 +1,33 @@
 """The ring of keyframes: which to look into, looking their points up in a frame, and adding one."""
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 from jaxlie import SE3
 from jaxslam_kernels.camera import Intrinsics, normalise
 from jaxslam_kernels.depth_image import sample_depth
-from jaxslam_kernels.image import Pyramid
 from jaxslam_kernels.patch_align import align_patches
 from jaxslam_kernels.transform import to_camera
-from jaxslam_kernels.types import Mask, Pixels, Points, Scalar, Weights
+from jaxslam_kernels.types import Mask, Pixels, Scalar, Weights
 from jaxtyping import Array, Bool, Float, Int, Num
 
-from jaxslam.observe import predict_pixels
-from jaxslam.state import Keyframes, TrackedPoints, TrackParams, TrackPlan
+from jaxslam.observe import View, predict_pixels
+from jaxslam.state import Keyframes, LookedUp, TrackedPoints, TrackParams, TrackPlan
 
 _MARGIN_PX = 8
 _MAX_SHIFT_PX = 12.0
 """A point found further from where the pose predicts it is another one."""
 
 
-class LookedUp(NamedTuple):
-    """Points of keyframes found in a frame.
-
-    Attributes:
-        X_world: `(3, n)` metres.
-        uv: `(2, n)` pixels in the frame.
-        weight: `(n,)` how much each counts; 0 for what was not found.
-        overlap: Largest share of a keyframe's points that the frame shows.
-    """
-
-    X_world: Points
-    uv: Pixels
-    weight: Weights
-    overlap: Scalar
-
-
 def empty_keyframes(height: int, width: int, plan: TrackPlan, image_dtype: jnp.dtype, dtype: jnp.dtype) -> Keyframes:
     """A ring without keyframes."""
-    k, n = plan.num_keyframes, plan.num_points
+    k, n = plan.num_keyframes + plan.num_recalled, plan.num_points
     return Keyframes(
         images=jnp.zeros((k, height, width), image_dtype),
         T_world_cam=jnp.tile(SE3.identity().wxyz_xyz.astype(dtype), (k, 1)),
         uv=jnp.zeros((k, 2, n), dtype),
         X_world=jnp.zeros((k, 3, n), dtype),
         weight=jnp.zeros((k, n), dtype),
+        id=jnp.zeros((k, n), jnp.int32),
         made=jnp.zeros((), jnp.int32),
     )
 
@@ -54,8 +36,7 @@ def look_up(
     keyframes: Keyframes,
     T_world_cam: SE3,
     twist: Float[Array, "6"],
-    pyramid: Pyramid,
-    depth: Float[Array, "h w"],
+    view: View,
     params: TrackParams,
     plan: TrackPlan,
 ) -> LookedUp:
@@ -65,12 +46,11 @@ def look_up(
         keyframes: The ring.
         T_world_cam: Pose of the current frame, good to a few pixels.
         twist: Velocity of the camera, for the rolling shutter.
-        pyramid: Of the current frame.
-        depth: Of the current frame, to drop points that something covers.
+        view: The current frame; its depth drops points that something covers.
         params: Thresholds and camera.
         plan: Static.
     """
-    height, width = pyramid.size()
+    height, width = view.pyramid.size()
     k, n = keyframes.weight.shape
     valid = keyframes.weight > 0
     X_cam = to_camera(T_world_cam, jnp.moveaxis(keyframes.X_world, 1, 0).reshape(3, k * n))
@@ -86,7 +66,7 @@ def look_up(
     index = (sources[:, None] * n + jnp.minimum(chosen, n - 1).astype(sources.dtype)).reshape(-1)
     take = lambda array: jnp.take(array, index, axis=-1, mode="clip")
     guess, X_there = take(predicted), take(X_cam)
-    seen_depth = sample_depth(depth, jax.lax.stop_gradient(guess), reach=0)
+    seen_depth = sample_depth(view.depth, jax.lax.stop_gradient(guess), reach=0)
     covered = (seen_depth > 0) & (jnp.abs(seen_depth - X_there[2]) > 0.1 * X_there[2] + 0.05)
     source = index // n
     X_world = take(jnp.moveaxis(keyframes.X_world, 1, 0).reshape(3, k * n))
@@ -95,14 +75,15 @@ def look_up(
         source,
         take(jnp.moveaxis(keyframes.uv, 1, 0).reshape(2, k * n)),
         _warp(guess, X_there[2], T_world_cam, keyframes.T_world_cam[source], params.intrinsics),
-        pyramid,
+        view.pyramid,
         guess,
         real & ~covered,
         plan=plan.look_up,
     )
     shift = jnp.sum(jnp.square(match.points - guess), axis=0)
     found = match.converged & (match.correlation > params.min_correlation) & (shift < _MAX_SHIFT_PX**2)
-    return LookedUp(X_world, match.points, jnp.where(found, take(keyframes.weight.reshape(-1)), 0), overlap)
+    weight = jnp.where(found, take(keyframes.weight.reshape(-1)), 0)
+    return LookedUp(X_world, match.points, weight, take(keyframes.id.reshape(-1)), overlap)
 
 
 def _visible(uv: Pixels, depth: Weights, height: int, width: int) -> Mask:
@@ -139,9 +120,10 @@ def with_keyframe(
     T_world_cam: SE3,
     points: TrackedPoints,
     weight: Weights,
+    plan: TrackPlan,
 ) -> Keyframes:
     """The ring with a keyframe in place of the oldest one where `make` is true, else unchanged."""
-    slot: Int[Array, ""] = keyframes.made % keyframes.weight.shape[0]
+    slot: Int[Array, ""] = keyframes.made % plan.num_keyframes
     put = lambda ring, new: ring.at[slot].set(jnp.where(make, new, ring[slot]))
     return Keyframes(
         images=put(keyframes.images, image.astype(keyframes.images.dtype)),
@@ -149,5 +131,6 @@ def with_keyframe(
         uv=put(keyframes.uv, points.uv),
         X_world=put(keyframes.X_world, points.X_world),
         weight=put(keyframes.weight, weight),
+        id=put(keyframes.id, points.id),
         made=keyframes.made + make.astype(jnp.int32),
     )

@@ -5,11 +5,29 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxslam_kernels.camera import distort, normalise, to_pixels
 from jaxslam_kernels.depth_image import sample_depth
+from jaxslam_kernels.image import Pyramid
 from jaxslam_kernels.rolling_shutter import as_if_at_once, image_velocity, row_time
 from jaxslam_kernels.types import DepthImage, Pixels, Points, Scalar, Weights
 from jaxtyping import Array, Float
 
+from jaxslam.frame_arrays import FrameArrays
 from jaxslam.state import TrackParams
+
+
+class View(NamedTuple):
+    """The current frame, prepared.
+
+    Attributes:
+        frame: As it came.
+        pyramid: Of its image.
+        depth: Its depth image, 0 where missing or not to be believed.
+        elapsed_s: Seconds since the last good frame.
+    """
+
+    frame: FrameArrays
+    pyramid: Pyramid
+    depth: DepthImage
+    elapsed_s: Scalar
 
 
 class Observed(NamedTuple):

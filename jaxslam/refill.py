@@ -4,11 +4,10 @@ import jax.numpy as jnp
 from jaxlie import SE3
 from jaxslam_kernels.corners import corner_score, grid_corners, occupied_cells
 from jaxslam_kernels.depth_image import sample_depth
-from jaxslam_kernels.image import Pyramid
 from jaxslam_kernels.transform import to_world
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float, Int
 
-from jaxslam.observe import depth_sigma, observe
+from jaxslam.observe import View, depth_sigma, observe
 from jaxslam.state import TrackedPoints, TrackParams, TrackPlan
 
 _MIN_SCORE = 2.0
@@ -20,16 +19,14 @@ _DEPTH_STEP = 0.3
 
 def refill(
     points: TrackedPoints,
-    pyramid: Pyramid,
-    depth: Float[Array, "h w"],
-    ignore: Bool[Array, "h w"],
-    depth_delay_s: Float[Array, ""],
+    next_id: Int[Array, ""],
+    view: View,
     T_world_cam: SE3,
     twist: Float[Array, "6"],
     params: TrackParams,
     plan: TrackPlan,
 ) -> TrackedPoints:
-    """Put the best corners of empty grid cells into free slots.
+    """Put the best corners of empty grid cells into free slots, numbered from `next_id` on.
 
     Corners are sought on the second level of the pyramid: a quarter of the work, and less noise. A new point has the
     depth measured at it, the rolling shutter and the delay of the depth image taken into account.
@@ -40,19 +37,18 @@ def refill(
     leaves too few points (`fr1_rpy` 10.2); giving them a fifth of the weight hands the scene to people, who are one
     surface (two people 145).
     """
-    border, cell = pyramid.border, plan.cell_px // 2
-    image = pyramid.levels[1][border:-border, border:-border]
+    border, cell, depth = view.pyramid.border, plan.cell_px // 2, view.depth
+    image = view.pyramid.levels[1][border:-border, border:-border]
     v, u = jnp.mgrid[: image.shape[0], : image.shape[1]]
     edge = _EDGE_PX // 2
     inside = (u >= edge) & (v >= edge) & (u < image.shape[1] - edge) & (v < image.shape[0] - edge)
-    corners = grid_corners(
-        corner_score(image), inside & ~ignore[::2, ::2][: image.shape[0], : image.shape[1]], cell=cell
-    )
+    ignore = view.frame.ignore[::2, ::2][: image.shape[0], : image.shape[1]]
+    corners = grid_corners(corner_score(image), inside & ~ignore, cell=cell)
     taken = occupied_cells(points.uv / 2, points.valid, (image.shape[0], image.shape[1]), cell=cell)
     uv = corners.points * 2
 
     rough = sample_depth(depth, uv, reach=2)
-    seen = observe(uv, rough, twist, depth, depth_delay_s, params, reach=2)
+    seen = observe(uv, rough, twist, depth, view.frame.depth_delay_s, params, reach=2)
     X_world = to_world(T_world_cam, seen.in_camera())
     sigma = depth_sigma(seen.depth, params)
 
@@ -69,5 +65,6 @@ def refill(
         information=put(points.information, 1 / jnp.square(sigma)),
         weight=jnp.where(new, 1, points.weight),
         age=jnp.where(new, 0, points.age),
+        id=jnp.where(new, next_id + rank, points.id),
         valid=points.valid | new,
     )

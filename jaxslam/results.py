@@ -20,8 +20,9 @@ from jaxslam.errors import TrajectoryError
 from jaxslam.evaluation import Evaluation, evaluate
 from jaxslam.files import write_atomically
 from jaxslam.frame import Frame
-from jaxslam.slam import FrameRecord, Rejected, Slam, Tracked
+from jaxslam.slam import Slam
 from jaxslam.state import TrackStatus
+from jaxslam.tracked import FrameRecord, Rejected, Tracked
 from jaxslam.trajectory import write_tum
 from jaxslam.visualize import Snapshot, plot_trajectory
 from jaxslam.xla import threads, usable_cores

@@ -3,81 +3,36 @@
 import logging
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import replace
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxslam.back_end import BackEnd, copied
 from jaxslam.camera import Camera
 from jaxslam.config import Config, TrackConfig
 from jaxslam.datasets import Dataset, prefetch
-from jaxslam.errors import DatasetError, FrameError, JaxSlamError
+from jaxslam.errors import DatasetError, FrameError, JaxSlamError, MapFileError
 from jaxslam.frame import Frame, check_frame
 from jaxslam.frame_arrays import FrameArrays, frame_arrays
-from jaxslam.state import TrackOutput, TrackParams, TrackPlan, TrackReason, TrackState, TrackStatus
+from jaxslam.map import Map
+from jaxslam.map_file import load_map, save_map
+from jaxslam.map_link import Hung
+from jaxslam.pose import IDENTITY, moved
+from jaxslam.state import TrackOutput, TrackParams, TrackPlan, TrackState, TrackStatus
 from jaxslam.track import init_state, track_step
-from jaxslam.trajectory import Trajectory
+from jaxslam.tracked import FrameRecord, Rejected, Tracked, tracked_of
+from jaxslam.trajectory import PathLike, Trajectory
 from jaxslam.xla import enable_compile_cache
 
 _log = logging.getLogger(__name__)
 
-
-@dataclass(frozen=True, eq=False)
-class Tracked:
-    """What became of one frame.
-
-    Attributes:
-        timestamp_ns: Its time.
-        T_world_cam: `(7,)` float64 pose of the camera as `wxyz_xyz`; the last one where `status` is `LOST`.
-        covariance: `(6, 6)` of the pose, in the tangent space at the camera: translation (m), then rotation (rad).
-        status: What the pose is worth.
-        reason: Why it is not worth more; empty if it is `OK`.
-        num_inliers: Followed points that agree with the pose.
-        inlier_ratio: Their share of the points that could be followed.
-        num_looked_up: Points found again in keyframes.
-        residual_px: Robust standard deviation of the inliers' reprojection error, pixels.
-        uv: `(2, n)` float32 pixels of the points in the frame, those just found included.
-        weights: `(n,)` float32 weight of each, 0 to 1; 0 for a slot without a point.
-        followed: `(n,)` bool, true for points that came from the frame before, false for new ones.
-        is_keyframe: Whether the frame was kept.
-        track_ms: Time it took, in milliseconds.
-    """
-
-    timestamp_ns: int
-    T_world_cam: np.ndarray
-    covariance: np.ndarray
-    status: TrackStatus
-    reason: str
-    num_inliers: int
-    inlier_ratio: float
-    num_looked_up: int
-    residual_px: float
-    uv: np.ndarray
-    weights: np.ndarray
-    followed: np.ndarray
-    is_keyframe: bool
-    track_ms: float
-
-
-@dataclass(frozen=True)
-class Rejected:
-    """A frame of a recording that could not be read or does not fit; tracking goes on with the next one."""
-
-    timestamp_ns: int
-    error: JaxSlamError
-
-    @property
-    def status(self) -> TrackStatus:
-        """Always `REJECTED`."""
-        return TrackStatus.REJECTED
-
-    @property
-    def reason(self) -> str:
-        """What was wrong."""
-        return str(self.error)
-
+_NEVER = 1e6
+"""Frames of loss: fewer than those a fresh state counts, which starts at once."""
+_PREDICTED_S = 1.0
+"""Longest time for which a constant velocity is believed."""
 
 _new_state = jax.jit(init_state, static_argnames=("height", "width", "plan"))
 """One program instead of some fifty."""
@@ -90,61 +45,88 @@ def _step(
     return track_step(state, frame, params, plan)
 
 
-@dataclass(frozen=True)
-class FrameRecord:
-    """One line of a run's log: a frame's fate without its arrays.
-
-    Attributes are those of `Tracked`; a rejected frame has only a time, a status and a reason.
-    """
-
-    timestamp_ns: int
-    status: TrackStatus
-    reason: str
-    num_inliers: int = 0
-    inlier_ratio: float = 0.0
-    num_looked_up: int = 0
-    residual_px: float = 0.0
-    is_keyframe: bool = False
-    track_ms: float | None = None
-
-    @classmethod
-    def of(cls, result: "Tracked | Rejected") -> "FrameRecord":
-        """The record of a result."""
-        return cls(**{field.name: getattr(result, field.name) for field in fields(cls) if hasattr(result, field.name)})
-
-
 class Slam:
-    """Tracks a camera through a scene, frame by frame.
+    """Tracks a camera through a scene, frame by frame, and maps it.
 
-    The world is the camera's place at the first frame. Calls must come from one thread at a time.
+    The world is the camera's place at the first frame, or that of the map it starts with. Calls must come from one
+    thread at a time. With `run.deterministic` everything happens in that thread, on a fixed schedule; without it,
+    mapping and loop closing have threads of their own, and `close` (or `with`) ends them.
     """
 
-    def __init__(self, camera: Camera, config: Config | None = None) -> None:
-        """Prepare for frames of a camera. Compiling happens at the first frame or in `warm_up`."""
+    def __init__(
+        self,
+        camera: Camera,
+        config: Config | None = None,
+        *,
+        map: Map | None = None,
+        localize_only: bool = False,
+    ) -> None:
+        """Prepare for frames of a camera. Compiling happens at the first frame or in `warm_up`.
+
+        Args:
+            camera: That takes the frames.
+            config: Settings; the default preset if not given.
+            map: To start with: the first frame is `LOST` until its place is recognised.
+            localize_only: Leave the map as it is.
+
+        Raises:
+            MapFileError: If the map is of a camera of another size.
+        """
         self.camera = camera
         self.config = config or Config()
         self.compile_s = 0.0
-        self._params = track_params(camera, self.config.track)
+        if map is not None and (map.camera.width, map.camera.height) != (camera.width, camera.height):
+            raise MapFileError(
+                f"map: expected one of a camera of {camera.width}x{camera.height} pixels,"
+                f" got {map.camera.width}x{map.camera.height}"
+            )
+        self._start_map, self._localize_only = map, localize_only
+        self._params = track_params(camera, self.config.track)._replace(restart_after=jnp.float32(_NEVER))
         self._plan = track_plan(self.config.track)
         self._ready = False
-        self.reset()
+        self._begin()
+
+    @classmethod
+    def load(
+        cls, path: PathLike, camera: Camera | None = None, config: Config | None = None, *, localize_only: bool = False
+    ) -> "Slam":
+        """Start with the map in a file that `save` wrote.
+
+        Args:
+            path: The file.
+            camera: That takes the frames; the one that made the map if not given.
+            config: Settings.
+            localize_only: Leave the map as it is.
+
+        Raises:
+            MapFileError: If the file is missing, damaged, of another kind, or of a camera of another size.
+        """
+        map = load_map(path)
+        return cls(camera or map.camera, config, map=map, localize_only=localize_only)
+
+    def save(self, path: PathLike) -> None:
+        """Write the map, with all that was handed over to it, to a file that `load` reads.
+
+        Raises:
+            MapFileError: If it cannot be written; a file that was there before is as it was.
+        """
+        self.finish()
+        save_map(path, self.map)
 
     def reset(self) -> None:
-        """Forget everything; the next frame starts a new world."""
-        self._state = _new_state(self.camera.height, self.camera.width, self._plan, seed=self.config.run.seed)
-        self._last_ns: int | None = None
-        self._times_ns: list[int] = []
-        self._poses: list[np.ndarray] = []
+        """Forget everything since the beginning; the next frame starts anew."""
+        self._back.close()
+        self._begin()
 
     def warm_up(self) -> float:
-        """Compile the step, or load it from the cache of an earlier run; gives the seconds it took, once."""
+        """Compile all that is needed, or load it from the cache of an earlier run; gives the seconds it took, once."""
         if not self._ready:
             enable_compile_cache()
             began = time.perf_counter()
-            blank = _new_state(self.camera.height, self.camera.width, self._plan, seed=self.config.run.seed)
             shape = (self.camera.height, self.camera.width)
             nothing = frame_arrays(Frame(0, np.zeros(shape, np.uint8), np.zeros(shape, np.float32)), 0.0)
-            jax.block_until_ready(_step(blank, nothing, self._params, self._plan))
+            jax.block_until_ready(_step(self._fresh_state(), nothing, self._params, self._plan))
+            self._back.compile(nothing)
             self.compile_s = time.perf_counter() - began
             self._ready = True
         return self.compile_s
@@ -162,19 +144,24 @@ class Slam:
         Raises:
             FrameError: If the frame does not fit the camera, or its time is not later than the last one's. Nothing
                 has happened then; go on with the next frame.
+            Exception: What went wrong in a thread of the map, if something did.
         """
         check_frame(frame, self.camera.width, self.camera.height, self._last_ns)
         self.warm_up()
         began = time.perf_counter()
+        self._state, correction = self._back.update(self._state, self._frame)
         dt_s = 1 / self.camera.fps if self._last_ns is None else (frame.timestamp_ns - self._last_ns) * 1e-9
-        self._state, output = _step(self._state, frame_arrays(frame, dt_s), self._params, self._plan)
-        output: TrackOutput = jax.device_get(output)
-        tracked = _tracked(frame.timestamp_ns, output, (time.perf_counter() - began) * 1e3)
+        arrays = frame_arrays(frame, dt_s)
+        output, recognised = self._advance(arrays), None
+        if output.status == TrackStatus.LOST:
+            output, recognised = self._regain(arrays, output)
+        if output.keyframe:
+            self._back.keyframe_made(frame.timestamp_ns, copied(arrays), output, self._frame, recognised)
+        tracked = tracked_of(frame.timestamp_ns, output, correction, recognised is not None)
         self._last_ns = frame.timestamp_ns
-        if tracked.status != TrackStatus.LOST:
-            self._times_ns.append(frame.timestamp_ns)
-            self._poses.append(tracked.T_world_cam)
-        return tracked
+        tracked = self._recorded(tracked, dt_s)
+        self._frame += 1
+        return replace(tracked, track_ms=(time.perf_counter() - began) * 1e3)
 
     def run(
         self, dataset: Dataset, on_frame: Callable[[Frame | None, Tracked | Rejected], None] | None = None
@@ -200,7 +187,32 @@ class Slam:
             records.append(FrameRecord.of(result))
             if on_frame is not None:
                 on_frame(frame if isinstance(frame, Frame) else None, result)
+        self.finish()
         return records
+
+    def finish(self) -> None:
+        """Wait until mapping has caught up, so that `map` and `trajectory` hold all that was seen."""
+        self._state = self._back.finish(self._state)
+
+    def close(self) -> None:
+        """End the threads, in two seconds at most; nothing can be tracked after that but from a `reset`."""
+        self._back.close()
+
+    def __enter__(self) -> "Slam":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def map(self) -> Map:
+        """The map as it is now; it never changes, the next one is another."""
+        return self._back.map
+
+    @property
+    def loops_closed(self) -> int:
+        """Loops closed so far, submaps that became one included."""
+        return self._back.loops_closed
 
     @property
     def online_trajectory(self) -> Trajectory:
@@ -211,8 +223,66 @@ class Slam:
 
     @property
     def trajectory(self) -> Trajectory:
-        """Every pose as it is known now. Without a map that is adjusted later, the same as `online_trajectory`."""
-        return self.online_trajectory
+        """Every pose as it is known now: where its keyframe is in the map, and from there as it was tracked."""
+        poses = np.array([self._back.pose(hung) for hung in self._hung]).reshape(-1, 7)
+        return Trajectory(np.array(self._times_ns, np.int64), poses)
+
+    def _begin(self) -> None:
+        self._back = BackEnd(
+            self.camera,
+            self._params,
+            self._plan,
+            self.config,
+            self._start_map,
+            localize_only=self._localize_only,
+        )
+        self._state = self._fresh_state()
+        if self._start_map is not None:
+            self._state = self._state._replace(lost_frames=jnp.zeros((), jnp.int32))
+        self._frame = self._unrecognised = 0
+        self._last_ns: int | None = None
+        self._last_pose, self._last_twist, self._lost_s = np.array(IDENTITY), np.zeros(6), 0.0
+        self._times_ns: list[int] = []
+        self._poses: list[np.ndarray] = []
+        self._hung: list[Hung] = []
+
+    def _fresh_state(self) -> TrackState:
+        return _new_state(self.camera.height, self.camera.width, self._plan, seed=self.config.run.seed)
+
+    def _advance(self, arrays: FrameArrays) -> TrackOutput:
+        self._state, output = _step(self._state, arrays, self._params, self._plan)
+        return jax.device_get(output)
+
+    def _regain(self, arrays: FrameArrays, lost: TrackOutput) -> tuple[TrackOutput, Hung | None]:
+        """The frame once more, from where the map recognises it; or from the pose held, if the settings say so."""
+        recognised, shows_enough = self._back.recognise(arrays)
+        self._unrecognised += shows_enough
+        if recognised is not None:
+            self._state = self._back.relocated(self._state, recognised)
+        elif (
+            self.config.run.on_loss == "submap" and self._unrecognised > self.config.track.restart_after and self._poses
+        ):
+            self._state = self._back.restarted(self._state, np.asarray(lost.T_world_cam.wxyz_xyz))
+        else:
+            return lost, None
+        output = self._advance(arrays)
+        return output, recognised if output.status == TrackStatus.STARTED else None
+
+    def _recorded(self, tracked: Tracked, dt_s: float) -> Tracked:
+        """The result as it is given out, and remembered."""
+        if tracked.status == TrackStatus.LOST:
+            self._lost_s += dt_s
+            if self.config.run.on_loss == "predict":
+                ahead_s = min(self._lost_s, _PREDICTED_S)
+                tracked = replace(tracked, T_world_cam=moved(self._last_pose, self._last_twist * ahead_s))
+            return tracked
+        self._unrecognised, self._lost_s = 0, 0.0
+        self._last_pose, self._last_twist = tracked.T_world_cam, tracked.twist
+        self._back.localize(tracked.T_world_cam, self._frame)
+        self._hung.append(self._back.hang(tracked.T_world_cam))
+        self._times_ns.append(tracked.timestamp_ns)
+        self._poses.append(tracked.T_world_cam)
+        return tracked
 
 
 def track_plan(config: TrackConfig) -> TrackPlan:
@@ -225,25 +295,6 @@ def track_params(camera: Camera, config: TrackConfig, dtype: type[np.floating] =
     traced = (name for name in TrackParams._fields if name not in ("intrinsics", "readout_s"))
     settings = {name: jnp.asarray(getattr(config, name), dtype) for name in traced}
     return TrackParams(intrinsics=camera.intrinsics(dtype), readout_s=jnp.asarray(camera.readout_s, dtype), **settings)
-
-
-def _tracked(timestamp_ns: int, output: TrackOutput, track_ms: float) -> Tracked:
-    return Tracked(
-        timestamp_ns=timestamp_ns,
-        T_world_cam=np.asarray(output.T_world_cam.wxyz_xyz, np.float64),
-        covariance=np.asarray(output.covariance),
-        status=TrackStatus(int(output.status)),
-        reason=TrackReason(int(output.reason)).text,
-        num_inliers=int(output.num_inliers),
-        inlier_ratio=float(output.inlier_ratio),
-        num_looked_up=int(output.num_looked_up),
-        residual_px=float(output.residual_px),
-        uv=np.asarray(output.uv),
-        weights=np.asarray(output.weights),
-        followed=np.asarray(output.tracked),
-        is_keyframe=bool(output.is_keyframe),
-        track_ms=track_ms,
-    )
 
 
 class _Tolerant:

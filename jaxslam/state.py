@@ -23,6 +23,25 @@ class TrackStatus(enum.IntEnum):
     """Tracking begins here, or begins anew at the pose held while lost."""
     REJECTED = 4
     """The frame could not be read or does not fit; it never reached the tracker."""
+    RELOCALISED = 5
+    """After a loss, tracking goes on where the map shows this place: the same world as before."""
+
+
+class KeyframeReason(enum.IntEnum):
+    """Why a frame was kept, the first that applies."""
+
+    NONE = 0
+    """It was not kept."""
+    STARTED = 1
+    """Tracking begins here."""
+    NEW_AREA = 2
+    """No kept keyframe shows much of what it shows."""
+    FEW_FOLLOWED = 3
+    """Few of the points followed were there at the last keyframe."""
+    WEAK = 4
+    """Tracking is weak here: more points are wanted."""
+    TIME = 5
+    """The last one was long ago."""
 
 
 class TrackReason(enum.IntEnum):
@@ -59,7 +78,8 @@ class TrackPlan(NamedTuple):
     Attributes:
         num_points: Points followed from frame to frame.
         num_levels: Levels of the image pyramid.
-        num_keyframes: Pictures kept to look points up in again.
+        num_keyframes: Latest keyframes kept to look points up in again.
+        num_recalled: Further keyframes to look into, put there from a map by `recalled`.
         num_sources: How many of them are looked into in a frame.
         points_per_source: Points looked up from each.
         num_hypotheses: Pose hypotheses a frame.
@@ -72,6 +92,7 @@ class TrackPlan(NamedTuple):
     num_points: int = 512
     num_levels: int = 4
     num_keyframes: int = 12
+    num_recalled: int = 4
     num_sources: int = 2
     points_per_source: int = 192
     num_hypotheses: int = 64
@@ -115,7 +136,11 @@ class TrackParams(NamedTuple):
         weak_inliers: Below this the status is `WEAK`.
         min_share: Smallest share of the followed points that must agree on the pose.
         refill_below: New points are sought when fewer than this share of the capacity is alive.
-        keyframe_below: A keyframe is made when no kept one shows more than this share of its points.
+        keyframe_below: A keyframe is made when no kept one shows more than this share of its points (`NEW_AREA`),
+        keyframe_followed_below: when less than this share of the followed points was there at the last keyframe
+            (`FEW_FOLLOWED`),
+        keyframe_after_s: or when the last one was made this many seconds ago (`TIME`),
+        keyframe_weak_after_s: or this many while tracking is weak (`WEAK`).
         probation_frames: Frames after which a point counts in full. What moves on its own is an outlier within a few
             frames, so that it never counts for much.
         restart_after: Frames of loss after which tracking starts anew at the held pose.
@@ -140,6 +165,9 @@ class TrackParams(NamedTuple):
     min_share: Scalar
     refill_below: Scalar
     keyframe_below: Scalar
+    keyframe_followed_below: Scalar
+    keyframe_after_s: Scalar
+    keyframe_weak_after_s: Scalar
     probation_frames: Scalar
     restart_after: Scalar
     max_speed_m_per_s: Scalar
@@ -155,6 +183,7 @@ class TrackedPoints(NamedTuple):
         information: `(n,)` inverse variance of their depth, 1 / m^2.
         weight: `(n,)` how much each counts, 0 to 1; the caller may change it between steps.
         age: `(n,)` frames each has survived.
+        id: `(n,)` number of each point, given once and never again.
         valid: `(n,)` which slots hold a point.
     """
 
@@ -163,11 +192,12 @@ class TrackedPoints(NamedTuple):
     information: Weights
     weight: Weights
     age: Int[Array, " n"]
+    id: Int[Array, " n"]
     valid: Mask
 
 
 class Keyframes(NamedTuple):
-    """A ring of past frames with the points seen in them, to look up again.
+    """Past frames with the points seen in them, to look up again: a ring of the latest, then those recalled.
 
     Attributes:
         images: `(k, h, w)` pictures, of the type of the frames.
@@ -175,7 +205,8 @@ class Keyframes(NamedTuple):
         uv: `(k, 2, n)` the points in them, pixels.
         X_world: `(k, 3, n)` the points in the world, metres.
         weight: `(k, n)` how much each counted when the keyframe was made; 0 for a slot without a point.
-        made: Keyframes made so far.
+        id: `(k, n)` number of each point.
+        made: Keyframes made so far; the next one goes to slot `made` modulo the size of the ring.
     """
 
     images: Num[Array, "k h w"]
@@ -183,7 +214,26 @@ class Keyframes(NamedTuple):
     uv: Float[Array, "k 2 n"]
     X_world: Float[Array, "k 3 n"]
     weight: Float[Array, "k n"]
+    id: Int[Array, "k n"]
     made: Code
+
+
+class LookedUp(NamedTuple):
+    """Points of keyframes found in a frame.
+
+    Attributes:
+        X_world: `(3, n)` metres.
+        uv: `(2, n)` pixels in the frame.
+        weight: `(n,)` how much each counts; 0 for what was not found.
+        id: `(n,)` number of each point.
+        overlap: Largest share of a keyframe's points that the frame shows.
+    """
+
+    X_world: Points
+    uv: Pixels
+    weight: Weights
+    id: Int[Array, " n"]
+    overlap: Scalar
 
 
 class TrackState(NamedTuple):
@@ -196,8 +246,11 @@ class TrackState(NamedTuple):
         T_world_cam: Pose of the camera.
         twist: Velocity of the camera in its own axes, metres a second then radians a second.
         elapsed_s: Seconds since the last good frame.
+        since_keyframe_s: Seconds since the last keyframe.
+        since_keyframe: Good frames since the last keyframe.
         lost_frames: Frames since tracking was lost, 0 while it is not.
         frame: Frames seen.
+        next_id: Number of the next new point.
         key: Source of every random choice.
     """
 
@@ -207,8 +260,11 @@ class TrackState(NamedTuple):
     T_world_cam: SE3
     twist: Float[Array, "6"]
     elapsed_s: Scalar
+    since_keyframe_s: Scalar
+    since_keyframe: Code
     lost_frames: Code
     frame: Code
+    next_id: Code
     key: Key[Array, ""]
 
 
@@ -227,7 +283,11 @@ class TrackOutput(NamedTuple):
         uv: `(2, n)` pixels of the points in this frame, new ones included.
         weights: `(n,)` final weight of each, 0 to 1; 0 for what is no inlier, 1 times the given weight for a new point.
         tracked: `(n,)` which of the points came from the frame before.
-        is_keyframe: Whether the frame was kept.
+        X_world: `(3, n)` where the points are in the world, metres.
+        id: `(n,)` number of each point.
+        looked_up: Points of keyframes found in the frame.
+        twist: Velocity of the camera in its own axes, metres a second then radians a second.
+        keyframe: A `KeyframeReason`.
     """
 
     T_world_cam: SE3
@@ -241,4 +301,13 @@ class TrackOutput(NamedTuple):
     uv: Pixels
     weights: Weights
     tracked: Mask
-    is_keyframe: Flag
+    X_world: Points
+    id: Int[Array, " n"]
+    looked_up: LookedUp
+    twist: Float[Array, "6"]
+    keyframe: Code
+
+    @property
+    def is_keyframe(self) -> Flag:
+        """Whether the frame was kept."""
+        return self.keyframe > 0

@@ -15,7 +15,7 @@ from jax import lax
 from jaxlie import SE3
 from jaxslam_kernels.camera import Intrinsics, to_pixels
 from jaxslam_kernels.depth_image import believable
-from jaxslam_kernels.image import Pyramid, build_pyramid
+from jaxslam_kernels.image import build_pyramid
 from jaxslam_kernels.lk_flow import lk_flow
 from jaxslam_kernels.pnp import ransac_pnp
 from jaxslam_kernels.pose_refine import PoseRefinement, refine_pose
@@ -25,10 +25,12 @@ from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Points, Scalar, Weig
 from jaxtyping import Array, Float
 
 from jaxslam.frame_arrays import FrameArrays
-from jaxslam.keyframes import LookedUp, empty_keyframes, look_up, with_keyframe
-from jaxslam.observe import Observed, depth_sigma, observe, predict_pixels
+from jaxslam.keyframes import empty_keyframes, look_up, with_keyframe
+from jaxslam.observe import Observed, View, depth_sigma, observe, predict_pixels
 from jaxslam.refill import refill
 from jaxslam.state import (
+    KeyframeReason,
+    LookedUp,
     TrackedPoints,
     TrackOutput,
     TrackParams,
@@ -43,16 +45,6 @@ _MAX_PREDICTION_S = 0.1
 """A constant velocity says nothing about longer gaps."""
 _MAX_FUSED = 4
 _UNKNOWN_VARIANCE = 1e2
-
-
-class _View(NamedTuple):
-    """The current frame, prepared."""
-
-    frame: FrameArrays
-    pyramid: Pyramid
-    depth: Float[Array, "h w"]
-    elapsed_s: Scalar
-    """Seconds since the last good frame."""
 
 
 class _Verdict(NamedTuple):
@@ -96,14 +88,18 @@ def init_state(
             information=jnp.zeros(n, dtype),
             weight=jnp.ones(n, dtype),
             age=jnp.zeros(n, jnp.int32),
+            id=jnp.zeros(n, jnp.int32),
             valid=jnp.zeros(n, bool),
         ),
         keyframes=empty_keyframes(height, width, plan, image_dtype, dtype),
         T_world_cam=SE3(pose.wxyz_xyz.astype(dtype)),
         twist=jnp.zeros(6, dtype),
         elapsed_s=jnp.zeros((), dtype),
+        since_keyframe_s=jnp.zeros((), dtype),
+        since_keyframe=jnp.zeros((), jnp.int32),
         lost_frames=jnp.full((), 2**20, jnp.int32),
         frame=jnp.zeros((), jnp.int32),
+        next_id=jnp.zeros((), jnp.int32),
         key=jax.random.key(seed),
     )
 
@@ -129,27 +125,25 @@ def track_step(
     params = _widened(params, state.points.uv, uv, followed)
     coarse, agreeing = _coarse_pose(state, view, uv, followed, predicted, params, plan)
     twist = _twist(state.T_world_cam, coarse, view.elapsed_s)
-    looked_up = look_up(state.keyframes, coarse, twist, view.pyramid, view.depth, params, plan)
+    looked_up = look_up(state.keyframes, coarse, twist, view, params, plan)
     refined, inliers = _refine(state, view, uv, agreeing, looked_up, coarse, twist, params)
     verdict = _judge(state, view, refined, followed, inliers, params)
     kept = _update_points(state, view, uv, inliers, refined.T_world_cam, params)
     return _conclude(state, view, kept, refined, looked_up, verdict, params, plan)
 
 
-def _prepare(state: TrackState, frame: FrameArrays, params: TrackParams, plan: TrackPlan) -> _View:
+def _prepare(state: TrackState, frame: FrameArrays, params: TrackParams, plan: TrackPlan) -> View:
     pyramid = build_pyramid(frame.image, num_levels=plan.num_levels, dtype=state.twist.dtype)
     depth = believable(frame.depth, params.min_depth_m, params.max_depth_m)
-    return _View(frame, pyramid, depth, state.elapsed_s + frame.dt_s)
+    return View(frame, pyramid, depth, state.elapsed_s + frame.dt_s)
 
 
-def _predict(state: TrackState, view: _View) -> SE3:
+def _predict(state: TrackState, view: View) -> SE3:
     """Constant velocity."""
     return moved(state.T_world_cam, state.twist * jnp.clip(view.elapsed_s, 0, _MAX_PREDICTION_S))
 
 
-def _follow(
-    state: TrackState, view: _View, predicted: SE3, params: TrackParams, plan: TrackPlan
-) -> tuple[Pixels, Mask]:
+def _follow(state: TrackState, view: View, predicted: SE3, params: TrackParams, plan: TrackPlan) -> tuple[Pixels, Mask]:
     """Follow the points into the frame by optical flow, starting where the prediction puts them."""
     points = state.points
     height, width = view.pyramid.size()
@@ -175,9 +169,7 @@ def _widened(params: TrackParams, before: Pixels, after: Pixels, followed: Mask)
     return params._replace(ransac_px=params.ransac_px + extra, outlier_px=params.outlier_px + extra)
 
 
-def _see(
-    X_world: Points, uv: Pixels, pose: SE3, twist: Float[Array, "6"], view: _View, params: TrackParams
-) -> Observed:
+def _see(X_world: Points, uv: Pixels, pose: SE3, twist: Float[Array, "6"], view: View, params: TrackParams) -> Observed:
     """What the frame says of map points, seen from about `pose`."""
     expected = jnp.maximum(to_camera(pose, X_world)[2], params.min_depth_m)
     return observe(uv, expected, twist, view.depth, view.frame.depth_delay_s, params)
@@ -190,7 +182,7 @@ def _trust(points: TrackedPoints, params: TrackParams) -> Weights:
 
 
 def _coarse_pose(
-    state: TrackState, view: _View, uv: Pixels, followed: Mask, predicted: SE3, params: TrackParams, plan: TrackPlan
+    state: TrackState, view: View, uv: Pixels, followed: Mask, predicted: SE3, params: TrackParams, plan: TrackPlan
 ) -> tuple[SE3, Mask]:
     """The pose most points agree with, and which do."""
     seen = _see(state.points.X_world, uv, predicted, state.twist, view, params)
@@ -217,7 +209,7 @@ def _twist(before: SE3, after: SE3, elapsed_s: Scalar) -> Float[Array, "6"]:
 
 def _refine(
     state: TrackState,
-    view: _View,
+    view: View,
     uv: Pixels,
     agreeing: Mask,
     looked_up: LookedUp,
@@ -259,7 +251,7 @@ def _close(T_world_cam: SE3, X_world: Points, xy: Pixels, params: TrackParams) -
 
 
 def _judge(
-    state: TrackState, view: _View, refined: PoseRefinement, followed: Mask, inliers: Mask, params: TrackParams
+    state: TrackState, view: View, refined: PoseRefinement, followed: Mask, inliers: Mask, params: TrackParams
 ) -> _Verdict:
     """Lost, weak or fine, and why."""
     num_followed, num_inliers = (jnp.sum(mask, dtype=state.twist.dtype) for mask in (followed, inliers))
@@ -286,7 +278,7 @@ def _code(value: enum.IntEnum) -> Code:
 
 
 def _update_points(
-    state: TrackState, view: _View, uv: Pixels, inliers: Mask, T_world_cam: SE3, params: TrackParams
+    state: TrackState, view: View, uv: Pixels, inliers: Mask, T_world_cam: SE3, params: TrackParams
 ) -> TrackedPoints:
     """Keep the inliers, and fuse the depth measured now into where they are.
 
@@ -309,13 +301,14 @@ def _update_points(
         information=jnp.where(agrees, jnp.minimum(points.information + information, cap), points.information),
         weight=points.weight,
         age=points.age + inliers.astype(jnp.int32),
+        id=points.id,
         valid=points.valid & inliers,
     )
 
 
 def _conclude(
     state: TrackState,
-    view: _View,
+    view: View,
     kept: TrackedPoints,
     refined: PoseRefinement,
     looked_up: LookedUp,
@@ -333,22 +326,19 @@ def _conclude(
     pose = choose(state.T_world_cam, refined.T_world_cam)
     twist = choose(jnp.zeros_like(state.twist), _twist(state.T_world_cam, pose, view.elapsed_s))
     points = choose(state.points._replace(valid=state.points.valid & held), kept)
-
-    alive = jnp.sum(points.valid, dtype=twist.dtype)
-    few = alive < params.refill_below * plan.num_points
+    few = jnp.sum(points.valid, dtype=twist.dtype) < params.refill_below * plan.num_points
     points = lax.cond(
         start | (few & ~verdict.lost),
-        lambda p: refill(
-            p, view.pyramid, view.depth, view.frame.ignore, view.frame.depth_delay_s, pose, twist, params, plan
-        ),
+        lambda p: refill(p, state.next_id, view, pose, twist, params, plan),
         lambda p: p,
         points,
     )
     failed = start & (jnp.sum(points.valid, dtype=twist.dtype) < params.min_inliers)
-    started = start & ~failed
-    make = started | (~verdict.lost & (looked_up.overlap < params.keyframe_below))
-    keyframes = with_keyframe(state.keyframes, make, view.frame.image, pose, points, _trust(points, params))
-    stale = held | failed
+    started, stale = start & ~failed, held | failed
+    since_keyframe_s = state.since_keyframe_s + jnp.maximum(view.frame.dt_s, 0)
+    keyframe = _keyframe_reason(state, kept, looked_up, verdict, started, since_keyframe_s, params)
+    make = keyframe > 0
+    keyframes = with_keyframe(state.keyframes, make, view.frame.image, pose, points, _trust(points, params), plan)
     new_state = TrackState(
         pyramid=jax.tree.map(lambda old, new: jnp.where(stale, old, new), state.pyramid, view.pyramid),
         points=points,
@@ -356,8 +346,11 @@ def _conclude(
         T_world_cam=pose,
         twist=twist,
         elapsed_s=jnp.where(stale, jnp.maximum(view.elapsed_s, 0), 0),
+        since_keyframe_s=jnp.where(make, 0, since_keyframe_s),
+        since_keyframe=jnp.where(make, 0, state.since_keyframe + (~verdict.lost).astype(jnp.int32)),
         lost_frames=jnp.where(started, 0, lost_frames),
         frame=state.frame + 1,
+        next_id=jnp.maximum(state.next_id, jnp.max(jnp.where(points.valid, points.id + 1, 0))),
         key=state.key,
     )
     status = jnp.select(
@@ -366,6 +359,7 @@ def _conclude(
         _code(TrackStatus.OK),
     )
     reason = jnp.select([failed, started], [_code(TrackReason.NO_DEPTH), _code(TrackReason.NONE)], verdict.reason)
+    found = looked_up._replace(weight=jnp.where(verdict.lost, 0, looked_up.weight))
     output = TrackOutput(
         T_world_cam=pose,
         covariance=jnp.where(verdict.lost, jnp.eye(6, dtype=twist.dtype) * _UNKNOWN_VARIANCE, refined.covariance),
@@ -373,11 +367,41 @@ def _conclude(
         reason=reason,
         num_inliers=jnp.where(verdict.lost, 0, jnp.sum(kept.valid)),
         inlier_ratio=jnp.where(verdict.lost, 0, verdict.inlier_ratio),
-        num_looked_up=jnp.where(verdict.lost, 0, jnp.sum(looked_up.weight > 0)),
+        num_looked_up=jnp.sum(found.weight > 0),
         residual_px=refined.residual_scale * params.pixel_sigma,
         uv=points.uv,
         weights=jnp.where(points.valid & ~held, points.weight, 0),
         tracked=kept.valid & ~verdict.lost,
-        is_keyframe=make,
+        X_world=points.X_world,
+        id=points.id,
+        looked_up=found,
+        twist=twist,
+        keyframe=keyframe,
     )
     return new_state, output
+
+
+def _keyframe_reason(
+    state: TrackState,
+    kept: TrackedPoints,
+    looked_up: LookedUp,
+    verdict: _Verdict,
+    started: Flag,
+    since_keyframe_s: Scalar,
+    params: TrackParams,
+) -> Code:
+    """Why to keep the frame, if at all."""
+    old = kept.valid & (kept.age > state.since_keyframe)
+    share = jnp.sum(old, dtype=since_keyframe_s.dtype) / jnp.maximum(
+        jnp.sum(kept.valid, dtype=since_keyframe_s.dtype), 1
+    )
+    tracked = ~verdict.lost
+    causes = (
+        (started, KeyframeReason.STARTED),
+        (tracked & (looked_up.overlap < params.keyframe_below), KeyframeReason.NEW_AREA),
+        (tracked & (share < params.keyframe_followed_below), KeyframeReason.FEW_FOLLOWED),
+        (verdict.weak & (since_keyframe_s > params.keyframe_weak_after_s), KeyframeReason.WEAK),
+        (tracked & (since_keyframe_s > params.keyframe_after_s), KeyframeReason.TIME),
+    )
+    conditions = [condition for condition, _ in causes]
+    return jnp.select(conditions, [_code(reason) for _, reason in causes], _code(KeyframeReason.NONE))

@@ -27,6 +27,12 @@ def moved(T_a_b: SE3, tangent_b: Float[Array, "6"]) -> SE3:
         return _typed(T_a_b @ SE3.exp(tangent_b), T_a_b)
 
 
+def composed(T_a_b: SE3, T_b_c: SE3) -> SE3:
+    """`T_a_c`, its quaternion of unit length."""
+    with lenient_promotion():
+        return _typed((T_a_b @ T_b_c).normalize(), T_a_b)
+
+
 def between(T_world_a: SE3, T_world_b: SE3) -> SE3:
     """`T_a_b`: the second pose seen from the first."""
     with lenient_promotion():

@@ -9,8 +9,9 @@ from small_scene import CONFIG, HEIGHT, WIDTH, Clip, clip, truth_from_start
 
 from jaxslam.errors import DatasetError, FrameError
 from jaxslam.frame import Frame
-from jaxslam.slam import Slam, Tracked
+from jaxslam.slam import Slam
 from jaxslam.state import TrackStatus
+from jaxslam.tracked import Tracked
 
 BAD = slice(20, 24)
 RECOVERED = 30

@@ -12,8 +12,9 @@ import pytest
 from small_scene import CONFIG, Clip, clip, resident_mb, track_round_trip
 
 from jaxslam.evaluation import evaluate
-from jaxslam.slam import FrameRecord, Slam
+from jaxslam.slam import Slam
 from jaxslam.state import TrackStatus
+from jaxslam.tracked import FrameRecord
 from jaxslam.trajectory import write_tum
 
 COMPILED = "/jax/core/compile/backend_compile_duration"

@@ -1,0 +1,352 @@
+"""What becomes of a new keyframe: features, points of the map found in it, new points, adjustment, culling.
+
+Runs beside tracking, in a thread or in turn, and owns the map: nobody else makes a new one. The tracker gets the new
+map when it is there, and moves what it tracks along with the keyframes.
+
+Source: Mur-Artal and Tardos, "ORB-SLAM2", 2017, section III, for the order of things and for the rules of culling.
+"""
+
+from typing import NamedTuple
+
+import cv2
+import jax
+import numpy as np
+from jaxslam_kernels.camera import to_pixels
+from jaxslam_kernels.depth_image import believable
+from jaxslam_kernels.types import Pixels, Weights
+from jaxtyping import Array, Float
+
+from jaxslam.camera import Camera
+from jaxslam.config import MappingConfig, TrackConfig
+from jaxslam.features import FeaturePlan, Features, features_of
+from jaxslam.frame_arrays import FrameArrays
+from jaxslam.local_adjustment import AdjustPlan, adjust_all, adjust_around, compile_adjustment
+from jaxslam.loop_closing import LoopClosure
+from jaxslam.map import (
+    NONE,
+    Keyframe,
+    Map,
+    MapPoints,
+    Sightings,
+    covisible,
+    empty_map,
+    has,
+    point_submaps,
+    rows,
+    standing,
+)
+from jaxslam.map_edit import (
+    moved,
+    transformed,
+    with_keyframe,
+    with_loop,
+    with_points,
+    with_sightings,
+    without_keyframe,
+    without_points,
+)
+from jaxslam.map_matching import feature_sightings, find_points, fuse_duplicates, recognisable_in
+from jaxslam.observe import observe
+from jaxslam.pose import IDENTITY, compose, inverse, rotate, transform
+from jaxslam.state import TrackParams
+
+_LOCAL_KEYFRAMES = 15
+_FUSE_KEYFRAMES = 6
+_CULL_AFTER = 3
+"""Keyframes after which a point that no second one has seen is dropped."""
+_REDUNDANT_SHARE, _REDUNDANT_VIEWS = 0.9, 3
+"""A keyframe goes if this share of its points is seen by so many others (ORB-SLAM)."""
+_KEEP_LATEST = 12
+"""Keyframes the tracker may still be looking into."""
+_SPAN = 64
+"""Keyframes after which the number the tracker gave a point is forgotten."""
+
+
+class Tracks(NamedTuple):
+    """Points the tracker saw in a keyframe.
+
+    Attributes:
+        id: `(n,)` the tracker's numbers; of a point recalled from the map, `recalled_id` of its id.
+        seen_uv: `(2, n)` pixels as seen.
+        X_cam: `(3, n)` in the axes of the camera, metres.
+        weight: `(n,)` 0 to 1; 0 for no point.
+    """
+
+    id: np.ndarray
+    seen_uv: np.ndarray
+    X_cam: np.ndarray
+    weight: np.ndarray
+
+
+class NewKeyframe(NamedTuple):
+    """A frame the tracker kept.
+
+    Attributes:
+        id: Number of the keyframe; they come in order.
+        timestamp_ns: Its time.
+        frame: Image (grey, uint8), depth and what to ignore.
+        parent: The keyframe it hangs on; `NONE` if it is the first of a submap.
+        T_parent_keyframe: `(7,)` its pose seen from there; in the world without a parent.
+        submap: Number of its submap.
+        twist: `(6,)` velocity of the camera in its own axes.
+        tracks: Points seen.
+    """
+
+    id: int
+    timestamp_ns: int
+    frame: FrameArrays
+    parent: int
+    T_parent_keyframe: np.ndarray
+    submap: int
+    twist: np.ndarray
+    tracks: Tracks
+
+
+class MappingPlan(NamedTuple):
+    """Settings of local mapping, static.
+
+    Attributes:
+        features: How features are found.
+        adjust: How windows are adjusted.
+        track_sigma_px: Standard deviation of a point followed by flow, pixels.
+        search_px: How far from where the pose puts a point a feature is sought.
+    """
+
+    features: FeaturePlan = FeaturePlan()
+    adjust: AdjustPlan = AdjustPlan()
+    track_sigma_px: float = 0.3
+    search_px: float = 3.0
+
+
+def mapping_plan(config: MappingConfig, track: TrackConfig) -> MappingPlan:
+    """The settings of local mapping; depth is measured as well as in tracking."""
+    return MappingPlan(
+        features=FeaturePlan(**{name: getattr(config, name) for name in FeaturePlan._fields}),
+        adjust=AdjustPlan(
+            config.window, config.max_steps, track.loss_scale, track.depth_sigma_m, track.depth_sigma_per_m2
+        ),
+        track_sigma_px=config.track_sigma_px,
+        search_px=config.search_px,
+    )
+
+
+def recalled_id(point_ids: np.ndarray) -> np.ndarray:
+    """The tracker's numbers for points of the map: negative, so that none is one of its own."""
+    return -1 - point_ids
+
+
+class LocalMapping:
+    """Makes the map out of keyframes."""
+
+    def __init__(self, camera: Camera, params: TrackParams, plan: MappingPlan, map: Map | None = None) -> None:
+        """Start with a map, empty by default."""
+        self.map = empty_map(camera) if map is None else map
+        self._params, self._plan = params, plan
+        self._point_of: dict[int, int] = {}
+        self._last_seen: dict[int, int] = {}
+
+    def compile(self, frame: FrameArrays, num_tracks: int) -> None:
+        """Compile all that a keyframe needs, for frames of this size with so many tracks."""
+        twist = np.zeros(6, np.float32)
+        features_of(frame, twist, self._params, self._plan.features)
+        nothing = np.zeros((2, num_tracks), np.float32)
+        jax.block_until_ready(_ideal(nothing, nothing[0], twist, frame, self._params))
+        compile_adjustment(self._plan.adjust)
+
+    def add(self, new: NewKeyframe) -> Map:
+        """Take in a keyframe; gives the new map."""
+        features = features_of(new.frame, new.twist, self._params, self._plan.features)
+        map = self._with_keyframe(self.map, new, features)
+        map = self._with_tracks(map, new)
+        map = self._with_found_points(map, new.id, features)
+        map = self._with_new_points(map, new.id, features)
+        near, _ = covisible(map, new.id)
+        map = self._fused(map, new.id, near[:_FUSE_KEYFRAMES])
+        map = _without_unconfirmed(map, new.id)
+        map = adjust_around(map, new.id, self._plan.adjust)
+        map = _without_redundant(map, new.id)
+        self._forget(new.id)
+        self.map = map
+        return map
+
+    def close_loop(self, loop: LoopClosure) -> Map:
+        """Close a loop, or make one submap of two; gives the new map."""
+        map = self.map
+        if not has(map.ids, np.array([loop.source, loop.target])).all():
+            return map  # one of them has been culled since
+        map = _merged(map, loop) if not len(loop.keyframes) else _bent(map, loop)
+        map = with_loop(map, loop.source, loop.target, loop.T_source_target, loop.information)
+        near, _ = covisible(map, loop.source)
+        map = self._fused(map, loop.target, np.concatenate([[loop.source], near[:_LOCAL_KEYFRAMES]]))
+        map = adjust_around(map, loop.target, self._plan.adjust)
+        self.map = adjust_all(map, self._plan.adjust)
+        return self.map
+
+    def _with_keyframe(self, map: Map, new: NewKeyframe, features: Features) -> Map:
+        pose, parent, submap = new.T_parent_keyframe, new.parent, new.submap
+        if parent != NONE:
+            pose = compose(map.pose(parent), pose)
+            parent = int(standing(map, np.array([parent]))[0])
+            submap = int(map.submap[map.row(parent)])  # which may have become part of another one
+        encoded, png = cv2.imencode(".png", np.asarray(new.frame.image), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        if not encoded:
+            raise RuntimeError("the image of a keyframe could not be compressed")
+        keyframe = Keyframe(new.id, new.timestamp_ns, features, png.tobytes())
+        return with_keyframe(map, keyframe, pose, parent, submap)
+
+    def _with_tracks(self, map: Map, new: NewKeyframe) -> Map:
+        """The points the tracker saw: those the map has get a sighting, the others become points."""
+        tracks = new.tracks
+        uv, depth = jax.device_get(
+            _ideal(tracks.seen_uv, tracks.X_cam[2].astype(np.float32), new.twist, new.frame, self._params)
+        )
+        used = (tracks.weight > 0) & np.isfinite(uv).all(axis=0) & np.isfinite(tracks.X_cam).all(axis=0)
+        known = np.array([self._known(map, int(id)) for id in tracks.id], np.int64)
+        fresh = np.flatnonzero(used & (known == NONE))
+        _, first = np.unique(tracks.id[fresh], return_index=True)
+        fresh = fresh[np.sort(first)]
+        ids = map.next_point + np.arange(len(fresh))
+        map = with_points(
+            map,
+            MapPoints(
+                ids=ids,
+                X_world=transform(map.pose(new.id), tracks.X_cam[:, fresh].astype(np.float64)),
+                weight=np.ones(len(fresh), np.float32),
+                descriptor=np.zeros((len(fresh), 32), np.uint8),
+                recognisable=np.zeros(len(fresh), bool),
+                made_by=np.full(len(fresh), new.id, np.int64),
+            ),
+        )
+        known[fresh] = ids
+        self._point_of.update(zip(tracks.id[fresh].tolist(), ids.tolist(), strict=True))
+        self._last_seen.update(dict.fromkeys(tracks.id[used].tolist(), new.id))
+        seen = np.flatnonzero(used & has(map.points.ids, known))
+        of_submap = point_submaps(map)[rows(map.points.ids, known[seen])] == map.submap[map.row(new.id)]
+        seen = seen[of_submap]
+        return with_sightings(
+            map,
+            Sightings(
+                keyframe=np.full(len(seen), new.id, np.int64),
+                point=known[seen],
+                feature=np.full(len(seen), NONE, np.int32),
+                seen_uv=tracks.seen_uv[:, seen],
+                uv=uv[:, seen],
+                depth=depth[seen],
+                sigma_px=np.full(len(seen), self._plan.track_sigma_px, np.float32),
+                weight=tracks.weight[seen],
+            ),
+        )
+
+    def _known(self, map: Map, track_id: int) -> int:
+        """The point of the map that the tracker has under a number; `NONE` if it has not come up yet."""
+        return -1 - track_id if track_id < 0 else self._point_of.get(track_id, NONE)
+
+    def _with_found_points(self, map: Map, keyframe_id: int, features: Features) -> Map:
+        """Points of the map that its neighbours see, found in it by their descriptor."""
+        near, _ = covisible(map, keyframe_id, at_least=1)
+        points = recognisable_in(map, near[:_LOCAL_KEYFRAMES])
+        plan = self._plan.features
+        index, feature = find_points(map, points, features, map.pose(keyframe_id), plan, radius_px=self._plan.search_px)
+        return with_sightings(map, feature_sightings(keyframe_id, features, points.ids[index], feature, plan))
+
+    def _with_new_points(self, map: Map, keyframe_id: int, features: Features) -> Map:
+        """A point for every feature with depth that is none yet."""
+        mine = map.sightings.keyframe == keyframe_id
+        taken = np.zeros(len(features.octave), bool)
+        taken[map.sightings.feature[mine & (map.sightings.feature != NONE)]] = True
+        free = np.flatnonzero(~taken & (features.depth > 0))
+        camera, depth = map.camera, features.depth[free].astype(np.float64)
+        u, v = features.uv[:, free].astype(np.float64)
+        X_cam = np.stack([(u - camera.cx) / camera.fx * depth, (v - camera.cy) / camera.fy * depth, depth])
+        ids = map.next_point + np.arange(len(free))
+        points = MapPoints(
+            ids=ids,
+            X_world=transform(map.pose(keyframe_id), X_cam),
+            weight=np.ones(len(free), np.float32),
+            descriptor=features.descriptor[free],
+            recognisable=np.ones(len(free), bool),
+            made_by=np.full(len(free), keyframe_id, np.int64),
+        )
+        return with_sightings(
+            with_points(map, points), feature_sightings(keyframe_id, features, ids, free, self._plan.features)
+        )
+
+    def _fused(self, map: Map, keyframe_id: int, neighbours: np.ndarray) -> Map:
+        map, keep, drop = fuse_duplicates(
+            map, keyframe_id, neighbours, self._plan.features, radius_px=self._plan.search_px
+        )
+        into = dict(zip(drop.tolist(), keep.tolist(), strict=True))
+        for track, point in self._point_of.items() if into else ():
+            while point in into:
+                point = into[point]  # noqa: PLW2901 - one may have become one with a third
+            self._point_of[track] = point
+        return map
+
+    def _forget(self, keyframe_id: int) -> None:
+        """Forget numbers of the tracker that have not come up for long."""
+        old = [track for track, last in self._last_seen.items() if last < keyframe_id - _SPAN]
+        for track in old:
+            del self._last_seen[track]
+            self._point_of.pop(track, None)
+
+
+@jax.jit
+def _ideal(
+    seen_uv: Pixels, expected_depth: Weights, twist: Float[Array, "6"], frame: FrameArrays, params: TrackParams
+) -> tuple[Pixels, Weights]:
+    """Pixels of the ideal camera, and depth."""
+    believed = believable(frame.depth, params.min_depth_m, params.max_depth_m)
+    seen = observe(seen_uv, expected_depth, twist, believed, frame.depth_delay_s, params)
+    return to_pixels(params.intrinsics, seen.xy), seen.depth
+
+
+def _merged(map: Map, loop: LoopClosure) -> Map:
+    """The later of two submaps carried into the frame of the other."""
+    first, second = map.submap[rows(map.ids, np.array([loop.source, loop.target]))]
+    if first == second:
+        return map  # they have become one since
+    T_new_old = compose(compose(map.pose(loop.source), loop.T_source_target), inverse(map.pose(loop.target)))
+    if second > first:
+        return transformed(map, T_new_old, int(second), int(first), loop.source)
+    return transformed(map, inverse(T_new_old), int(first), int(second), loop.target)
+
+
+def _bent(map: Map, loop: LoopClosure) -> Map:
+    """New poses for the keyframes; what came after them, and all points, move along."""
+    known = has(map.ids, loop.keyframes)
+    change = np.tile(IDENTITY, (len(map.ids), 1))
+    row = rows(map.ids, loop.keyframes[known])
+    change[row] = compose(loop.T_world_cam[known], inverse(map.T_world_cam[row]))
+    settled = map.parent == NONE
+    settled[row] = True
+    for index in np.flatnonzero(~settled):
+        line = [int(index)]
+        while not settled[line[-1]]:
+            line.append(map.row(map.parent[line[-1]]))
+        change[line] = change[line[-1]]
+        settled[line] = True
+    of_point = change[rows(map.ids, standing(map, map.points.made_by))]
+    X_world = (rotate(of_point, map.points.X_world.T) + of_point[:, 4:]).T
+    return moved(map, map.ids, compose(change, map.T_world_cam), map.points.ids, X_world)
+
+
+def _without_unconfirmed(map: Map, keyframe_id: int) -> Map:
+    """Drop the points that only one keyframe has seen, some keyframes after they were made."""
+    seen = np.bincount(rows(map.points.ids, map.sightings.point), minlength=len(map.points.ids))
+    old = (map.points.made_by <= keyframe_id - _CULL_AFTER) & (map.points.made_by > keyframe_id - 2 * _CULL_AFTER)
+    return without_points(map, map.points.ids[(old & (seen < 2)) | (seen < 1)])
+
+
+def _without_redundant(map: Map, keyframe_id: int) -> Map:
+    """Drop neighbours of a keyframe whose points others see well enough."""
+    near, _ = covisible(map, keyframe_id)
+    for candidate in near[near <= keyframe_id - _KEEP_LATEST]:
+        row = map.row(candidate)
+        if map.parent[row] == NONE:
+            continue
+        counts = np.bincount(rows(map.points.ids, map.sightings.point), minlength=len(map.points.ids))
+        mine = map.sightings.point[map.sightings.keyframe == candidate]
+        elsewhere = counts[rows(map.points.ids, mine)] - 1
+        if len(mine) and np.mean(elsewhere >= _REDUNDANT_VIEWS) > _REDUNDANT_SHARE:
+            map = without_keyframe(map, int(candidate))
+    return map

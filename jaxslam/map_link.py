@@ -1,0 +1,170 @@
+"""The tracker and the map kept in step: keyframes go to mapping, corrections of the map come back to the tracker.
+
+What the tracker believes of its keyframes is followed here on the host, so that a correction is the difference of two
+known poses, and frames and keyframes still on their way to the map hang on those that are in it.
+"""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from jaxslam.frame_arrays import FrameArrays
+from jaxslam.local_mapping import NewKeyframe, Tracks
+from jaxslam.map import NONE, Map, has
+from jaxslam.pose import IDENTITY, angle, between, compose, inverse, to_local, transform
+from jaxslam.recall import Recalled
+from jaxslam.state import TrackOutput, TrackPlan, TrackState, TrackStatus
+from jaxslam.state_edit import carried, recalled
+
+_LEAST_MOVE_M, _LEAST_TURN = 1e-6, 1e-6
+"""A correction below both is none."""
+
+_carried = jax.jit(carried, donate_argnums=0)
+_recalled = jax.jit(recalled, donate_argnums=0)
+
+
+class Hung(NamedTuple):
+    """A pose that moves with a keyframe.
+
+    Attributes:
+        keyframe: Its id.
+        T_keyframe_cam: `(7,)` the pose seen from it.
+    """
+
+    keyframe: int
+    T_keyframe_cam: np.ndarray
+
+
+class MapLink:
+    """Knows which keyframes the tracker looks into, and where both sides believe them to be."""
+
+    def __init__(self, plan: TrackPlan, map: Map) -> None:
+        """Start with a tracker that has no keyframe."""
+        self.map = map
+        self.reference = NONE
+        """The keyframe that the frames hang on now."""
+        self._plan = plan
+        self._slots = [NONE] * (plan.num_keyframes + plan.num_recalled)
+        self._made = 0
+        self._believed: dict[int, np.ndarray] = {}
+        self._on_the_way: dict[int, Hung] = {}
+        self._next = map.next_keyframe
+        self._submap = int(map.submap.max(initial=-1)) + 1
+
+    def hang(self, T_world_cam: np.ndarray) -> Hung:
+        """A pose of the tracker, tied to the reference keyframe."""
+        return Hung(self.reference, between(self._believed[self.reference], T_world_cam))
+
+    def pose(self, hung: Hung) -> np.ndarray:
+        """`(7,)` where a pose is in the map as it is now."""
+        return compose(self._in_map(hung.keyframe), hung.T_keyframe_cam)
+
+    def believed(self, keyframe_id: int) -> np.ndarray:
+        """`(7,)` where the tracker believes a keyframe to be."""
+        return self._believed[keyframe_id]
+
+    def refer_to(self, keyframe_id: int) -> None:
+        """Hang the frames to come on a keyframe of the map."""
+        self.reference = keyframe_id
+        self._believed.setdefault(keyframe_id, self.map.pose(keyframe_id))
+
+    def forget_slots(self) -> None:
+        """The tracker has forgotten its keyframes."""
+        self._slots = [NONE] * len(self._slots)
+
+    def submap_now(self) -> int:
+        """Number of the submap that the frames are in."""
+        if not knows(self.map, self.reference):
+            return self._submap
+        return int(self.map.submap[self.map.row(self.reference)])
+
+    def keyframe_made(
+        self, timestamp_ns: int, frame: FrameArrays, output: TrackOutput, recognised: Hung | None
+    ) -> NewKeyframe:
+        """The job for mapping that a keyframe of the tracker is.
+
+        Args:
+            timestamp_ns: Time of the frame.
+            frame: As the tracker got it.
+            output: What it said.
+            recognised: Where it is in the map, if tracking began at a place that was recognised.
+        """
+        pose = compose(np.asarray(output.T_world_cam.wxyz_xyz, np.float64), IDENTITY)  # of unit length in float64
+        first = int(output.status) == TrackStatus.STARTED and recognised is None
+        if first and self.reference != NONE:
+            self._submap += 1  # nothing ties the frame to those before
+        parent = NONE if first else self.reference
+        seen_from = pose if parent == NONE else self.hang(pose).T_keyframe_cam
+        id = self._next
+        self._next += 1
+        self._believed[id] = pose
+        self._on_the_way[id] = Hung(parent, seen_from)
+        self._slots[self._made % self._plan.num_keyframes] = id
+        self._made += 1
+        self.reference = id
+        tracks = _tracks(pose, output)
+        return NewKeyframe(id, timestamp_ns, frame, parent, seen_from, self._submap, np.asarray(output.twist), tracks)
+
+    def corrected(self, state: TrackState, map: Map) -> tuple[TrackState, np.ndarray]:
+        """The tracker's state carried along with a new map.
+
+        Returns:
+            The state, and the correction `(7,)` at the camera, from the old world to the new one.
+        """
+        self.map = map
+        self._on_the_way = {id: hung for id, hung in self._on_the_way.items() if id >= map.next_keyframe}
+        wanted = {id for id in (*self._slots, self.reference, *self._on_the_way) if id != NONE}
+        new = {id: self._in_map(id) for id in wanted}
+        change = {id: compose(new[id], inverse(self._believed[id])) for id in wanted}
+        self._believed = new
+        now = change.get(self.reference, IDENTITY)
+        corrections = np.stack([change.get(id, IDENTITY) for id in self._slots])
+        both = np.concatenate([corrections, now[None]])
+        if np.abs(both[:, 4:]).max() < _LEAST_MOVE_M and angle(both).max() < _LEAST_TURN:
+            return state, IDENTITY
+        return _carried(state, now.astype(np.float32), corrections.astype(np.float32)), now
+
+    def latest(self) -> list[int]:
+        """The keyframes in the tracker's ring."""
+        return [id for id in self._slots[: self._plan.num_keyframes] if id != NONE]
+
+    def slot_for(self, keyframe_id: int, others: set[int]) -> int | None:
+        """Where to put a recalled keyframe, not in place of the others; `None` if the tracker has it or it is gone."""
+        if keyframe_id in self._slots or not knows(self.map, keyframe_id):
+            return None
+        free = range(self._plan.num_keyframes, len(self._slots))
+        return next((slot for slot in free if self._slots[slot] not in others), None)
+
+    def recalled(self, state: TrackState, slot: int, keyframe: Recalled) -> TrackState:
+        """The tracker's state with a keyframe of the map to look into."""
+        pose = self._believed.setdefault(keyframe.keyframe, self._in_map(keyframe.keyframe))
+        self._slots[slot] = keyframe.keyframe
+        X_world = transform(pose, keyframe.X_cam.astype(np.float64)).astype(np.float32)
+        places = (pose.astype(np.float32), keyframe.seen_uv, X_world)
+        return _recalled(state, np.int32(slot), keyframe.image, *places, keyframe.weight, keyframe.id)
+
+    def _in_map(self, keyframe_id: int) -> np.ndarray:
+        """Where a keyframe is in the map; one on its way there hangs on the one before."""
+        hung = self._on_the_way.get(keyframe_id)
+        if hung is None:
+            return self.map.pose(keyframe_id)
+        return hung.T_keyframe_cam if hung.keyframe == NONE else self.pose(hung)
+
+
+def knows(map: Map, keyframe_id: int) -> bool:
+    """Whether a keyframe is in a map."""
+    return bool(has(map.ids, np.array([keyframe_id]))[0])
+
+
+def _tracks(pose: np.ndarray, output: TrackOutput) -> Tracks:
+    """Points followed and looked up, in the axes of the camera."""
+    found = output.looked_up
+    join = lambda followed, looked_up: np.concatenate([np.asarray(followed), np.asarray(looked_up)], axis=-1)
+    X_world = join(output.X_world, found.X_world).astype(np.float64)
+    return Tracks(
+        id=join(output.id, found.id),
+        seen_uv=join(output.uv, found.uv),
+        X_cam=to_local(pose, X_world).astype(np.float32),
+        weight=join(output.weights, found.weight),
+    )

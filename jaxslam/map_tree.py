@@ -1,0 +1,55 @@
+"""The spanning tree of a submap's keyframes, and how it closes over one that goes."""
+
+import numpy as np
+
+from jaxslam.map import NONE, Map, covisible
+
+
+def children(map: Map, keyframe_id: int) -> np.ndarray:
+    """Ids, ascending, of the keyframes that hang on one in the spanning tree."""
+    return map.ids[map.parent == keyframe_id]
+
+
+def subtree(map: Map, keyframe_id: int) -> np.ndarray:
+    """Ids, ascending, of a keyframe and of all that hang on it, directly or not."""
+    inside = map.ids == keyframe_id
+    while (grown := inside | np.isin(map.parent, map.ids[inside])).sum() > inside.sum():
+        inside = grown
+    return map.ids[inside]
+
+
+def new_anchor(map: Map, keyframe_id: int) -> int:
+    """Id of the keyframe that holds the place of one that goes.
+
+    Its parent, or for the first of a submap the child that shares most points with it.
+
+    Raises:
+        ValueError: If it is the only one of its submap.
+    """
+    parent = map.parent[map.row(keyframe_id)]
+    if parent != NONE:
+        return int(parent)
+    below = children(map, keyframe_id)
+    if not len(below):
+        raise ValueError(f"keyframe {keyframe_id} is the only one of its submap")
+    near, _ = covisible(map, keyframe_id, at_least=1)
+    near = near[np.isin(near, below)]
+    return int(near[0] if len(near) else below[0])
+
+
+def parents_without(map: Map, keyframe_id: int, anchor: int) -> np.ndarray:
+    """`(k,)` parents after a keyframe went and `anchor` took its place.
+
+    Its children hang on the keyframe that shares most points with them and does not itself hang on them, or if there
+    is none on `anchor`.
+    """
+    parent = map.parent.copy()
+    if map.parent[map.row(keyframe_id)] == NONE:
+        parent[map.row(anchor)] = NONE
+    orphans = children(map, keyframe_id)
+    for orphan in orphans[orphans != anchor].tolist():
+        near, _ = covisible(map, orphan, at_least=1)
+        below = subtree(map._replace(parent=parent), orphan)
+        allowed = near[~np.isin(near, below) & (near != keyframe_id)]
+        parent[map.row(orphan)] = allowed[0] if len(allowed) else anchor
+    return parent

@@ -1,0 +1,118 @@
+"""What became of a frame: with all its arrays, rejected, or as one line of a log."""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from jaxslam.errors import JaxSlamError
+from jaxslam.state import KeyframeReason, TrackOutput, TrackReason, TrackStatus
+
+
+@dataclass(frozen=True, eq=False)
+class Tracked:
+    """What became of one frame.
+
+    Attributes:
+        timestamp_ns: Its time.
+        T_world_cam: `(7,)` float64 pose of the camera as `wxyz_xyz`; the last one where `status` is `LOST`.
+        covariance: `(6, 6)` of the pose, in the tangent space at the camera: translation (m), then rotation (rad).
+        status: What the pose is worth.
+        reason: Why it is not worth more; empty if it is `OK`.
+        twist: `(6,)` velocity of the camera in its own axes: m/s, then rad/s.
+        num_inliers: Followed points that agree with the pose.
+        inlier_ratio: Their share of the points that could be followed.
+        num_looked_up: Points found again in keyframes.
+        residual_px: Robust standard deviation of the inliers' reprojection error, pixels.
+        uv: `(2, n)` float32 pixels of the points in the frame, those just found included.
+        weights: `(n,)` float32 weight of each, 0 to 1; 0 for a slot without a point.
+        followed: `(n,)` bool, true for points that came from the frame before, false for new ones.
+        keyframe: Why the frame was kept, `NONE` if it was not.
+        correction: `(7,)` how the map's frame changed since the frame before, from the old world to the new one, as
+            `wxyz_xyz`: the part of the change of pose that is no motion of the camera.
+        track_ms: Time it took, in milliseconds.
+    """
+
+    timestamp_ns: int
+    T_world_cam: np.ndarray
+    covariance: np.ndarray
+    status: TrackStatus
+    reason: str
+    twist: np.ndarray
+    num_inliers: int
+    inlier_ratio: float
+    num_looked_up: int
+    residual_px: float
+    uv: np.ndarray
+    weights: np.ndarray
+    followed: np.ndarray
+    keyframe: KeyframeReason
+    correction: np.ndarray
+    track_ms: float
+
+    @property
+    def is_keyframe(self) -> bool:
+        """Whether the frame was kept."""
+        return self.keyframe != KeyframeReason.NONE
+
+
+@dataclass(frozen=True)
+class Rejected:
+    """A frame of a recording that could not be read or does not fit; tracking goes on with the next one."""
+
+    timestamp_ns: int
+    error: JaxSlamError
+
+    @property
+    def status(self) -> TrackStatus:
+        """Always `REJECTED`."""
+        return TrackStatus.REJECTED
+
+    @property
+    def reason(self) -> str:
+        """What was wrong."""
+        return str(self.error)
+
+
+@dataclass(frozen=True)
+class FrameRecord:
+    """One line of a run's log: a frame's fate without its arrays.
+
+    Attributes are those of `Tracked`; a rejected frame has only a time, a status and a reason.
+    """
+
+    timestamp_ns: int
+    status: TrackStatus
+    reason: str
+    num_inliers: int = 0
+    inlier_ratio: float = 0.0
+    num_looked_up: int = 0
+    residual_px: float = 0.0
+    is_keyframe: bool = False
+    track_ms: float | None = None
+
+    @classmethod
+    def of(cls, result: "Tracked | Rejected") -> "FrameRecord":
+        """The record of a result."""
+        return cls(**{field.name: getattr(result, field.name) for field in fields(cls) if hasattr(result, field.name)})
+
+
+def tracked_of(timestamp_ns: int, output: TrackOutput, correction: np.ndarray, relocalised: bool) -> Tracked:
+    """The result of a frame, from what the compiled step said of it."""
+    return Tracked(
+        timestamp_ns=timestamp_ns,
+        T_world_cam=np.asarray(output.T_world_cam.wxyz_xyz, np.float64),
+        covariance=np.asarray(output.covariance),
+        status=TrackStatus.RELOCALISED if relocalised else TrackStatus(int(output.status)),
+        reason=TrackReason(int(output.reason)).text,
+        twist=np.asarray(output.twist, np.float64),
+        num_inliers=int(output.num_inliers),
+        inlier_ratio=float(output.inlier_ratio),
+        num_looked_up=int(output.num_looked_up),
+        residual_px=float(output.residual_px),
+        uv=np.asarray(output.uv),
+        weights=np.asarray(output.weights),
+        followed=np.asarray(output.tracked),
+        keyframe=KeyframeReason(int(output.keyframe)),
+        correction=correction,
+        track_ms=0.0,
+    )

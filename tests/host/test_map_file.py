@@ -1,0 +1,311 @@
+"""The map's file: equal to the bit after a round trip, and one clear line for whatever is not such a file."""
+
+import io
+import json
+import os
+import re
+import subprocess
+import sys
+import textwrap
+import tracemalloc
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from small_map import CAMERA, keyframe, pose, same, small_map
+
+from jaxslam import map_file
+from jaxslam.camera import Camera
+from jaxslam.errors import MapFileError
+from jaxslam.map import NONE, Map, empty_map
+from jaxslam.map_edit import with_keyframe, without_keyframe
+from jaxslam.map_file import load_map, save_map
+
+Members = dict[str, bytes]
+
+
+def full_map() -> Map:
+    """With two submaps, a culled keyframe, one without features, and a camera that uses every field."""
+    camera = Camera("größe 1", 64, 48, 50.1, 51.3, 31.2, 24.7, (0.1, -0.2, 0.001, 0.002, 0.05), 5000.0, 29.97, 0.12)
+    rng = np.random.default_rng(2)
+    map = without_keyframe(small_map(num_keyframes=4, camera=camera), 1)
+    return with_keyframe(map, keyframe(map, rng, count=0), pose(rng), NONE, 1)
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    path = tmp_path_factory.mktemp("saved") / "full.map"
+    save_map(path, full_map())
+    return path.read_bytes()
+
+
+class TestRoundTrip:
+    @pytest.mark.parametrize("map", [full_map(), empty_map(CAMERA), small_map()], ids=["full", "empty", "small"])
+    def test_is_equal_to_the_bit(self, map, tmp_path):
+        save_map(tmp_path / "a.map", map)
+        again = load_map(tmp_path / "a.map")
+        assert same(again, map)
+        save_map(tmp_path / "b.map", again)
+        assert (tmp_path / "a.map").read_bytes() == (tmp_path / "b.map").read_bytes()
+
+    def test_arrays_are_whole_and_can_be_copied_on(self, saved, tmp_path):
+        (tmp_path / "a.map").write_bytes(saved)
+        features = load_map(tmp_path / "a.map").keyframes[1].features
+        assert all(array.flags.c_contiguous and array.flags.owndata for array in features)
+
+    def test_numpy_opens_it(self, saved):
+        with np.load(io.BytesIO(saved), allow_pickle=False) as file:
+            np.testing.assert_array_equal(file["points.X_world"], full_map().points.X_world)
+
+    def test_docstring_lists_every_array(self, saved):
+        """A change of a record is a change of the format: then the version must rise."""
+        rows = re.findall(r"^    (\w+\.\w+) +(\w+) +(\([^)]*\))", map_file.__doc__ or "", re.MULTILINE)
+        documented = {name: (dtype, shape) for name, dtype, shape in rows}
+        layout = {
+            name: (field.dtype.name, f"({', '.join(field.dims)})".replace("+", " + "))
+            for name, field in map_file._layout().items()
+        }
+        assert documented == layout
+        assert {name.removesuffix(".npy") for name in unpacked(saved)} == {"header.json", *layout}
+
+
+def unpacked(data: bytes) -> Members:
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def packed(members: Members, compression: int = zipfile.ZIP_STORED) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", compression) as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
+    return buffer.getvalue()
+
+
+def npy(array: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, array)
+    return buffer.getvalue()
+
+
+def refused(path: Path, data: bytes) -> str:
+    """The message, after the path, about a file of these bytes."""
+    path.write_bytes(data)
+    with pytest.raises(MapFileError) as caught:
+        load_map(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ")
+    assert "\n" not in message
+    return message.removeprefix(f"{path}: ")
+
+
+class TestForeign:
+    def test_missing(self, tmp_path):
+        with pytest.raises(MapFileError, match=r"no\.map: cannot be read: No such file or directory"):
+            load_map(tmp_path / "no.map")
+
+    def test_folder(self, tmp_path):
+        with pytest.raises(MapFileError, match="cannot be read: Is a directory"):
+            load_map(tmp_path)
+
+    def test_other_files(self, tmp_path):
+        path = tmp_path / "a.map"
+        assert refused(path, b"") == "is empty"
+        assert refused(path, full_map().keyframes[0].image_png) == "not a jaxslam map"
+        assert refused(path, b"keyframes: 3\n" * 100) == "not a jaxslam map"
+        assert refused(path, npy(np.zeros(3))) == "not a jaxslam map"
+
+    def test_other_archives(self, tmp_path):
+        path = tmp_path / "a.map"
+        assert refused(path, packed({"a.txt": b"x"})) == "not a jaxslam map: an archive of a.txt"
+        assert refused(path, packed({})) == "not a jaxslam map: an archive of nothing"
+        buffer = io.BytesIO()
+        np.savez(buffer, points=np.zeros(3))
+        assert refused(path, buffer.getvalue()) == "not a jaxslam map: an archive of points.npy"
+        assert "header does not say so" in refused(path, packed({"header.json": b'{"format": "else"}'}))
+        assert "header does not say so" in refused(path, packed({"header.json": b"[]"}))
+        assert "damaged" in refused(path, packed({"header.json": b"[" * 50_000}))
+
+
+class TestDamaged:
+    def test_cut_short_anywhere(self, saved, tmp_path):
+        path = tmp_path / "a.map"
+        for length in [*range(1, 200), *range(200, len(saved), 97), *range(len(saved) - 200, len(saved))]:
+            assert refused(path, saved[:length]).startswith(
+                "is damaged or cut short" if length > 1 else "not a jaxslam"
+            )
+
+    @settings(max_examples=300, deadline=None)
+    @given(st.data())
+    def test_changed_bytes_are_noticed_or_make_no_difference(self, saved, tmp_path_factory, data):
+        path = tmp_path_factory.getbasetemp() / "changed.map"
+        where = st.integers(0, len(saved) - 1) | st.integers(len(saved) - 3500, len(saved) - 1)
+        damaged = bytearray(saved)
+        for place in data.draw(st.lists(where, min_size=1, max_size=4)):
+            damaged[place] = data.draw(st.integers(0, 255))
+        path.write_bytes(damaged)
+        try:
+            map = load_map(path)
+        except MapFileError:
+            return  # noticed; any other error fails the test
+        assert same(map, full_map())
+
+
+def edited(members: Members, path: list[str], value: Any) -> bytes:
+    header = json.loads(members["header.json"])
+    inner = header
+    for key in path[:-1]:
+        inner = inner[key]
+    inner[path[-1]] = value
+    return packed({**members, "header.json": json.dumps(header).encode()})
+
+
+class TestHeader:
+    @pytest.mark.parametrize(
+        ("path", "value", "message"),
+        [
+            (["version"], 2, "expected a map file of version 1, got version 2"),
+            (["version"], None, "expected a map file of version 1, got version None"),
+            (["version"], True, "expected a map file of version 1, got version True"),
+            (["counts"], 3, "header: counts: expected dict, got 3"),
+            (["counts", "points"], -1, "header: points: expected a count, got -1"),
+            (["counts", "points"], 1.5, "header: points: expected int, got 1.5"),
+            (["next_point"], None, "header: next_point: expected int, got None"),
+            (["camera", "fx"], -4.0, "header: Camera.fx: expected a finite number > 0, got -4.0"),
+            (["camera", "fx"], float("nan"), "header: Camera.fx: expected a finite number > 0, got nan"),
+            (["camera", "zoom"], 1, "header: camera: unknown or missing: zoom"),
+            (["next_keyframe"], 3, "the map is not whole: ids: expected them to ascend from 0 and end before 3"),
+        ],
+    )
+    def test_refuses(self, path, value, message, saved, tmp_path):
+        assert message in refused(tmp_path / "a.map", edited(unpacked(saved), path, value))
+
+    @pytest.mark.parametrize("count", [10**9, 10**15, 2**61])
+    def test_announced_sizes_take_no_memory(self, count, saved, tmp_path):
+        data = edited(unpacked(saved), ["counts", "points"], count)
+        tracemalloc.start()
+        message = refused(tmp_path / "a.map", data)
+        most = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert re.fullmatch(rf"announces \d+ bytes of arrays in a file of {len(data)}", message)
+        assert most < 2_000_000
+
+    def test_refuses_compression(self, saved, tmp_path):
+        zeros = {**unpacked(saved), "images.png.npy": npy(np.zeros(50_000_000, np.uint8))}
+        assert (
+            refused(tmp_path / "a.map", packed(zeros, zipfile.ZIP_DEFLATED)) == "header.json: expected no compression"
+        )
+
+
+def array_of(members: Members, name: str) -> np.ndarray:
+    return np.load(io.BytesIO(members[f"{name}.npy"]))
+
+
+class TestArrays:
+    @pytest.mark.parametrize(
+        ("name", "change", "message"),
+        [
+            ("points.X_world", lambda a: a.astype(np.float32), "points.X_world: expected float64 (3, 10), got float32"),
+            ("points.X_world", lambda a: a.T.copy(), "points.X_world: expected float64 (3, 10), got float64 (10, 3)"),
+            ("points.X_world", np.asfortranarray, "points.X_world: expected float64 (3, 10)"),
+            ("points.X_world", lambda a: a.astype(">f8"), "points.X_world: expected float64 (3, 10), got >f8 (3, 10)"),
+            ("points.ids", lambda a: a[::-1].copy(), "the map is not whole: points.ids: expected them to ascend"),
+            (
+                "points.X_world",
+                lambda a: a * np.nan,
+                "the map is not whole: points.X_world: holds a number that is not",
+            ),
+            ("keyframes.parent", lambda a: a * 0, "the map is not whole: parent: goes round in a circle"),
+            (
+                "keyframes.image_offsets",
+                lambda a: a[::-1].copy(),
+                "keyframes.image_offsets: expected them to rise from 0",
+            ),
+            (
+                "keyframes.feature_offsets",
+                lambda a: a + 1,
+                "keyframes.feature_offsets: expected them to rise from 0 to",
+            ),
+        ],
+    )
+    def test_refuses(self, name, change: Callable[[np.ndarray], np.ndarray], message, saved, tmp_path):
+        members = unpacked(saved)
+        members[f"{name}.npy"] = npy(change(array_of(members, name)))
+        assert message in refused(tmp_path / "a.map", packed(members))
+
+    def test_refuses_pickles(self, saved, tmp_path):
+        objects = np.array([print] * 10, object)
+        members = {**unpacked(saved), "points.weight.npy": npy(objects)}
+        assert "points.weight: expected float32 (10,), got object (10,)" in refused(tmp_path / "a.map", packed(members))
+
+    def test_refuses_members_too_many_or_too_few(self, saved, tmp_path):
+        members = unpacked(saved)
+        extra = packed({**members, "notes.npy": npy(np.zeros(1))})
+        assert refused(tmp_path / "a.map", extra) == "unknown or missing members: notes.npy"
+        del members["culled.ids.npy"]
+        assert refused(tmp_path / "a.map", packed(members)) == "unknown or missing members: culled.ids.npy"
+
+    def test_refuses_arrays_cut_short_or_with_more_behind(self, saved, tmp_path):
+        members = unpacked(saved)
+        weight = members["points.weight.npy"]
+        for data in (weight[:-4], weight + b"more"):
+            changed = packed({**members, "points.weight.npy": data})
+            assert "points.weight: expected float32 (10,), got" in refused(tmp_path / "a.map", changed)
+
+
+KILLED = """
+    import sys, zipfile
+    sys.path[:0] = sys.argv[2:]
+    import numpy as np
+    from small_map import small_map
+    from jaxslam.map_file import save_map
+
+    write = np.lib.format.write_array
+    def slowly(file, array, **options):
+        write(file, array, **options)
+        print("writing", flush=True)
+        sys.stdin.read()
+    np.lib.format.write_array = slowly
+    save_map(sys.argv[1], small_map(seed=5))
+"""
+
+
+class TestAtomic:
+    def test_a_kill_leaves_the_old_file(self, saved, tmp_path):
+        path = tmp_path / "a.map"
+        path.write_bytes(saved)
+        script = [sys.executable, "-c", textwrap.dedent(KILLED), str(path), str(Path(__file__).parent)]
+        with subprocess.Popen(script, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+            assert process.stdout is not None
+            assert process.stdout.readline() == b"writing\n"
+            process.kill()
+        assert process.returncode != 0
+        assert len(list(tmp_path.iterdir())) == 2  # what was written so far lies beside it
+        assert path.read_bytes() == saved
+
+    def test_failure_leaves_the_old_file_and_nothing_else(self, saved, tmp_path, monkeypatch):
+        def full(*_: object) -> None:
+            raise OSError(28, "No space left on device")
+
+        path = tmp_path / "a.map"
+        path.write_bytes(saved)
+        monkeypatch.setattr(os, "replace", full)
+        with pytest.raises(MapFileError, match=r"a\.map: cannot be written: .*No space left"):
+            save_map(path, small_map())
+        assert path.read_bytes() == saved
+        assert list(tmp_path.iterdir()) == [path]
+
+    def test_no_folder(self, tmp_path):
+        with pytest.raises(MapFileError, match="cannot be written"):
+            save_map(tmp_path / "no" / "a.map", small_map())
+
+    def test_a_map_that_is_not_whole_is_not_written(self, tmp_path):
+        map = small_map()
+        with pytest.raises(MapFileError, match=r"not written: parent: 76 is not in the map"):
+            save_map(tmp_path / "a.map", map._replace(parent=map.parent + 77))
+        assert not list(tmp_path.iterdir())
