@@ -1,4 +1,4 @@
-"""The command line: `jaxslam demo`, `run`, `eval`, `doctor`."""
+"""The command line: `jaxslam demo`, `run`, `eval`, `doctor`, `export`."""
 
 import itertools
 import logging
@@ -14,12 +14,14 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from jaxslam.config import Config, load_config
+from jaxslam.config import load_config
 from jaxslam.datasets import Dataset, Subset, dataset_kinds, open_dataset
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.doctor import diagnose
 from jaxslam.errors import ConfigError, DatasetError, JaxSlamError, nearest
 from jaxslam.evaluation import Evaluation, evaluate
+from jaxslam.map_export import write_colmap, write_keyframe_trajectory, write_ply
+from jaxslam.map_file import load_map
 from jaxslam.results import RunInfo, Snapshots, write_results
 from jaxslam.slam import Slam
 from jaxslam.trajectory import read
@@ -52,7 +54,8 @@ class Demo:
         """Run the command."""
         scene = SyntheticConfig(frames=self.frames, path=self.path, people=self.people, seed=self.seed)
         _console.print(f"Rendering a room with {self.people} people, the camera moving as in '{self.path}'.")
-        _track(SyntheticDataset(scene), load_config(), "default", self.out)
+        dataset = SyntheticDataset(scene)
+        _track(dataset, Slam(dataset.camera, load_config()), "default", self.out)
 
 
 @dataclass(frozen=True)
@@ -80,6 +83,12 @@ class Run:
     """First frame to track."""
     deterministic: bool = True
     """Run everything in turn: two runs give the same bytes."""
+    map: Path | None = None
+    """Map file to start with; the world is that of the map."""
+    localize_only: bool = False
+    """Only find the camera in the map, which stays as it is."""
+    save_map: Path | None = None
+    """File to write the map to."""
     set: _Settings = ()
     """Settings, as in `--set track.num_points=400 run.seed=3`; may be given again."""
 
@@ -91,6 +100,8 @@ class Run:
             )
         if self.max_frames is not None and self.max_frames < 1:
             raise ConfigError(f"--max-frames: expected at least 1, got {self.max_frames}")
+        if self.localize_only and self.map is None:
+            raise ConfigError("--localize-only: needs the map to localise in: --map FILE")
         override = f"run.deterministic={str(self.deterministic).lower()}"
         config = load_config(self.preset, self.config, (override, *itertools.chain(*self.set)))
         dataset = open_dataset(self.recording, self.dataset, self.camera)
@@ -98,7 +109,12 @@ class Run:
         if self.start or self.max_frames is not None:
             stop = None if self.max_frames is None else self.start + self.max_frames
             dataset = Subset(dataset, self.start, stop)
-        _track(dataset, config, self.preset, self.out or Path("results") / self.recording.resolve().name)
+        start = None if self.map is None else load_map(self.map)
+        slam = Slam(dataset.camera, config, map=start, localize_only=self.localize_only)
+        _track(dataset, slam, self.preset, self.out or Path("results") / self.recording.resolve().name)
+        if self.save_map is not None:
+            slam.save(self.save_map)
+            _console.print(f"Map in {self.save_map}: {len(slam.map.ids)} keyframes, {len(slam.map.points.ids)} points")
 
 
 @dataclass(frozen=True)
@@ -145,10 +161,42 @@ class Doctor:
             raise DatasetError(f"{self.recording}: not fit to be tracked, see above")
 
 
+@dataclass(frozen=True)
+class Export:
+    """Write a map for other programs: points as PLY, all of it as a COLMAP model, keyframes as a trajectory."""
+
+    map: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MAP")]
+    """Map file, as `run --save-map` writes it."""
+    ply: Path | None = None
+    """PLY file for the points and keyframes."""
+    colmap: Path | None = None
+    """Folder for a COLMAP text model with its images."""
+    trajectory: Path | None = None
+    """TUM file for the poses of the keyframes."""
+
+    def main(self) -> None:
+        """Run the command."""
+        map = load_map(self.map)
+        wanted = [path for path in (self.ply, self.colmap, self.trajectory) if path is not None]
+        if not wanted:
+            raise ConfigError("export: expected at least one of --ply FILE, --colmap FOLDER, --trajectory FILE")
+        if self.ply is not None:
+            write_ply(self.ply, map, keyframes=True)
+        if self.colmap is not None:
+            write_colmap(self.colmap, map)
+        if self.trajectory is not None:
+            write_keyframe_trajectory(self.trajectory, map)
+        _console.print(
+            f"{len(map.ids)} keyframes, {len(map.points.ids)} points: {', '.join(str(path) for path in wanted)}"
+        )
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """The `jaxslam` command: known errors are one line and exit code 1."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
-    command: Any = tyro.cli(Demo | Run | Eval | Doctor, prog="jaxslam", args=arguments, description=_DESCRIPTION)
+    command: Any = tyro.cli(
+        Demo | Run | Eval | Doctor | Export, prog="jaxslam", args=arguments, description=_DESCRIPTION
+    )
     try:
         command.main()
     except JaxSlamError as error:
@@ -178,10 +226,9 @@ class _Meter:
         self.progress.update(self.task, advance=1, status=text)
 
 
-def _track(dataset: Dataset, config: Config, preset: str, out: Path) -> None:
+def _track(dataset: Dataset, slam: Slam, preset: str, out: Path) -> None:
     """Track, write the results, print them."""
     began = time.perf_counter()
-    slam = Slam(dataset.camera, config)
     with _console.status("Compiling the tracker (some 15 s at the first start on a machine, then 2) ..."):
         slam.warm_up()
     _console.print(f"Tracker ready after {slam.compile_s:.1f} s.")
@@ -193,7 +240,7 @@ def _track(dataset: Dataset, config: Config, preset: str, out: Path) -> None:
         TextColumn("{task.fields[status]}"),
     )
     snapshots = Snapshots(len(dataset))
-    with Progress(*columns, console=_console) as progress:
+    with slam, Progress(*columns, console=_console) as progress:
         meter = _Meter(progress, progress.add_task("track", total=len(dataset), status=""), snapshots)
         records = slam.run(dataset, meter)
     info = RunInfo(dataset, preset, time.perf_counter() - began)
@@ -205,6 +252,8 @@ def _print_summary(summary: dict[str, Any], evaluation: Evaluation | None, out: 
     table = Table("figure", "value", "unit", title=summary["dataset"], title_justify="left")
     statuses = ", ".join(f"{name} {count}" for name, count in summary["status_counts"].items())
     table.add_row("tracked", f"{summary['tracked']} of {summary['frames']}", f"frames ({statuses})")
+    table.add_row("map", str(summary["keyframes"]), f"keyframes, {summary['map_points']} points")
+    table.add_row("loops closed", str(summary["loops_closed"]), f"{summary['submaps']} submaps")
     table.add_row("ATE (SE(3) aligned)", _number(summary["ate_rmse_m"], 4), "m RMSE")
     table.add_row("ATE (Sim(3) aligned)", _number(summary["ate_sim3_rmse_m"], 4), "m RMSE")
     table.add_row("RPE over 1 s", _number(summary["rpe_trans_m_per_s"], 4), "m/s RMSE")
@@ -217,7 +266,10 @@ def _print_summary(summary: dict[str, Any], evaluation: Evaluation | None, out: 
         _console.print(f"Not evaluated: {summary['evaluation_problem']}.")
     for note in evaluation.notes if evaluation is not None else ():
         _console.print(f"Note: {note}.")
-    _console.print(f"Results in {out}: trajectory.txt, trajectory_online.txt, summary.json, config.yaml, plot.png")
+    _console.print(
+        f"Results in {out}: trajectory.txt, trajectory_online.txt, trajectory_keyframes.txt, summary.json,"
+        " config.yaml, plot.png"
+    )
 
 
 def _number(value: float | None, digits: int) -> str:

@@ -20,6 +20,7 @@ from jaxslam.errors import TrajectoryError
 from jaxslam.evaluation import Evaluation, evaluate
 from jaxslam.files import write_atomically
 from jaxslam.frame import Frame
+from jaxslam.map_export import write_keyframe_trajectory
 from jaxslam.slam import Slam
 from jaxslam.state import TrackStatus
 from jaxslam.tracked import FrameRecord, Rejected, Tracked
@@ -60,7 +61,7 @@ class RunInfo:
 def write_results(
     folder: Path, slam: Slam, records: Sequence[FrameRecord], info: RunInfo, snapshots: Sequence[Snapshot] = ()
 ) -> tuple[dict[str, Any], Evaluation | None]:
-    """Write `trajectory.txt`, `trajectory_online.txt`, `summary.json`, `config.yaml` and `plot.png`.
+    """Write three trajectories (final, online, keyframes), `summary.json`, `config.yaml` and `plot.png`.
 
     Args:
         folder: Where they go; made if it is not there. Files of an earlier run are replaced, each in one piece.
@@ -83,6 +84,8 @@ def write_results(
     summary = _summary(slam, records, info, evaluation) | {"evaluation_problem": problem}
     write_tum(folder / "trajectory.txt", slam.trajectory)
     write_tum(folder / "trajectory_online.txt", slam.online_trajectory)
+    if len(slam.map.ids):
+        write_keyframe_trajectory(folder / "trajectory_keyframes.txt", slam.map)
     write_atomically(folder / "config.yaml", to_yaml(slam.config).encode())
     write_atomically(folder / "summary.json", (json.dumps(summary, indent=2) + "\n").encode())
     if len(slam.trajectory):
@@ -109,7 +112,12 @@ def _summary(
         "tracked_percent": round(100 * tracked / max(len(records), 1), 3),
         "status_counts": dict(sorted(statuses.items())),
         "first_loss_s": (lost[0].timestamp_ns - records[0].timestamp_ns) * 1e-9 if lost else None,
-        "keyframes": sum(record.is_keyframe for record in records),
+        "relocalised": statuses[TrackStatus.RELOCALISED.name],
+        "keyframes": len(slam.map.ids),
+        "keyframes_made": sum(record.is_keyframe for record in records),
+        "map_points": len(slam.map.points.ids),
+        "loops_closed": slam.loops_closed,
+        "submaps": len(set(slam.map.submap.tolist())),
         **{name: figures.get(name) for name in wanted},
         "evaluation": figures or None,
         "track_ms": _distribution([record.track_ms for record in records if record.track_ms is not None]),

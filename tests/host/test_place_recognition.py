@@ -72,8 +72,10 @@ def exhaustive(places: list[Features], ids: set[int], sought: Features) -> list[
 
 def test_scores_are_those_of_an_exhaustive_search(places):
     random = np.random.default_rng(1)
-    sought = described(like(places[7].descriptor, 0.06, random))
-    index = index_of(places, range(20))
+    changed = like(places[7].descriptor, 0.06, random)
+    changed[::2] = like(places[7].descriptor[::2], 0.17, random)  # about as many bits as may differ
+    changed[:, :3] = places[7].descriptor[:, :3]
+    sought, index = described(changed), index_of(places, range(20))
     found, expected = index.query(sought, limit=100), exhaustive(places, set(range(20)), sought)
     assert [place for place, _ in found] == [place for place, _ in expected]
     np.testing.assert_allclose([score for _, score in found], [score for _, score in expected], rtol=1e-12)
@@ -204,8 +206,10 @@ def test_too_little_to_be_certain(round_map, monkeypatch):
         assert verify(keyframe, take(index), params()) is None
     flat = keyframe._replace(features=keyframe.features._replace(depth=np.zeros_like(whole.depth)))
     assert verify(flat, whole, params()) is None
-    monkeypatch.setattr(module, "MIN_CELLS", 1)
-    assert verify(keyframe, take(corner), params()) is not None  # it was only too small a part of the image
+    for gates, certain in (((12, 1.0), False), ((1, 0.03), False), ((1, 1.0), True)):  # each alone refuses the corner
+        monkeypatch.setattr(module, "MIN_CELLS", gates[0])
+        monkeypatch.setattr(module, "MAX_SIGMA_M", gates[1])
+        assert (verify(keyframe, take(corner), params()) is not None) == certain
 
 
 def test_compiles_once(round_map, monkeypatch):
