@@ -268,7 +268,7 @@ def _print_summary(summary: dict[str, Any], evaluation: Evaluation | None, out: 
         _console.print(f"Note: {note}.")
     _console.print(
         f"Results in {out}: trajectory.txt, trajectory_online.txt, trajectory_keyframes.txt, summary.json,"
-        " config.yaml, plot.png"
+        " config.yaml, plot.png, map.png"
     )
 
 

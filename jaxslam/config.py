@@ -136,8 +136,8 @@ class Config(Checked):
     """Everything that can be set."""
 
     track: TrackConfig = field(default_factory=TrackConfig)
-    mapping: MappingConfig = field(default_factory=MappingConfig)
     run: RunConfig = field(default_factory=RunConfig)
+    mapping: MappingConfig = field(default_factory=MappingConfig)
 
 
 def load_config(preset: str = "default", file: str | Path | None = None, overrides: Sequence[str] = ()) -> Config:

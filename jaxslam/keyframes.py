@@ -14,6 +14,10 @@ from jaxslam.observe import View, predict_pixels
 from jaxslam.state import Keyframes, LookedUp, TrackedPoints, TrackParams, TrackPlan
 
 _MARGIN_PX = 8
+_MOST_TURN = 0.7
+"""Cosine of the largest angle between the directions from which a point is looked up and was seen."""
+_MOST_SCALE = 2.0
+"""How much nearer or farther it may be."""
 _MAX_SHIFT_PX = 12.0
 """A point found further from where the pose predicts it is another one."""
 
@@ -55,7 +59,8 @@ def look_up(
     valid = keyframes.weight > 0
     X_cam = to_camera(T_world_cam, jnp.moveaxis(keyframes.X_world, 1, 0).reshape(3, k * n))
     predicted = predict_pixels(X_cam, twist, height, params)
-    visible = _visible(predicted, X_cam[2], height, width) & valid.reshape(-1)
+    alike = _seen_alike(keyframes, T_world_cam).reshape(-1)
+    visible = _visible(predicted, X_cam[2], height, width) & alike & valid.reshape(-1)
     shown = jnp.sum(visible.reshape(k, n), axis=1)
     overlap = jnp.max((shown / jnp.maximum(jnp.sum(valid, axis=1), 1)).astype(predicted.dtype))
     _, sources = jax.lax.top_k(shown, plan.num_sources)
@@ -90,6 +95,16 @@ def _visible(uv: Pixels, depth: Weights, height: int, width: int) -> Mask:
     u, v = uv
     inside = (u > _MARGIN_PX) & (v > _MARGIN_PX) & (u < width - _MARGIN_PX) & (v < height - _MARGIN_PX)
     return inside & (depth > 0)
+
+
+def _seen_alike(keyframes: Keyframes, T_world_cam: SE3) -> Bool[Array, "k n"]:
+    """Which points are seen from about the same direction and distance as in their keyframe."""
+    then = keyframes.X_world - keyframes.T_world_cam[:, 4:, None]
+    now = keyframes.X_world - T_world_cam.translation()[None, :, None]
+    far_then, far_now = jnp.sum(jnp.square(then), axis=1), jnp.sum(jnp.square(now), axis=1)
+    along = jnp.sum(then * now, axis=1)
+    aligned = (along > 0) & (jnp.square(along) > _MOST_TURN**2 * far_then * far_now)
+    return aligned & (far_now < _MOST_SCALE**2 * far_then) & (far_then < _MOST_SCALE**2 * far_now)
 
 
 def _warp(

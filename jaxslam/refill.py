@@ -55,9 +55,9 @@ def refill(
     good = (corners.score > _MIN_SCORE) & ~taken & (rough > 0) & (seen.depth > 0)
     one_surface = sample_depth(depth, uv, reach=plan.flow.finest.window // 2, max_step=_DEPTH_STEP) > 0
     order = jnp.lexsort((-corners.score, ~one_surface, ~good))
-    rank = jnp.cumsum(~points.valid) - 1
+    rank = jnp.cumsum(~points.valid, dtype=jnp.int32) - 1
     candidate = order[jnp.clip(rank, 0, order.shape[0] - 1)]
-    new = ~points.valid & (rank < jnp.sum(good))
+    new = ~points.valid & (rank < jnp.sum(good, dtype=jnp.int32))
     put = lambda old, fresh: jnp.where(new, jnp.take(fresh, candidate, axis=-1), old)
     return TrackedPoints(
         uv=put(points.uv, uv),

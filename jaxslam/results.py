@@ -25,7 +25,7 @@ from jaxslam.slam import Slam
 from jaxslam.state import TrackStatus
 from jaxslam.tracked import FrameRecord, Rejected, Tracked
 from jaxslam.trajectory import write_tum
-from jaxslam.visualize import Snapshot, plot_trajectory
+from jaxslam.visualize import Snapshot, plot_map, plot_trajectory
 from jaxslam.xla import threads, usable_cores
 
 _PACKAGES = ("jaxslam", "jax", "jaxlib", "jaxlie", "equinox", "optimistix", "numpy", "opencv-python-headless")
@@ -61,7 +61,7 @@ class RunInfo:
 def write_results(
     folder: Path, slam: Slam, records: Sequence[FrameRecord], info: RunInfo, snapshots: Sequence[Snapshot] = ()
 ) -> tuple[dict[str, Any], Evaluation | None]:
-    """Write three trajectories (final, online, keyframes), `summary.json`, `config.yaml` and `plot.png`.
+    """Write three trajectories (final, online, keyframes), `summary.json`, `config.yaml`, `plot.png`, `map.png`.
 
     Args:
         folder: Where they go; made if it is not there. Files of an earlier run are replaced, each in one piece.
@@ -86,6 +86,7 @@ def write_results(
     write_tum(folder / "trajectory_online.txt", slam.online_trajectory)
     if len(slam.map.ids):
         write_keyframe_trajectory(folder / "trajectory_keyframes.txt", slam.map)
+        plot_map(slam.map, slam.trajectory, folder / "map.png")
     write_atomically(folder / "config.yaml", to_yaml(slam.config).encode())
     write_atomically(folder / "summary.json", (json.dumps(summary, indent=2) + "\n").encode())
     if len(slam.trajectory):

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure, SubFigure
 from jaxslam.errors import TrajectoryError
 from jaxslam.evaluation import Evaluation
 from jaxslam.files import write_atomically
+from jaxslam.map import NONE, Map, rows
 from jaxslam.trajectory import Trajectory
 
 _BREAK_INTERVALS = 3.0
@@ -83,6 +84,63 @@ def plot_trajectory(
     picture = io.BytesIO()
     FigureCanvasAgg(figure).print_png(picture)
     write_atomically(path, picture.getvalue(), TrajectoryError)
+
+
+def plot_map(map: Map, trajectory: Trajectory, path: str | os.PathLike[str]) -> None:
+    """Write one PNG: points of the map by how many keyframes saw them, keyframes with their spanning tree, loops, path.
+
+    Two views, from above and from the side as gravity is not known: along the flattest axis of the points, and along
+    the next one.
+
+    Args:
+        map: With a keyframe at least.
+        trajectory: Of the camera in the frame of the map.
+        path: Where the picture goes.
+
+    Raises:
+        TrajectoryError: If there is no keyframe, or the file cannot be written.
+    """
+    if not len(map.ids):
+        raise TrajectoryError("nothing to plot: the map holds no keyframes")
+    seen = np.bincount(np.searchsorted(map.points.ids, map.sightings.point), minlength=len(map.points.ids))
+    order = np.argsort(seen, kind="stable")
+    centres, X = map.T_world_cam[:, 4:], map.points.X_world[:, order].T
+    low, high = np.percentile(np.concatenate([X, centres]), [1, 99], axis=0)
+    by_extent = np.argsort(high - low, kind="stable")
+    figure = Figure(figsize=(12, 6), layout="constrained")
+    points = None
+    for axes, hidden in zip(figure.subplots(1, 2), by_extent[:2], strict=True):
+        plane = [axis for axis in range(3) if axis != hidden]
+        points = axes.scatter(*X[:, plane].T, s=1.5, c=seen[order], cmap="viridis", vmin=1, vmax=8, label="points")
+        _draw_links(axes, map, plane)
+        _draw_path(axes, trajectory, plane, color=_PATH_COLOR, label="path")
+        axes.plot(*centres[:, plane].T, "^", color="black", markersize=4, label="keyframes")
+        room = 0.05 * (high - low)[plane] + 0.1
+        axes.set(xlabel=f"{'xyz'[plane[0]]} [m]", ylabel=f"{'xyz'[plane[1]]} [m]")
+        (left, bottom), (right, top) = (low[plane] - room).tolist(), (high[plane] + room).tolist()
+        axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
+        axes.legend(fontsize=8)
+    assert points is not None
+    figure.colorbar(points, ax=figure.axes, label="keyframes that saw the point", shrink=0.8)
+    figure.suptitle(
+        f"{len(map.ids)} keyframes, {len(map.points.ids)} points, {len(map.sightings.point)} sightings,"
+        f" {len(map.loops.source)} loops, {len(np.unique(map.submap))} submaps",
+        fontsize=10,
+    )
+    picture = io.BytesIO()
+    FigureCanvasAgg(figure).print_png(picture)
+    write_atomically(path, picture.getvalue(), TrajectoryError)
+
+
+def _draw_links(axes: Axes, map: Map, plane: list[int]) -> None:
+    """The spanning tree, and loops."""
+    children = np.flatnonzero(map.parent != NONE)
+    parents = rows(map.ids, map.parent[children])
+    loops = rows(map.ids, map.loops.source), rows(map.ids, map.loops.target)
+    for (first, second), color, label in (((parents, children), "0.5", None), (loops, _LOST_COLOR, "loops")):
+        ends = np.stack([map.T_world_cam[first, 4:], map.T_world_cam[second, 4:]], axis=1)[:, :, plane]
+        if len(ends):
+            axes.add_collection(LineCollection(list(ends), colors=color, linewidths=1.0, label=label))
 
 
 def _draw_snapshots(figure: SubFigure, snapshots: Sequence[Snapshot]) -> None:

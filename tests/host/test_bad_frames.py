@@ -136,17 +136,20 @@ class TestBadImages:
         assert results[5].T_world_cam == pytest.approx([1, 0, 0, 0, 0, 0, 0], abs=1e-6)
         assert len(slam.trajectory) == 10
 
-    def test_long_loss_starts_anew_at_the_held_pose(self, slam: Slam) -> None:
+    def test_long_loss_ends_in_the_same_world(self, slam: Slam, undisturbed: list[Tracked]) -> None:
+        """The tracker finds what it followed before again, or the map the place: in the dark nothing starts anew."""
         recording = clip()
         frames = recording.frames[:50]
         dark = slice(10, 10 + int(CONFIG.track.restart_after) + 5)
         frames[dark] = [SPOILED["black"](frame, frame) for frame in frames[dark]]
         results = track(slam, frames)
         assert {result.status for result in results[dark]} == {TrackStatus.LOST}
-        again = results[dark.stop]
-        assert again.status is TrackStatus.STARTED
-        np.testing.assert_allclose(again.T_world_cam, results[9].T_world_cam, atol=1e-6)
-        assert {result.status for result in results[dark.stop + 1 :]} <= {TrackStatus.OK, TrackStatus.WEAK}
+        assert {result.status for result in results[dark.stop :]} <= {
+            TrackStatus.OK,
+            TrackStatus.WEAK,
+            TrackStatus.RELOCALISED,
+        }
+        np.testing.assert_allclose(results[-1].T_world_cam[4:], undisturbed[49].T_world_cam[4:], atol=0.02)  # of 20 cm
         assert {result.status for result in results[-5:]} == {TrackStatus.OK}
 
 

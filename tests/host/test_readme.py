@@ -22,6 +22,15 @@ README = ROOT / "README.md"
 CONTRIBUTING = ROOT / ".github" / "CONTRIBUTING.md"
 _FENCED = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 _SET_UP = re.compile(r"^python -m venv \.venv && \.venv/bin/pip install (?:\.|-e '\.\[dev\]') && ")
+FILES = {
+    "trajectory.txt",
+    "trajectory_online.txt",
+    "trajectory_keyframes.txt",
+    "summary.json",
+    "config.yaml",
+    "plot.png",
+    "map.png",
+}
 
 
 class _Block(NamedTuple):
@@ -61,10 +70,10 @@ def test_blocks_run_in_order(tmp_path: Path) -> None:
     (tmp_path / ".venv").symlink_to(sys.prefix)
     printed = {block.line: _run_block(block, tmp_path) for block in _blocks(README)}
     text = "".join(printed.values())
-    assert len(printed) == 8
+    assert len(printed) == 9
     assert "ATE" in text
     left_behind = {path.name for path in (tmp_path / "results" / "demo").iterdir()}
-    assert left_behind == {"trajectory.txt", "trajectory_online.txt", "summary.json", "config.yaml", "plot.png"}
+    assert left_behind == FILES
     assert all(f"`{name}`" in README.read_text(encoding="utf-8") for name in left_behind)
     assert (tmp_path / "ate.png").is_file()
     assert Camera.load(tmp_path / "my_camera.yaml").depth_scale_per_m == 5000

@@ -15,7 +15,15 @@ from jaxslam.results import RunInfo, Snapshots, write_results
 from jaxslam.slam import Slam
 from jaxslam.trajectory import Trajectory, read_tum
 
-FILES = {"trajectory.txt", "trajectory_online.txt", "summary.json", "config.yaml", "plot.png"}
+FILES = {
+    "trajectory.txt",
+    "trajectory_online.txt",
+    "trajectory_keyframes.txt",
+    "summary.json",
+    "config.yaml",
+    "plot.png",
+    "map.png",
+}
 PROMISED = {
     *("frames", "tracked", "tracked_percent", "ate_rmse_m", "ate_sim3_rmse_m", "rpe_trans_m_per_s"),
     *("rpe_rot_deg_per_s", "track_ms", "compile_s", "wall_s", "peak_rss_mb", "preset", "deterministic", "versions"),
@@ -72,7 +80,7 @@ class TestSmallScene:
         assert evaluation is None
         assert summary["evaluation_problem"] == "no ground truth"
         assert (summary["frames"], summary["tracked_percent"], summary["track_ms"]) == (0, 0, None)
-        assert {path.name for path in tmp_path.iterdir()} == FILES - {"plot.png"}
+        assert {path.name for path in tmp_path.iterdir()} == FILES - {"plot.png", "map.png", "trajectory_keyframes.txt"}
 
 
 class TestRealRecordings:

@@ -15,10 +15,11 @@ from jaxslam.state import TrackOutput, TrackParams, TrackState, TrackStatus
 from jaxslam.track import track_step
 
 COUNT = 12
-SAME = {"twist": 1e-4 * 30, "covariance": 1e-7}
+SAME = {"twist": 1e-4 * 30, "covariance": 1e-7, "looked_up.uv": 1e-2}
 """What is the same number in metres a second and square metres, where poses are the same to 1e-4.
 
 Rounding decides whether the refinement takes its last step: compiled in another way, poses differ by 0 or by 5e-6 m.
+So it does for the search of a point that is looked up, whose last step is up to 0.05 px long.
 """
 
 Step = Callable[[TrackState, FrameArrays, TrackParams], tuple[TrackState, TrackOutput]]
@@ -115,7 +116,7 @@ class TestCompiled:
             name = jax.tree_util.keystr(path)
             assert one.dtype == other.dtype, name
             if np.issubdtype(one.dtype, np.floating):
-                field = name.split(".")[-1]
+                field = "looked_up.uv" if name.endswith("looked_up.uv") else name.split(".")[-1]
                 np.testing.assert_allclose(one, other, rtol=1e-5, atol=SAME.get(field, 1e-4), err_msg=name)
             else:
                 np.testing.assert_array_equal(one, other, err_msg=name)
