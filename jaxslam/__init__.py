@@ -27,5 +27,6 @@ from jaxslam.track import init_state as init_state
 from jaxslam.track import track_step as track_step
 from jaxslam.tracked import Tracked as Tracked
 from jaxslam.trajectory import Trajectory as Trajectory
+from jaxslam.xla import prefer_one_thread as prefer_one_thread
 
 __version__ = "0.1.0"

@@ -5,19 +5,23 @@ thread, in `update`: jobs and results are immutable, so threads share nothing bu
 """
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
+import cv2
 import jax
 import numpy as np
 
 from jaxslam.camera import Camera
 from jaxslam.config import Config
-from jaxslam.features import features_of
+from jaxslam.essential_graph import compile_graph
+from jaxslam.features import DESCRIPTOR_BYTES, Features, features_of
 from jaxslam.frame_arrays import FrameArrays
 from jaxslam.local_mapping import LocalMapping, NewKeyframe, mapping_plan
 from jaxslam.loop_closing import LoopClosing, LoopClosure
-from jaxslam.map import NONE, Map, empty_map
+from jaxslam.map import NONE, Keyframe, Map, empty_map, standing
+from jaxslam.map_edit import with_keyframe
 from jaxslam.map_link import Hung, MapLink
 from jaxslam.place_index import PlaceIndex
 from jaxslam.place_recognition import MIN_INLIERS, compile_recognition, recognise
@@ -25,12 +29,15 @@ from jaxslam.pose import IDENTITY, compose
 from jaxslam.recall import Recalled, recall, worth_recalling
 from jaxslam.state import TrackOutput, TrackParams, TrackPlan, TrackState
 from jaxslam.state_edit import relocated
-from jaxslam.worker import InlineWorker, ThreadWorker, Worker
+from jaxslam.track import init_state
+from jaxslam.worker import InlineWorker, ThreadWorker, Worker, close_all
 
 _relocated = jax.jit(relocated, donate_argnums=0)
 
 _RECALL_EVERY = 10
 """Frames after which a tracker that only localises gets other keyframes."""
+_PATIENCE_S = 0.02
+"""Longest wait for the index of places, while lost; the next frame asks again."""
 
 
 class _Look(NamedTuple):
@@ -50,10 +57,11 @@ class _Recall(NamedTuple):
 
 
 class _MapUpdate(NamedTuple):
-    """A new map, and the keyframe it is of; `NONE` if a loop was closed."""
+    """A new map, the keyframe it is of or `NONE`, and the loops closed in it."""
 
     map: Map
     keyframe: int
+    loops: int
 
 
 _PlaceJob: TypeAlias = _Look | _Recall
@@ -84,16 +92,20 @@ class BackEnd:
             localize_only: Leave the map as it is.
         """
         self._params, self._track_plan, self._plan = params, plan, mapping_plan(config.mapping, config.track)
-        self._config, self._localize_only = config, localize_only
+        self._camera, self._config, self._localize_only = camera, config, localize_only
         start = empty_map(camera) if map is None else map
         self._mapping = LocalMapping(camera, params, self._plan, start)
         self._index, self._lock = PlaceIndex.from_map(start), threading.Lock()
-        self._loops = LoopClosing(self._index, params, self._plan.features)
+        self._loops = LoopClosing(self._index, params, self._plan.features, self._lock)
         self._to_mapping: Worker[NewKeyframe | LoopClosure, _MapUpdate] = self._worker(self._map_job, "mapping", 1)
         self._to_places: Worker[_PlaceJob, _PlaceResult] = self._worker(self._place_job, "places", 2)
         self._link = MapLink(plan, start)
+        self._arrived: Map | None = None
         self._waiting: list[Recalled] = []
+        self._wanted: set[int] = set()
+        self._correction = IDENTITY
         self._loops_closed = 0
+        self._closed = False
 
     @property
     def map(self) -> Map:
@@ -110,6 +122,9 @@ class BackEnd:
         num_looked_up = self._track_plan.num_sources * self._track_plan.points_per_source
         self._mapping.compile(frame, self._track_plan.num_points + num_looked_up)
         compile_recognition(self._params, self._plan.features)
+        self._compile_edits(*frame.image.shape)
+        if not self._config.run.deterministic:
+            compile_graph()  # while frames come, it would take seconds from them
 
     def update(self, state: TrackState, frame: int) -> tuple[TrackState, np.ndarray]:
         """Take in what is ready by a frame: carry the tracker along with the map, and give it keyframes back.
@@ -118,10 +133,17 @@ class BackEnd:
             The state, and the correction of the world `(7,)` at the camera since the last update.
 
         Raises:
-            Exception: What went wrong in a thread.
+            RuntimeError: If it is closed.
+            Exception: What went wrong in a thread. The state is as it was, and nothing else is lost.
         """
-        state, correction = self._take_maps(state, self._to_mapping.take(frame), frame)
+        if self._closed:
+            raise RuntimeError("the back end is closed")
         self._take_places(self._to_places.take(frame), frame)
+        more = self._take_maps(self._to_mapping.take(frame), frame)
+        state = self._carried(state)
+        if more:
+            self._offer_recall(self._link.believed(self._link.reference), frame)
+        correction, self._correction = self._correction, IDENTITY
         return self._with_recalled(state), correction
 
     def keyframe_made(
@@ -140,13 +162,19 @@ class BackEnd:
             self._to_mapping.offer(self._link.keyframe_made(timestamp_ns, arrays, output, recognised), frame)
 
     def recognise(self, arrays: FrameArrays) -> tuple[Hung | None, bool]:
-        """Where a frame was taken, if the map shows that place; and whether the frame shows enough to tell."""
+        """Where a frame was taken, if the map shows that place; and whether the frame may begin a new submap.
+
+        It may if it shows enough to tell that it is another place, and the map may grow.
+        """
         features = features_of(arrays, np.zeros(6, np.float32), self._params, self._plan.features)
-        if np.count_nonzero(features.depth) < MIN_INLIERS:
+        if np.count_nonzero(features.depth) < MIN_INLIERS or not self._lock.acquire(timeout=_PATIENCE_S):
             return None, False
-        with self._lock:
+        try:
             found = recognise(self.map, self._index, features, self._params, plan=self._plan.features)
-        return None if found is None else Hung(found.keyframe, found.T_keyframe_cam), True
+        finally:
+            self._lock.release()
+        hung = None if found is None else Hung(found.keyframe, found.T_keyframe_cam)
+        return hung, not self._localize_only
 
     def relocated(self, state: TrackState, recognised: Hung) -> TrackState:
         """The state of the tracker begun anew where the map recognised a place, with keyframes of it at hand."""
@@ -154,7 +182,7 @@ class BackEnd:
         pose = self._link.pose(recognised)
         state = self.restarted(state, pose)
         wanted = worth_recalling(self.map, pose, self._link.submap_now(), set(), self._track_plan.num_recalled)
-        self._waiting = [recall(self.map, keyframe_id, self._track_plan.num_points) for keyframe_id in wanted]
+        self._wait_for(recall(self.map, keyframe_id, self._track_plan.num_points) for keyframe_id in wanted)
         while self._waiting:
             state = self._with_recalled(state)
         return state
@@ -162,7 +190,7 @@ class BackEnd:
     def restarted(self, state: TrackState, T_world_cam: np.ndarray) -> TrackState:
         """The state of the tracker begun anew at a pose."""
         self._link.forget_slots()
-        self._waiting = []
+        self._wait_for(())
         return _relocated(state, T_world_cam.astype(np.float32))
 
     def localize(self, T_world_cam: np.ndarray, frame: int) -> None:
@@ -179,52 +207,80 @@ class BackEnd:
         return self._link.pose(hung)
 
     def finish(self, state: TrackState) -> TrackState:
-        """Wait until everything handed over is in the map."""
-        while maps := self._to_mapping.drain():
-            state, _ = self._take_maps(state, maps, 0)
+        """Wait until everything handed over is in the map; once closed, take what was done until then.
+
+        Raises:
+            Exception: What went wrong in a thread. The state is as it was, and nothing else is lost: finish again.
+        """
+        self._take_places(self._to_places.drain(), 0)
+        while self._take_maps(self._to_mapping.drain(), 0):
             self._take_places(self._to_places.drain(), 0)
-        return state
+        return self._carried(state)
 
     def close(self) -> None:
-        """End the threads."""
-        self._to_mapping.close()
-        self._to_places.close()
+        """End the threads, with the jobs they have not begun, in less than two seconds."""
+        self._closed = True
+        close_all((self._to_mapping, self._to_places))
+
+    def _compile_edits(self, height: int, width: int) -> None:
+        """Compile the changes to the tracker's state, on one that holds nothing."""
+        shapes: Any = jax.eval_shape(partial(init_state, height, width, self._track_plan))
+        nothing = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes._replace(key=None))
+        state = _relocated(nothing._replace(key=jax.random.key(0)), np.asarray(IDENTITY, np.float32))
+        jax.block_until_ready(self._link.compile(state))
 
     def _worker(self, work: Callable[[Any], Any], name: str, turn: int) -> Worker[Any, Any]:
         if self._config.run.deterministic:
-            return InlineWorker(work, turn * self._config.mapping.latency_frames)
+            return InlineWorker(work, f"jaxslam-{name}", turn * self._config.mapping.latency_frames)
         return ThreadWorker(work, f"jaxslam-{name}")
 
     def _map_job(self, job: NewKeyframe | LoopClosure) -> _MapUpdate:
-        if isinstance(job, LoopClosure):
-            return _MapUpdate(self._mapping.close_loop(job), NONE)
-        return _MapUpdate(self._mapping.add(job), job.id)
+        before = self._mapping.map
+        try:
+            if isinstance(job, LoopClosure):
+                map = self._mapping.close_loop(job)
+                return _MapUpdate(map, NONE, int(map is not before))
+            return _MapUpdate(self._mapping.add(job), job.id, 0)
+        except BaseException:
+            # What was begun is forgotten; those after a keyframe hang on it, and so it is there, without points.
+            map = before if isinstance(job, LoopClosure) else _with_bare(before, job)
+            self._mapping = LocalMapping(self._camera, self._params, self._plan, map)
+            raise
 
     def _place_job(self, job: _PlaceJob) -> _PlaceResult:
         if isinstance(job, _Look):
-            with self._lock:
-                return self._loops.look(job.map, job.keyframe)
+            return self._loops.look(job.map, job.keyframe)
         wanted = worth_recalling(job.map, job.T_world_cam, job.submap, set(job.known), self._track_plan.num_recalled)
         return tuple(recall(job.map, keyframe_id, self._track_plan.num_points) for keyframe_id in wanted)
 
-    def _take_maps(self, state: TrackState, updates: list[_MapUpdate], frame: int) -> tuple[TrackState, np.ndarray]:
-        correction = IDENTITY
+    def _take_maps(self, updates: list[_MapUpdate], frame: int) -> bool:
+        """Keep the newest map until the state is carried along, and look for loops; whether there was one."""
         for update in updates:
-            state, change = self._link.corrected(state, update.map)
-            correction = compose(change, correction)
-            if update.keyframe == NONE:
-                self._loops_closed += 1
-                continue
-            self._to_places.offer(_Look(update.map, update.keyframe), frame)
-            self._offer_recall(self._link.believed(self._link.reference), frame)
-        return state, correction
+            self._arrived = update.map
+            self._loops_closed += update.loops
+            if update.keyframe != NONE and not self._closed:
+                self._to_places.offer(_Look(update.map, update.keyframe), frame)
+        return bool(updates)
+
+    def _carried(self, state: TrackState) -> TrackState:
+        if self._arrived is not None:
+            state, change = self._link.corrected(state, self._arrived)
+            self._arrived = None
+            self._correction = compose(change, self._correction)
+        return state
 
     def _take_places(self, results: list[_PlaceResult], frame: int) -> None:
         for result in results:
             if isinstance(result, LoopClosure):
-                self._to_mapping.offer(result, frame)
+                if not self._closed:
+                    self._to_mapping.offer(result, frame)
             elif result:
-                self._waiting = list(result)
+                self._wait_for(result)
+
+    def _wait_for(self, keyframes: Iterable[Recalled]) -> None:
+        """Have keyframes put back into the tracker, one a frame."""
+        self._waiting = list(keyframes)
+        self._wanted = {keyframe.keyframe for keyframe in self._waiting}
 
     def _offer_recall(self, T_world_cam: np.ndarray, frame: int) -> None:
         if self._track_plan.num_recalled and self._link.reference != NONE:
@@ -235,7 +291,7 @@ class BackEnd:
         """The state with one more of the keyframes that wait; one a frame, so that none takes long."""
         while self._waiting:
             keyframe = self._waiting.pop(0)
-            slot = self._link.slot_for(keyframe.keyframe, {other.keyframe for other in self._waiting})
+            slot = self._link.slot_for(keyframe.keyframe, self._wanted)
             if slot is not None:
                 return self._link.recalled(state, slot, keyframe)
         return state
@@ -244,3 +300,17 @@ class BackEnd:
 def copied(arrays: FrameArrays) -> FrameArrays:
     """A frame's own copy, for use after the caller has got its images back."""
     return FrameArrays(*jax.tree.map(np.array, tuple(arrays)))
+
+
+def _with_bare(map: Map, new: NewKeyframe) -> Map:
+    """The map with a keyframe in its place that shows nothing."""
+    pose, parent, submap = new.T_parent_keyframe, new.parent, new.submap
+    if parent != NONE:
+        pose = compose(map.pose(parent), pose)
+        parent = int(standing(map, np.array([parent]))[0])
+        submap = int(map.submap[map.row(parent)])
+    none, plane = np.zeros(0, np.float32), np.zeros((2, 0), np.float32)
+    octave, descriptor = np.zeros(0, np.uint8), np.zeros((0, DESCRIPTOR_BYTES), np.uint8)
+    features = Features(seen_uv=plane, uv=plane, depth=none, octave=octave, angle=none, descriptor=descriptor)
+    _, png = cv2.imencode(".png", np.asarray(new.frame.image))
+    return with_keyframe(map, Keyframe(new.id, new.timestamp_ns, features, png.tobytes()), pose, parent, submap)

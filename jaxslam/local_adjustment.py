@@ -10,9 +10,9 @@ from jaxslam_kernels.bundle_cost import Observations
 from jaxslam_kernels.types import Scalar
 from jaxtyping import Array, Bool, Float
 
-from jaxslam.map import Map, Sightings, covisible, has, rows, sightings_at
+from jaxslam.map import NONE, Map, Sightings, covisible, has, rows, sightings_at
 from jaxslam.map_edit import moved, without_sightings
-from jaxslam.pose import between, compose, to_local, transform
+from jaxslam.pose import between, compose, inverse, rotate, to_local, transform
 
 _NUM_FIXED = 4
 """Keyframes outside the window that hold it in place."""
@@ -53,18 +53,27 @@ class _Window(NamedTuple):
     """and the row of each in the map."""
 
 
-def adjust_around(map: Map, keyframe_id: int, plan: AdjustPlan) -> Map:
+def adjust_around(map: Map, keyframe_id: int, plan: AdjustPlan, movable: np.ndarray | None = None) -> Map:
     """The map with a keyframe, those covisible with it and their points where they fit what was seen best.
 
     Sightings that do not fit are dropped. What the window does not move stays; a window that cannot be solved leaves
     the map as it was.
+
+    Args:
+        map: The map, or a part of it.
+        keyframe_id: The keyframe.
+        plan: How.
+        movable: Ids, ascending, of the keyframes that may move: of a part, those whose points are all here. By default
+            all may.
     """
-    window = _window(map, keyframe_id, plan)
+    window = _window(map, keyframe_id, plan, map.ids if movable is None else movable)
     if window is None:
         return map
     reference = map.T_world_cam[map.row(keyframe_id)]
     poses, X = _solve_input(map, window, reference)
-    size = next(size for size in _POINT_SIZES if size >= len(window.points))
+    size = next(
+        size for size in _POINT_SIZES if size >= len(window.points) and size * _SIGHTINGS_A_POINT >= len(window.row)
+    )
     num_cameras = plan.window + _NUM_FIXED
     free = np.arange(num_cameras) < window.num_free
     solution: Any = jax.device_get(
@@ -82,15 +91,15 @@ def adjust_around(map: Map, keyframe_id: int, plan: AdjustPlan) -> Map:
     return _put_back(map, window, reference, solution)
 
 
-def adjust_all(map: Map, plan: AdjustPlan, sweeps: int = 2) -> Map:
-    """The map adjusted window by window, over all keyframes and over again.
+def adjust_all(map: Map, plan: AdjustPlan, movable: np.ndarray, sweeps: int = 2) -> Map:
+    """The map adjusted window by window, over some keyframes (ids, ascending) and over again.
 
-    The whole as one problem would need a Schur complement of all keyframes; windows that overlap by half pass on what
-    a loop changes, and each costs the same however long the map is.
+    They as one problem would need a Schur complement of all keyframes; windows that overlap by half pass on what a
+    loop changes, and each costs the same however many there are.
     """
     for _ in range(sweeps):
-        for keyframe_id in map.ids[:: max(plan.window // 2, 1)]:
-            map = adjust_around(map, int(keyframe_id), plan)
+        for keyframe_id in movable[:: max(plan.window // 2, 1)].tolist():
+            map = adjust_around(map, keyframe_id, plan, movable)
     return map
 
 
@@ -110,26 +119,27 @@ def _no_observations(room: int) -> Observations:
     return Observations(index, index, plane[:2], plane[0], plane, plane[0], plane[0] > 0)
 
 
-def _window(map: Map, keyframe_id: int, plan: AdjustPlan) -> _Window | None:
+def _window(map: Map, keyframe_id: int, plan: AdjustPlan, movable: np.ndarray) -> _Window | None:
     """The window, or nothing if there is nothing to hold it or to move."""
     near, _ = covisible(map, keyframe_id)
     submap = map.submap[map.row(keyframe_id)]
-    near = near[map.submap[rows(map.ids, near)] == submap]
+    near = near[(map.submap[rows(map.ids, near)] == submap) & has(movable, near)]
     free = np.concatenate([[keyframe_id], near[: plan.window - 1]])
+    first = map.parent[rows(map.ids, free)] == NONE  # it never moves: the frame of the submap is where it is
+    first, free = free[first], free[~first]
     of_window = np.isin(map.sightings.keyframe, free)
     points, counts = np.unique(map.sightings.point[of_window], return_counts=True)
     others = ~of_window & has(points, map.sightings.point)
     outside, shared = np.unique(map.sightings.keyframe[others], return_counts=True)
-    held = outside[np.lexsort((outside, -shared))][:_NUM_FIXED]
-    if not len(held):  # the whole submap is in the window: its first keyframe holds it
-        held, free = free[free == free.min()], free[free != free.min()]
-    if not len(free):
+    held = outside[np.lexsort((outside, -shared, ~np.isin(outside, first)))][:_NUM_FIXED]
+    if not len(free) or not len(held):
         return None
     keyframes = np.concatenate([free, held])
     of_both = np.isin(map.sightings.keyframe, keyframes) & has(points, map.sightings.point)
     points, counts = np.unique(map.sightings.point[of_both], return_counts=True)
     points, counts = points[counts > 1], counts[counts > 1]
     best = np.argsort(-counts, kind="stable")[: _POINT_SIZES[-1]]
+    best = best[np.cumsum(counts[best]) <= _POINT_SIZES[-1] * _SIGHTINGS_A_POINT]
     points = np.sort(points[best])
     row = np.flatnonzero(of_both & has(points, map.sightings.point))
     if not len(row):
@@ -155,7 +165,7 @@ def _observations(map: Map, window: _Window, size: int, plan: AdjustPlan) -> Obs
     point_row = np.searchsorted(window.points, seen.point)
     weight = seen.weight * map.points.weight[rows(map.points.ids, seen.point)]
     precision = np.concatenate([focal / seen.sigma_px, np.where(seen.depth > 0, 1 / sigma_depth, 0)[None, :]])
-    fit: Any = lambda array, dtype: _padded(array[..., :room].astype(dtype), room, axis=-1, fill=0)
+    fit: Any = lambda array, dtype: _padded(array.astype(dtype), room, axis=-1, fill=0)
     valid: Any = np.arange(room) < len(row)
     return Observations(
         camera=fit(row, np.int32),
@@ -184,15 +194,28 @@ def _adjust(
 
 
 def _put_back(map: Map, window: _Window, reference: np.ndarray, solution: Any) -> Map:
-    num = len(window.row)
     poses = compose(reference[None, :], solution.poses[: window.num_free].astype(np.float64))
     good = solution.determined[: len(window.points)]
     X_world = transform(reference, solution.X_world[:, : len(window.points)].astype(np.float64))
-    map = moved(map, window.keyframes[: window.num_free], poses, window.points[good], X_world[:, good])
-    seen = min(num, len(solution.chi2))
+    free = window.keyframes[: window.num_free]
+    lone, along = _moved_along(map, free, poses)
+    ids, places = np.concatenate([window.points[good], lone]), np.concatenate([X_world[:, good], along], axis=1)
+    map = moved(map, free, poses, ids, places)
     wrong = np.zeros(len(map.sightings.keyframe), bool)
-    wrong[window.row[:seen]] = ~(solution.chi2[:seen] < _OUTLIER_CHI2)
+    wrong[window.row] = ~(solution.chi2[: len(window.row)] < _OUTLIER_CHI2)
     return without_sightings(map, wrong)
+
+
+def _moved_along(map: Map, keyframe_ids: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The points that only one of some keyframes sees, and where they are when it has its new pose."""
+    row = rows(map.points.ids, map.sightings.point)
+    once = np.bincount(row, minlength=len(map.points.ids))[row] == 1
+    order = np.argsort(keyframe_ids)
+    lone = np.flatnonzero(once & has(keyframe_ids[order], map.sightings.keyframe))
+    which = order[rows(keyframe_ids[order], map.sightings.keyframe[lone])]
+    change = compose(poses, inverse(map.T_world_cam[rows(map.ids, keyframe_ids)]))[which]
+    X_world = rotate(change, map.points.X_world[:, row[lone]].T) + change[:, 4:]
+    return map.sightings.point[lone], X_world.T
 
 
 def _padded(array: np.ndarray, size: int, *, axis: int, fill: np.ndarray | float) -> np.ndarray:

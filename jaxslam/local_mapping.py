@@ -18,46 +18,28 @@ from jaxtyping import Array, Float
 
 from jaxslam.camera import Camera
 from jaxslam.config import MappingConfig, TrackConfig
+from jaxslam.culling import CONFIRM_WITHIN, without_redundant, without_unconfirmed
 from jaxslam.features import FeaturePlan, Features, features_of
 from jaxslam.frame_arrays import FrameArrays
 from jaxslam.local_adjustment import AdjustPlan, adjust_all, adjust_around, compile_adjustment
 from jaxslam.loop_closing import LoopClosure
-from jaxslam.map import (
-    NONE,
-    Keyframe,
-    Map,
-    MapPoints,
-    Sightings,
-    covisible,
-    empty_map,
-    has,
-    point_submaps,
-    rows,
-    standing,
-)
-from jaxslam.map_edit import (
-    moved,
-    transformed,
-    with_keyframe,
-    with_loop,
-    with_points,
-    with_sightings,
-    without_keyframe,
-    without_points,
-)
+from jaxslam.loop_correction import with_loop_closed
+from jaxslam.map import NONE, Keyframe, Map, Sightings, covisible, empty_map, has, point_submaps, rows, standing
+from jaxslam.map_edit import with_keyframe, with_points, with_sightings
 from jaxslam.map_matching import feature_sightings, find_points, fuse_duplicates, recognisable_in
+from jaxslam.map_part import Part, most_shared, part_around, put_back
+from jaxslam.new_points import new_points, with_triangulated
 from jaxslam.observe import observe
-from jaxslam.pose import IDENTITY, compose, inverse, rotate, transform
+from jaxslam.pose import compose, transform
 from jaxslam.state import TrackParams
 
 _LOCAL_KEYFRAMES = 15
+"""Keyframes whose points are sought in a new one,"""
+_PART_KEYFRAMES = 30
+"""and those that mapping looks at and changes at all."""
 _FUSE_KEYFRAMES = 6
-_CULL_AFTER = 3
-"""Keyframes after which a point that no second one has seen is dropped."""
-_REDUNDANT_SHARE, _REDUNDANT_VIEWS = 0.9, 3
-"""A keyframe goes if this share of its points is seen by so many others (ORB-SLAM)."""
-_KEEP_LATEST = 12
-"""Keyframes the tracker may still be looking into."""
+_LOOP_KEYFRAMES = 96
+"""Keyframes around a loop that are adjusted when it is closed: where those that see the same do not yet agree."""
 _SPAN = 64
 """Keyframes after which the number the tracker gave a point is forgotten."""
 
@@ -156,30 +138,34 @@ class LocalMapping:
     def add(self, new: NewKeyframe) -> Map:
         """Take in a keyframe; gives the new map."""
         features = features_of(new.frame, new.twist, self._params, self._plan.features)
-        map = self._with_keyframe(self.map, new, features)
-        map = self._with_tracks(map, new)
-        map = self._with_found_points(map, new.id, features)
-        map = self._with_new_points(map, new.id, features)
+        whole = self._with_keyframe(self.map, new, features)
+        known = self._known(new.tracks)
+        part = _part(whole, new.id, known[has(whole.points.ids, known)])
+        map = self._with_tracks(part.map, new, known)
+        map, taken = self._with_found_points(map, new.id, features)
+        map = self._with_new_points(map, new.id, features, taken)
         near, _ = covisible(map, new.id)
+        near = near[has(part.keyframes, near)]
+        map = with_triangulated(map, new.id, near, self._plan.features)
         map = self._fused(map, new.id, near[:_FUSE_KEYFRAMES])
-        map = _without_unconfirmed(map, new.id)
-        map = adjust_around(map, new.id, self._plan.adjust)
-        map = _without_redundant(map, new.id)
+        map = without_unconfirmed(map, new.id)
+        map = adjust_around(map, new.id, self._plan.adjust, part.keyframes)
+        map = without_redundant(map, new.id, part.keyframes)
         self._forget(new.id)
-        self.map = map
-        return map
+        self.map = put_back(whole, part, map)
+        return self.map
 
     def close_loop(self, loop: LoopClosure) -> Map:
         """Close a loop, or make one submap of two; gives the new map."""
-        map = self.map
-        if not has(map.ids, np.array([loop.source, loop.target])).all():
-            return map  # one of them has been culled since
-        map = _merged(map, loop) if not len(loop.keyframes) else _bent(map, loop)
-        map = with_loop(map, loop.source, loop.target, loop.T_source_target, loop.information)
-        near, _ = covisible(map, loop.source)
-        map = self._fused(map, loop.target, np.concatenate([[loop.source], near[:_LOCAL_KEYFRAMES]]))
-        map = adjust_around(map, loop.target, self._plan.adjust)
-        self.map = adjust_all(map, self._plan.adjust)
+        if not has(self.map.ids, np.array([loop.source, loop.target])).all():
+            return self.map  # one of them has been culled since
+        whole = with_loop_closed(self.map, loop)
+        part = part_around(whole, _around_loop(whole, loop))
+        near = covisible(part.map, loop.source)[0]
+        near = near[has(part.keyframes, near) & (near != loop.target)][:_LOCAL_KEYFRAMES]
+        map = self._fused(part.map, loop.target, np.append(np.int64(loop.source), near))
+        map = adjust_around(map, loop.target, self._plan.adjust, part.keyframes)
+        self.map = put_back(whole, part, adjust_all(map, self._plan.adjust, part.keyframes))
         return self.map
 
     def _with_keyframe(self, map: Map, new: NewKeyframe, features: Features) -> Map:
@@ -194,31 +180,21 @@ class LocalMapping:
         keyframe = Keyframe(new.id, new.timestamp_ns, features, png.tobytes())
         return with_keyframe(map, keyframe, pose, parent, submap)
 
-    def _with_tracks(self, map: Map, new: NewKeyframe) -> Map:
+    def _with_tracks(self, map: Map, new: NewKeyframe, known: np.ndarray) -> Map:
         """The points the tracker saw: those the map has get a sighting, the others become points."""
         tracks = new.tracks
         uv, depth = jax.device_get(
             _ideal(tracks.seen_uv, tracks.X_cam[2].astype(np.float32), new.twist, new.frame, self._params)
         )
         used = (tracks.weight > 0) & np.isfinite(uv).all(axis=0) & np.isfinite(tracks.X_cam).all(axis=0)
-        known = np.array([self._known(map, int(id)) for id in tracks.id], np.int64)
         fresh = np.flatnonzero(used & (known == NONE))
         _, first = np.unique(tracks.id[fresh], return_index=True)
         fresh = fresh[np.sort(first)]
-        ids = map.next_point + np.arange(len(fresh))
-        map = with_points(
-            map,
-            MapPoints(
-                ids=ids,
-                X_world=transform(map.pose(new.id), tracks.X_cam[:, fresh].astype(np.float64)),
-                weight=np.ones(len(fresh), np.float32),
-                descriptor=np.zeros((len(fresh), 32), np.uint8),
-                recognisable=np.zeros(len(fresh), bool),
-                made_by=np.full(len(fresh), new.id, np.int64),
-            ),
-        )
-        known[fresh] = ids
-        self._point_of.update(zip(tracks.id[fresh].tolist(), ids.tolist(), strict=True))
+        X_world = transform(map.pose(new.id), tracks.X_cam[:, fresh].astype(np.float64))
+        points = new_points(map, new.id, X_world)
+        map = with_points(map, points)
+        known[fresh] = points.ids
+        self._point_of.update(zip(tracks.id[fresh].tolist(), points.ids.tolist(), strict=True))
         self._last_seen.update(dict.fromkeys(tracks.id[used].tolist(), new.id))
         seen = np.flatnonzero(used & has(map.points.ids, known))
         of_submap = point_submaps(map)[rows(map.points.ids, known[seen])] == map.submap[map.row(new.id)]
@@ -237,38 +213,29 @@ class LocalMapping:
             ),
         )
 
-    def _known(self, map: Map, track_id: int) -> int:
-        """The point of the map that the tracker has under a number; `NONE` if it has not come up yet."""
-        return -1 - track_id if track_id < 0 else self._point_of.get(track_id, NONE)
+    def _known(self, tracks: Tracks) -> np.ndarray:
+        """The points of the map that the tracker has; `NONE` where one has not come up yet."""
+        points = (-1 - track if track < 0 else self._point_of.get(track, NONE) for track in tracks.id.tolist())
+        return np.fromiter(points, np.int64, len(tracks.id))
 
-    def _with_found_points(self, map: Map, keyframe_id: int, features: Features) -> Map:
-        """Points of the map that its neighbours see, found in it by their descriptor."""
+    def _with_found_points(self, map: Map, keyframe_id: int, features: Features) -> tuple[Map, np.ndarray]:
+        """Points of the map that its neighbours see, found in it by their descriptor; and the features they are."""
         near, _ = covisible(map, keyframe_id, at_least=1)
         points = recognisable_in(map, near[:_LOCAL_KEYFRAMES])
         plan = self._plan.features
         index, feature = find_points(map, points, features, map.pose(keyframe_id), plan, radius_px=self._plan.search_px)
-        return with_sightings(map, feature_sightings(keyframe_id, features, points.ids[index], feature, plan))
+        return with_sightings(map, feature_sightings(keyframe_id, features, points.ids[index], feature, plan)), feature
 
-    def _with_new_points(self, map: Map, keyframe_id: int, features: Features) -> Map:
+    def _with_new_points(self, map: Map, keyframe_id: int, features: Features, taken: np.ndarray) -> Map:
         """A point for every feature with depth that is none yet."""
-        mine = map.sightings.keyframe == keyframe_id
-        taken = np.zeros(len(features.octave), bool)
-        taken[map.sightings.feature[mine & (map.sightings.feature != NONE)]] = True
-        free = np.flatnonzero(~taken & (features.depth > 0))
+        free = np.flatnonzero(features.depth > 0)
+        free = free[~np.isin(free, taken)]
         camera, depth = map.camera, features.depth[free].astype(np.float64)
         u, v = features.uv[:, free].astype(np.float64)
         X_cam = np.stack([(u - camera.cx) / camera.fx * depth, (v - camera.cy) / camera.fy * depth, depth])
-        ids = map.next_point + np.arange(len(free))
-        points = MapPoints(
-            ids=ids,
-            X_world=transform(map.pose(keyframe_id), X_cam),
-            weight=np.ones(len(free), np.float32),
-            descriptor=features.descriptor[free],
-            recognisable=np.ones(len(free), bool),
-            made_by=np.full(len(free), keyframe_id, np.int64),
-        )
+        points = new_points(map, keyframe_id, transform(map.pose(keyframe_id), X_cam), features.descriptor[free])
         return with_sightings(
-            with_points(map, points), feature_sightings(keyframe_id, features, ids, free, self._plan.features)
+            with_points(map, points), feature_sightings(keyframe_id, features, points.ids, free, self._plan.features)
         )
 
     def _fused(self, map: Map, keyframe_id: int, neighbours: np.ndarray) -> Map:
@@ -300,53 +267,19 @@ def _ideal(
     return to_pixels(params.intrinsics, seen.xy), seen.depth
 
 
-def _merged(map: Map, loop: LoopClosure) -> Map:
-    """The later of two submaps carried into the frame of the other."""
-    first, second = map.submap[rows(map.ids, np.array([loop.source, loop.target]))]
-    if first == second:
-        return map  # they have become one since
-    T_new_old = compose(compose(map.pose(loop.source), loop.T_source_target), inverse(map.pose(loop.target)))
-    if second > first:
-        return transformed(map, T_new_old, int(second), int(first), loop.source)
-    return transformed(map, inverse(T_new_old), int(first), int(second), loop.target)
+def _part(map: Map, keyframe_id: int, known: np.ndarray) -> Part:
+    """The part of a map that a new keyframe may change, given the points of it that the tracker saw."""
+    latest = map.ids[map.ids >= keyframe_id - CONFIRM_WITHIN]
+    near = np.concatenate([most_shared(map, known, _LOCAL_KEYFRAMES), latest])
+    parent = map.parent[map.row(keyframe_id)]
+    near = np.append(near, parent) if parent != NONE else near
+    around = most_shared(map, part_around(map, near).map.points.ids, _PART_KEYFRAMES)
+    return part_around(map, np.concatenate([near, around]), known)
 
 
-def _bent(map: Map, loop: LoopClosure) -> Map:
-    """New poses for the keyframes; what came after them, and all points, move along."""
-    known = has(map.ids, loop.keyframes)
-    change = np.tile(IDENTITY, (len(map.ids), 1))
-    row = rows(map.ids, loop.keyframes[known])
-    change[row] = compose(loop.T_world_cam[known], inverse(map.T_world_cam[row]))
-    settled = map.parent == NONE
-    settled[row] = True
-    for index in np.flatnonzero(~settled):
-        line = [int(index)]
-        while not settled[line[-1]]:
-            line.append(map.row(map.parent[line[-1]]))
-        change[line] = change[line[-1]]
-        settled[line] = True
-    of_point = change[rows(map.ids, standing(map, map.points.made_by))]
-    X_world = (rotate(of_point, map.points.X_world.T) + of_point[:, 4:]).T
-    return moved(map, map.ids, compose(change, map.T_world_cam), map.points.ids, X_world)
-
-
-def _without_unconfirmed(map: Map, keyframe_id: int) -> Map:
-    """Drop the points that only one keyframe has seen, some keyframes after they were made."""
-    seen = np.bincount(rows(map.points.ids, map.sightings.point), minlength=len(map.points.ids))
-    old = (map.points.made_by <= keyframe_id - _CULL_AFTER) & (map.points.made_by > keyframe_id - 2 * _CULL_AFTER)
-    return without_points(map, map.points.ids[(old & (seen < 2)) | (seen < 1)])
-
-
-def _without_redundant(map: Map, keyframe_id: int) -> Map:
-    """Drop neighbours of a keyframe whose points others see well enough."""
-    near, _ = covisible(map, keyframe_id)
-    for candidate in near[near <= keyframe_id - _KEEP_LATEST]:
-        row = map.row(candidate)
-        if map.parent[row] == NONE:
-            continue
-        counts = np.bincount(rows(map.points.ids, map.sightings.point), minlength=len(map.points.ids))
-        mine = map.sightings.point[map.sightings.keyframe == candidate]
-        elsewhere = counts[rows(map.points.ids, mine)] - 1
-        if len(mine) and np.mean(elsewhere >= _REDUNDANT_VIEWS) > _REDUNDANT_SHARE:
-            map = without_keyframe(map, int(candidate))
-    return map
+def _around_loop(map: Map, loop: LoopClosure) -> np.ndarray:
+    """The keyframes nearest to a loop, of its submap."""
+    inside = map.ids[map.submap == map.submap[map.row(loop.target)]]
+    apart = np.linalg.norm(map.T_world_cam[rows(map.ids, inside), 4:] - map.pose(loop.target)[4:], axis=1)
+    near = inside[np.argsort(apart, kind="stable")[:_LOOP_KEYFRAMES]]
+    return np.union1d(near, [loop.source, loop.target])

@@ -23,7 +23,7 @@ from jaxslam.map import (
     standing,
 )
 from jaxslam.map_check import Record, number_problems
-from jaxslam.map_tree import new_anchor, parents_without
+from jaxslam.map_tree import new_anchor, parents_from, parents_without
 from jaxslam.pose import between, compose, inverse, transform
 from jaxslam.rotation import matrices
 
@@ -91,8 +91,9 @@ def with_sightings(map: Map, sightings: Sightings) -> Map:
     at = rows(map.ids, sightings.keyframe)
     if (map.submap[at] != point_submaps(map)[rows(map.points.ids, sightings.point)]).any():
         raise ValueError("a keyframe cannot see a point of another submap")
-    num_features = np.array([len(keyframe.features.octave) for keyframe in map.keyframes], np.int64)
-    wrong = (sightings.feature < NONE) | (sightings.feature >= num_features[at])
+    involved, which = np.unique(at, return_inverse=True)
+    num_features = np.array([len(map.keyframes[row].features.octave) for row in involved], np.int64)
+    wrong = (sightings.feature < NONE) | (sightings.feature >= num_features[which])
     if wrong.any():
         raise ValueError(f"keyframe {sightings.keyframe[wrong][0]} has no feature {sightings.feature[wrong][0]}")
     rivals = np.isin(map.sightings.keyframe, sightings.keyframe)
@@ -152,8 +153,8 @@ def moved(
 def fused(map: Map, keep: np.ndarray, drop: np.ndarray) -> Map:
     """Make one point of two: sightings of `drop[i]` become those of `keep[i]`, and `drop[i]` goes.
 
-    Points linked by several pairs become one, the lowest of those not dropped. It takes over a descriptor if it has
-    none. Of two sightings in one keyframe the first stays.
+    Points linked by several pairs become one, the lowest of those not dropped. It takes over the place and weight of
+    the one seen most often, and a descriptor if it has none. Of two sightings in one keyframe the first stays.
 
     Args:
         map: The map.
@@ -176,8 +177,8 @@ def fused(map: Map, keep: np.ndarray, drop: np.ndarray) -> Map:
     seen = map.sightings._replace(point=point)
     stays = ~changed
     stays[changed] = _first_of_rivals(sightings_at(seen, changed))
-    points = points_at(_with_descriptors(map.points, into), into == np.arange(len(into)))
-    return map._replace(points=points, sightings=sightings_at(seen, stays))
+    points = _with_best_known(_with_descriptors(map.points, into), into, map.sightings.point)
+    return map._replace(points=points_at(points, into == np.arange(len(into))), sightings=sightings_at(seen, stays))
 
 
 def without_points(map: Map, point_ids: np.ndarray) -> Map:
@@ -226,7 +227,7 @@ def without_keyframe(map: Map, keyframe_id: int) -> Map:
     )
 
 
-def transformed(map: Map, T_new_old: np.ndarray, submap: int, into: int, parent: int = NONE) -> Map:
+def transformed(map: Map, T_new_old: np.ndarray, submap: int, into: int, parent: int = NONE, child: int = NONE) -> Map:
     """Carry all keyframes and points of a submap rigidly into the frame of another, or of the same.
 
     Args:
@@ -234,10 +235,13 @@ def transformed(map: Map, T_new_old: np.ndarray, submap: int, into: int, parent:
         T_new_old: `(7,)` from the frame of `submap` to that of `into`.
         submap: Number of a submap.
         into: Number of the submap that they belong to then.
-        parent: Keyframe of `into` on which the first one of `submap` hangs then; by default the first one there.
+        parent: Keyframe of `into` on which `child` hangs then; by default the first one there.
+        child: Keyframe of `submap` that hangs on it, and on which those hang that were above it; by default the first
+            one of `submap`. The tree then leads from one to the other where they are known to touch.
 
     Raises:
-        ValueError: If the transform is not finite, or the parent is not in `into`.
+        ValueError: If the transform is not finite, the parent is not in `into`, or the child not in `submap`.
+        KeyError: If one is not in the map.
     """
     T = _poses(T_new_old)[0]
     inside, points = map.submap == submap, point_submaps(map) == submap
@@ -250,6 +254,10 @@ def transformed(map: Map, T_new_old: np.ndarray, submap: int, into: int, parent:
             parent = int(map.ids[there & (map.parent == NONE)][0])
         if not there[map.row(parent)]:
             raise ValueError(f"parent: keyframe {parent} is not in submap {into}")
+        if child != NONE:
+            if not inside[map.row(child)]:
+                raise ValueError(f"child: keyframe {child} is not in submap {submap}")
+            parents = parents_from(map, child)
         parents[inside & (parents == NONE)] = parent
     return map._replace(
         T_world_cam=poses,
@@ -328,6 +336,17 @@ def _with_descriptors(points: MapPoints, into: np.ndarray) -> MapPoints:
     descriptor, recognisable = points.descriptor.copy(), points.recognisable.copy()
     descriptor[takers], recognisable[takers] = descriptor[givers[first]], True
     return points._replace(descriptor=descriptor, recognisable=recognisable)
+
+
+def _with_best_known(points: MapPoints, into: np.ndarray, seen: np.ndarray) -> MapPoints:
+    """Points take over place and weight of that of them seen most often; of several, their own or the lowest's."""
+    changing = np.flatnonzero(np.isin(into, into[into != np.arange(len(into))]))
+    counts = np.bincount(rows(points.ids, seen), minlength=len(points.ids))[changing]
+    order = changing[np.lexsort((changing, changing != into[changing], -counts, into[changing]))]
+    takers, first = np.unique(into[order], return_index=True)
+    X_world, weight = points.X_world.copy(), points.weight.copy()
+    X_world[:, takers], weight[takers] = points.X_world[:, order[first]], points.weight[order[first]]
+    return points._replace(X_world=X_world, weight=weight)
 
 
 def _loops_without(loops: Loops, keyframe_id: int, anchor: int, T_anchor_keyframe: np.ndarray) -> Loops:

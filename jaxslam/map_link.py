@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxslam.frame_arrays import FrameArrays
 from jaxslam.local_mapping import NewKeyframe, Tracks
-from jaxslam.map import NONE, Map, has
+from jaxslam.map import NONE, Map, has, standing
 from jaxslam.pose import IDENTITY, angle, between, compose, inverse, to_local, transform
 from jaxslam.recall import Recalled
 from jaxslam.state import TrackOutput, TrackPlan, TrackState, TrackStatus
@@ -52,6 +52,16 @@ class MapLink:
         self._next = map.next_keyframe
         self._submap = int(map.submap.max(initial=-1)) + 1
 
+    def compile(self, state: TrackState) -> TrackState:
+        """Compile what changes a state, on one that is not needed any more."""
+        identity, nothing = IDENTITY.astype(np.float32), np.zeros(self._plan.num_points, np.float32)
+        state = _carried(state, identity, np.tile(identity, (len(self._slots), 1)))
+        if self._plan.num_recalled:
+            plane, image = np.tile(nothing, (3, 1)), np.zeros(state.keyframes.images.shape[1:], np.uint8)
+            places = (identity, plane[:2], plane)
+            state = _recalled(state, np.int32(0), image, *places, nothing, nothing.astype(np.int32))
+        return state
+
     def hang(self, T_world_cam: np.ndarray) -> Hung:
         """A pose of the tracker, tied to the reference keyframe."""
         return Hung(self.reference, between(self._believed[self.reference], T_world_cam))
@@ -75,9 +85,12 @@ class MapLink:
 
     def submap_now(self) -> int:
         """Number of the submap that the frames are in."""
-        if not knows(self.map, self.reference):
+        id = self.reference
+        while (hung := self._on_the_way.get(id)) is not None:
+            id = hung.keyframe
+        if id == NONE:
             return self._submap
-        return int(self.map.submap[self.map.row(self.reference)])
+        return int(self.map.submap[self.map.row(int(standing(self.map, np.array([id]))[0]))])
 
     def keyframe_made(
         self, timestamp_ns: int, frame: FrameArrays, output: TrackOutput, recognised: Hung | None
@@ -117,24 +130,25 @@ class MapLink:
         wanted = {id for id in (*self._slots, self.reference, *self._on_the_way) if id != NONE}
         new = {id: self._in_map(id) for id in wanted}
         change = {id: compose(new[id], inverse(self._believed[id])) for id in wanted}
-        self._believed = new
         now = change.get(self.reference, IDENTITY)
         corrections = np.stack([change.get(id, IDENTITY) for id in self._slots])
         both = np.concatenate([corrections, now[None]])
         if np.abs(both[:, 4:]).max() < _LEAST_MOVE_M and angle(both).max() < _LEAST_TURN:
+            self._believed = {id: self._believed[id] for id in wanted}  # small ones add up until they are made
             return state, IDENTITY
+        self._believed = new
         return _carried(state, now.astype(np.float32), corrections.astype(np.float32)), now
 
     def latest(self) -> list[int]:
         """The keyframes in the tracker's ring."""
         return [id for id in self._slots[: self._plan.num_keyframes] if id != NONE]
 
-    def slot_for(self, keyframe_id: int, others: set[int]) -> int | None:
-        """Where to put a recalled keyframe, not in place of the others; `None` if the tracker has it or it is gone."""
+    def slot_for(self, keyframe_id: int, keep: set[int]) -> int | None:
+        """Where to put a recalled keyframe, not in place of those to keep; `None` if it is there or gone."""
         if keyframe_id in self._slots or not knows(self.map, keyframe_id):
             return None
         free = range(self._plan.num_keyframes, len(self._slots))
-        return next((slot for slot in free if self._slots[slot] not in others), None)
+        return next((slot for slot in free if self._slots[slot] not in keep), None)
 
     def recalled(self, state: TrackState, slot: int, keyframe: Recalled) -> TrackState:
         """The tracker's state with a keyframe of the map to look into."""

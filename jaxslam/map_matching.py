@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxslam.features import FeaturePlan, Features
-from jaxslam.map import NONE, Map, Sightings, has, rows, sightings_at
+from jaxslam.map import NONE, Map, Sightings, empty_sightings, rows, sightings_at
 from jaxslam.map_edit import fused, with_sightings
 from jaxslam.matching import NEAR, match_by_projection
 from jaxslam.pose import to_local
@@ -118,37 +118,35 @@ def fuse_duplicates(
 ) -> tuple[Map, np.ndarray, np.ndarray]:
     """Look for the points of a keyframe in its neighbours: what is there a point already becomes one with it.
 
+    Args:
+        map: The map, or a part with all that these keyframes saw.
+        keyframe_id: The keyframe.
+        neighbours: Ids of others of its submap.
+        plan: How features are found.
+        radius_px: As for `find_points`.
+
     Returns:
         The map, and the points that others became one with: ids kept and ids dropped.
     """
-    kept, dropped = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     points = recognisable_in(map, np.array([keyframe_id]))
-    for neighbour in neighbours:
+    kept, dropped, new = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [empty_sightings()]
+    for neighbour in neighbours.tolist():
         features = map.keyframe(neighbour).features
-        seen = sightings_at(map.sightings, (map.sightings.keyframe == neighbour) & (map.sightings.feature != NONE))
+        seen = sightings_at(map.sightings, np.flatnonzero(map.sightings.keyframe == neighbour))
         unseen = ~np.isin(points.ids, seen.point)
         wanted = Recognisable(
             points.ids[unseen], points.X_world[:, unseen], points.descriptor[unseen], points.size[unseen]
         )
         index, feature = find_points(map, wanted, features, map.pose(neighbour), plan, radius_px=radius_px)
-        order = np.argsort(seen.feature)
-        at = np.minimum(np.searchsorted(seen.feature[order], feature), max(len(order) - 1, 0))
-        taken = seen.feature[order][at] == feature if len(order) else np.zeros(len(feature), bool)
-        map = with_sightings(
-            map, feature_sightings(int(neighbour), features, wanted.ids[index[~taken]], feature[~taken], plan)
-        )
-        there = seen.point[order][at[taken]] if len(order) else np.zeros(0, np.int64)
-        mine = wanted.ids[index[taken]]
-        kept.append(np.minimum(there, mine))
-        dropped.append(np.maximum(there, mine))
-    keep, drop = np.concatenate(kept), np.concatenate(dropped)
-    drop, first = np.unique(drop, return_index=True)
-    keep = keep[first]
-    pairs = keep != drop
-    keep, drop = keep[pairs], drop[pairs]
-    return (fused(map, keep, drop), keep, drop) if len(drop) else (map, keep, drop)
-
-
-def present(map: Map, point_ids: np.ndarray) -> np.ndarray:
-    """Which of some points are in the map still."""
-    return has(map.points.ids, point_ids)
+        point_at = np.full(len(features.octave), NONE, np.int64)
+        by_feature = seen.feature != NONE
+        point_at[seen.feature[by_feature]] = seen.point[by_feature]
+        there, mine = point_at[feature], wanted.ids[index]
+        free = there == NONE
+        new.append(feature_sightings(neighbour, features, mine[free], feature[free], plan))
+        kept.append(np.minimum(there, mine)[~free])
+        dropped.append(np.maximum(there, mine)[~free])
+    map = with_sightings(map, Sightings(*(np.concatenate(columns, axis=-1) for columns in zip(*new, strict=True))))
+    drop, first = np.unique(np.concatenate(dropped), return_index=True)
+    keep = np.concatenate(kept)[first]
+    return fused(map, keep, drop), keep, drop

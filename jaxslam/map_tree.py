@@ -1,8 +1,10 @@
 """The spanning tree of a submap's keyframes, and how it closes over one that goes."""
 
 import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import breadth_first_order
 
-from jaxslam.map import NONE, Map, covisible
+from jaxslam.map import NONE, Map, covisible, rows
 
 
 def children(map: Map, keyframe_id: int) -> np.ndarray:
@@ -12,10 +14,19 @@ def children(map: Map, keyframe_id: int) -> np.ndarray:
 
 def subtree(map: Map, keyframe_id: int) -> np.ndarray:
     """Ids, ascending, of a keyframe and of all that hang on it, directly or not."""
-    inside = map.ids == keyframe_id
-    while (grown := inside | np.isin(map.parent, map.ids[inside])).sum() > inside.sum():
-        inside = grown
-    return map.ids[inside]
+    hangs = np.flatnonzero(map.parent != NONE)
+    above = rows(map.ids, map.parent[hangs])
+    below = csr_array((np.ones(len(hangs), np.int8), (above, hangs)), shape=(len(map.ids), len(map.ids)))
+    return np.sort(map.ids[breadth_first_order(below, map.row(keyframe_id), return_predecessors=False)])
+
+
+def parents_from(map: Map, keyframe_id: int) -> np.ndarray:
+    """`(k,)` parents if a keyframe were the first of its submap: those above it hang on it, each on the one before."""
+    parent, above, below = map.parent.copy(), int(keyframe_id), NONE
+    while above != NONE:
+        row = map.row(above)
+        parent[row], below, above = below, above, int(map.parent[row])
+    return parent
 
 
 def new_anchor(map: Map, keyframe_id: int) -> int:

@@ -146,7 +146,8 @@ def _where_expected(
     """Matches near where a pose puts the features of the keyframe."""
     known = np.flatnonzero(source.depth > 0)
     X_cam = to_local(T_keyframe_cam, _in_camera(source, params)[:, known])
-    known, X_cam = known[X_cam[2] > params.min_depth_m], X_cam[:, X_cam[2] > params.min_depth_m]
+    in_front = X_cam[2] > float(params.min_depth_m)
+    known, X_cam = known[in_front], X_cam[:, in_front]
     focal, centre = _pinhole(params)
     pairs = match_by_projection(
         X_cam[:2] / X_cam[2] * focal + centre,
@@ -274,5 +275,6 @@ def compile_recognition(params: TrackParams, plan: FeaturePlan = DEFAULT_PLAN) -
     empty = Features(*(np.zeros(shape, np.float32) for shape in ((2, 0), (2, 0), 0, 0, 0, (0, 32))))  # type: ignore[arg-type]
     empty = empty._replace(octave=np.zeros(0, np.uint8))
     identity = SE3(jnp.asarray([1.0, 0, 0, 0, 0, 0, 0], jnp.float32))
-    jax.block_until_ready(_agreed(jax.random.key(0), _seen(empty, empty, nothing, _MOST_MATCHES, params, plan), params))
+    key = jax.random.fold_in(jax.random.key(0), 0)
+    jax.block_until_ready(_agreed(key, _seen(empty, empty, nothing, _MOST_MATCHES, params, plan), params))
     jax.block_until_ready(_refined(identity, _seen(empty, empty, nothing, plan.num_features, params, plan), params))

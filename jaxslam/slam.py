@@ -20,7 +20,7 @@ from jaxslam.frame_arrays import FrameArrays, frame_arrays
 from jaxslam.map import Map
 from jaxslam.map_file import load_map, save_map
 from jaxslam.map_link import Hung
-from jaxslam.pose import IDENTITY, moved
+from jaxslam.pose import IDENTITY, compose, moved
 from jaxslam.state import TrackOutput, TrackParams, TrackPlan, TrackState, TrackStatus
 from jaxslam.track import init_state, track_step
 from jaxslam.tracked import FrameRecord, Rejected, Tracked, tracked_of
@@ -144,6 +144,7 @@ class Slam:
         Raises:
             FrameError: If the frame does not fit the camera, or its time is not later than the last one's. Nothing
                 has happened then; go on with the next frame.
+            RuntimeError: After `close`.
             Exception: What went wrong in a thread of the map, if something did.
         """
         check_frame(frame, self.camera.width, self.camera.height, self._last_ns)
@@ -266,12 +267,16 @@ class Slam:
         else:
             return lost, None
         output = self._advance(arrays)
-        return output, recognised if output.status == TrackStatus.STARTED else None
+        if output.status == TrackStatus.STARTED:
+            return output, recognised
+        self._state = self._state._replace(lost_frames=jnp.zeros((), jnp.int32))  # not to start by itself
+        return output, None
 
     def _recorded(self, tracked: Tracked, dt_s: float) -> Tracked:
         """The result as it is given out, and remembered."""
         if tracked.status == TrackStatus.LOST:
             self._lost_s += dt_s
+            self._last_pose = compose(tracked.correction, self._last_pose)
             if self.config.run.on_loss == "predict":
                 ahead_s = min(self._lost_s, _PREDICTED_S)
                 tracked = replace(tracked, T_world_cam=moved(self._last_pose, self._last_twist * ahead_s))

@@ -3,24 +3,37 @@
 The tracker offers jobs and takes results; it never waits for either, but when it asks to (`drain`).
 """
 
+import atexit
 import queue
 import threading
+import time
+import weakref
 from collections import deque
-from collections.abc import Callable
-from typing import Generic, Protocol, TypeVar
+from collections.abc import Callable, Iterable
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 _Job = TypeVar("_Job")
 _Job_contra = TypeVar("_Job_contra", contravariant=True)
 _Result = TypeVar("_Result")
-_CLOSE_S = 2.0
-"""Longest wait for the job at hand when a thread is closed."""
+_CLOSE_S = 1.8
+"""Longest wait for the jobs at hand when threads are closed."""
+
+
+class _Failed(NamedTuple):
+    """What came of a job that raised."""
+
+    error: BaseException
 
 
 class Worker(Protocol[_Job_contra, _Result]):
     """Does jobs one after the other."""
 
     def offer(self, job: _Job_contra, frame: int) -> None:
-        """Give it a job, in frame number `frame`."""
+        """Give it a job, in frame number `frame`.
+
+        Raises:
+            RuntimeError: If it is closed.
+        """
         ...
 
     def take(self, frame: int) -> list[_Result]:
@@ -32,33 +45,51 @@ class Worker(Protocol[_Job_contra, _Result]):
         ...
 
     def drain(self) -> list[_Result]:
-        """Wait for all jobs, and take their results; raises as `take` does."""
+        """Wait for all jobs unless it is closed, and take their results; raises as `take` does."""
         ...
 
-    def close(self) -> None:
-        """End it, with the jobs not yet begun. Safe to call twice."""
+    def stop(self) -> None:
+        """Take no more jobs and forget those not yet begun, without waiting; what is done can still be taken."""
         ...
+
+    def close(self, within_s: float = _CLOSE_S) -> None:
+        """`stop`, and wait for the job at hand, for so many seconds at most. Safe to call twice."""
+        ...
+
+
+def close_all(workers: Iterable[Worker[Any, Any]], within_s: float = _CLOSE_S) -> None:
+    """Close workers in so many seconds together, whatever they are doing."""
+    until_s = time.monotonic() + within_s
+    workers = list(workers)
+    for worker in workers:
+        worker.stop()
+    for worker in workers:
+        worker.close(max(until_s - time.monotonic(), 0.0))
 
 
 class InlineWorker(Generic[_Job, _Result]):
     """Does each job at once, and hands its result over a fixed number of frames later: the same on every machine."""
 
-    def __init__(self, work: Callable[[_Job], _Result], latency_frames: int) -> None:
+    def __init__(self, work: Callable[[_Job], _Result], name: str, latency_frames: int) -> None:
         """Do jobs by calling `work`."""
-        self._work, self._latency = work, latency_frames
-        self._outcomes: deque[tuple[int, _Result | Exception]] = deque()
+        self._work, self._name, self._latency = work, name, latency_frames
+        self._outcomes: deque[tuple[int, _Result | _Failed]] = deque()
+        self._stopped = False
 
     def offer(self, job: _Job, frame: int) -> None:
         """Do it."""
+        if self._stopped:
+            raise RuntimeError(f"{self._name} is closed")
+        outcome: _Result | _Failed
         try:
             outcome = self._work(job)
         except Exception as error:
-            outcome = error
+            outcome = _Failed(error)
         self._outcomes.append((frame + self._latency, outcome))
 
     def take(self, frame: int) -> list[_Result]:
         """The results whose frame has come."""
-        due: deque[_Result | Exception] = deque()
+        due: deque[_Result | _Failed] = deque()
         while self._outcomes and self._outcomes[0][0] <= frame:
             due.append(self._outcomes.popleft()[1])
         try:
@@ -70,30 +101,43 @@ class InlineWorker(Generic[_Job, _Result]):
         """All results."""
         return self.take(max((frame for frame, _ in self._outcomes), default=0))
 
-    def close(self) -> None:
+    def stop(self) -> None:
         """Nothing runs."""
+        self._stopped = True
+
+    def close(self, within_s: float = _CLOSE_S) -> None:
+        """Nothing runs."""
+        del within_s
+        self.stop()
 
 
 class ThreadWorker(Generic[_Job, _Result]):
-    """Does jobs in a thread."""
+    """Does jobs in a thread.
+
+    Between jobs the thread holds nothing but the queue: a worker that nobody holds is collected, and its thread ends.
+    Those left when the interpreter ends are closed first: a thread stopped within compiled code ends the process badly.
+    """
 
     def __init__(self, work: Callable[[_Job], _Result], name: str) -> None:
         """Do jobs by calling `work` in a thread of this name, started with the first job."""
         self._work, self._name = work, name
-        self._jobs: queue.Queue[_Job | None] = queue.Queue()
-        self._outcomes: deque[_Result | Exception] = deque()
-        self._closing = threading.Event()
+        self._jobs: queue.Queue[tuple[Callable[[Any], Any], Any] | None] = queue.Queue()
+        self._outcomes: deque[_Result | _Failed] = deque()
+        self._stopped = threading.Event()
         self._thread: threading.Thread | None = None
 
     def offer(self, job: _Job, frame: int) -> None:
         """Queue it."""
         del frame
-        if self._closing.is_set():
+        if self._stopped.is_set():
             raise RuntimeError(f"{self._name} is closed")
         if self._thread is None:
-            self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
+            arguments = (self._jobs, self._outcomes, self._stopped)
+            self._thread = threading.Thread(target=_serve, args=arguments, name=self._name, daemon=True)
             self._thread.start()
-        self._jobs.put(job)
+            _running.add(self)
+            weakref.finalize(self, _stop, self._jobs, self._stopped).atexit = False
+        self._jobs.put((self._work, job))
 
     def take(self, frame: int) -> list[_Result]:
         """What is done."""
@@ -102,35 +146,59 @@ class ThreadWorker(Generic[_Job, _Result]):
 
     def drain(self) -> list[_Result]:
         """Wait until nothing is left to do."""
-        self._jobs.join()
+        if not self._stopped.is_set():
+            self._jobs.join()
         return self.take(0)
 
-    def close(self) -> None:
-        """Wait for the job at hand, for two seconds at most."""
-        self._closing.set()
+    def stop(self) -> None:
+        """The thread ends after the job at hand."""
+        _stop(self._jobs, self._stopped)
+
+    def close(self, within_s: float = _CLOSE_S) -> None:
+        """The thread is left to itself if its job takes longer; what comes of that can be taken."""
+        self.stop()
         if self._thread is not None:
-            self._jobs.put(None)
-            self._thread.join(_CLOSE_S)
-
-    def _run(self) -> None:
-        while (job := self._jobs.get()) is not None:
-            try:
-                if not self._closing.is_set():
-                    self._outcomes.append(self._work(job))
-            except Exception as error:
-                self._outcomes.append(error)
-            finally:
-                self._jobs.task_done()
-        self._jobs.task_done()
+            self._thread.join(within_s)
 
 
-def _results(outcomes: "deque[_Result | Exception]") -> list[_Result]:
+_running: "weakref.WeakSet[ThreadWorker[Any, Any]]" = weakref.WeakSet()
+
+
+@atexit.register
+def _close_running() -> None:
+    close_all(_running)
+
+
+def _stop(jobs: "queue.Queue[Any]", stopped: threading.Event) -> None:
+    if not stopped.is_set():
+        stopped.set()
+        jobs.put(None)
+
+
+def _serve(jobs: "queue.Queue[Any]", outcomes: "deque[Any]", stopped: threading.Event) -> None:
+    """Do jobs until there comes none; those that come after a stop are not done."""
+    while (entry := jobs.get()) is not None:
+        work, job = entry
+        try:
+            if not stopped.is_set():
+                outcomes.append(work(job))
+        except BaseException as error:  # handed to the caller, whatever it is
+            outcomes.append(_Failed(error))
+        finally:
+            jobs.task_done()
+        del entry, work, job  # so that nothing is held while waiting for the next one
+
+
+def _results(outcomes: "deque[_Result | _Failed]") -> list[_Result]:
     """Results from the left up to an error, which is raised once nothing stands before it."""
     taken: list[_Result] = []
     while outcomes:
-        if isinstance(outcomes[0], Exception):
+        first = outcomes[0]
+        if isinstance(first, _Failed):
             if taken:
                 break
-            raise outcomes.popleft()  # type: ignore[misc]
-        taken.append(outcomes.popleft())  # type: ignore[arg-type]
+            outcomes.popleft()
+            raise first.error
+        taken.append(first)
+        outcomes.popleft()
     return taken

@@ -1,6 +1,7 @@
 """Pictures of the synthetic room with their features and poses, for tests of matching and recognition."""
 
 import functools
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -39,7 +40,7 @@ def params(seed: int = 0) -> TrackParams:
     return track_params(room(seed).camera, TrackConfig())
 
 
-def map_of(indices: range, seed: int = 0) -> Map:
+def map_of(indices: Sequence[int], seed: int = 0) -> Map:
     """Keyframe `k` is picture `indices[k]`, at its true pose."""
     map = empty_map(room(seed).camera)
     for index in indices:

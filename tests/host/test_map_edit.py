@@ -270,6 +270,17 @@ class TestFused:
         np.testing.assert_array_equal(after.points.descriptor[0], map.points.descriptor[2])
         np.testing.assert_array_equal(after.points.X_world[:, 0], map.points.X_world[:, 0])
 
+    def test_place_and_weight_are_those_of_the_one_seen_most(self):
+        map = small_map(num_keyframes=3, num_points=4)
+        seen = map.sightings
+        map = without_sightings(
+            map, ((seen.point == 0) & (seen.keyframe > 0)) | ((seen.point == 2) & (seen.keyframe > 1))
+        )
+        after = fused(map, np.array([0, 0]), np.array([1, 2]))
+        assert after.points.ids.tolist() == [0, 3]
+        np.testing.assert_array_equal(after.points.X_world, map.points.X_world[:, [1, 3]])
+        np.testing.assert_array_equal(after.points.weight, map.points.weight[[1, 3]])
+
     def test_refuses_points_of_two_submaps(self):
         map, rng = small_map(num_points=2), np.random.default_rng(1)
         map = with_keyframe(map, keyframe(map, rng), pose(rng), NONE, 1)
@@ -371,6 +382,19 @@ class TestTransformed:
         assert transformed(map, T_new_old, 1, 0, parent=1).parent.tolist() == [NONE, 0, 1, 0]
         with pytest.raises(ValueError, match="keyframe 2 is not in submap 0"):
             transformed(map, T_new_old, 1, 0, parent=2)
+
+    def test_the_tree_is_hung_on_the_other_where_they_touch(self):
+        """The second submap is a chain 3-4-5-6 with 7 on 4; it is known to touch keyframe 1 in 5."""
+        map, rng = small_map(num_keyframes=3, num_points=3), np.random.default_rng(1)
+        for parent in (NONE, 3, 4, 5, 4):
+            map = with_keyframe(map, keyframe(map, rng), pose(rng), parent, 1)
+        after = transformed(map, pose(rng), 1, 0, parent=1, child=5)
+        assert after.parent.tolist() == [NONE, 0, 1, 4, 5, 1, 5, 4]
+        assert problems(after) == []
+        first = transformed(map, pose(rng), 1, 0, parent=1, child=3)
+        assert first.parent.tolist() == [NONE, 0, 1, 1, 3, 4, 5, 4]
+        with pytest.raises(ValueError, match="keyframe 2 is not in submap 1"):
+            transformed(map, pose(rng), 1, 0, parent=1, child=2)
 
     def test_what_cameras_see_stays(self):
         map, T = small_map(), pose(np.random.default_rng(1), 1.0, 5.0)
