@@ -10,7 +10,6 @@ Bandwidth of Sparse Symmetric Matrices", 1969, for the order.
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -139,7 +138,7 @@ class _Search(NamedTuple):
 
 def conjugate_gradients(
     multiply_by: Callable[[Vector], Vector],
-    factor: BandFactor,
+    precondition: Callable[[Vector], Vector],
     right: Vector,
     *,
     tolerance: float,
@@ -147,10 +146,9 @@ def conjugate_gradients(
 ) -> tuple[Vector, Int[Array, ""]]:
     """Solves a positive definite system, and counts the iterations.
 
-    Ends when the residual in the metric of the factor has fallen by `tolerance`, or when the matrix turns out not to
-    be positive definite; the last good iterate is returned.
+    Ends when the residual in the metric of the preconditioner has fallen by `tolerance`, or when the matrix turns out
+    not to be positive definite; the last good iterate is returned.
     """
-    precondition = partial(solve_factor, factor)
     z = precondition(right)
     first = jnp.sum(right * z)
     start = _Search(jnp.zeros_like(right), right, z, first, jnp.zeros((), jnp.int32), ~jnp.isfinite(first))

@@ -2,11 +2,12 @@
 
 Levenberg-Marquardt with Marquardt's scaling. No two points share a residual, so the points are eliminated and what is
 left to factorise is the Schur complement, dense, six numbers a camera: right for a window of up to some 64 cameras.
+A camera may have a lens to be found with its pose, three numbers more (`bundle_lens`).
 `levenberg_marquardt` holds its Hessian as one matrix, which here would have thousands of rows; hence a loop of its own.
 
 The result is differentiable, forward and reverse, by the implicit function theorem at the optimum, with one more
 elimination of the exact Hessian, however many steps the solver took. Where a solve starts has no derivative, apart
-from the poses and points that are held fixed.
+from what is held fixed.
 
 Source: Triggs et al., "Bundle Adjustment: A Modern Synthesis", 2000, section 6.
 """
@@ -30,10 +31,12 @@ from jaxslam_kernels.bundle_cost import (
     bundle_problem,
     bundle_views,
     exact_blocks,
+    free_cameras,
     normal_equations,
 )
+from jaxslam_kernels.bundle_lens import Cameras, Lenses, move_cameras, shift_cameras, usable_lenses
 from jaxslam_kernels.bundle_schur import Reduced, eliminate, is_determined, points_determined, solve_reduced
-from jaxslam_kernels.pose_cost import UNKNOWN_CHI2, retract, tangent_basis
+from jaxslam_kernels.pose_cost import UNKNOWN_CHI2
 from jaxslam_kernels.pose_refine import usable_pose
 from jaxslam_kernels.robust import Loss
 from jaxslam_kernels.types import Code, Flag, Mask, Points, Scalar, Weights
@@ -70,6 +73,7 @@ class BundleAdjustment(NamedTuple):
         used: Observations that have weight, a slot of their own, and lie in front of the camera.
         robust_weights: `ρ'(s)` in [0, 1] of every observation, whatever its weight; 0 where it has no value.
         chi2: Squared whitened residual s of every observation, `UNKNOWN_CHI2` where it has no value.
+        lenses: Adjusted lenses, focal length one where the initial one was not usable; `None` without.
     """
 
     poses: Poses
@@ -82,6 +86,7 @@ class BundleAdjustment(NamedTuple):
     used: Bool[Array, " m"]
     robust_weights: Float[Array, " m"]
     chi2: Float[Array, " m"]
+    lenses: Lenses | None = None
 
 
 def bundle_adjust(
@@ -92,6 +97,9 @@ def bundle_adjust(
     fixed_poses: Bool[Array, " k"],
     fixed_points: Mask | None = None,
     point_weights: Weights | None = None,
+    lenses: Lenses | None = None,
+    fixed_lenses: Bool[Array, " k"] | None = None,
+    two_sided: bool = False,
     loss: Loss = "cauchy",
     scale: Scalar | float = 2.0,
     tolerance: Scalar | float = 1e-6,
@@ -110,6 +118,11 @@ def bundle_adjust(
         fixed_poses: Poses that do not move.
         fixed_points: Points that do not move; `None` for none.
         point_weights: Factor of all observations of a point, not negative; `None` for one each.
+        lenses: Where a lens of each camera's own starts (focal length, k1, k2); the observations then are pixels from
+            the principal point, see `Observations`. `None` for ideal cameras.
+        fixed_lenses: Lenses that do not change; `None` for none.
+        two_sided: Whether a point behind a camera is seen too, where its line of sight meets the image, static. Data
+            sets whose residuals ignore the side need it, as Bundle Adjustment in the Large.
         loss: The robust loss, static.
         scale: Its scale in standard deviations, traced.
         tolerance: Ends the solve when a step changes the cost by less than this fraction, traced; rounding ends it
@@ -122,29 +135,33 @@ def bundle_adjust(
     dtype, n = X_world.dtype, X_world.shape[1]
     fixed_points = jnp.zeros(n, bool) if fixed_points is None else fixed_points
     point_weights = jnp.ones(n, dtype) if point_weights is None else point_weights
-    poses, X_world, observations = _usable(poses, X_world, observations)
+    cameras, X_world, observations = _usable(Cameras(poses, lenses), X_world, observations)
     problem, slot = bundle_problem(observations, point_weights, jnp.asarray(scale, dtype), ~fixed_poses, ~fixed_points)
-    solution = solve_bundle(poses, X_world, problem, loss, jnp.asarray(tolerance, dtype), max_steps)
+    if lenses is not None:
+        free_lens = jnp.ones_like(fixed_poses) if fixed_lenses is None else ~fixed_lenses
+        problem = problem._replace(free_lens=free_lens)
+    problem = problem._replace(two_sided=jnp.array(True) if two_sided else None)
+    solution = solve_bundle(cameras, X_world, problem, loss, jnp.asarray(tolerance, dtype), max_steps)
     # What is fixed keeps its derivative, what is free gets that of the optimum.
-    start, start_points = jnp.where(fixed_poses[:, None], poses, solution.poses), solution.X_world
-    start_points = jnp.where(fixed_points[None, :], X_world, start_points)
+    start = _where_free(problem, solution.cameras, cameras)
+    start_points = jnp.where(fixed_points[None, :], X_world, solution.X_world)
     tangents, shifts = _optimum_shift(start, start_points, problem, loss)
-    optimum = start + jax.vmap(lambda pose, tangent: tangent_basis(SE3(pose)) @ tangent)(start, tangents)
-    initial_cost = bundle_cost(bundle_views(poses, X_world, problem, loss), problem, loss)
+    optimum = shift_cameras(start, tangents)
+    initial_cost = bundle_cost(bundle_views(cameras, X_world, problem, loss), problem, loss)
     return _report(optimum, start_points + shifts, problem, slot, loss, initial_cost, solution)
 
 
 class Solution(NamedTuple):
     """Where the solver ended, a constant for differentiation."""
 
-    poses: Poses
+    cameras: Cameras
     X_world: Points
     converged: Flag
     num_steps: Int[Array, ""]
 
 
 class _State(NamedTuple):
-    poses: Poses
+    cameras: Cameras
     X_world: Points
     cost: Scalar
     damping: Scalar
@@ -154,36 +171,36 @@ class _State(NamedTuple):
 
 
 def solve_bundle(
-    poses: Poses, X_world: Points, problem: BundleProblem, loss: Loss, tolerance: Scalar, max_steps: int
+    cameras: Cameras, X_world: Points, problem: BundleProblem, loss: Loss, tolerance: Scalar, max_steps: int
 ) -> Solution:
-    """The optimum from finite poses and points."""
-    poses, X_world, problem, tolerance = lax.stop_gradient((poses, X_world, problem, tolerance))
+    """The optimum from finite cameras and points."""
+    cameras, X_world, problem, tolerance = lax.stop_gradient((cameras, X_world, problem, tolerance))
     epsilon = float(jnp.finfo(X_world.dtype).eps)
 
-    def evaluate(poses: Poses, X_world: Points) -> Scalar:
-        return bundle_cost(bundle_views(poses, X_world, problem, loss), problem, loss)
+    def evaluate(cameras: Cameras, X_world: Points) -> Scalar:
+        return bundle_cost(bundle_views(cameras, X_world, problem, loss), problem, loss)
 
     def step(state: _State) -> _State:
-        equations = normal_equations(bundle_views(state.poses, state.X_world, problem, loss))
+        equations = normal_equations(bundle_views(state.cameras, state.X_world, problem, loss))
         reduced = eliminate(equations, problem, state.damping)
-        tangents, shifts = solve_reduced(reduced, equations.pose_gradient, equations.point_gradient)
+        tangents, shifts = solve_reduced(reduced, equations.camera_gradient, equations.point_gradient)
         predicted = _predicted_decrease(equations, tangents, shifts, state.damping)
-        poses = jax.vmap(lambda pose, tangent: retract(SE3(pose), tangent).wxyz_xyz)(state.poses, tangents)
-        poses = jnp.where(problem.free_pose[:, None], poses, state.poses)
+        cameras = _where_free(problem, move_cameras(state.cameras, tangents), state.cameras)
         X_world = state.X_world + shifts
-        cost = evaluate(poses, X_world)
-        finite = jnp.isfinite(cost) & jnp.isfinite(poses).all() & jnp.isfinite(X_world).all()
+        cost = evaluate(cameras, X_world)
+        finite = jnp.isfinite(cost) & jnp.isfinite(X_world).all()
+        finite = finite & jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(cameras)]).all()
         accept = finite & (cost <= (1.0 + 32.0 * epsilon) * state.cost)  # a sum is no better than its rounding
         # The promised gain is the square of the step in standard deviations: it tells steps far below what the cost
         # can show, down to the rounding of the values themselves.
         enough = jnp.maximum(tolerance * state.cost, (1e4 * epsilon) ** 2 * jnp.maximum(state.cost, 1.0))
         level = (finite & (predicted <= enough)) | (accept & (jnp.abs(state.cost - cost) < tolerance * state.cost))
         damping = jnp.where(accept, state.damping / _DAMPING_FACTOR, state.damping * _DAMPING_FACTOR)
-        poses, X_world, cost = jax.tree.map(
-            lambda new, old: jnp.where(accept, new, old), (poses, X_world, cost), state[:3]
+        cameras, X_world, cost = jax.tree.map(
+            lambda new, old: jnp.where(accept, new, old), (cameras, X_world, cost), state[:3]
         )
         return _State(
-            poses=poses,
+            cameras=cameras,
             X_world=X_world,
             cost=cost,
             damping=jnp.maximum(damping, 4.0 * epsilon),
@@ -192,55 +209,64 @@ def solve_bundle(
             num_steps=state.num_steps + 1,
         )
 
-    cost, no = evaluate(poses, X_world), jnp.zeros((), bool)
+    cost, no = evaluate(cameras, X_world), jnp.zeros((), bool)
     damping = jnp.full_like(cost, _INITIAL_DAMPING)
-    start = _State(poses, X_world, cost, damping, no, no, jnp.zeros((), jnp.int32))
+    start = _State(cameras, X_world, cost, damping, no, no, jnp.zeros((), jnp.int32))
     end = lax.while_loop(lambda s: ~s.converged & ~s.stuck & (s.num_steps < max_steps), step, start)
-    return Solution(end.poses, end.X_world, end.converged, end.num_steps)
+    return Solution(end.cameras, end.X_world, end.converged, end.num_steps)
+
+
+def _where_free(problem: BundleProblem, new: Cameras, old: Cameras) -> Cameras:
+    """New poses and lenses, but for those that are fixed."""
+    poses = jnp.where(problem.free_pose[:, None], new.poses, old.poses)
+    if problem.free_lens is None or new.lenses is None or old.lenses is None:
+        return Cameras(poses)
+    return Cameras(poses, jnp.where(problem.free_lens[:, None], new.lenses, old.lenses))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(3,))
 def _optimum_shift(
-    poses: Poses, X_world: Points, problem: BundleProblem, loss: Loss
-) -> tuple[Float[Array, "k 6"], Points]:
+    cameras: Cameras, X_world: Points, problem: BundleProblem, loss: Loss
+) -> tuple[Float[Array, "k c"], Points]:
     """Zero, with the derivative of the optimum with respect to the problem and to what is fixed.
 
     At the optimum the gradient g of the cost vanishes whatever the problem θ, so dξ = -H⁻¹ (∂g/∂θ) dθ with H the
     exact Hessian.
     """
     del problem, loss
-    return jnp.zeros((poses.shape[0], 6), poses.dtype), jnp.zeros_like(X_world)
+    c = 6 if cameras.lenses is None else 9
+    return jnp.zeros((cameras.poses.shape[0], c), X_world.dtype), jnp.zeros_like(X_world)
 
 
 @_optimum_shift.defjvp
 def _optimum_shift_jvp(loss: Loss, primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
-    poses, X_world, problem = primals
+    cameras, X_world, problem = primals
 
-    def gradients(poses: Poses, X_world: Points, problem: BundleProblem) -> tuple[Array, Array]:
-        equations = normal_equations(bundle_views(poses, X_world, problem, loss))
-        return equations.pose_gradient, equations.point_gradient
+    def gradients(cameras: Cameras, X_world: Points, problem: BundleProblem) -> tuple[Array, Array]:
+        equations = normal_equations(bundle_views(cameras, X_world, problem, loss))
+        return equations.camera_gradient, equations.point_gradient
 
-    (pose_gradient, point_gradient), changes = jax.jvp(gradients, primals, tangents)
-    reduced, determined = lax.stop_gradient(_at_optimum(poses, X_world, problem, loss))
+    (camera_gradient, point_gradient), changes = jax.jvp(gradients, primals, tangents)
+    reduced, determined = lax.stop_gradient(_at_optimum(cameras, X_world, problem, loss))
     keep = lambda change: jnp.where(determined, change, 0.0)
     shifts = solve_reduced(reduced, *map(keep, changes))
-    return (jnp.zeros_like(pose_gradient), jnp.zeros_like(point_gradient)), shifts
+    return (jnp.zeros_like(camera_gradient), jnp.zeros_like(point_gradient)), shifts
 
 
-def _at_optimum(poses: Poses, X_world: Points, problem: BundleProblem, loss: Loss) -> tuple[Reduced, Flag]:
-    """The exact Hessian, eliminated, and whether it determines the poses.
+def _at_optimum(cameras: Cameras, X_world: Points, problem: BundleProblem, loss: Loss) -> tuple[Reduced, Flag]:
+    """The exact Hessian, eliminated, and whether it determines the cameras.
 
     At a strict minimum it is positive definite. A point where it is not (the solver stopped short of one, or a
-    direction is free) gets its reweighted Hessian; all of them do if the poses are undetermined still.
+    direction is free) gets its reweighted Hessian; all of them do if the cameras are undetermined still.
     """
-    reweighted = normal_equations(bundle_views(poses, X_world, problem, loss))
-    blocks = exact_blocks(poses, X_world, problem, loss)
+    reweighted = normal_equations(bundle_views(cameras, X_world, problem, loss))
+    blocks = exact_blocks(cameras, X_world, problem, loss)
     convex = points_determined(blocks.point.sum(axis=2), problem.free_point) | ~problem.free_point
     rest = problem._replace(weights=jnp.where(convex[None, :], 0.0, problem.weights))
-    others = normal_equations(bundle_views(poses, X_world, rest, loss))
+    others = normal_equations(bundle_views(cameras, X_world, rest, loss))
     mixed = BundleEquations(
-        pose_gradient=reweighted.pose_gradient,
-        pose_hessian=others.pose_hessian + jnp.where(convex, blocks.pose, 0.0).sum(axis=3),
+        camera_gradient=reweighted.camera_gradient,
+        camera_hessian=others.camera_hessian + jnp.where(convex, blocks.camera, 0.0).sum(axis=3),
         point_gradient=reweighted.point_gradient,
         point_hessian=others.point_hessian + jnp.where(convex, blocks.point.sum(axis=2), 0.0),
         cross=others.cross + jnp.where(convex, blocks.cross, 0.0),
@@ -253,7 +279,7 @@ def _at_optimum(poses: Poses, X_world: Points, problem: BundleProblem, loss: Los
 
 
 def _report(
-    poses: Poses,
+    cameras: Cameras,
     X_world: Points,
     problem: BundleProblem,
     slot: Int[Array, " m"],
@@ -262,10 +288,10 @@ def _report(
     solution: Solution,
 ) -> BundleAdjustment:
     """Everything that is said of the final values, evaluated there."""
-    views = bundle_views(poses, X_world, problem, loss)
+    views = bundle_views(cameras, X_world, problem, loss)
     equations = lax.stop_gradient(normal_equations(views))
     counts = (problem.weights > 0) & (views.robust_weights > 0)
-    free = counts & (problem.free_pose[:, None] | problem.free_point[None, :])
+    free = counts & (free_cameras(problem).any(axis=1)[:, None] | problem.free_point[None, :])
     determined = is_determined(eliminate(equations, problem, jnp.zeros_like(problem.scale)))
     status = jnp.select(
         [~free.any(), ~determined, ~solution.converged],
@@ -274,7 +300,7 @@ def _report(
     )
     of_slot = lambda plane, none: jnp.append(plane.reshape(-1), jnp.asarray(none, plane.dtype))[slot]
     return BundleAdjustment(
-        poses=poses,
+        poses=cameras.poses,
         X_world=X_world,
         initial_cost=initial_cost,
         cost=bundle_cost(views, problem, loss),
@@ -284,25 +310,31 @@ def _report(
         used=of_slot(counts, False),
         robust_weights=of_slot(views.robust_weights, 0.0),
         chi2=of_slot(views.chi2, UNKNOWN_CHI2),
+        lenses=cameras.lenses,
     )
 
 
-def _usable(poses: Poses, X_world: Points, observations: Observations) -> tuple[Poses, Points, Observations]:
+def _usable(cameras: Cameras, X_world: Points, observations: Observations) -> tuple[Cameras, Points, Observations]:
     """Finite poses with unit quaternions and finite points; what observes others is no longer valid."""
-    clean, usable = jax.vmap(usable_pose)(SE3(poses))
+    clean, usable = jax.vmap(usable_pose)(SE3(cameras.poses))
+    lenses = cameras.lenses
+    if lenses is not None:
+        lenses, usable_lens = usable_lenses(lenses)
+        usable = usable & usable_lens
     finite = jnp.isfinite(X_world).all(axis=0)
-    camera = jnp.clip(observations.camera, 0, poses.shape[0] - 1)
+    camera = jnp.clip(observations.camera, 0, usable.shape[0] - 1)
     point = jnp.clip(observations.point, 0, X_world.shape[1] - 1)
     valid = observations.valid & usable[camera] & finite[point]
-    return clean.wxyz_xyz, jnp.where(finite[None, :], X_world, 0.0), observations._replace(valid=valid)
+    X_world = jnp.where(finite[None, :], X_world, 0.0)
+    return Cameras(clean.wxyz_xyz, lenses), X_world, observations._replace(valid=valid)
 
 
 def _predicted_decrease(
-    equations: BundleEquations, tangents: Float[Array, "k 6"], shifts: Points, damping: Scalar
+    equations: BundleEquations, tangents: Float[Array, "k c"], shifts: Points, damping: Scalar
 ) -> Scalar:
     """What the quadratic model promises of a damped step."""
-    slope = jnp.sum(equations.pose_gradient * tangents) + jnp.sum(equations.point_gradient * shifts)
-    pose_diagonal = jnp.diagonal(equations.pose_hessian, axis1=1, axis2=2)
+    slope = jnp.sum(equations.camera_gradient * tangents) + jnp.sum(equations.point_gradient * shifts)
+    camera_diagonal = jnp.diagonal(equations.camera_hessian, axis1=1, axis2=2)
     point_diagonal = jnp.diagonal(equations.point_hessian).T
-    raised = jnp.sum(pose_diagonal * jnp.square(tangents)) + jnp.sum(point_diagonal * jnp.square(shifts))
+    raised = jnp.sum(camera_diagonal * jnp.square(tangents)) + jnp.sum(point_diagonal * jnp.square(shifts))
     return 0.5 * (damping * raised - slope)

@@ -1,7 +1,7 @@
 """The Schur complement of bundle adjustment: points eliminated, poses solved for, points found again.
 
 No two points share a residual, so their part of the Hessian is a 3 x 3 block each. What is left is dense, six numbers
-a camera: right for a window of up to some 64 of them.
+a camera, or nine with its lens: right for a window of up to some 64 of them.
 
 Source: Triggs et al., "Bundle Adjustment: A Modern Synthesis", 2000, section 6.1.
 """
@@ -13,53 +13,53 @@ from jax import lax
 from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Float
 
-from jaxslam_kernels.bundle_cost import BundleEquations, BundleProblem
+from jaxslam_kernels.bundle_cost import BundleEquations, BundleProblem, free_cameras
 from jaxslam_kernels.types import Flag, Mask, Points, Scalar
 
 
 class Reduced(NamedTuple):
-    """The equations after the points are eliminated, in units that give poses and points a unit diagonal.
+    """The equations after the points are eliminated, in units that give cameras and points a unit diagonal.
 
     Attributes:
-        units: Of the poses; 0 for what is fixed or has nothing to go by.
+        units: Of the cameras; 0 for what is fixed or has nothing to go by.
         root: Lower triangular C of each point with `Cᵀ C = V⁻¹`; rows of 0 for directions that nothing determines.
         coupling: `B = units W Cᵀ` as a matrix, so that the Schur complement is `H - B Bᵀ`.
         factor: Its Cholesky factor; not finite if it is not positive definite.
     """
 
-    units: Float[Array, "k 6"]
+    units: Float[Array, "k c"]
     root: Float[Array, "3 3 n"]
-    coupling: Float[Array, "k6 n3"]
-    factor: Float[Array, "k6 k6"]
+    coupling: Float[Array, "kc n3"]
+    factor: Float[Array, "kc kc"]
 
 
 def eliminate(equations: BundleEquations, problem: BundleProblem, damping: Scalar) -> Reduced:
     """Eliminates the points from equations whose diagonal is raised by the fraction `damping`."""
-    k, n = equations.pose_hessian.shape[0], equations.point_hessian.shape[2]
-    units = _units(jnp.diagonal(equations.pose_hessian, axis1=1, axis2=2), problem.free_pose[:, None])
+    (k, c, _), n = equations.camera_hessian.shape, equations.point_hessian.shape[2]
+    units = _units(jnp.diagonal(equations.camera_hessian, axis1=1, axis2=2), free_cameras(problem))
     root = _inverse_root(equations.point_hessian, problem.free_point, damping)
     cross = equations.cross * units[:, :, None, None]
     first, second, third = (cross[:, :, j, None, :] * root[:, j][None, None] for j in range(3))
-    coupling = (first + second + third).reshape(6 * k, 3 * n)
-    poses = equations.pose_hessian * units[:, :, None] * units[:, None, :]
+    coupling = (first + second + third).reshape(c * k, 3 * n)
+    cameras = equations.camera_hessian * units[:, :, None] * units[:, None, :]
     diagonal = jnp.where(units > 0, damping, 1.0)  # and 1 for what does not move
-    poses = poses + jnp.eye(6, dtype=units.dtype)[None] * diagonal[:, :, None]
-    blocks = jnp.eye(k, dtype=units.dtype)[:, None, :, None] * poses[:, :, None, :]
+    cameras = cameras + jnp.eye(c, dtype=units.dtype)[None] * diagonal[:, :, None]
+    blocks = jnp.eye(k, dtype=units.dtype)[:, None, :, None] * cameras[:, :, None, :]
     return Reduced(
-        units, root, coupling, cho_factor(blocks.reshape(6 * k, 6 * k) - coupling @ coupling.T, lower=True)[0]
+        units, root, coupling, cho_factor(blocks.reshape(c * k, c * k) - coupling @ coupling.T, lower=True)[0]
     )
 
 
 def solve_reduced(
-    reduced: Reduced, pose_gradient: Float[Array, "k 6"], point_gradient: Points
-) -> tuple[Float[Array, "k 6"], Points]:
+    reduced: Reduced, camera_gradient: Float[Array, "k c"], point_gradient: Points
+) -> tuple[Float[Array, "k c"], Points]:
     """The step that cancels the gradients, linear in them."""
     n = point_gradient.shape[1]
     along = jnp.einsum("ijn,jn->in", reduced.root, point_gradient)
-    right = reduced.units.reshape(-1) * pose_gradient.reshape(-1) - reduced.coupling @ along.reshape(-1)
+    right = reduced.units.reshape(-1) * camera_gradient.reshape(-1) - reduced.coupling @ along.reshape(-1)
     step = -cho_solve((reduced.factor, True), right)
     along = along + (step @ reduced.coupling).reshape(3, n)
-    return reduced.units * step.reshape(-1, 6), -jnp.einsum("ijn,in->jn", reduced.root, along)
+    return reduced.units * step.reshape(reduced.units.shape), -jnp.einsum("ijn,in->jn", reduced.root, along)
 
 
 def points_determined(hessian: Float[Array, "3 3 n"], free: Mask) -> Mask:

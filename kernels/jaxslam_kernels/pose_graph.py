@@ -1,21 +1,20 @@
 """Optimises a pose graph, SE(3) or Sim(3): closes loops over thousands of nodes, differentiably.
 
-Levenberg-Marquardt on the cost of `pose_graph_cost`; each step solves the sparse normal equations by the conjugate
-gradients of `block_band`. The result is differentiable, forward and reverse, by the implicit function theorem at the
-optimum, with respect to measured poses, scales, information, weights and loss scale: one sparse solve with the exact
-Hessian. The initial poses have no derivative, but for nodes that are fixed or otherwise stay where they were.
-
-Open: a graph whose band stays wide in any order, such as M3500 lifted to 3-D (groups of 105 nodes), did not finish in
-100 s; a sparse factorisation of it takes 0.1 s.
+Levenberg-Marquardt on the cost of `pose_graph_cost`; each step solves the sparse normal equations, by the conjugate
+gradients of `block_band` or, much faster for graphs of thousands of nodes, on the host by `pose_graph_sparse`. The
+result is differentiable, forward and reverse, by the implicit function theorem at the optimum, with respect to measured
+poses, scales, information, weights and loss scale: one sparse solve with the exact Hessian. The initial poses have no
+derivative, but for nodes that are fixed or otherwise stay where they were.
 
 Source: Grisetti et al., "A Tutorial on Graph-Based SLAM", 2010; Strasdat et al., "Scale Drift-Aware Large Scale
 Monocular SLAM", 2010, for Sim(3); Madsen, Nielsen and Tingleff, "Methods for Non-Linear Least Squares Problems", 2004,
 section 3.2, for the damping.
 """
 
+from collections.abc import Callable
 from enum import IntEnum
 from functools import partial
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from jaxslam_kernels.block_band import BandFactor, GraphMatrix, conjugate_gradients, factorise, multiply
+from jaxslam_kernels.block_band import GraphMatrix, Vector, conjugate_gradients, factorise, multiply, solve_factor
 from jaxslam_kernels.pose_graph_cost import (
     GraphEquations,
     GraphProblem,
@@ -41,12 +40,18 @@ from jaxslam_kernels.pose_graph_cost import (
     move_nodes,
     shift_nodes,
 )
+from jaxslam_kernels.pose_graph_sparse import solve_on_host
 from jaxslam_kernels.robust import Loss
 from jaxslam_kernels.types import Code, Flag, Scalar
 
 GROUP_SIZE = 32
 """Nodes in a group of the preconditioner; at the largest `|rank[source] - rank[target]|` the factor is exact."""
 
+Elimination = Literal["band", "host"]
+"""How the normal equations are solved: in compiled code, within a band; or on the host, whatever the structure."""
+
+_GROUP_SIZES = (16, 32, 64)
+"""Those that `suitable_group_size` chooses from: beyond, the host is faster."""
 _INITIAL_DAMPING = 1e-5  # relative to the diagonal of the Hessian
 _LEAST_DAMPING, _MOST_DAMPING = 1e-9, 1e9
 _STEP_TOLERANCE = 1e-2  # of the conjugate gradients in a step
@@ -109,6 +114,7 @@ class _Solver(NamedTuple):
     max_steps: int
     max_iterations: int
     group_size: int
+    elimination: Elimination
 
 
 class _Search(NamedTuple):
@@ -135,6 +141,7 @@ def optimise_pose_graph(
     max_steps: int = 50,
     max_iterations: int = 200,
     group_size: int = GROUP_SIZE,
+    elimination: Elimination = "band",
 ) -> PoseGraph:
     """The poses that agree best with the measured relative poses.
 
@@ -153,10 +160,16 @@ def optimise_pose_graph(
         loss_scale: Its scale in standard deviations, traced.
         max_steps: Bound on the steps, static.
         max_iterations: Bound on the iterations of conjugate gradients in a step, static.
-        group_size: Nodes in a group of the preconditioner, static.
+        group_size: Nodes in a group of the preconditioner, static; see `suitable_group_size`.
+        elimination: Where the normal equations are solved, static. "host" calls back to SciPy from compiled code, and
+            then `rank`, `max_iterations` and `group_size` matter to derivatives only, or not at all; it needs two
+            threads of XLA.
 
     Returns:
         A `PoseGraph`; everything in it is finite, and so are its derivatives.
+
+    Raises:
+        ValueError: While tracing, for "host" where XLA has one thread only.
     """
     k, d = fixed.shape[0], 6 if scales is None else 7
     mask = jnp.ones(k, bool) if mask is None else mask
@@ -167,7 +180,7 @@ def optimise_pose_graph(
     anchored = _anchored(problem, fixed & mask & usable)
     free = anchored & ~fixed
     touched = jnp.zeros(k, bool).at[problem.source].max(used).at[problem.target].max(used)
-    solver = _Solver(loss, max_steps, max_iterations, group_size)
+    solver = _Solver(loss, max_steps, max_iterations, group_size, elimination)
     bad_initial = (mask & ~usable).any()
     free = free & ~bad_initial
     graph = _Graph(problem, free, rank)
@@ -219,6 +232,23 @@ def band_rank(source: np.ndarray, target: np.ndarray, num_nodes: int) -> np.ndar
     return rank
 
 
+def suitable_group_size(source: np.ndarray, target: np.ndarray, rank: np.ndarray) -> int | None:
+    """The least group size of a few that makes every step exact in one iteration.
+
+    For the host, like `band_rank`. The sizes are few so that a graph that grows seldom compiles anew.
+
+    Args:
+        source: `(m,)` indices of nodes, those of edges in use only.
+        target: `(m,)` indices of nodes.
+        rank: `(k,)` each node's place, from `band_rank`.
+
+    Returns:
+        The size, or `None` if the band is too wide: then `elimination="host"` is faster.
+    """
+    width = int(np.abs(rank[source] - rank[target]).max(initial=1))
+    return next((size for size in _GROUP_SIZES if size >= width), None)
+
+
 def _anchored(problem: GraphProblem, fixed: Bool[Array, " k"]) -> Bool[Array, " k"]:
     """Which nodes have a path to a fixed one: labels fall to the least of the neighbours' until they rest."""
     k, used = fixed.shape[0], problem.weights > 0
@@ -248,14 +278,7 @@ def _solve(initial: Nodes, graph: _Graph, solver: _Solver) -> _Search:
     def step(s: _Search) -> _Search:
         matrix = _system(s.equations, graph, s.damping)
         gradient = jnp.where(graph.free[:, None], s.equations.gradient, 0.0)
-        factor = factorise(matrix, graph.rank, solver.group_size)
-        steps, iterations = conjugate_gradients(
-            partial(multiply, matrix),
-            factor,
-            -gradient,
-            tolerance=_STEP_TOLERANCE,
-            max_steps=solver.max_iterations,
-        )
+        steps, iterations = _linear_solve(matrix, -gradient, graph, solver)
         trial = move_nodes(s.nodes, steps)
         trial_cost, _, _ = graph_cost(trial, graph.problem, solver.loss)
         damped = s.damping * jnp.sum(steps * _diagonal(s.equations, graph) * steps)
@@ -280,6 +303,22 @@ def _solve(initial: Nodes, graph: _Graph, solver: _Solver) -> _Search:
         )
 
     return lax.while_loop(lambda s: ~s.converged & (s.num_steps < solver.max_steps), step, start)
+
+
+def _linear_solve(matrix: GraphMatrix, right: Steps, graph: _Graph, solver: _Solver) -> tuple[Steps, Int[Array, ""]]:
+    precondition = _preconditioner(matrix, graph, solver)
+    if solver.elimination == "host":
+        return precondition(right), jnp.ones((), jnp.int32)
+    return conjugate_gradients(
+        partial(multiply, matrix), precondition, right, tolerance=_STEP_TOLERANCE, max_steps=solver.max_iterations
+    )
+
+
+def _preconditioner(matrix: GraphMatrix, graph: _Graph, solver: _Solver) -> Callable[[Vector], Vector]:
+    """The inverse of the matrix, exact on the host and as good as the band is otherwise."""
+    if solver.elimination == "host":
+        return partial(solve_on_host, matrix)
+    return partial(solve_factor, factorise(matrix, graph.rank, solver.group_size))
 
 
 def _diagonal(equations: GraphEquations, graph: _Graph) -> Steps:
@@ -340,9 +379,11 @@ def _solve_exact(solver: _Solver, optimum: Nodes, graph: _Graph, right: Steps) -
 
     epsilon = float(jnp.finfo(right.dtype).eps)
     matrix = _system(graph_equations(optimum, graph.problem, solver.loss), graph, _LEAST_DAMPING)
-    factor: BandFactor = factorise(matrix, graph.rank, solver.group_size)
+    precondition = _preconditioner(matrix, graph, solver)
 
     def solve(_: object, b: Steps) -> Steps:
-        return conjugate_gradients(hessian, factor, b, tolerance=epsilon**0.75, max_steps=4 * solver.max_iterations)[0]
+        return conjugate_gradients(
+            hessian, precondition, b, tolerance=epsilon**0.75, max_steps=4 * solver.max_iterations
+        )[0]
 
     return lax.custom_linear_solve(hessian, right, solve, symmetric=True)

@@ -3,13 +3,14 @@
 `pytest -m benchmark -n 0 tests/benchmarks/test_bench_bundle_adjust.py -s`
 """
 
+import time
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from benchmarks.timing import compare, compile_seconds
+from benchmarks.timing import compare, compile_seconds, pinned_to_one_core
 from jaxslam_kernels.bundle_adjust import BundleStatus, bundle_adjust
 from jaxslam_kernels.bundle_cost import Observations, observe
 from jaxslam_kernels.camera import make_intrinsics
@@ -70,6 +71,54 @@ def test_one_step():
     print(f"  a step {wall:.2f} ms, {processor:.2f} ms of processor time")
     print(f"  compile {compile_seconds(partial(_adjust, max_steps=11), *ARGUMENTS):.1f} s of processor time")
     assert processor < 5.0
+
+
+def test_one_step_against_ceres():
+    """Without depth, which COLMAP's cost functions lack, and so with two poses fixed. Ceres times its steps itself."""
+    ceres_window = pytest.importorskip("benchmarks.ceres_window")
+    poses, X_world, seen = (jax.tree.map(np.asarray, x) for x in ARGUMENTS)
+    often = np.bincount(seen.point, minlength=N)[seen.point] > 1
+    camera, point, steps = seen.camera[often], seen.point[often], 10
+    uv = seen.xy[:, often] * 500.0 + [[320.0], [240.0]]
+    fixed = jnp.arange(K) < 2
+    observations = ARGUMENTS[2]._replace(depth=jnp.zeros(M), valid=jnp.asarray(often))
+    ours = {n: jax.jit(partial(bundle_adjust, fixed_poses=fixed, tolerance=0.0, max_steps=n)) for n in (1, steps + 1)}
+    inputs = *ARGUMENTS[:2], observations
+    start = np.concatenate(
+        [poses.astype(float)[:, :4] / np.linalg.norm(poses[:, :4], axis=1)[:, None], poses[:, 4:]], 1
+    )
+    for f in ours.values():
+        jax.block_until_ready(f(*inputs))
+
+    def one_round():
+        adjuster, model = ceres_window.ceres_problem(start, X_world.astype(float), camera, point, uv, 2)
+        one, (result, *all_steps) = (_timed(partial(ours[n], *inputs)) for n in (1, steps + 1))
+        summary = ceres_window.solve(adjuster, steps)
+        del model  # not before: Ceres works on its memory
+        differences = (np.array(all_steps) - one[1:]) / (int(result.num_steps) - 1)
+        return result, summary, (*differences, 1e3 * summary.minimizer_time_in_seconds / steps)
+
+    with pinned_to_one_core():
+        rounds = [one_round() for _ in range(12)]
+    result, summary, _ = rounds[-1]
+    times = np.array([r[2] for r in rounds[2:]])
+    (wall, processor, theirs), least = np.median(times, axis=0), times.min(axis=0)
+    print(f"\na step of {K} keyframes, {point.size} observations without depth: ours {wall:.2f} ms", end="")
+    print(
+        f" ({processor:.2f} ms of processor time, least {least[0]:.2f}), Ceres {theirs:.2f} ms (least {least[2]:.2f})"
+    )
+    print(f"  cost: ours {result.initial_cost:.1f} to {result.cost:.1f} in {result.num_steps} steps", end="")
+    print(f", Ceres {summary.initial_cost:.1f} to {summary.final_cost:.1f} in {steps}")
+    assert float(result.initial_cost) == pytest.approx(summary.initial_cost, rel=1e-3)
+    assert float(result.cost) < 1.01 * summary.final_cost
+    assert processor < theirs
+
+
+def _timed(function):
+    """The result, and milliseconds on the wall clock and of processor time."""
+    began, processor_began = time.perf_counter(), time.process_time()
+    result = jax.block_until_ready(function())
+    return result, (time.perf_counter() - began) * 1e3, (time.process_time() - processor_began) * 1e3
 
 
 def test_it_arrives():

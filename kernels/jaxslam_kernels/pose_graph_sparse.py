@@ -1,0 +1,100 @@
+"""Sparse symmetric systems of a graph, solved on the host by SciPy's SuperLU, from inside compiled code.
+
+For graphs whose band is wide in any order: a minimum-degree order of the nodes keeps the factor sparse, which XLA
+cannot express without compiling for each structure. It is pure, batches one by one and blocks no other thread of
+Python while it factorises; it has no derivative of its own.
+
+Source: Li, "An Overview of SuperLU", 2005; Liu, "Modification of the Minimum-Degree Algorithm by Multiple
+Elimination", 1985, for the order.
+"""
+
+import os
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+from scipy.sparse import coo_array
+from scipy.sparse.linalg import splu
+
+from jaxslam_kernels.block_band import GraphMatrix, Vector
+
+_SYMMETRIC: dict[str, Any] = {"diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
+
+
+def solve_on_host(matrix: GraphMatrix, right: Vector) -> Vector:
+    """The solution, computed in double precision; not finite where the matrix is not, or is singular.
+
+    Raises:
+        ValueError: While tracing, where XLA has one thread: the callback would wait for arrays that this thread is to
+            bring, for ever (seen with 1000 nodes, not with 250).
+    """
+    if num_threads() < 2:
+        raise ValueError("elimination: 'host' needs two threads of XLA, got one (NPROC=1, or one core): use 'band'")
+    # As bits: in the thread that calls back, JAX rounds to single precision whatever `enable_x64` says here.
+    numbers = [_bits(values) for values in (matrix.diagonal, matrix.coupling, right)]
+    indices = [index.astype(jnp.int32) for index in (matrix.source, matrix.target)]
+    shape = jax.ShapeDtypeStruct(numbers[2].shape, jnp.uint32)
+    solve = partial(_solve_bits, np.dtype(right.dtype))
+    found = jax.pure_callback(solve, shape, *numbers, *indices, vmap_method="sequential")
+    return lax.bitcast_convert_type(found, right.dtype)
+
+
+def num_threads() -> int:
+    """How many threads XLA has."""
+    chosen = os.environ.get("NPROC", "")
+    if chosen.isdigit() and int(chosen) > 0:
+        return int(chosen)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _bits(values: Array) -> Array:
+    return lax.bitcast_convert_type(values, jnp.uint32)  # two words a double
+
+
+def _solve_bits(dtype: np.dtype, *arrays: Any) -> np.ndarray:
+    diagonal, coupling, right, source, target = (np.ascontiguousarray(array) for array in arrays)
+    blocks = [words.view(dtype).reshape(words.shape[:3]) for words in (diagonal, coupling)]
+    found = _solve(blocks[0], blocks[1], right.view(dtype).reshape(right.shape[:2]), source, target)
+    return np.ascontiguousarray(found).view(np.uint32).reshape(right.shape)
+
+
+def _solve(
+    diagonal: np.ndarray, coupling: np.ndarray, right: np.ndarray, source: np.ndarray, target: np.ndarray
+) -> np.ndarray:
+    if not all(np.isfinite(values).all() for values in (diagonal, coupling, right)):
+        return np.full_like(right, np.nan)
+    used = coupling.any(axis=(1, 2))
+    coupling, source, target = coupling[used], source[used], target[used]
+    order = _elimination_order(source, target, len(diagonal))
+    place = np.argsort(order)
+    sparse = _assemble(diagonal[order], coupling, place[source], place[target])
+    try:
+        factor = splu(sparse, permc_spec="NATURAL", **_SYMMETRIC)
+    except RuntimeError:  # exactly singular, which LAPACK's Cholesky factor shows in the same way
+        return np.full_like(right, np.nan)
+    return factor.solve(right[order].astype(np.float64).ravel()).reshape(right.shape)[place].astype(right.dtype)
+
+
+def _elimination_order(source: np.ndarray, target: np.ndarray, num_nodes: int) -> np.ndarray:
+    """Minimum degree, by nodes: SuperLU finds it on its way to factorising any matrix of this structure."""
+    nodes = np.arange(num_nodes)
+    rows, columns = np.concatenate([nodes, source, target]), np.concatenate([nodes, target, source])
+    degree = np.bincount(rows, minlength=num_nodes)
+    values = np.where(rows == columns, 1.0 + degree[rows], -1.0)
+    pattern = coo_array((values, (rows, columns)), shape=(num_nodes, num_nodes)).tocsc()
+    return np.argsort(splu(pattern, permc_spec="MMD_AT_PLUS_A", **_SYMMETRIC).perm_c)
+
+
+def _assemble(diagonal: np.ndarray, coupling: np.ndarray, source: np.ndarray, target: np.ndarray) -> Any:
+    k, d, _ = diagonal.shape
+    nodes = np.arange(k)
+    blocks = np.concatenate([diagonal, coupling, coupling.swapaxes(1, 2)]).astype(np.float64)
+    rows, columns = np.concatenate([nodes, source, target]), np.concatenate([nodes, target, source])
+    within = np.arange(d)
+    row = np.broadcast_to((d * rows)[:, None, None] + within[:, None], blocks.shape)
+    column = np.broadcast_to((d * columns)[:, None, None] + within, blocks.shape)
+    return coo_array((blocks.ravel(), (row.ravel(), column.ravel())), shape=(k * d, k * d)).tocsc()
