@@ -22,8 +22,6 @@ _SIGHTINGS_A_POINT = 6
 _LEAST_KEYFRAMES = 4
 """Below that tracking knows better: it has followed the points through all frames in between. With people in two or
 three keyframes, adjusting made 4.1 mm of 2.6 in the synthetic room."""
-_CONFIRMED = 3
-"""Further keyframes that see a point from which it counts in full: what moves is not found again for long."""
 _OUTLIER_CHI2 = 11.3
 """Squared whitened error over which a sighting is dropped: 1 % of good ones with three residuals."""
 
@@ -168,9 +166,7 @@ def _observations(map: Map, window: _Window, size: int, plan: AdjustPlan) -> Obs
     focal = np.array([[camera.fx], [camera.fy]])
     centre = np.array([[camera.cx], [camera.cy]])
     point_row = np.searchsorted(window.points, seen.point)
-    confirmed = np.bincount(point_row, minlength=len(window.points))[point_row] - 1
     weight = seen.weight * map.points.weight[rows(map.points.ids, seen.point)]
-    weight = weight * np.minimum(confirmed / _CONFIRMED, 1)
     precision = np.concatenate([focal / seen.sigma_px, np.where(seen.depth > 0, 1 / sigma_depth, 0)[None, :]])
     fit: Any = lambda array, dtype: _padded(array.astype(dtype), room, axis=-1, fill=0)
     valid: Any = np.arange(room) < len(row)

@@ -21,3 +21,14 @@ def _folder(variable: str) -> Path:
 def data_dir() -> Path:
     """The folder of real recordings, or a skip."""
     return _folder("JAXSLAM_DATA")
+
+
+@pytest.fixture(autouse=True)
+def _number_of_threads_stays():
+    """What a command sets for its own process is not told to the tests after it."""
+    chosen = os.environ.get("NPROC")
+    yield
+    if chosen is None:
+        os.environ.pop("NPROC", None)
+    else:
+        os.environ["NPROC"] = chosen

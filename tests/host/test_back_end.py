@@ -352,8 +352,9 @@ class TestFinish:
             assert slam.loops_closed == 1
             assert slam.map.loops.target.tolist() == [1]
 
-    def test_its_correction_is_told_with_the_next_frame(self) -> None:
+    def test_its_correction_is_told_with_the_next_frame(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """A jump is told from a motion, also if the map was waited for."""
+        monkeypatch.setattr("jaxslam.local_adjustment._LEAST_KEYFRAMES", 2)  # so that the second one corrects
         second = keyframe_frames()[1]
         with new_slam() as slam:
             before = [slam.track(frame) for frame in _frames()[: second + 1]][-1]
