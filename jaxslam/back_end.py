@@ -9,19 +9,17 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
-import cv2
 import jax
 import numpy as np
 
 from jaxslam.camera import Camera
 from jaxslam.config import Config
 from jaxslam.essential_graph import compile_graph
-from jaxslam.features import DESCRIPTOR_BYTES, Features, features_of
+from jaxslam.features import features_of, no_features
 from jaxslam.frame_arrays import FrameArrays
-from jaxslam.local_mapping import LocalMapping, NewKeyframe, mapping_plan
+from jaxslam.local_mapping import LocalMapping, NewKeyframe, mapping_plan, with_new_keyframe
 from jaxslam.loop_closing import LoopClosing, LoopClosure
-from jaxslam.map import NONE, Keyframe, Map, empty_map, standing
-from jaxslam.map_edit import with_keyframe
+from jaxslam.map import NONE, Map, empty_map
 from jaxslam.map_link import Hung, MapLink
 from jaxslam.place_index import PlaceIndex
 from jaxslam.place_recognition import MIN_INLIERS, compile_recognition, recognise
@@ -153,13 +151,14 @@ class BackEnd:
 
         Args:
             timestamp_ns: Its time.
-            arrays: The frame, not to be written to any more.
+            arrays: The frame; it is copied.
             output: What the tracker said of it.
             frame: Its number.
             recognised: Where it is, if tracking began at a place that was recognised.
         """
         if not self._localize_only:
-            self._to_mapping.offer(self._link.keyframe_made(timestamp_ns, arrays, output, recognised), frame)
+            new = self._link.keyframe_made(timestamp_ns, _copied(arrays), output, recognised)
+            self._to_mapping.offer(new, frame)
 
     def recognise(self, arrays: FrameArrays) -> tuple[Hung | None, bool]:
         """Where a frame was taken, if the map shows that place; and whether the frame may begin a new submap.
@@ -181,8 +180,7 @@ class BackEnd:
         self._link.refer_to(recognised.keyframe)
         pose = self._link.pose(recognised)
         state = self.restarted(state, pose)
-        wanted = worth_recalling(self.map, pose, self._link.submap_now(), set(), self._track_plan.num_recalled)
-        self._wait_for(recall(self.map, keyframe_id, self._track_plan.num_points) for keyframe_id in wanted)
+        self._wait_for(self._recalls(_Recall(self.map, pose, self._link.submap_now(), frozenset())))
         while self._waiting:
             state = self._with_recalled(state)
         return state
@@ -243,13 +241,16 @@ class BackEnd:
             return _MapUpdate(self._mapping.add(job), job.id, 0)
         except BaseException:
             # What was begun is forgotten; those after a keyframe hang on it, and so it is there, without points.
-            map = before if isinstance(job, LoopClosure) else _with_bare(before, job)
+            map = before if isinstance(job, LoopClosure) else with_new_keyframe(before, job, no_features())
             self._mapping = LocalMapping(self._camera, self._params, self._plan, map)
             raise
 
     def _place_job(self, job: _PlaceJob) -> _PlaceResult:
         if isinstance(job, _Look):
             return self._loops.look(job.map, job.keyframe)
+        return self._recalls(job)
+
+    def _recalls(self, job: _Recall) -> tuple[Recalled, ...]:
         wanted = worth_recalling(job.map, job.T_world_cam, job.submap, set(job.known), self._track_plan.num_recalled)
         return tuple(recall(job.map, keyframe_id, self._track_plan.num_points) for keyframe_id in wanted)
 
@@ -297,20 +298,6 @@ class BackEnd:
         return state
 
 
-def copied(arrays: FrameArrays) -> FrameArrays:
+def _copied(arrays: FrameArrays) -> FrameArrays:
     """A frame's own copy, for use after the caller has got its images back."""
     return FrameArrays(*jax.tree.map(np.array, tuple(arrays)))
-
-
-def _with_bare(map: Map, new: NewKeyframe) -> Map:
-    """The map with a keyframe in its place that shows nothing."""
-    pose, parent, submap = new.T_parent_keyframe, new.parent, new.submap
-    if parent != NONE:
-        pose = compose(map.pose(parent), pose)
-        parent = int(standing(map, np.array([parent]))[0])
-        submap = int(map.submap[map.row(parent)])
-    none, plane = np.zeros(0, np.float32), np.zeros((2, 0), np.float32)
-    octave, descriptor = np.zeros(0, np.uint8), np.zeros((0, DESCRIPTOR_BYTES), np.uint8)
-    features = Features(seen_uv=plane, uv=plane, depth=none, octave=octave, angle=none, descriptor=descriptor)
-    _, png = cv2.imencode(".png", np.asarray(new.frame.image))
-    return with_keyframe(map, Keyframe(new.id, new.timestamp_ns, features, png.tobytes()), pose, parent, submap)

@@ -12,6 +12,7 @@ from jaxslam_kernels.pose_graph import PoseGraphStatus, band_rank, optimise_pose
 from jaxslam_kernels.pose_graph_cost import PoseGraphEdges
 
 from jaxslam.map import NONE, Map, has, rows, visibility
+from jaxslam.padding import padded
 from jaxslam.pose import IDENTITY, angle, between
 
 _STRONG = 100
@@ -108,16 +109,16 @@ def _solved(graph: _Graph, poses: np.ndarray, fixed: np.ndarray) -> Any:
     size = next(size for size in _SIZES if size >= num)
     room = size * _EDGES_A_NODE
     columns: Any = (
-        _padded(graph.source, room, 0).astype(np.int32),
-        _padded(graph.target, room, 0).astype(np.int32),
-        _pose_array(_padded(graph.T_source_target, room, IDENTITY)),
-        _padded(graph.information, room, np.eye(6)).astype(np.float32),
-        _padded(np.ones(num_edges, np.float32), room, 0),
+        padded(graph.source, room, fill=0).astype(np.int32),
+        padded(graph.target, room, fill=0).astype(np.int32),
+        _pose_array(padded(graph.T_source_target, room, fill=IDENTITY)),
+        padded(graph.information, room, fill=np.eye(6)).astype(np.float32),
+        padded(np.ones(num_edges, np.float32), room, fill=0),
         np.arange(room) < num_edges,
     )
-    edges, start = PoseGraphEdges(*columns), _pose_array(_padded(poses, size, IDENTITY))
+    edges, start = PoseGraphEdges(*columns), _pose_array(padded(poses, size, fill=IDENTITY))
     rank = band_rank(graph.source, graph.target, size)
-    solved = jax.device_get(_optimise(start, edges, _padded(fixed, size, False), np.arange(size) < num, rank))
+    solved = jax.device_get(_optimise(start, edges, padded(fixed, size, fill=False), np.arange(size) < num, rank))
     return solved._replace(chi2=solved.chi2[:num_edges])
 
 
@@ -129,7 +130,3 @@ def _optimise(T_world_cam: SE3, edges: PoseGraphEdges, fixed: Any, mask: Any, ra
 def _pose_array(T: np.ndarray) -> SE3:
     wxyz_xyz: Any = T.astype(np.float32)
     return SE3(wxyz_xyz)
-
-
-def _padded(array: np.ndarray, size: int, fill: Any) -> np.ndarray:
-    return np.concatenate([array, np.broadcast_to(fill, (size - len(array), *array.shape[1:]))])

@@ -205,6 +205,12 @@ def _spread(
     return order[np.argsort(256 * rank + weakness[order], kind="stable")][:quota]
 
 
+def no_features() -> Features:
+    """Features of an image that has none."""
+    seen_uv, *rest = _no_patches()
+    return Features(seen_uv, seen_uv, np.zeros(0, np.float32), *rest)
+
+
 def _no_patches() -> Patches:
     return Patches(
         np.zeros((2, 0), np.float32),

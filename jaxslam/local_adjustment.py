@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxslam.map import NONE, Map, Sightings, covisible, has, rows, sightings_at
 from jaxslam.map_edit import moved, without_sightings
+from jaxslam.padding import padded
 from jaxslam.pose import between, compose, inverse, rotate, to_local, transform
 
 _NUM_FIXED = 4
@@ -81,8 +82,8 @@ def adjust_around(map: Map, keyframe_id: int, plan: AdjustPlan, movable: np.ndar
     free = np.arange(num_cameras) < window.num_free
     solution: Any = jax.device_get(
         _adjust(
-            _padded(poses, num_cameras, axis=0, fill=_identity_row()),
-            _padded(X, size, axis=1, fill=0),
+            padded(poses, num_cameras, axis=0, fill=_identity_row()),
+            padded(X, size, axis=1, fill=0),
             _observations(map, window, size, plan),
             ~free,
             np.float32(plan.loss_scale),
@@ -109,7 +110,7 @@ def adjust_all(map: Map, plan: AdjustPlan, movable: np.ndarray, sweeps: int = 2)
 def compile_adjustment(plan: AdjustPlan) -> None:
     """Compile the adjustment for every size of window, so that none is compiled while frames come."""
     num_cameras = plan.window + _NUM_FIXED
-    poses = _padded(_identity_row()[None], num_cameras, axis=0, fill=_identity_row())
+    poses = padded(_identity_row()[None], num_cameras, axis=0, fill=_identity_row())
     for size in _POINT_SIZES:
         X, free = np.zeros((3, size), np.float32), np.zeros(num_cameras, bool)
         nothing = _no_observations(size * _SIGHTINGS_A_POINT)
@@ -168,7 +169,7 @@ def _observations(map: Map, window: _Window, size: int, plan: AdjustPlan) -> Obs
     point_row = np.searchsorted(window.points, seen.point)
     weight = seen.weight * map.points.weight[rows(map.points.ids, seen.point)]
     precision = np.concatenate([focal / seen.sigma_px, np.where(seen.depth > 0, 1 / sigma_depth, 0)[None, :]])
-    fit: Any = lambda array, dtype: _padded(array.astype(dtype), room, axis=-1, fill=0)
+    fit: Any = lambda array, dtype: padded(array.astype(dtype), room, axis=-1, fill=0)
     valid: Any = np.arange(room) < len(row)
     return Observations(
         camera=fit(row, np.int32),
@@ -219,12 +220,6 @@ def _moved_along(map: Map, keyframe_ids: np.ndarray, poses: np.ndarray) -> tuple
     change = compose(poses, inverse(map.T_world_cam[rows(map.ids, keyframe_ids)]))[which]
     X_world = rotate(change, map.points.X_world[:, row[lone]].T) + change[:, 4:]
     return map.sightings.point[lone], X_world.T
-
-
-def _padded(array: np.ndarray, size: int, *, axis: int, fill: np.ndarray | float) -> np.ndarray:
-    shape = list(array.shape)
-    shape[axis] = size - shape[axis]
-    return np.concatenate([array, np.broadcast_to(np.asarray(fill, array.dtype), shape)], axis=axis)
 
 
 def _identity_row() -> np.ndarray:

@@ -138,7 +138,7 @@ class LocalMapping:
     def add(self, new: NewKeyframe) -> Map:
         """Take in a keyframe; gives the new map."""
         features = features_of(new.frame, new.twist, self._params, self._plan.features)
-        whole = self._with_keyframe(self.map, new, features)
+        whole = with_new_keyframe(self.map, new, features)
         known = self._known(new.tracks)
         part = _part(whole, new.id, known[has(whole.points.ids, known)])
         map = self._with_tracks(part.map, new, known)
@@ -167,18 +167,6 @@ class LocalMapping:
         map = adjust_around(map, loop.target, self._plan.adjust, part.keyframes)
         self.map = put_back(whole, part, adjust_all(map, self._plan.adjust, part.keyframes))
         return self.map
-
-    def _with_keyframe(self, map: Map, new: NewKeyframe, features: Features) -> Map:
-        pose, parent, submap = new.T_parent_keyframe, new.parent, new.submap
-        if parent != NONE:
-            pose = compose(map.pose(parent), pose)
-            parent = int(standing(map, np.array([parent]))[0])
-            submap = int(map.submap[map.row(parent)])  # which may have become part of another one
-        encoded, png = cv2.imencode(".png", np.asarray(new.frame.image), [cv2.IMWRITE_PNG_COMPRESSION, 1])
-        if not encoded:
-            raise RuntimeError("the image of a keyframe could not be compressed")
-        keyframe = Keyframe(new.id, new.timestamp_ns, features, png.tobytes())
-        return with_keyframe(map, keyframe, pose, parent, submap)
 
     def _with_tracks(self, map: Map, new: NewKeyframe, known: np.ndarray) -> Map:
         """The points the tracker saw: those the map has get a sighting, the others become points."""
@@ -255,6 +243,20 @@ class LocalMapping:
         for track in old:
             del self._last_seen[track]
             self._point_of.pop(track, None)
+
+
+def with_new_keyframe(map: Map, new: NewKeyframe, features: Features) -> Map:
+    """The map with a keyframe where its parent has it, and no point seen in it yet."""
+    pose, parent, submap = new.T_parent_keyframe, new.parent, new.submap
+    if parent != NONE:
+        pose = compose(map.pose(parent), pose)
+        parent = int(standing(map, np.array([parent]))[0])
+        submap = int(map.submap[map.row(parent)])  # which may have become part of another one
+    encoded, png = cv2.imencode(".png", np.asarray(new.frame.image), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    if not encoded:
+        raise RuntimeError("the image of a keyframe could not be compressed")
+    keyframe = Keyframe(new.id, new.timestamp_ns, features, png.tobytes())
+    return with_keyframe(map, keyframe, pose, parent, submap)
 
 
 @jax.jit

@@ -7,16 +7,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxlie import SE3
-from jaxslam_kernels.camera import Intrinsics
+from jaxslam_kernels.camera import without_distortion
 from jaxslam_kernels.pnp import PnpResult, ransac_pnp
 from jaxslam_kernels.pose_refine import PoseRefinement, PoseStatus, refine_pose
 from jaxslam_kernels.types import Pixels, Points, Weights
 from jaxtyping import Array, Float64, Int64, Key
 
-from jaxslam.features import DEFAULT_PLAN, FeaturePlan, Features
+from jaxslam.features import DEFAULT_PLAN, FeaturePlan, Features, no_features
 from jaxslam.map import Keyframe, Map, has
 from jaxslam.matching import hamming_pairs, match_by_projection, match_descriptors, predicted_octave, same_turn
 from jaxslam.observe import depth_sigma
+from jaxslam.padding import padded
 from jaxslam.place_index import PlaceIndex
 from jaxslam.pose import to_local
 from jaxslam.state import TrackParams
@@ -220,14 +221,8 @@ def _seen(
         plan.scale(features.octave[now]),
         np.ones(len(now)),
     )
-    padded: Any = (_padded(column, capacity) for column in columns)
-    return _Seen(*padded)
-
-
-def _padded(array: np.ndarray, capacity: int) -> np.ndarray:
-    padded = np.zeros((*array.shape[:-1], capacity), np.float32)
-    padded[..., : array.shape[-1]] = array
-    return padded
+    filled: Any = (padded(column.astype(np.float32), capacity, axis=-1) for column in columns)
+    return _Seen(*filled)
 
 
 @jax.jit
@@ -236,7 +231,7 @@ def _agreed(key: Key[Array, ""], seen: _Seen, params: TrackParams) -> PnpResult:
         key,
         seen.X,
         seen.uv,
-        _ideal(params.intrinsics),
+        without_distortion(params.intrinsics),
         weights=seen.weight,
         depth=seen.depth,
         threshold_px=_GATE_SIGMAS * _SIGMA_PX * seen.scale,
@@ -252,7 +247,7 @@ def _refined(T_keyframe_cam: SE3, seen: _Seen, params: TrackParams) -> PoseRefin
         T_keyframe_cam,
         seen.X,
         seen.uv,
-        _ideal(params.intrinsics),
+        without_distortion(params.intrinsics),
         weights=seen.weight,
         depth=seen.depth,
         sigma_px=_SIGMA_PX * seen.scale,
@@ -265,15 +260,10 @@ def _depth_sigma(seen: _Seen, params: TrackParams) -> Weights:
     return jnp.hypot(depth_sigma(seen.depth_then, params), depth_sigma(seen.depth, params))
 
 
-def _ideal(intrinsics: Intrinsics) -> Intrinsics:
-    return intrinsics._replace(distortion=jnp.zeros_like(intrinsics.distortion))
-
-
 def compile_recognition(params: TrackParams, plan: FeaturePlan = DEFAULT_PLAN) -> None:
     """Compile all that `recognise` needs, so that nothing is compiled while frames come."""
     nothing: Any = np.zeros((2, 0), np.int64)
-    empty = Features(*(np.zeros(shape, np.float32) for shape in ((2, 0), (2, 0), 0, 0, 0, (0, 32))))  # type: ignore[arg-type]
-    empty = empty._replace(octave=np.zeros(0, np.uint8))
+    empty = no_features()
     identity = SE3(jnp.asarray([1.0, 0, 0, 0, 0, 0, 0], jnp.float32))
     key = jax.random.fold_in(jax.random.key(0), 0)
     jax.block_until_ready(_agreed(key, _seen(empty, empty, nothing, _MOST_MATCHES, params, plan), params))

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.back_end import BackEnd, copied
+from jaxslam.back_end import BackEnd
 from jaxslam.camera import Camera
 from jaxslam.config import Config, TrackConfig
 from jaxslam.datasets import Dataset, prefetch
@@ -157,7 +157,7 @@ class Slam:
         if output.status == TrackStatus.LOST:
             output, recognised = self._regain(arrays, output)
         if output.keyframe:
-            self._back.keyframe_made(frame.timestamp_ns, copied(arrays), output, self._frame, recognised)
+            self._back.keyframe_made(frame.timestamp_ns, arrays, output, self._frame, recognised)
         tracked = tracked_of(frame.timestamp_ns, output, correction, recognised is not None)
         self._last_ns = frame.timestamp_ns
         tracked = self._recorded(tracked, dt_s)

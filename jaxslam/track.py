@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxlie import SE3
-from jaxslam_kernels.camera import Intrinsics, to_pixels
+from jaxslam_kernels.camera import to_pixels, without_distortion
 from jaxslam_kernels.depth_image import believable
 from jaxslam_kernels.image import build_pyramid
 from jaxslam_kernels.lk_flow import lk_flow
@@ -191,7 +191,7 @@ def _coarse_pose(
         jax.random.fold_in(state.key, state.frame),
         state.points.X_world,
         to_pixels(params.intrinsics, seen.xy),
-        _ideal(params.intrinsics),
+        without_distortion(params.intrinsics),
         weights=usable,
         depth=seen.depth,
         threshold_px=params.ransac_px,
@@ -225,7 +225,7 @@ def _refine(
         coarse,
         X_world,
         to_pixels(params.intrinsics, seen.xy),
-        _ideal(params.intrinsics),
+        without_distortion(params.intrinsics),
         weights=weights,
         depth=seen.depth,
         sigma_px=params.pixel_sigma,
@@ -235,10 +235,6 @@ def _refine(
     )
     close = _close(refined.T_world_cam, X_world, seen.xy, params)
     return refined, agreeing & close[: agreeing.shape[0]]
-
-
-def _ideal(intrinsics: Intrinsics) -> Intrinsics:
-    return intrinsics._replace(distortion=jnp.zeros_like(intrinsics.distortion))
 
 
 def _close(T_world_cam: SE3, X_world: Points, xy: Pixels, params: TrackParams) -> Mask:

@@ -81,9 +81,7 @@ def plot_trajectory(
         _draw_evaluated_paths(seen, reference, evaluation)
         _draw_errors(over_time, evaluation)
         plots.suptitle(str(evaluation), fontsize=8, family="monospace", x=0.02, ha="left")
-    picture = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(picture)
-    write_atomically(path, picture.getvalue(), TrajectoryError)
+    _write_png(figure, path)
 
 
 def plot_map(map: Map, trajectory: Trajectory, path: str | os.PathLike[str]) -> None:
@@ -127,6 +125,10 @@ def plot_map(map: Map, trajectory: Trajectory, path: str | os.PathLike[str]) -> 
         f" {len(map.loops.source)} loops, {len(np.unique(map.submap))} submaps",
         fontsize=10,
     )
+    _write_png(figure, path)
+
+
+def _write_png(figure: Figure, path: str | os.PathLike[str]) -> None:
     picture = io.BytesIO()
     FigureCanvasAgg(figure).print_png(picture)
     write_atomically(path, picture.getvalue(), TrajectoryError)

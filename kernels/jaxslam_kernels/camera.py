@@ -59,6 +59,11 @@ def make_intrinsics(
     return Intrinsics(*scalars, distortion=jnp.asarray(coefficients, dtype))
 
 
+def without_distortion(intrinsics: Intrinsics) -> Intrinsics:
+    """The ideal pinhole camera of the same focal lengths and principal point."""
+    return intrinsics._replace(distortion=jnp.zeros_like(intrinsics.distortion))
+
+
 def in_front(X_cam: Points) -> Mask:
     """True for finite points at least `MIN_DEPTH` in front of the camera."""
     return jnp.isfinite(X_cam).all(axis=0) & (X_cam[2] > MIN_DEPTH)

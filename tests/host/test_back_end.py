@@ -6,7 +6,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,6 @@ from jaxslam.slam import Slam
 from jaxslam.state import TrackStatus
 from jaxslam.trajectory import write_tum
 
-COMPILED = "/jax/core/compile/backend_compile_duration"
 FRAMES = 72
 INLINE, LIVE = (Config(track=TRACK, run=RunConfig(deterministic=inline)) for inline in (True, False))
 KINDS = pytest.mark.parametrize("config", [INLINE, LIVE], ids=["inline", "live"])
@@ -108,20 +107,6 @@ def write_run(folder: Path) -> None:
         assert len(slam.map.ids) >= 4
         write_tum(folder / "trajectory", slam.trajectory)
         slam.save(folder / "map")
-
-
-@pytest.fixture
-def compiled() -> Iterator[list[str]]:
-    """The names of the programs XLA compiles, or loads from the cache on disk, during a test."""
-    names: list[str] = []
-
-    def listener(event: str, duration_secs: float, **details: str | int) -> None:
-        if event == COMPILED:
-            names.append(str(details.get("fun_name")))
-
-    jax.monitoring.register_event_duration_secs_listener(listener)
-    yield names
-    jax.monitoring.unregister_event_duration_listener(listener)
 
 
 class TestCompiling:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from result_files import FILES
 
 from jaxslam import Camera, TrackParams, TrackPlan, TrackStatus
 from jaxslam.xla import cache_dir
@@ -22,15 +23,6 @@ README = ROOT / "README.md"
 CONTRIBUTING = ROOT / ".github" / "CONTRIBUTING.md"
 _FENCED = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 _SET_UP = re.compile(r"^python -m venv \.venv && \.venv/bin/pip install (?:\.|-e '\.\[dev\]') && ")
-FILES = {
-    "trajectory.txt",
-    "trajectory_online.txt",
-    "trajectory_keyframes.txt",
-    "summary.json",
-    "config.yaml",
-    "plot.png",
-    "map.png",
-}
 
 
 class _Block(NamedTuple):

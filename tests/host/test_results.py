@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from evo.tools import file_interface
+from result_files import FILES
 from small_scene import CONFIG, clip
 
 from jaxslam.cli import main
@@ -15,15 +16,6 @@ from jaxslam.results import RunInfo, Snapshots, write_results
 from jaxslam.slam import Slam
 from jaxslam.trajectory import Trajectory, read_tum
 
-FILES = {
-    "trajectory.txt",
-    "trajectory_online.txt",
-    "trajectory_keyframes.txt",
-    "summary.json",
-    "config.yaml",
-    "plot.png",
-    "map.png",
-}
 PROMISED = {
     *("frames", "tracked", "tracked_percent", "ate_rmse_m", "ate_sim3_rmse_m", "rpe_trans_m_per_s"),
     *("rpe_rot_deg_per_s", "track_ms", "compile_s", "wall_s", "peak_rss_mb", "preset", "deterministic", "versions"),

@@ -3,7 +3,6 @@
 import dataclasses
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -17,7 +16,6 @@ from jaxslam.state import TrackStatus
 from jaxslam.tracked import FrameRecord
 from jaxslam.trajectory import write_tum
 
-COMPILED = "/jax/core/compile/backend_compile_duration"
 MOST_PROGRAMS = 24
 """Measured: 22. The tracker is one, the changes to its state three, the map's kernels six; the first state, and what
 makes numbers of the settings, are the others."""
@@ -93,20 +91,6 @@ class TestDeterminism:
             [sys.executable, "-c", script, str(Path(__file__).parent), str(tmp_path / "there")], check=True, timeout=600
         )
         assert (tmp_path / "here").read_bytes() == (tmp_path / "there").read_bytes()
-
-
-@pytest.fixture
-def compiled() -> Iterator[list[str]]:
-    """The names of the programs XLA compiles, or loads from the cache on disk, during a test."""
-    names: list[str] = []
-
-    def listener(event: str, duration_secs: float, **details: str | int) -> None:
-        if event == COMPILED:
-            names.append(str(details.get("fun_name")))
-
-    jax.monitoring.register_event_duration_secs_listener(listener)
-    yield names
-    jax.monitoring.unregister_event_duration_listener(listener)
 
 
 class TestCompiling:

@@ -1,0 +1,11 @@
+"""What a run leaves in its folder."""
+
+FILES = {
+    "trajectory.txt",
+    "trajectory_online.txt",
+    "trajectory_keyframes.txt",
+    "summary.json",
+    "config.yaml",
+    "plot.png",
+    "map.png",
+}
