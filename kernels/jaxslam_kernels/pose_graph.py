@@ -162,14 +162,10 @@ def optimise_pose_graph(
         max_iterations: Bound on the iterations of conjugate gradients in a step, static.
         group_size: Nodes in a group of the preconditioner, static; see `suitable_group_size`.
         elimination: Where the normal equations are solved, static. "host" calls back to SciPy from compiled code, and
-            then `rank`, `max_iterations` and `group_size` matter to derivatives only, or not at all; it needs two
-            threads of XLA.
+            then `rank`, `max_iterations` and `group_size` matter to derivatives only, or not at all.
 
     Returns:
         A `PoseGraph`; everything in it is finite, and so are its derivatives.
-
-    Raises:
-        ValueError: While tracing, for "host" where XLA has one thread only.
     """
     k, d = fixed.shape[0], 6 if scales is None else 7
     mask = jnp.ones(k, bool) if mask is None else mask

@@ -8,7 +8,6 @@ Source: Li, "An Overview of SuperLU", 2005; Liu, "Modification of the Minimum-De
 Elimination", 1985, for the order.
 """
 
-import os
 from functools import partial
 from typing import Any
 
@@ -22,44 +21,43 @@ from scipy.sparse.linalg import splu
 
 from jaxslam_kernels.block_band import GraphMatrix, Vector
 
+_PIECE = 2**14  # words, 64 kB
 _SYMMETRIC: dict[str, Any] = {"diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
 
 
 def solve_on_host(matrix: GraphMatrix, right: Vector) -> Vector:
-    """The solution, computed in double precision; not finite where the matrix is not, or is singular.
-
-    Raises:
-        ValueError: While tracing, where XLA has one thread: the callback would wait for arrays that this thread is to
-            bring, for ever (seen with 1000 nodes, not with 250).
-    """
-    if num_threads() < 2:
-        raise ValueError("elimination: 'host' needs two threads of XLA, got one (NPROC=1, or one core): use 'band'")
-    # As bits: in the thread that calls back, JAX rounds to single precision whatever `enable_x64` says here.
-    numbers = [_bits(values) for values in (matrix.diagonal, matrix.coupling, right)]
-    indices = [index.astype(jnp.int32) for index in (matrix.source, matrix.target)]
-    shape = jax.ShapeDtypeStruct(numbers[2].shape, jnp.uint32)
-    solve = partial(_solve_bits, np.dtype(right.dtype))
-    found = jax.pure_callback(solve, shape, *numbers, *indices, vmap_method="sequential")
+    """The solution, computed in double precision; not finite where the matrix is not, or is singular."""
+    # As words: in the thread that calls back, JAX rounds to single precision whatever `enable_x64` says here.
+    arrays = [lax.bitcast_convert_type(values, jnp.uint32) for values in (matrix.diagonal, matrix.coupling, right)]
+    arrays += [index.astype(jnp.uint32) for index in (matrix.source, matrix.target)]
+    shapes = tuple(array.shape for array in arrays)
+    solve = partial(_solve_words, shapes, np.dtype(right.dtype))
+    pieces = [_pieces(array.ravel()) for array in arrays]
+    result = jax.ShapeDtypeStruct(shapes[2], jnp.uint32)
+    found = jax.pure_callback(solve, result, pieces, vmap_method="sequential")
     return lax.bitcast_convert_type(found, right.dtype)
 
 
-def num_threads() -> int:
-    """How many threads XLA has."""
-    chosen = os.environ.get("NPROC", "")
-    if chosen.isdigit() and int(chosen) > 0:
-        return int(chosen)
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+def _pieces(words: Array) -> list[Array]:
+    """JAX copies what it hands to a callback here and now only up to 100 kB; more is left to XLA's threads.
+
+    With one thread, which is the one that calls back, that copy never comes.
+    """
+    return jnp.split(words, list(range(_PIECE, words.size, _PIECE)))
 
 
-def _bits(values: Array) -> Array:
-    return lax.bitcast_convert_type(values, jnp.uint32)  # two words a double
+def _solve_words(shapes: tuple[tuple[int, ...], ...], dtype: np.dtype, pieces: list[list[Any]]) -> np.ndarray:
+    arrays = [np.concatenate(p).reshape(shape) for p, shape in zip(pieces, shapes, strict=True)]
+    diagonal, coupling, right = (_numbers(words, dtype) for words in arrays[:3])
+    source, target = (index.astype(np.int32) for index in arrays[3:])
+    found = _solve(diagonal, coupling, right, source, target)
+    return np.ascontiguousarray(found).view(np.uint32).reshape(shapes[2])
 
 
-def _solve_bits(dtype: np.dtype, *arrays: Any) -> np.ndarray:
-    diagonal, coupling, right, source, target = (np.ascontiguousarray(array) for array in arrays)
-    blocks = [words.view(dtype).reshape(words.shape[:3]) for words in (diagonal, coupling)]
-    found = _solve(blocks[0], blocks[1], right.view(dtype).reshape(right.shape[:2]), source, target)
-    return np.ascontiguousarray(found).view(np.uint32).reshape(right.shape)
+def _numbers(words: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    """Words back to numbers; a double has two, along a last axis of their own."""
+    numbers = words.view(dtype)
+    return numbers[..., 0] if dtype.itemsize > words.itemsize else numbers
 
 
 def _solve(

@@ -15,13 +15,11 @@ from jaxlie import SE3
 from jaxslam_kernels.block_band import GraphMatrix, factorise, solve_factor
 from jaxslam_kernels.pose_graph import PoseGraphStatus, band_rank, optimise_pose_graph
 from jaxslam_kernels.pose_graph_cost import PoseGraphEdges, graph_equations, graph_nodes, graph_problem
-from jaxslam_kernels.pose_graph_sparse import num_threads
 from kernels.pose_graph_cases import Graph, read_g2o
 from scipy.sparse import bsr_array, coo_array
 from scipy.sparse.linalg import splu
 
 pytestmark = pytest.mark.benchmark
-two_threads = pytest.mark.skipif(num_threads() < 2, reason="elimination on the host: start with NPROC=2")
 
 
 def _load(data_dir: Path, name: str) -> tuple[Graph, SE3, PoseGraphEdges, np.ndarray, int]:
@@ -75,7 +73,6 @@ def test_one_linear_solve_against_scipy(data_dir, name):
     assert comparison.processor_ratio < 4.0
 
 
-@two_threads
 @pytest.mark.parametrize("name", ["sphere2500.g2o", "parking-garage.g2o", "input_M3500_g2o.g2o"])
 def test_whole_solve_against_gtsam(data_dir, name):
     """From the file's poses to the optimum, in single and double precision, steps eliminated on the host.
