@@ -11,21 +11,24 @@ from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import numpy as np
+from jaxlie import SE3
 
 from jaxslam.camera import Camera
 from jaxslam.config import Config
 from jaxslam.essential_graph import compile_graph
-from jaxslam.features import features_of, no_features
+from jaxslam.feature_pose import MIN_INLIERS
+from jaxslam.features import Features, features_of, no_features
 from jaxslam.frame_arrays import FrameArrays
+from jaxslam.local_map import match_local_map
 from jaxslam.local_mapping import LocalMapping, NewKeyframe, mapping_plan, with_new_keyframe
 from jaxslam.loop_closing import LoopClosing, LoopClosure
 from jaxslam.map import NONE, Map, empty_map
-from jaxslam.map_link import Hung, MapLink
+from jaxslam.map_link import Hung, MapLink, pose_of
 from jaxslam.place_index import PlaceIndex
-from jaxslam.place_recognition import MIN_INLIERS, compile_recognition, recognise
-from jaxslam.pose import IDENTITY, compose
+from jaxslam.place_recognition import compile_recognition, recognise
+from jaxslam.pose import IDENTITY, compose, inverse, transform
 from jaxslam.recall import Recalled, recall, worth_recalling
-from jaxslam.state import TrackOutput, TrackParams, TrackPlan, TrackState
+from jaxslam.state import TrackOutput, TrackParams, TrackPlan, TrackReason, TrackState, TrackStatus
 from jaxslam.state_edit import relocated
 from jaxslam.track import init_state
 from jaxslam.worker import InlineWorker, ThreadWorker, Worker, close_all
@@ -36,6 +39,20 @@ _RECALL_EVERY = 10
 """Frames after which a tracker that only localises gets other keyframes."""
 _PATIENCE_S = 0.02
 """Longest wait for the index of places, while lost; the next frame asks again."""
+
+
+class Placed(NamedTuple):
+    """Where a frame was taken, by points of the map found in it.
+
+    Attributes:
+        hung: The pose.
+        num_matched: Points that agree on it.
+        covariance: `(6, 6)` in the tangent space at the camera: translation (m), then rotation (rad).
+    """
+
+    hung: Hung
+    num_matched: int
+    covariance: np.ndarray
 
 
 class _Look(NamedTuple):
@@ -160,20 +177,60 @@ class BackEnd:
             new = self._link.keyframe_made(timestamp_ns, _copied(arrays), output, recognised)
             self._to_mapping.offer(new, frame)
 
-    def recognise(self, arrays: FrameArrays) -> tuple[Hung | None, bool]:
-        """Where a frame was taken, if the map shows that place; and whether the frame may begin a new submap.
+    def held_to_map(
+        self, state: TrackState, arrays: FrameArrays, output: TrackOutput
+    ) -> tuple[TrackState, TrackOutput, int]:
+        """A frame whose flow is weak, with the pose that points of the map around it give it.
 
-        It may if it shows enough to tell that it is another place, and the map may grow.
+        Returns:
+            State and output, and how many points agree on the pose; as they were and 0 if too few do.
+        """
+        pose = pose_of(output)
+        placed = self._in_local_map(
+            features_of(arrays, np.asarray(output.twist), self._params, self._plan.features), pose
+        )
+        if placed is None:
+            return state, output, 0
+        T_world_cam = self._link.pose(placed.hung)
+        state = self._link.moved_to(state, T_world_cam, pose, is_keyframe=bool(output.keyframe))
+        X_world = transform(compose(T_world_cam, inverse(pose)), np.asarray(output.X_world, np.float64))
+        fine = placed.num_matched >= self._config.track.weak_inliers
+        wxyz_xyz: Any = T_world_cam.astype(np.float32)
+        output = output._replace(
+            T_world_cam=SE3(wxyz_xyz),
+            X_world=X_world.astype(np.float32),
+            covariance=placed.covariance.astype(np.float32),
+            status=TrackStatus.OK if fine else output.status,
+            reason=TrackReason.NONE if fine else output.reason,
+        )
+        return state, output, placed.num_matched
+
+    def regain(self, arrays: FrameArrays, predicted: np.ndarray | None) -> tuple[Placed | None, bool]:
+        """Where a frame was taken that flow has lost, if the map shows that place.
+
+        Args:
+            arrays: The frame.
+            predicted: `(7,)` where the camera may be, if it was lost just now.
+
+        Returns:
+            Where; and if nowhere, whether the frame may begin a new submap: it may if it shows enough to tell that it
+            is another place, and the map may grow.
         """
         features = features_of(arrays, np.zeros(6, np.float32), self._params, self._plan.features)
-        if np.count_nonzero(features.depth) < MIN_INLIERS or not self._lock.acquire(timeout=_PATIENCE_S):
+        if np.count_nonzero(features.depth) < MIN_INLIERS:
+            return None, False
+        near = None if predicted is None else self._in_local_map(features, predicted)
+        if near is not None:
+            return near, False
+        if not self._lock.acquire(timeout=_PATIENCE_S):
             return None, False
         try:
             found = recognise(self.map, self._index, features, self._params, plan=self._plan.features)
         finally:
             self._lock.release()
-        hung = None if found is None else Hung(found.keyframe, found.T_keyframe_cam)
-        return hung, not self._localize_only
+        if found is None:
+            return None, not self._localize_only
+        return Placed(Hung(found.keyframe, found.T_keyframe_cam), found.num_inliers, found.covariance), False
 
     def relocated(self, state: TrackState, recognised: Hung) -> TrackState:
         """The state of the tracker begun anew where the map recognised a place, with keyframes of it at hand."""
@@ -219,6 +276,18 @@ class BackEnd:
         """End the threads, with the jobs they have not begun, in less than two seconds."""
         self._closed = True
         close_all((self._to_mapping, self._to_places))
+
+    def _in_local_map(self, features: Features, T_world_cam: np.ndarray) -> Placed | None:
+        """Where a frame was taken that is about at a pose, if the map around shows it."""
+        about = self._link.in_map(T_world_cam)
+        if about is None:
+            return None
+        found = match_local_map(
+            self.map, about.keyframe, about.T_keyframe_cam, features, self._params, self._plan.features
+        )
+        if found is None:
+            return None
+        return Placed(Hung(about.keyframe, found.T_origin_cam), len(found.agree), found.covariance)
 
     def _compile_edits(self, height: int, width: int) -> None:
         """Compile the changes to the tracker's state, on one that holds nothing."""

@@ -22,6 +22,7 @@ from jaxslam.culling import CONFIRM_WITHIN, without_redundant, without_unconfirm
 from jaxslam.features import FeaturePlan, Features, features_of
 from jaxslam.frame_arrays import FrameArrays
 from jaxslam.local_adjustment import AdjustPlan, adjust_all, adjust_around, compile_adjustment
+from jaxslam.local_map import LOCAL_KEYFRAMES, local_keyframes
 from jaxslam.loop_closing import LoopClosure
 from jaxslam.loop_correction import with_loop_closed
 from jaxslam.map import NONE, Keyframe, Map, Sightings, covisible, empty_map, has, point_submaps, rows, standing
@@ -33,10 +34,8 @@ from jaxslam.observe import observe
 from jaxslam.pose import compose, transform
 from jaxslam.state import TrackParams
 
-_LOCAL_KEYFRAMES = 15
-"""Keyframes whose points are sought in a new one,"""
 _PART_KEYFRAMES = 30
-"""and those that mapping looks at and changes at all."""
+"""Keyframes that mapping looks at and changes at all, for a new one."""
 _FUSE_KEYFRAMES = 6
 _LOOP_KEYFRAMES = 96
 """Keyframes around a loop that are adjusted when it is closed: where those that see the same do not yet agree."""
@@ -162,7 +161,7 @@ class LocalMapping:
         whole = with_loop_closed(self.map, loop)
         part = part_around(whole, _around_loop(whole, loop))
         near = covisible(part.map, loop.source)[0]
-        near = near[has(part.keyframes, near) & (near != loop.target)][:_LOCAL_KEYFRAMES]
+        near = near[has(part.keyframes, near) & (near != loop.target)][:LOCAL_KEYFRAMES]
         map = self._fused(part.map, loop.target, np.append(np.int64(loop.source), near))
         map = adjust_around(map, loop.target, self._plan.adjust, part.keyframes)
         self.map = put_back(whole, part, adjust_all(map, self._plan.adjust, part.keyframes))
@@ -208,8 +207,7 @@ class LocalMapping:
 
     def _with_found_points(self, map: Map, keyframe_id: int, features: Features) -> tuple[Map, np.ndarray]:
         """Points of the map that its neighbours see, found in it by their descriptor; and the features they are."""
-        near, _ = covisible(map, keyframe_id, at_least=1)
-        points = recognisable_in(map, near[:_LOCAL_KEYFRAMES])
+        points = recognisable_in(map, local_keyframes(map, keyframe_id))
         plan = self._plan.features
         index, feature = find_points(map, points, features, map.pose(keyframe_id), plan, radius_px=self._plan.search_px)
         return with_sightings(map, feature_sightings(keyframe_id, features, points.ids[index], feature, plan)), feature
@@ -272,7 +270,7 @@ def _ideal(
 def _part(map: Map, keyframe_id: int, known: np.ndarray) -> Part:
     """The part of a map that a new keyframe may change, given the points of it that the tracker saw."""
     latest = map.ids[map.ids >= keyframe_id - CONFIRM_WITHIN]
-    near = np.concatenate([most_shared(map, known, _LOCAL_KEYFRAMES), latest])
+    near = np.concatenate([most_shared(map, known, LOCAL_KEYFRAMES), latest])
     parent = map.parent[map.row(keyframe_id)]
     near = np.append(near, parent) if parent != NONE else near
     around = most_shared(map, part_around(map, near).map.points.ids, _PART_KEYFRAMES)

@@ -70,6 +70,18 @@ class MapLink:
         """`(7,)` where a pose is in the map as it is now."""
         return compose(self._in_map(hung.keyframe), hung.T_keyframe_cam)
 
+    def in_map(self, T_world_cam: np.ndarray) -> Hung | None:
+        """A pose of the tracker tied to a keyframe that is in the map; `None` if there is none yet."""
+        if self.reference == NONE:
+            return None
+        hung = self.hang(T_world_cam)
+        while (above := self._on_the_way.get(hung.keyframe)) is not None:
+            hung = Hung(above.keyframe, compose(above.T_keyframe_cam, hung.T_keyframe_cam))
+        if hung.keyframe == NONE:
+            return None
+        standing_id = int(standing(self.map, np.array([hung.keyframe]))[0])
+        return Hung(standing_id, between(self.map.pose(standing_id), self.pose(hung)))
+
     def believed(self, keyframe_id: int) -> np.ndarray:
         """`(7,)` where the tracker believes a keyframe to be."""
         return self._believed[keyframe_id]
@@ -85,12 +97,8 @@ class MapLink:
 
     def submap_now(self) -> int:
         """Number of the submap that the frames are in."""
-        id = self.reference
-        while (hung := self._on_the_way.get(id)) is not None:
-            id = hung.keyframe
-        if id == NONE:
-            return self._submap
-        return int(self.map.submap[self.map.row(int(standing(self.map, np.array([id]))[0]))])
+        hung = self.in_map(IDENTITY)
+        return self._submap if hung is None else int(self.map.submap[self.map.row(hung.keyframe)])
 
     def keyframe_made(
         self, timestamp_ns: int, frame: FrameArrays, output: TrackOutput, recognised: Hung | None
@@ -103,7 +111,7 @@ class MapLink:
             output: What it said.
             recognised: Where it is in the map, if tracking began at a place that was recognised.
         """
-        pose = compose(np.asarray(output.T_world_cam.wxyz_xyz, np.float64), IDENTITY)  # of unit length in float64
+        pose = pose_of(output)
         first = int(output.status) == TrackStatus.STARTED and recognised is None
         if first and self.reference != NONE:
             self._submap += 1  # nothing ties the frame to those before
@@ -139,6 +147,21 @@ class MapLink:
         self._believed = new
         return _carried(state, now.astype(np.float32), corrections.astype(np.float32)), now
 
+    def moved_to(self, state: TrackState, T_world_cam: np.ndarray, before: np.ndarray, is_keyframe: bool) -> TrackState:
+        """The tracker's state with the camera moved, and with it what it saw last; keyframes stay but this frame.
+
+        Args:
+            state: The state.
+            T_world_cam: `(7,)` where the camera is.
+            before: `(7,)` where it was taken to be.
+            is_keyframe: Whether the frame is the tracker's newest keyframe, not handed over yet.
+        """
+        change = compose(T_world_cam, inverse(before)).astype(np.float32)
+        corrections = np.tile(IDENTITY.astype(np.float32), (len(self._slots), 1))
+        if is_keyframe:
+            corrections[self._made % self._plan.num_keyframes] = change
+        return _carried(state, change, corrections)
+
     def latest(self) -> list[int]:
         """The keyframes in the tracker's ring."""
         return [id for id in self._slots[: self._plan.num_keyframes] if id != NONE]
@@ -164,6 +187,11 @@ class MapLink:
         if hung is None:
             return self.map.pose(keyframe_id)
         return hung.T_keyframe_cam if hung.keyframe == NONE else self.pose(hung)
+
+
+def pose_of(output: TrackOutput) -> np.ndarray:
+    """`(7,)` the pose, its quaternion of unit length in float64."""
+    return compose(np.asarray(output.T_world_cam.wxyz_xyz, np.float64), IDENTITY)
 
 
 def knows(map: Map, keyframe_id: int) -> bool:

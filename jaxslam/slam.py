@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.back_end import BackEnd
+from jaxslam.back_end import BackEnd, Placed
 from jaxslam.camera import Camera
 from jaxslam.config import Config, TrackConfig
 from jaxslam.datasets import Dataset, prefetch
@@ -153,12 +153,16 @@ class Slam:
         self._state, correction = self._back.update(self._state, self._frame)
         dt_s = 1 / self.camera.fps if self._last_ns is None else (frame.timestamp_ns - self._last_ns) * 1e-9
         arrays = frame_arrays(frame, dt_s)
-        output, recognised = self._advance(arrays), None
+        output, placed, num_matched = self._advance(arrays), None, 0
         if output.status == TrackStatus.LOST:
-            output, recognised = self._regain(arrays, output)
+            output, placed = self._regain(arrays, output, dt_s)
+            num_matched = 0 if placed is None else placed.num_matched
+        elif output.status == TrackStatus.WEAK:
+            self._state, output, num_matched = self._back.held_to_map(self._state, arrays, output)
         if output.keyframe:
-            self._back.keyframe_made(frame.timestamp_ns, arrays, output, self._frame, recognised)
-        tracked = tracked_of(frame.timestamp_ns, output, correction, recognised is not None)
+            hung = None if placed is None else placed.hung
+            self._back.keyframe_made(frame.timestamp_ns, arrays, output, self._frame, hung)
+        tracked = tracked_of(frame.timestamp_ns, output, correction, num_matched, relocalised=placed is not None)
         self._last_ns = frame.timestamp_ns
         tracked = self._recorded(tracked, dt_s)
         self._frame += 1
@@ -254,12 +258,14 @@ class Slam:
         self._state, output = _step(self._state, arrays, self._params, self._plan)
         return jax.device_get(output)
 
-    def _regain(self, arrays: FrameArrays, lost: TrackOutput) -> tuple[TrackOutput, Hung | None]:
-        """The frame once more, from where the map recognises it; or from the pose held, if the settings say so."""
-        recognised, shows_enough = self._back.recognise(arrays)
+    def _regain(self, arrays: FrameArrays, lost: TrackOutput, dt_s: float) -> tuple[TrackOutput, Placed | None]:
+        """The frame once more, from where the map shows it; or from the pose held, if the settings say so."""
+        lost_s = self._lost_s + dt_s
+        predicted = moved(self._last_pose, self._last_twist * lost_s) if self._poses and lost_s < _PREDICTED_S else None
+        placed, shows_enough = self._back.regain(arrays, predicted)
         self._unrecognised += shows_enough
-        if recognised is not None:
-            self._state = self._back.relocated(self._state, recognised)
+        if placed is not None:
+            self._state = self._back.relocated(self._state, placed.hung)
         elif (
             self.config.run.on_loss == "submap" and self._unrecognised > self.config.track.restart_after and self._poses
         ):
@@ -268,7 +274,7 @@ class Slam:
             return lost, None
         output = self._advance(arrays)
         if output.status == TrackStatus.STARTED:
-            return output, recognised
+            return output, placed
         self._state = self._state._replace(lost_frames=jnp.zeros((), jnp.int32))  # not to start by itself
         return output, None
 

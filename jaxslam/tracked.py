@@ -21,7 +21,9 @@ class Tracked:
         twist: `(6,)` velocity of the camera in its own axes: m/s, then rad/s.
         num_inliers: Followed points that agree with the pose.
         inlier_ratio: Their share of the points that could be followed.
-        num_looked_up: Points found again in keyframes.
+        num_looked_up: Points found again in keyframes, by their picture.
+        num_matched: Points of the map that were found by their descriptor and agree with the pose, sought where flow
+            is weak or lost.
         residual_px: Robust standard deviation of the inliers' reprojection error, pixels.
         uv: `(2, n)` float32 pixels of the points in the frame, those just found included.
         weights: `(n,)` float32 weight of each, 0 to 1; 0 for a slot without a point.
@@ -41,6 +43,7 @@ class Tracked:
     num_inliers: int
     inlier_ratio: float
     num_looked_up: int
+    num_matched: int
     residual_px: float
     uv: np.ndarray
     weights: np.ndarray
@@ -86,6 +89,7 @@ class FrameRecord:
     num_inliers: int = 0
     inlier_ratio: float = 0.0
     num_looked_up: int = 0
+    num_matched: int = 0
     residual_px: float = 0.0
     is_keyframe: bool = False
     track_ms: float | None = None
@@ -96,7 +100,9 @@ class FrameRecord:
         return cls(**{field.name: getattr(result, field.name) for field in fields(cls) if hasattr(result, field.name)})
 
 
-def tracked_of(timestamp_ns: int, output: TrackOutput, correction: np.ndarray, relocalised: bool) -> Tracked:
+def tracked_of(
+    timestamp_ns: int, output: TrackOutput, correction: np.ndarray, num_matched: int, *, relocalised: bool
+) -> Tracked:
     """The result of a frame, from what the compiled step said of it."""
     return Tracked(
         timestamp_ns=timestamp_ns,
@@ -108,6 +114,7 @@ def tracked_of(timestamp_ns: int, output: TrackOutput, correction: np.ndarray, r
         num_inliers=int(output.num_inliers),
         inlier_ratio=float(output.inlier_ratio),
         num_looked_up=int(output.num_looked_up),
+        num_matched=num_matched,
         residual_px=float(output.residual_px),
         uv=np.asarray(output.uv),
         weights=np.asarray(output.weights),

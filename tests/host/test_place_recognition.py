@@ -10,15 +10,16 @@ import pytest
 from room_views import FRAMES, STILL, features, map_of, params, room
 from scipy.spatial.transform import Rotation, Slerp
 
-from jaxslam import place_recognition as module
+from jaxslam import feature_pose, place_recognition
 from jaxslam.config import TrackConfig
 from jaxslam.datasets import Dataset, open_dataset
+from jaxslam.feature_pose import MAX_SIGMA_M, MIN_INLIERS
 from jaxslam.features import Features, features_of
 from jaxslam.frame_arrays import frame_arrays
 from jaxslam.map import NONE, Keyframe, Map, empty_map
 from jaxslam.map_edit import with_keyframe, without_keyframe
 from jaxslam.place_index import PlaceIndex
-from jaxslam.place_recognition import MAX_SIGMA_M, MIN_INLIERS, Recognition, recognise, verify
+from jaxslam.place_recognition import Recognition, recognise, verify
 from jaxslam.pose import angle, between
 from jaxslam.slam import track_params
 
@@ -207,13 +208,13 @@ def test_too_little_to_be_certain(round_map, monkeypatch):
     flat = keyframe._replace(features=keyframe.features._replace(depth=np.zeros_like(whole.depth)))
     assert verify(flat, whole, params()) is None
     for gates, certain in (((12, 1.0), False), ((1, 0.03), False), ((1, 1.0), True)):  # each alone refuses the corner
-        monkeypatch.setattr(module, "MIN_CELLS", gates[0])
-        monkeypatch.setattr(module, "MAX_SIGMA_M", gates[1])
+        monkeypatch.setattr(feature_pose, "MIN_CELLS", gates[0])
+        monkeypatch.setattr(feature_pose, "MAX_SIGMA_M", gates[1])
         assert (verify(keyframe, take(corner), params()) is not None) == certain
 
 
 def test_compiles_once(round_map, monkeypatch):
-    for name in ("_agreed", "_refined"):
+    for module, name in ((place_recognition, "_agreed"), (feature_pose, "_refined")):
         monkeypatch.setattr(module, name, jax.jit(eqx.debug.assert_max_traces(getattr(module, name), max_traces=1)))
     found = [verify(round_map.keyframes[0], features(index), params()) for index in (0, 10)]
     assert all(found)

@@ -1,6 +1,5 @@
 """Losses and what comes after: the same world again, the policies, and a map kept in a file."""
 
-import functools
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -9,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from room_round import FPS, FRAMES, TRACK, room
 from small_map import same
-from small_scene import Clip
 
 from jaxslam.camera import Camera
 from jaxslam.cli import main
 from jaxslam.config import Config, RunConfig, TrackConfig
 from jaxslam.datasets import Dataset, open_dataset
-from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset, write_tum
+from jaxslam.datasets.synthetic import SyntheticDataset, write_tum
 from jaxslam.evaluation import evaluate
 from jaxslam.frame import Frame
 from jaxslam.map import empty_map
@@ -29,29 +28,10 @@ from jaxslam.tracked import Tracked
 from jaxslam.trajectory import Trajectory
 from jaxslam.trajectory import read as read_trajectory
 
-WIDTH, HEIGHT, FPS, FRAMES = 320, 240, 15.0, 166
-TRACK = TrackConfig(
-    num_points=256, num_levels=3, num_keyframes=6, num_sources=2, points_per_source=96, num_hypotheses=32, cell_px=16
-)
 CONFIG = Config(track=TRACK)
 HOLD, PREDICT, SUBMAP = (replace(CONFIG, run=RunConfig(on_loss=policy)) for policy in ("hold", "predict", "submap"))
 BLACK = None
 Order = Sequence[int | None]
-
-
-@functools.cache
-def _source() -> SyntheticDataset:
-    """A third of a round of the room."""
-    return SyntheticDataset(SyntheticConfig(width=WIDTH, height=HEIGHT, frames=FRAMES, people=0, path="loop", fps=FPS))
-
-
-@functools.cache
-def _frames() -> tuple[Frame, ...]:
-    return tuple(_source()[index] for index in range(FRAMES))
-
-
-def room() -> Clip:
-    return Clip(_source(), _frames())
 
 
 class Played:
@@ -298,7 +278,7 @@ class TestFile:
             Played(slam, room(), range(40, 60), FPS)
             slam.reset()
             assert slam.map is start
-            assert slam.track(_frames()[20]).status is TrackStatus.RELOCALISED
+            assert slam.track(room()[20]).status is TrackStatus.RELOCALISED
 
 
 SETTINGS = [
@@ -312,7 +292,7 @@ SETTINGS = [
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The first frames as a recording in files."""
     folder = tmp_path_factory.mktemp("recordings") / "room"
-    write_tum(SyntheticDataset(replace(_source().config, frames=40)), folder)
+    write_tum(SyntheticDataset(replace(room().source.config, frames=40)), folder)
     return folder
 
 
