@@ -73,9 +73,19 @@ def check_frame(frame: Frame, width: int, height: int, last_timestamp_ns: int | 
         )
 
 
-def to_grey(image: np.ndarray) -> np.ndarray:
-    """`(height, width)` uint8 grey of an RGB image (ITU-R BT.601 weights); a grey image stays as it is."""
-    return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+def to_grey(image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+    """`(height, width)` uint8 grey of an RGB image (ITU-R BT.601 weights); a grey image stays as it is.
+
+    Args:
+        image: `(height, width, 3)` or `(height, width)`.
+        out: `(height, width)` uint8, where to put it; then that comes back.
+    """
+    if image.ndim == 3:
+        return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY, dst=out)
+    if out is None:
+        return image
+    np.copyto(out, image)
+    return out
 
 
 def _check_timestamp(field: str, timestamp_ns: object) -> None:

@@ -1,5 +1,6 @@
 """Frames as the compiled step takes them: one, or a clip of them with time as the first axis."""
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -9,6 +10,8 @@ from numpy.typing import DTypeLike
 
 from jaxslam.errors import FrameError
 from jaxslam.frame import Frame, to_grey
+
+_ALIGNMENT = 64  # bytes
 
 
 class FrameArrays(NamedTuple):
@@ -38,16 +41,34 @@ def frame_arrays(frame: Frame, dt_s: float, dtype: DTypeLike = np.float32) -> Fr
         dtype: Floating-point type of everything but the image, that of the state.
     """
     ignore = np.zeros(frame.depth_m.shape, bool) if frame.dynamic_mask is None else frame.dynamic_mask
-    delay_ns = 0 if frame.depth_timestamp_ns is None else frame.depth_timestamp_ns - frame.timestamp_ns
-    # Left to the call of the compiled step to convert: a separate copy of every image would cost 0.3 ms.
-    arrays: Any = (
-        to_grey(frame.image),
-        frame.depth_m.astype(dtype, copy=False),
-        ignore,
-        np.asarray(dt_s, dtype),
-        np.asarray(delay_ns * 1e-9, dtype),
-    )
+    depth = frame.depth_m.astype(dtype, copy=False)
+    arrays: Any = (to_grey(frame.image), depth, ignore, *_times(frame, dt_s, dtype))
     return FrameArrays(*arrays)
+
+
+class FrameMemory:
+    """Room for the arrays of one frame, filled anew with each.
+
+    It begins at multiples of 64 bytes. XLA computes on such arrays in place, in the calling thread; others it copies in
+    a thread of its own, where the step then waits for what mapping has XLA do.
+    """
+
+    def __init__(self, height: int, width: int) -> None:
+        """Make room for frames of one size."""
+        self._image, self._depth = _aligned((height, width), np.uint8), _aligned((height, width), np.float32)
+        self._ignore, self._nothing = (_aligned((height, width), np.bool_) for _ in range(2))
+        self._nothing[:] = False
+
+    def hold(self, frame: Frame, dt_s: float) -> FrameArrays:
+        """The arrays of a frame, as of `frame_arrays`, until the next one is held."""
+        to_grey(frame.image, out=self._image)
+        np.copyto(self._depth, frame.depth_m)
+        ignore = self._nothing
+        if frame.dynamic_mask is not None:
+            ignore = self._ignore
+            np.copyto(ignore, frame.dynamic_mask)
+        arrays: Any = (self._image, self._depth, ignore, *_times(frame, dt_s, np.float32))
+        return FrameArrays(*arrays)
 
 
 def stack_frames(frames: Sequence[Frame], previous_ns: int | None = None, dtype: DTypeLike = np.float32) -> FrameArrays:
@@ -73,3 +94,15 @@ def stack_frames(frames: Sequence[Frame], previous_ns: int | None = None, dtype:
     arrays = [frame_arrays(frame, step_s, dtype) for frame, step_s in zip(frames, steps_s, strict=True)]
     stacked: Any = (np.stack(column) for column in zip(*arrays, strict=True))
     return FrameArrays(*stacked)
+
+
+def _times(frame: Frame, dt_s: float, dtype: DTypeLike) -> tuple[np.ndarray, np.ndarray]:
+    delay_ns = 0 if frame.depth_timestamp_ns is None else frame.depth_timestamp_ns - frame.timestamp_ns
+    return np.asarray(dt_s, dtype), np.asarray(delay_ns * 1e-9, dtype)
+
+
+def _aligned(shape: tuple[int, int], dtype: DTypeLike) -> np.ndarray:
+    size = math.prod(shape) * np.dtype(dtype).itemsize
+    room = np.empty(size + _ALIGNMENT, np.uint8)
+    begin = -room.ctypes.data % _ALIGNMENT
+    return room[begin : begin + size].view(dtype).reshape(shape)

