@@ -36,7 +36,7 @@ class TrackConfig(Checked):
     """Further keyframes to look into, recalled from the map where the camera comes back."""
     num_sources: Annotated[int, Range(at_least=1, at_most=8)] = 2
     """How many of the keyframes are looked into in a frame."""
-    points_per_source: Annotated[int, Range(at_least=16, at_most=2048)] = 192
+    points_per_source: Annotated[int, Range(at_least=16, at_most=2048)] = 160
     """Points looked up from each of them."""
     num_hypotheses: Annotated[int, Range(at_least=16, at_most=1024)] = 64
     """Pose hypotheses a frame."""
@@ -69,7 +69,7 @@ class TrackConfig(Checked):
     """Below this many points a pose is `WEAK`."""
     min_share: Annotated[float, Share] = 0.3
     """Smallest share of the followed points that must agree on the pose."""
-    refill_below: Annotated[float, Share] = 0.8
+    refill_below: Annotated[float, Share] = 0.7
     """New points are sought when fewer than this share of `num_points` is alive."""
     keyframe_below: Annotated[float, Share] = 0.8
     """A keyframe is made when no kept one shows more than this share of its points,"""
