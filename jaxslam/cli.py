@@ -1,4 +1,4 @@
-"""The command line: `jaxslam demo`, `run`, `eval`, `doctor`, `export`."""
+"""The command line: `jaxslam demo`, `run`, `eval`, `doctor`, `export`, `models`."""
 
 import itertools
 import logging
@@ -22,6 +22,7 @@ from jaxslam.errors import ConfigError, DatasetError, JaxSlamError, nearest
 from jaxslam.evaluation import Evaluation, evaluate
 from jaxslam.map_export import write_colmap, write_keyframe_trajectory, write_ply
 from jaxslam.map_file import load_map
+from jaxslam.models_command import Models
 from jaxslam.results import RunInfo, Snapshots, write_results
 from jaxslam.slam import Slam
 from jaxslam.trajectory import read
@@ -195,7 +196,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """The `jaxslam` command: known errors are one line and exit code 1."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
     command: Any = tyro.cli(
-        Demo | Run | Eval | Doctor | Export, prog="jaxslam", args=arguments, description=_DESCRIPTION
+        Demo | Run | Eval | Doctor | Export | Models, prog="jaxslam", args=arguments, description=_DESCRIPTION
     )
     try:
         command.main()

@@ -69,7 +69,7 @@ class TrackConfig(Checked):
     """Below this many points a pose is `WEAK`."""
     min_share: Annotated[float, Share] = 0.3
     """Smallest share of the followed points that must agree on the pose."""
-    refill_below: Annotated[float, Share] = 0.7
+    refill_below: Annotated[float, Share] = 0.8
     """New points are sought when fewer than this share of `num_points` is alive."""
     keyframe_below: Annotated[float, Share] = 0.8
     """A keyframe is made when no kept one shows more than this share of its points,"""
@@ -116,6 +116,26 @@ class MappingConfig(Checked):
 
 
 @dataclass(frozen=True)
+class SemanticsConfig(Checked):
+    """Finding what may move by a network, and following it."""
+
+    model: str | None = None
+    """Network: a name of `jaxslam models list`, or an ONNX file. Without one, geometry alone decides."""
+    labels: tuple[str, ...] = ("person",)
+    """What may move, as the network names it."""
+    min_score: Annotated[float, Share] = 0.3
+    """Detections below this score are dropped."""
+    threads: Annotated[int, Range(at_least=1, at_most=64)] = 1
+    """Threads the network may use."""
+    latency_frames: Annotated[int, Range(at_least=0, at_most=100)] = 2
+    """Frames after which a deterministic run has what the network found; 0 has every frame wait, live too."""
+    propagate: bool = True
+    """Carry masks on from frame to frame, by flow and depth; without it, one stays where it was until the next."""
+    dilate_px: Annotated[int, Range(at_least=0, at_most=100)] = 3
+    """How far a mask reaches beyond what was found."""
+
+
+@dataclass(frozen=True)
 class RunConfig(Checked):
     """How a recording or a live stream is run."""
 
@@ -138,6 +158,7 @@ class Config(Checked):
     track: TrackConfig = field(default_factory=TrackConfig)
     run: RunConfig = field(default_factory=RunConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
+    semantics: SemanticsConfig = field(default_factory=SemanticsConfig)
 
 
 def load_config(preset: str = "default", file: str | Path | None = None, overrides: Sequence[str] = ()) -> Config:

@@ -32,6 +32,14 @@ class MapFileError(JaxSlamError):
     """A map file that is missing, damaged, of another format or version, or that cannot be written."""
 
 
+class ModelError(JaxSlamError):
+    """A network that is missing, damaged, or of a kind that is not supported."""
+
+
+class DownloadError(JaxSlamError):
+    """A file that cannot be fetched, or is not the one expected; the message says where to place it by hand."""
+
+
 def nearest(name: str, valid: Iterable[str]) -> str:
     """A hint for a misspelt name: ` (did you mean 'x'?)` or, when nothing is close, the valid names."""
     choices = sorted(valid)

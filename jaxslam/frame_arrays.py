@@ -59,6 +59,11 @@ class FrameMemory:
         self._ignore, self._nothing = (_aligned((height, width), np.bool_) for _ in range(2))
         self._nothing[:] = False
 
+    @property
+    def depth(self) -> np.ndarray:
+        """`(h, w)` depth of the frame held, metres."""
+        return self._depth
+
     def hold(self, frame: Frame, dt_s: float) -> FrameArrays:
         """The arrays of a frame, as of `frame_arrays`, until the next one is held."""
         to_grey(frame.image, out=self._image)
@@ -69,6 +74,12 @@ class FrameMemory:
             np.copyto(ignore, frame.dynamic_mask)
         arrays: Any = (self._image, self._depth, ignore, *_times(frame, dt_s, np.float32))
         return FrameArrays(*arrays)
+
+    def ignoring(self, arrays: FrameArrays, mask: np.ndarray) -> FrameArrays:
+        """The arrays held, with nothing trusted where `mask` `(h, w)` is true."""
+        np.copyto(self._ignore, mask)
+        ignore: Any = self._ignore
+        return arrays._replace(ignore=ignore)
 
 
 def stack_frames(frames: Sequence[Frame], previous_ns: int | None = None, dtype: DTypeLike = np.float32) -> FrameArrays:

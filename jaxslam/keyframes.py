@@ -72,6 +72,8 @@ def look_up(
     take = lambda array: jnp.take(array, index, axis=-1, mode="clip")
     guess, X_there = take(predicted), take(X_cam)
     seen_depth = sample_depth(view.depth, jax.lax.stop_gradient(guess), reach=0)
+    column, row = jnp.round(jax.lax.stop_gradient(guess)).astype(jnp.int32)
+    ignored = view.frame.ignore.at[row, column].get(mode="fill", fill_value=True)
     covered = (seen_depth > 0) & (jnp.abs(seen_depth - X_there[2]) > 0.1 * X_there[2] + 0.05)
     source = index // n
     X_world = take(jnp.moveaxis(keyframes.X_world, 1, 0).reshape(3, k * n))
@@ -82,7 +84,7 @@ def look_up(
         _warp(guess, X_there[2], T_world_cam, keyframes.T_world_cam[source], params.intrinsics),
         view.pyramid,
         guess,
-        real & ~covered,
+        real & ~covered & ~ignored,
         plan=plan.look_up,
     )
     shift = jnp.sum(jnp.square(match.points - guess), axis=0)

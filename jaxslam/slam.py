@@ -14,6 +14,8 @@ from jaxslam.back_end import BackEnd, Placed
 from jaxslam.camera import Camera
 from jaxslam.config import Config, TrackConfig
 from jaxslam.datasets import Dataset, prefetch
+from jaxslam.detector_choice import detector_of
+from jaxslam.dynamic_masks import DynamicMasks, FrameMask, MaskSource
 from jaxslam.errors import DatasetError, FrameError, JaxSlamError, MapFileError
 from jaxslam.frame import Frame, check_frame
 from jaxslam.frame_arrays import FrameArrays, FrameMemory
@@ -21,6 +23,7 @@ from jaxslam.map import Map
 from jaxslam.map_file import load_map, save_map
 from jaxslam.map_link import Hung
 from jaxslam.pose import IDENTITY, compose, moved
+from jaxslam.semantics import Detector
 from jaxslam.state import TrackOutput, TrackParams, TrackPlan, TrackState, TrackStatus
 from jaxslam.track import init_state, track_step
 from jaxslam.tracked import FrameRecord, Rejected, Tracked, tracked_of
@@ -60,6 +63,7 @@ class Slam:
         *,
         map: Map | None = None,
         localize_only: bool = False,
+        detector: Detector | None = None,
     ) -> None:
         """Prepare for frames of a camera. Compiling happens at the first frame or in `warm_up`.
 
@@ -68,9 +72,12 @@ class Slam:
             config: Settings; the default preset if not given.
             map: To start with: the first frame is `LOST` until its place is recognised.
             localize_only: Leave the map as it is.
+            detector: Finds what may move, instead of the network of the settings.
 
         Raises:
             MapFileError: If the map is of a camera of another size.
+            ModelError: If the network of the settings cannot be used. One that is known and only not there is no
+                error: that is said once, and geometry alone decides.
         """
         self.camera = camera
         self.config = config or Config()
@@ -83,6 +90,7 @@ class Slam:
         self._start_map, self._localize_only = map, localize_only
         self._params = track_params(camera, self.config.track)._replace(restart_after=jnp.float32(_NEVER))
         self._plan = track_plan(self.config.track)
+        self._detector = detector or detector_of(self.config.semantics)
         self._memory = FrameMemory(camera.height, camera.width)
         self._ready = False
         self._begin()
@@ -116,7 +124,7 @@ class Slam:
 
     def reset(self) -> None:
         """Forget everything since the beginning; the next frame starts anew."""
-        self._back.close()
+        self.close()
         self._begin()
 
     def warm_up(self) -> float:
@@ -128,6 +136,8 @@ class Slam:
             nothing = self._memory.hold(Frame(0, np.zeros(shape, np.uint8), np.zeros(shape, np.float32)), 0.0)
             jax.block_until_ready(_step(self._fresh_state(), nothing, self._params, self._plan))
             self._back.compile(nothing)
+            if self._masks is not None:
+                self._masks.compile()
             self.compile_s = time.perf_counter() - began
             self._ready = True
         return self.compile_s
@@ -154,6 +164,7 @@ class Slam:
         self._state, correction = self._back.update(self._state, self._frame)
         dt_s = 1 / self.camera.fps if self._last_ns is None else (frame.timestamp_ns - self._last_ns) * 1e-9
         arrays = self._memory.hold(frame, dt_s)
+        arrays, mask = self._masked(frame, arrays)
         output, placed, num_matched = self._advance(arrays), None, 0
         if int(output.status) == TrackStatus.LOST:
             output, placed = self._regain(arrays, output, dt_s)
@@ -163,7 +174,7 @@ class Slam:
         if output.keyframe:
             hung = None if placed is None else placed.hung
             self._back.keyframe_made(frame.timestamp_ns, arrays, output, self._frame, hung)
-        tracked = tracked_of(frame.timestamp_ns, output, correction, num_matched, relocalised=placed is not None)
+        tracked = tracked_of(frame.timestamp_ns, output, correction, num_matched, mask, relocalised=placed is not None)
         self._last_ns = frame.timestamp_ns
         tracked = self._recorded(tracked, dt_s)
         self._frame += 1
@@ -203,6 +214,8 @@ class Slam:
     def close(self) -> None:
         """End the threads, in two seconds at most; nothing can be tracked after that but from a `reset`."""
         self._back.close()
+        if self._masks is not None:
+            self._masks.close()
 
     def __enter__(self) -> "Slam":
         return self
@@ -242,6 +255,20 @@ class Slam:
             self._start_map,
             localize_only=self._localize_only,
         )
+        run, semantics = self.config.run, self.config.semantics
+        self._masks = (
+            None
+            if self._detector is None
+            else DynamicMasks(
+                self.camera,
+                self._detector,
+                deterministic=run.deterministic,
+                latency_frames=semantics.latency_frames,
+                propagate=semantics.propagate,
+                dilate_px=semantics.dilate_px,
+                seed=run.seed,
+            )
+        )
         self._state = self._fresh_state()
         if self._start_map is not None:
             self._state = self._state._replace(lost_frames=jnp.zeros((), jnp.int32))
@@ -254,6 +281,17 @@ class Slam:
 
     def _fresh_state(self) -> TrackState:
         return _new_state(self.camera.height, self.camera.width, self._plan, seed=self.config.run.seed)
+
+    def _masked(self, frame: Frame, arrays: FrameArrays) -> tuple[FrameArrays, FrameMask]:
+        """The frame with what may move left out, and what that is."""
+        given = frame.dynamic_mask
+        if self._masks is None:
+            source = MaskSource.NONE if given is None else MaskSource.CALLER
+            return arrays, FrameMask(np.asarray(arrays.ignore), source, -1, "")
+        mask = self._masks.of_frame(self._frame, frame.image, np.asarray(arrays.image), np.asarray(arrays.depth))
+        if given is not None:
+            mask = mask._replace(mask=mask.mask | given)
+        return self._memory.ignoring(arrays, mask.mask), mask
 
     def _advance(self, arrays: FrameArrays) -> TrackOutput:
         self._state, output = _step(self._state, arrays, self._params, self._plan)
@@ -288,6 +326,8 @@ class Slam:
                 ahead_s = min(self._lost_s, _PREDICTED_S)
                 tracked = replace(tracked, T_world_cam=moved(self._last_pose, self._last_twist * ahead_s))
             return tracked
+        if self._masks is not None:
+            self._masks.tracked(self._frame, tracked.T_world_cam, self._memory.depth)
         self._unrecognised, self._lost_s = 0, 0.0
         self._last_pose, self._last_twist = tracked.T_world_cam, tracked.twist
         self._back.localize(tracked.T_world_cam, self._frame)

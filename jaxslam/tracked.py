@@ -4,6 +4,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from jaxslam.dynamic_masks import FrameMask, MaskSource
 from jaxslam.errors import JaxSlamError
 from jaxslam.state import KeyframeReason, TrackOutput, TrackReason, TrackStatus
 
@@ -31,6 +32,10 @@ class Tracked:
         keyframe: Why the frame was kept, `NONE` if it was not.
         correction: `(7,)` how the map's frame changed since the frame before, from the old world to the new one, as
             `wxyz_xyz`: the part of the change of pose that is no motion of the camera.
+        dynamic_mask: `(h, w)` bool, true where nothing was trusted because it moves or may.
+        mask_source: Where that comes from.
+        mask_age: Frames since the one it was detected in; -1 if it was not.
+        detector_error: What went wrong in the detector, told once; empty if nothing did.
         track_ms: Time it took, in milliseconds.
     """
 
@@ -50,7 +55,16 @@ class Tracked:
     followed: np.ndarray
     keyframe: KeyframeReason
     correction: np.ndarray
+    dynamic_mask: np.ndarray
+    mask_source: MaskSource
+    mask_age: int
+    detector_error: str
     track_ms: float
+
+    @property
+    def dynamic_ratio(self) -> float:
+        """Share of the image that the mask covers."""
+        return float(self.dynamic_mask.mean())
 
     @property
     def is_keyframe(self) -> bool:
@@ -92,6 +106,10 @@ class FrameRecord:
     num_matched: int = 0
     residual_px: float = 0.0
     is_keyframe: bool = False
+    dynamic_ratio: float = 0.0
+    mask_source: MaskSource = MaskSource.NONE
+    mask_age: int = -1
+    detector_error: str = ""
     track_ms: float | None = None
 
     @classmethod
@@ -101,7 +119,13 @@ class FrameRecord:
 
 
 def tracked_of(
-    timestamp_ns: int, output: TrackOutput, correction: np.ndarray, num_matched: int, *, relocalised: bool
+    timestamp_ns: int,
+    output: TrackOutput,
+    correction: np.ndarray,
+    num_matched: int,
+    mask: FrameMask,
+    *,
+    relocalised: bool,
 ) -> Tracked:
     """The result of a frame, from what the compiled step said of it."""
     return Tracked(
@@ -121,5 +145,9 @@ def tracked_of(
         followed=np.asarray(output.tracked),
         keyframe=KeyframeReason(int(output.keyframe)),
         correction=correction,
+        dynamic_mask=mask.mask.copy(),
+        mask_source=mask.source,
+        mask_age=mask.age,
+        detector_error=mask.error,
         track_ms=0.0,
     )

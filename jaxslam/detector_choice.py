@@ -1,0 +1,28 @@
+"""The detector that the settings ask for."""
+
+import logging
+
+from jaxslam.config import SemanticsConfig
+from jaxslam.errors import ModelError
+from jaxslam.known_models import KNOWN_MODELS, find_model
+from jaxslam.semantics import Detector, load_detector
+
+_log = logging.getLogger(__name__)
+
+
+def detector_of(config: SemanticsConfig) -> Detector | None:
+    """The network of the settings; `None` if they name none, or one that is known but not on this machine.
+
+    Raises:
+        ModelError: If a file is named that is not there, or that cannot be used.
+    """
+    if config.model is None:
+        return None
+    try:
+        path = find_model(config.model)
+    except ModelError as error:
+        if config.model not in KNOWN_MODELS:
+            raise
+        _log.warning("no network finds what moves, geometry alone decides: %s", error)
+        return None
+    return load_detector(path, labels=config.labels, min_score=config.min_score, num_threads=config.threads)

@@ -1,0 +1,56 @@
+"""What stands still leaves a mask that has not been confirmed for a while: it may never have been part of an object."""
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxslam.camera import Camera
+from jaxslam.masks.propagation import Followed
+from jaxslam.masks.sampling import CELL_PX
+from jaxslam.pose import between, transform
+
+_STILL_PX = 2.0
+"""A point this near to where the camera's motion alone would have it stands still. On Bonn `crowd`, thirty frames after
+the last detection: median IoU with DeepLab's mask 0.48; with 1.5 0.44, with 1.0 0.22, without this 0.22."""
+
+
+def without_still_parts(
+    mask: Bool[np.ndarray, "h w"],
+    followed: Followed,
+    depth: Float[np.ndarray, "h w"],
+    before: np.ndarray,
+    now: np.ndarray,
+    camera: Camera,
+) -> Bool[np.ndarray, "h w"]:
+    """The mask without the cells of 15 x 15 pixels in which more points stand still than move.
+
+    Args:
+        mask: Of the present frame.
+        followed: Points of the mask, from the frame before to this one.
+        depth: Of this frame, metres, 0 where missing.
+        before: `(7,)` pose of the camera at the frame before.
+        now: `(7,)` pose of the camera at this frame.
+        camera: Its lens is taken to be without distortion, which such small motions do not tell.
+    """
+    still, known = _still(followed, depth, between(before, now), camera)
+    rows, columns = (-(-side // CELL_PX) for side in mask.shape)
+    column, row = (followed.now[:, known] // CELL_PX).astype(np.int64)
+    votes = np.zeros((rows, columns), np.int64)
+    np.add.at(votes, (row, column), np.where(still[known], 1, -1))
+    cells = np.repeat(np.repeat(votes > 0, CELL_PX, axis=0), CELL_PX, axis=1)
+    return mask & ~cells[: mask.shape[0], : mask.shape[1]]
+
+
+def _still(
+    followed: Followed, depth: np.ndarray, T_before_now: np.ndarray, camera: Camera
+) -> tuple[np.ndarray, np.ndarray]:
+    """Which points stand still, and for which that is known."""
+    column, row = np.round(np.where(followed.ok, followed.now, 0)).astype(np.int64)
+    inside = (row >= 0) & (row < depth.shape[0]) & (column >= 0) & (column < depth.shape[1])
+    z = np.where(inside, depth[np.where(inside, row, 0), np.where(inside, column, 0)], 0).astype(np.float64)
+    u, v = followed.now.astype(np.float64)
+    X_now = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z])
+    x, y, ahead = transform(T_before_now, X_now)
+    known = followed.ok & inside & np.isfinite(z) & (z > 0) & (ahead > 0.05)
+    ahead = np.where(known, ahead, 1.0)
+    expected = np.stack([camera.fx * x / ahead + camera.cx, camera.fy * y / ahead + camera.cy])
+    return known & (np.linalg.norm(expected - followed.before, axis=0) < _STILL_PX), known

@@ -1,0 +1,184 @@
+"""`jaxslam models list`, `get` and `check`: the networks that can be had, and what one finds in an image."""
+
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, TypeAlias
+
+import cv2
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
+from rich.table import Table
+
+from jaxslam.datasets.image_file import read_color
+from jaxslam.download import download, sha256_of
+from jaxslam.draw_detections import draw_detections
+from jaxslam.errors import ConfigError, ModelError
+from jaxslam.files import write_atomically
+from jaxslam.known_models import (
+    DEFAULT_MODEL,
+    KNOWN_MODELS,
+    KnownModel,
+    find_model,
+    known_model,
+    local_file,
+    models_dir,
+)
+from jaxslam.semantics import Detections, load_detector
+
+_console = Console(soft_wrap=True, markup=False, highlight=False)
+_REPEATS = 5
+
+
+@dataclass(frozen=True)
+class ListModels:
+    """Print the known public networks: size, licence, adapter, and where they lie on this machine."""
+
+    details: bool = False
+    """Also print what they are, where they come from, and their SHA-256."""
+
+    def main(self) -> None:
+        """Run the command."""
+        table = Table("name", "size", "licence", "adapter", "here", title="Known models", title_justify="left")
+        files = {model.name: local_file(model) for model in KNOWN_MODELS.values()}
+        for model in KNOWN_MODELS.values():
+            size = "-" if model.size_bytes is None else f"{model.size_bytes / 1e6:.1f} MB"
+            mark = " (default)" if model.name == DEFAULT_MODEL else ""
+            absent = "no" if model.url else "no, to be made by hand"
+            table.add_row(model.name + mark, size, model.licence, model.adapter, "yes" if files[model.name] else absent)
+        _console.print(table)
+        for name, file in files.items():
+            if file is not None:
+                _console.print(f"{name}: {file}")
+        if self.details:
+            _print_details()
+        _console.print(f"Downloads go to {models_dir()}; a folder named by JAXSLAM_MODELS is looked at first.")
+
+
+@dataclass(frozen=True)
+class GetModel:
+    """Download a network into the user's cache folder, or go on with a download that was cut."""
+
+    name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]
+    """Name of a known model, as `models list` prints it."""
+    force: bool = False
+    """Download it even if it is there."""
+
+    def main(self) -> None:
+        """Run the command."""
+        model, found = known_model(self.name), local_file(known_model(self.name))
+        if found is not None and not self.force:
+            _console.print(f"{model.name} is on this machine: {found}")
+            if model.sha256 is not None and sha256_of(found) != model.sha256:
+                _console.print("It is another file than the published one, which --force downloads.")
+            return
+        target = models_dir() / model.file
+        if model.url is None:
+            raise ModelError(f"{model.name} cannot be downloaded; {model.how}. Then place the file at {target}")
+        _download(model, model.url, target)
+        checked = "as expected" if model.sha256 else "which nobody has checked: no published one is known"
+        _console.print(f"{model.name}: {target}, {model.licence}, see {model.page}")
+        _console.print(f"SHA-256 {sha256_of(target)}, {checked}")
+        if local_file(model) != target:
+            _console.print(f"Used before it is, as JAXSLAM_MODELS says: {local_file(model)}")
+
+
+@dataclass(frozen=True)
+class CheckModel:
+    """Run a network on an image: print what it finds and how long it takes, and draw it."""
+
+    file: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
+    """Model file (ONNX), or the name of a known model."""
+    image: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="IMAGE")]
+    """Image to look at."""
+    out: Path = Path("detections.png")
+    """PNG to draw to."""
+    labels: str = "person"
+    """What to look for, separated by commas."""
+    adapter: str | None = None
+    """What reads the outputs of the network; recognised from them if not given."""
+    min_score: float = 0.3
+    """Leave out what is less sure than this, 0 to 1."""
+
+    def main(self) -> None:
+        """Run the command."""
+        labels = tuple(label for label in map(str.strip, self.labels.split(",")) if label)
+        if not labels:
+            raise ConfigError(f"--labels: expected names separated by commas, got '{self.labels}'")
+        if not 0 <= self.min_score <= 1:
+            raise ConfigError(f"--min-score: expected 0 to 1, got {self.min_score}")
+        if self.out.suffix.lower() != ".png":
+            raise ConfigError(f"--out: expected a name that ends in .png, got '{self.out}'")
+        path, image = find_model(self.file), read_color(self.image)
+        detector = load_detector(path, labels=labels, min_score=self.min_score, adapter=self.adapter)
+        found, first_ms, median_ms = _timed(detector, image)
+        _print_found(found, labels, self.min_score)
+        _console.print(f"{median_ms:.1f} ms an image, the first {first_ms:.1f} ms ({path})")
+        bgr = cv2.cvtColor(draw_detections(image, found), cv2.COLOR_RGB2BGR)
+        write_atomically(self.out, cv2.imencode(".png", bgr)[1].tobytes())
+        _console.print(f"Picture: {self.out}")
+
+
+_Command: TypeAlias = (
+    Annotated[ListModels, tyro.conf.subcommand("list")]
+    | Annotated[GetModel, tyro.conf.subcommand("get")]
+    | Annotated[CheckModel, tyro.conf.subcommand("check")]
+)
+
+
+@dataclass(frozen=True)
+class Models:
+    """Networks that find people: list them, get one, check what one finds in an image."""
+
+    command: tyro.conf.OmitSubcommandPrefixes[_Command]
+
+    def main(self) -> None:
+        """Run the command."""
+        self.command.main()
+
+
+def _print_details() -> None:
+    for model in KNOWN_MODELS.values():
+        _console.print(f"\n{model.name}: {model.about}; {model.page}")
+        _console.print(f"  {model.url or model.how}")
+        if model.sha256 is not None:
+            _console.print(f"  SHA-256 {model.sha256}")
+    _console.print()
+
+
+def _download(model: KnownModel, url: str, target: Path) -> None:
+    columns = (TextColumn(model.name), BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=_console) as progress:
+        task = progress.add_task("download", total=model.size_bytes)
+        show: Callable[[int, int | None], None] = lambda done, total: progress.update(task, completed=done, total=total)
+        download(url, target, sha256=model.sha256, size=model.size_bytes, progress=show)
+
+
+def _timed(detector: Callable[[np.ndarray], Detections], image: np.ndarray) -> tuple[Detections, float, float]:
+    """What it finds, and milliseconds: of the first run, and the median of those after it."""
+    times_ms: list[float] = []
+    found: Any = None
+    for _ in range(_REPEATS + 1):
+        began_s = time.perf_counter()
+        found = detector(image)
+        times_ms.append(1e3 * (time.perf_counter() - began_s))
+    return found, times_ms[0], statistics.median(times_ms[1:])
+
+
+def _print_found(found: Detections, labels: tuple[str, ...], min_score: float) -> None:
+    if len(found.labels):
+        table = Table("label", "score", "left", "top", "right", "bottom", "mask", title="Found", title_justify="left")
+        shares = (
+            ["-"] * len(found.labels) if found.masks is None else [f"{share:.1%}" for share in found.masks.mean((1, 2))]
+        )
+        for label, score, box, share in zip(found.labels, found.scores, found.boxes, shares, strict=True):
+            table.add_row(label, f"{score:.2f}", *(f"{edge:.0f}" for edge in box), share)
+        _console.print(table)
+    elif found.class_mask is None:
+        _console.print(f"Found nothing: no {' or '.join(labels)} with a score of at least {min_score}.")
+    if found.class_mask is not None:
+        _console.print(f"{' or '.join(labels)}: {found.class_mask.mean():.1%} of the picture, by class map")

@@ -1,0 +1,89 @@
+"""What a family of networks is to the detector."""
+
+from abc import ABC, abstractmethod
+from typing import ClassVar
+
+import numpy as np
+
+from jaxslam.semantics.choose import Candidates, Wanted, choose
+from jaxslam.semantics.detections import Detections
+from jaxslam.semantics.graph import Colours, Graph, ImageInput
+from jaxslam.semantics.placement import Fit, Placement, boxes_to_image, place
+
+
+class Adapter(ABC):
+    """One family of networks; an instance is for one graph that fits it.
+
+    Attributes:
+        name: What it is called in settings.
+        interface: Its outputs, for messages.
+        varying: Whether the sizes of outputs depend on the image.
+        fit: How the image enters the input.
+        pad: Value of the pixels beside it.
+        colours: How its values do.
+        image: The graph's input.
+        graph: The graph.
+        names: Every class by number; empty where a number has none.
+    """
+
+    name: ClassVar[str]
+    interface: ClassVar[str]
+    varying: ClassVar[bool] = False
+    fit: ClassVar[Fit] = "stretch"
+    pad: ClassVar[int] = 114
+    colours: Colours = Colours()
+
+    def __init__(self, graph: Graph, image: ImageInput) -> None:
+        """Prepare for a graph that fits."""
+        self.graph, self.image = graph, image
+        names = self.names_of(graph, image)
+        assert names is not None  # it fits
+        self.names = names
+
+    @classmethod
+    def fits(cls, graph: Graph) -> bool:
+        """Whether a graph is of this family."""
+        return graph.image is not None and cls.names_of(graph, graph.image) is not None
+
+    @classmethod
+    @abstractmethod
+    def names_of(cls, graph: Graph, image: ImageInput) -> tuple[str, ...] | None:
+        """The names of a graph's classes; `None` if it is not of this family, or they cannot be known."""
+
+    def prepare(self, pixels: np.ndarray) -> tuple[np.ndarray, Placement]:
+        """An RGB image as the network takes it, and where it lies in it."""
+        canvas, placement = place(pixels, self.image.size, self.fit, self.pad)
+        return self.image.tensor(canvas, self.colours), placement
+
+    @abstractmethod
+    def decode(self, outputs: list[np.ndarray], placement: Placement, wanted: Wanted) -> Detections:
+        """What the network's outputs say.
+
+        Args:
+            outputs: Of the expected shapes, and finite.
+            placement: Where the image lies in the input.
+            wanted: What to keep.
+
+        Raises:
+            ModelError: If they hold what they cannot mean.
+        """
+
+
+class BoxAdapter(Adapter):
+    """A family that finds boxes, and nothing else."""
+
+    @abstractmethod
+    def candidates(self, outputs: list[np.ndarray], wanted: Wanted) -> Candidates:
+        """The boxes it proposes, in pixels of the input; those that will not be kept may be left out."""
+
+    def decode(self, outputs: list[np.ndarray], placement: Placement, wanted: Wanted) -> Detections:
+        """The best of what it proposes."""
+        return found(choose(self.candidates(outputs, wanted), wanted), placement, wanted.names)
+
+
+def found(
+    kept: Candidates, placement: Placement, names: tuple[str, ...], masks: np.ndarray | None = None
+) -> Detections:
+    """Boxes that are kept as detections in the image."""
+    labels = tuple(names[index] for index in kept.classes)
+    return Detections(boxes_to_image(kept.boxes, placement), kept.scores, labels, masks, None)

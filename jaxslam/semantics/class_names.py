@@ -1,0 +1,82 @@
+"""Names of the classes that public networks are trained on, and which ones a network has."""
+
+import ast
+from collections.abc import Iterable, Mapping
+
+from jaxslam.errors import ModelError
+
+# The 91 categories of COCO by id, as its annotations number them. The second version of the data set leaves eleven
+# of them without an object; the id 0 is no category.
+_COCO_IDS = """
+person bicycle car motorcycle airplane bus train truck boat traffic_light fire_hydrant - stop_sign parking_meter
+bench bird cat dog horse sheep cow elephant bear zebra giraffe - backpack umbrella - - handbag tie suitcase frisbee
+skis snowboard sports_ball kite baseball_bat baseball_glove skateboard surfboard tennis_racket bottle - wine_glass cup
+fork knife spoon bowl banana apple sandwich orange broccoli carrot hot_dog pizza donut cake chair couch potted_plant
+bed - dining_table - - toilet - tv laptop mouse remote keyboard cell_phone microwave oven toaster sink refrigerator
+- book clock vase scissors teddy_bear hair_drier toothbrush
+"""
+
+COCO_IDS: tuple[str, ...] = ("", *(name.strip("-").replace("_", " ") for name in _COCO_IDS.split()))
+"""Name of each COCO category id, 0 to 90; empty where there is none."""
+
+COCO: tuple[str, ...] = tuple(name for name in COCO_IDS if name)
+"""The 80 classes of COCO, in the order networks number them."""
+
+VOC: tuple[str, ...] = (
+    *("background", "airplane", "bicycle", "bird", "boat", "bottle", "bus", "car", "cat", "chair", "cow"),
+    *("dining table", "dog", "horse", "motorcycle", "person", "potted plant", "sheep", "couch", "train", "tv"),
+)
+"""The 21 classes of PASCAL VOC's segmentation, with COCO's words."""
+
+_SYNONYMS = {
+    "aeroplane": "airplane",
+    "motorbike": "motorcycle",
+    "diningtable": "dining table",
+    "pottedplant": "potted plant",
+    "sofa": "couch",
+    "tvmonitor": "tv",
+}
+
+
+def one_name(name: str) -> str:
+    """A class by COCO's word for it, so that a label means the same to every network."""
+    return _SYNONYMS.get(name.strip(), name.strip())
+
+
+def box_names(num_classes: int, stored: tuple[str, ...] | None) -> tuple[str, ...] | None:
+    """Names of the classes of a network that finds boxes; `None` if they cannot be known."""
+    return stored if stored and len(stored) == num_classes else (COCO if num_classes == len(COCO) else None)
+
+
+def pixel_names(num_classes: int, stored: tuple[str, ...] | None) -> tuple[str, ...] | None:
+    """Names of the classes of a network that labels pixels; `None` if they cannot be known.
+
+    Only 21 classes are certain: 19 are Cityscapes' as well as those of parts of a face, 20 those of clothes.
+    """
+    return stored if stored and len(stored) == num_classes else (VOC if num_classes == len(VOC) else None)
+
+
+def stored_names(metadata: Mapping[str, str]) -> tuple[str, ...] | None:
+    """The names that a model's metadata holds under `names`: `{0: 'person', ...}` or `['person', ...]`.
+
+    Raises:
+        ModelError: If something else stands there.
+    """
+    text = metadata.get("names")
+    if text is None:
+        return None
+    try:
+        value = ast.literal_eval(text)
+    except (ValueError, SyntaxError):
+        value = None
+    if isinstance(value, dict) and sorted(map(str, value)) == sorted(str(index) for index in range(len(value))):
+        value = [value[key] for key in sorted(value, key=int)]
+    if not isinstance(value, list | tuple) or not value or not all(isinstance(name, str) for name in value):
+        expected = "a list of names, or a name for each number from 0 on"
+        raise ModelError(f"metadata names: expected {expected}, got {text[:80]!r}")
+    return tuple(map(one_name, value))
+
+
+def valid_labels(names: Iterable[str]) -> list[str]:
+    """The names that can be asked for."""
+    return sorted({name for name in names if name})

@@ -1,0 +1,144 @@
+"""A detector made of an ONNX file."""
+
+import os
+from collections.abc import Collection
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+
+from jaxslam.errors import ConfigError, FrameError, ModelError, nearest
+from jaxslam.semantics.adapters import ADAPTERS, Adapter
+from jaxslam.semantics.choose import Wanted
+from jaxslam.semantics.class_names import one_name, valid_labels
+from jaxslam.semantics.detections import Detections
+from jaxslam.semantics.graph import Graph
+from jaxslam.semantics.network import Network, check_outputs
+
+
+class OnnxDetector:
+    """Finds things of the wanted classes in an image. The same image gives the same bytes."""
+
+    def __init__(self, network: Network, adapter: Adapter, wanted: Wanted) -> None:
+        """Put together by `load_detector`."""
+        self._network, self._adapter, self._wanted = network, adapter, wanted
+
+    @property
+    def adapter(self) -> str:
+        """The name of the network's family."""
+        return self._adapter.name
+
+    @property
+    def path(self) -> Path:
+        """The network's file."""
+        return self._network.path
+
+    @property
+    def input_size(self) -> tuple[int, int]:
+        """`(width, height)` in pixels of what the network sees."""
+        return self._adapter.image.size
+
+    def __call__(self, image: UInt8[np.ndarray, "h w 3"], /) -> Detections:
+        """Find things in an RGB image of any size.
+
+        Raises:
+            FrameError: If it is no such image.
+            ModelError: If the network fails, or gives shapes or numbers that it cannot mean.
+        """
+        _check_image(image)
+        tensor, placement = self._adapter.prepare(image)
+        outputs = self._network.run(tensor)
+        try:
+            check_outputs(outputs, self._network.graph.outputs, self._adapter.varying)
+            return self._adapter.decode(outputs, placement, self._wanted)
+        except ModelError as error:
+            raise ModelError(f"{self.path.name}: {error}") from None
+
+
+def load_detector(
+    path: str | os.PathLike[str],
+    *,
+    labels: Collection[str] = ("person",),
+    min_score: float = 0.3,
+    nms_iou: float = 0.5,
+    adapter: str | None = None,
+    num_threads: int = 1,
+) -> OnnxDetector:
+    """Open an ONNX file as a detector; its family is recognised from the graph.
+
+    Args:
+        path: The file.
+        labels: What to find, by COCO's names ("person", "car", ...); VOC's words for the same are understood.
+        min_score: Least score kept, 0 to 1.
+        nms_iou: Overlap (intersection over union, 0 to 1) above which the worse of two boxes of a class is dropped.
+        adapter: The family, where it shall not be recognised; see `jaxslam.semantics.adapters.ADAPTERS`.
+        num_threads: Threads the network may use.
+
+    Raises:
+        ConfigError: If a label is none of the network's, or a number is out of range.
+        ModelError: If the file is missing or damaged, or of no family, or not of the one named.
+    """
+    _check_range("min_score", min_score)
+    _check_range("nms_iou", nms_iou)
+    if isinstance(num_threads, bool) or not isinstance(num_threads, int) or num_threads < 1:
+        raise ConfigError(f"num_threads: expected an integer >= 1, got {num_threads!r}")
+    if adapter is not None and adapter not in ADAPTERS:
+        raise ModelError(f"adapter: expected one of {', '.join(ADAPTERS)}, got {adapter!r}{nearest(adapter, ADAPTERS)}")
+    network = Network(Path(path), num_threads)
+    kind = _family(network, adapter)
+    assert network.graph.image is not None  # it fits
+    fitted = kind(network.graph, network.graph.image)
+    classes = _wanted_classes(labels, fitted.names)
+    return OnnxDetector(network, fitted, Wanted(fitted.names, classes, float(min_score), float(nms_iou)))
+
+
+def _family(network: Network, adapter: str | None) -> type[Adapter]:
+    graph = network.graph
+    if adapter is not None:
+        if not ADAPTERS[adapter].fits(graph):
+            wanted = f"{network.path}: expected a network for the adapter {adapter} ({ADAPTERS[adapter].interface})"
+            raise ModelError(f"{wanted}, got {graph}{_fitting_hint(graph)}")
+        return ADAPTERS[adapter]
+    fitting = _fitting(graph)
+    if len(fitting) != 1:
+        kinds = "; ".join(f"{name}: {kind.interface}" for name, kind in ADAPTERS.items())
+        found = f"{graph}, which fits {' and '.join(fitting)}: name one" if fitting else str(graph)
+        raise ModelError(
+            f"{network.path}: expected one image 1x3xHxW or 1xHxWx3 as input, classes whose names are known, and the"
+            f" outputs of one of these families: {kinds}; got {found}"
+        )
+    return ADAPTERS[fitting[0]]
+
+
+def _fitting(graph: Graph) -> list[str]:
+    return [name for name, kind in ADAPTERS.items() if kind.fits(graph)]
+
+
+def _fitting_hint(graph: Graph) -> str:
+    fitting = _fitting(graph)
+    return f" (it fits {' and '.join(fitting)})" if fitting else ""
+
+
+def _wanted_classes(labels: Collection[str], names: tuple[str, ...]) -> np.ndarray:
+    """`(c,)` true for the classes asked for."""
+    valid = valid_labels(names)
+    if isinstance(labels, str) or not labels:
+        raise ConfigError(f"labels: expected one or more names in a list, got {labels!r}")
+    for label in labels:
+        if not isinstance(label, str) or one_name(label) not in valid:
+            raise ConfigError(f"labels: expected names of {', '.join(valid)}; got {label!r}")
+    wanted = {one_name(label) for label in labels}
+    return np.array([name in wanted for name in names])
+
+
+def _check_range(field: str, value: float) -> None:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= 1:
+        raise ConfigError(f"{field}: expected a number from 0 to 1, got {value!r}")
+
+
+def _check_image(image: object) -> None:
+    expected = "image: expected (height, width, 3) RGB uint8"
+    if not isinstance(image, np.ndarray):
+        raise FrameError(f"{expected}, got {type(image).__name__}")
+    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
+        raise FrameError(f"{expected}, got {image.dtype} of shape {image.shape}")

@@ -1,0 +1,99 @@
+"""Real networks on frames with people: what YOLOX finds, the others find too."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jaxslam.datasets import open_dataset
+from jaxslam.semantics import Detections, load_detector
+
+FRAMES = (400, 600, 800)
+BOXES = {"nanodet_m_320": "nanodet", "FastestDet": "fastestdet", "yolov8n-seg_int8": "yolov8_seg"}
+MAPS = ("deeplabv3_mobilenetv2_voc", "deeplabv3_mobilenetv2_dm05_voc")
+
+
+def model(name: str) -> Path:
+    folder = os.environ.get("JAXSLAM_MODELS")
+    if not folder:
+        pytest.skip("JAXSLAM_MODELS is not set: no networks here")
+    path = Path(folder) / f"{name}.onnx"
+    if not path.is_file():
+        pytest.skip(f"JAXSLAM_MODELS holds no {path.name}")
+    return path
+
+
+def iou(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """`(n, m)` intersection over union."""
+    low, high = (pick(boxes[:, None, part], others[None, :, part]) for pick, part in _EDGES)
+    shared = np.clip(high - low, 0, None).prod(axis=2)
+    areas = [(each[:, 2:] - each[:, :2]).prod(axis=1) for each in (boxes, others)]
+    return shared / (areas[0][:, None] + areas[1][None] - shared)
+
+
+_EDGES = ((np.maximum, slice(0, 2)), (np.minimum, slice(2, 4)))
+
+
+@pytest.fixture(scope="module")
+def images(data_dir: Path) -> list[np.ndarray]:
+    folder = data_dir / "bonn" / "rgbd_bonn_crowd"
+    if not folder.is_dir():
+        pytest.skip(f"JAXSLAM_DATA holds no {folder.name}")
+    recording = open_dataset(folder)
+    return [recording[number].image for number in FRAMES]
+
+
+@pytest.fixture(scope="module")
+def people(images: list[np.ndarray]) -> list[Detections]:
+    detector = load_detector(model("yolox_nano"), min_score=0.45)
+    assert (detector.adapter, detector.input_size) == ("yolox", (416, 416))
+    return [detector(image) for image in images]
+
+
+def test_yolox(people: list[Detections]) -> None:
+    """As many as there are to see: one of four is cut off, and found as two."""
+    assert [len(found.boxes) for found in people] == [4, 3, 2]
+    assert min(found.scores.max() for found in people) > 0.85
+
+
+@pytest.mark.parametrize("name", BOXES)
+def test_boxes(images: list[np.ndarray], people: list[Detections], name: str) -> None:
+    detector = load_detector(model(name))
+    assert detector.adapter == BOXES[name]
+    overlaps = [iou(they.boxes, detector(image).boxes) for image, they in zip(images, people, strict=True)]
+    best = np.concatenate([overlap.max(axis=1, initial=0) for overlap in overlaps])
+    assert np.mean(best > 0.5) >= 0.75
+    assert np.median(best) > 0.8
+
+
+@pytest.mark.parametrize("name", MAPS)
+def test_class_maps(images: list[np.ndarray], people: list[Detections], name: str) -> None:
+    """Nearly all of the pixels are inside boxes, and every box has its share of them."""
+    detector = load_detector(model(name))
+    assert (detector.adapter, detector.input_size) == ("class_map", (513, 513))
+    for image, they in zip(images, people, strict=True):
+        mask = detector(image).class_mask
+        assert mask is not None
+        inside = np.zeros_like(mask)
+        for left, top, right, bottom in np.clip(they.boxes.round().astype(int), 0, None):
+            inside[top:bottom, left:right] = True
+            assert mask[top:bottom, left:right].mean() > 0.25
+        assert mask.shape == image.shape[:2]
+        assert np.count_nonzero(mask & inside) > 0.9 * np.count_nonzero(mask)
+
+
+def test_instance_masks_match_the_class_map(images: list[np.ndarray]) -> None:
+    instances, pixels = load_detector(model("yolov8n-seg_int8")), load_detector(model(MAPS[0]))
+    for image in images:
+        masks, mask = instances(image).masks, pixels(image).class_mask
+        assert masks is not None
+        assert mask is not None
+        union = masks.any(axis=0)
+        assert np.count_nonzero(union & mask) > 0.75 * np.count_nonzero(union | mask)
+
+
+def test_same_image_same_bytes(images: list[np.ndarray]) -> None:
+    first, second = (load_detector(model("yolox_nano"))(images[0]) for _ in range(2))
+    assert first.boxes.tobytes() == second.boxes.tobytes()
+    assert first.scores.tobytes() == second.scores.tobytes()
