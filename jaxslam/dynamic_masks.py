@@ -225,6 +225,6 @@ class DynamicMasks:
     def _forget(self, frame: int) -> None:
         """Drop what no mask can come from any more."""
         oldest = frame if self._looking_at is None else max(self._looking_at, frame - _MOST_FRAMES)
-        for kept in (self._seen, self._poses):
-            for old in [number for number in kept if number < oldest]:
+        for kept, first in ((self._seen, oldest), (self._poses, frame - 1)):
+            for old in [number for number in kept if number < first]:
                 del kept[old]

@@ -3,7 +3,8 @@
 Source: NGD-SLAM (Zhang, Cheng and Kaess 2025), section III-B: dynamic flow, clustering by DBSCAN, prediction of the
 mask from the depth of each cluster. The paper leaves open how the mask grows from a cluster: here it is where its part
 of the old mask has moved to, and a little around, as far as it has the cluster's depth and hangs together with its
-points. Without the old mask, what people touch joins them: thirty frames after the last detection precision was 0.3.
+points. What people touch joins them nevertheless: on Bonn `crowd`, thirty frames after the last detection, the mask
+agrees with DeepLab's with a median IoU of 0.18 only, and 0.74 while detections come two frames late.
 """
 
 import itertools
@@ -36,8 +37,6 @@ _DEPTH_RANGE = (5, 95)
 """Percentiles of the depth of a cluster's points,"""
 _DEPTH_MARGIN_M = 0.2
 """and how much farther the object may reach."""
-_AROUND_PX = 30
-"""How far from its points a cluster's part of the old mask reaches."""
 _LEAST_SHARE = 0.1
 """A piece of the new mask holds at least this share of the cluster's points."""
 
@@ -84,9 +83,12 @@ def predicted_mask(
     known, z = _depth_at(depth, followed)
     label = np.asarray(_clusters(followed.now, z, known))
     new = np.zeros_like(mask)
+    _, piece = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
     for cluster in range(int(label.max(initial=-1)) + 1):
         of_it = label == cluster
-        _add_object(new, mask, followed.before[:, of_it], followed.now[:, of_it], z[of_it], depth)
+        column, row = np.round(followed.before[:, of_it]).astype(np.int64)
+        old = np.isin(piece, np.setdiff1d(piece[row, column], [0]))
+        _add_object(new, old, followed.before[:, of_it], followed.now[:, of_it], z[of_it], depth)
     return new
 
 
@@ -102,10 +104,16 @@ def _depth_at(depth: np.ndarray, followed: Followed) -> tuple[np.ndarray, np.nda
 def _add_object(
     new: np.ndarray, old: np.ndarray, before: np.ndarray, now: np.ndarray, z: np.ndarray, depth: np.ndarray
 ) -> None:
-    """Add one object to the new mask: its part of the old one moved, cut by depth, and connected to its points."""
+    """Add one object to the new mask: its part of the old one moved, cut by depth, and connected to its points.
+
+    Its part is every piece of the old mask that holds one of its points: of people who overlap, depth keeps the others
+    out. Cut to what is near its points, masks had holes where flow had failed.
+    """
     height, width = old.shape
-    left, top = np.maximum(before.min(axis=1) - _AROUND_PX, 0).astype(int)
-    right, bottom = np.minimum(before.max(axis=1) + _AROUND_PX + 1, [width, height]).astype(int)
+    rows, columns = np.flatnonzero(old.any(axis=1)), np.flatnonzero(old.any(axis=0))
+    if not len(rows):
+        return
+    left, top, right, bottom = columns[0], rows[0], columns[-1] + 1, rows[-1] + 1
     shift = np.round(np.median(now - before, axis=1)).astype(int)
     reach = _GROW_PX + max(right - left, bottom - top) // 20  # what comes nearer grows
     moved = np.zeros((bottom - top + 2 * reach, right - left + 2 * reach), np.uint8)
