@@ -31,7 +31,7 @@ from jaxslam.recall import Recalled, recall, worth_recalling
 from jaxslam.state import TrackOutput, TrackParams, TrackPlan, TrackReason, TrackState, TrackStatus
 from jaxslam.state_edit import relocated
 from jaxslam.track import init_state
-from jaxslam.worker import InlineWorker, ThreadWorker, Worker, close_all
+from jaxslam.worker import Worker, close_all, make_worker
 
 _relocated = jax.jit(relocated, donate_argnums=0)
 
@@ -192,8 +192,9 @@ class BackEnd:
         if placed is None:
             return state, output, 0
         T_world_cam = self._link.pose(placed.hung)
-        state = self._link.moved_to(state, T_world_cam, pose, is_keyframe=bool(output.keyframe))
-        X_world = transform(compose(T_world_cam, inverse(pose)), np.asarray(output.X_world, np.float64))
+        change = compose(T_world_cam, inverse(pose))
+        state = self._link.moved(state, change, is_keyframe=bool(output.keyframe))
+        X_world = transform(change, np.asarray(output.X_world, np.float64))
         fine = placed.num_matched >= self._config.track.weak_inliers
         wxyz_xyz: Any = T_world_cam.astype(np.float32)
         output = output._replace(
@@ -297,9 +298,10 @@ class BackEnd:
         jax.block_until_ready(self._link.compile(state))
 
     def _worker(self, work: Callable[[Any], Any], name: str, turn: int) -> Worker[Any, Any]:
-        if self._config.run.deterministic:
-            return InlineWorker(work, f"jaxslam-{name}", turn * self._config.mapping.latency_frames)
-        return ThreadWorker(work, f"jaxslam-{name}")
+        latency_frames = turn * self._config.mapping.latency_frames
+        return make_worker(
+            work, f"jaxslam-{name}", deterministic=self._config.run.deterministic, latency_frames=latency_frames
+        )
 
     def _map_job(self, job: NewKeyframe | LoopClosure) -> _MapUpdate:
         before = self._mapping.map

@@ -4,7 +4,7 @@ import logging
 
 from jaxslam.config import SemanticsConfig
 from jaxslam.errors import ModelError
-from jaxslam.known_models import KNOWN_MODELS, find_model
+from jaxslam.known_models import find_model, is_known
 from jaxslam.semantics import Detector, load_detector
 
 _log = logging.getLogger(__name__)
@@ -21,7 +21,7 @@ def detector_of(config: SemanticsConfig) -> Detector | None:
     try:
         path = find_model(config.model)
     except ModelError as error:
-        if config.model not in KNOWN_MODELS:
+        if not is_known(config.model):
             raise
         _log.warning("no network finds what moves, geometry alone decides: %s", error)
         return None

@@ -7,8 +7,7 @@ goes wrong in the detector is told with the frame, and tracking goes on.
 import enum
 import logging
 import time
-from collections.abc import Callable
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -21,7 +20,7 @@ from jaxslam.masks.propagation import CAPACITY, Followed, follow, predicted_mask
 from jaxslam.masks.sampling import sample_mask
 from jaxslam.masks.stillness import without_still_parts
 from jaxslam.semantics import Detector
-from jaxslam.worker import InlineWorker, ThreadWorker, Worker
+from jaxslam.worker import InlineWorker, Worker, make_worker
 
 _log = logging.getLogger(__name__)
 
@@ -82,9 +81,6 @@ class _Seen(NamedTuple):
     pyramid: Pyramid
 
 
-_Job: TypeAlias = Worker[_Look, _Found]
-
-
 class DynamicMasks:
     """Makes the mask of every frame."""
 
@@ -113,11 +109,8 @@ class DynamicMasks:
         self._camera, self._detector = camera, detector
         self._propagate, self._dilate_px, self._seed = propagate, dilate_px, seed
         self._wait = latency_frames == 0
-        work: Callable[[_Look], _Found] = self._look
-        self._worker: _Job = (
-            InlineWorker(work, "jaxslam-semantics", latency_frames)
-            if deterministic
-            else ThreadWorker(work, "jaxslam-semantics")
+        self._worker: Worker[_Look, _Found] = make_worker(
+            self._look, "jaxslam-semantics", deterministic=deterministic, latency_frames=latency_frames
         )
         self._seen: dict[int, _Seen] = {}
         self._looking_at: int | None = None
@@ -143,7 +136,8 @@ class DynamicMasks:
             grey: `(h, w)` uint8; copied.
             depth: Metres.
         """
-        self._seen[frame] = _Seen(grey.copy(), _pyramid(grey.copy()))
+        kept = grey.copy()
+        self._seen[frame] = _Seen(kept, _pyramid(kept))
         found, error = self._newest(frame)
         if self._looking_at is None:
             self._offer(frame, image, depth)
@@ -172,8 +166,8 @@ class DynamicMasks:
         return _Found(job.frame, mask_of_detections(self._detector(job.image), job.depth, dilate_px=0))
 
     def _offer(self, frame: int, image: np.ndarray, depth: np.ndarray) -> None:
-        rgb = image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
-        self._worker.offer(_Look(frame, rgb.copy(), depth.copy()), frame)
+        rgb = image.copy() if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
+        self._worker.offer(_Look(frame, rgb, depth.copy()), frame)
         self._looking_at = frame
 
     def _newest(self, frame: int) -> tuple[_Found | None, str]:

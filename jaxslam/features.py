@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Float32, UInt8
 
 from jaxslam.frame_arrays import FrameArrays
 from jaxslam.observe import observe
+from jaxslam.padding import padded
 from jaxslam.state import TrackParams
 
 DESCRIPTOR_BYTES = 32
@@ -99,9 +100,8 @@ def features_of(
     """
     patches = extract(np.asarray(frame.image), np.asarray(frame.ignore), plan)
     num = len(patches.octave)
-    padded = np.zeros((2, plan.num_features), np.float32)  # one size, compiled once
-    padded[:, :num] = patches.seen_uv
-    uv, depth = jax.device_get(_ideal(padded, twist.astype(np.float32), frame.depth, frame.depth_delay_s, params))
+    fixed_size = padded(patches.seen_uv, plan.num_features, axis=1)  # compiled once
+    uv, depth = jax.device_get(_ideal(fixed_size, twist.astype(np.float32), frame.depth, frame.depth_delay_s, params))
     return Features(patches.seen_uv, uv[:, :num], depth[:num], *patches[1:])
 
 

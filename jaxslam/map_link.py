@@ -147,16 +147,15 @@ class MapLink:
         self._believed = new
         return _carried(state, now.astype(np.float32), corrections.astype(np.float32)), now
 
-    def moved_to(self, state: TrackState, T_world_cam: np.ndarray, before: np.ndarray, is_keyframe: bool) -> TrackState:
+    def moved(self, state: TrackState, T_new_old: np.ndarray, *, is_keyframe: bool) -> TrackState:
         """The tracker's state with the camera moved, and with it what it saw last; keyframes stay but this frame.
 
         Args:
             state: The state.
-            T_world_cam: `(7,)` where the camera is.
-            before: `(7,)` where it was taken to be.
+            T_new_old: `(7,)` the change of the camera's pose, in the world.
             is_keyframe: Whether the frame is the tracker's newest keyframe, not handed over yet.
         """
-        change = compose(T_world_cam, inverse(before)).astype(np.float32)
+        change = T_new_old.astype(np.float32)
         corrections = np.tile(IDENTITY.astype(np.float32), (len(self._slots), 1))
         if is_keyframe:
             corrections[self._made % self._plan.num_keyframes] = change

@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxslam.local_mapping import recalled_id
 from jaxslam.map import NONE, Map, rows, sightings_at
+from jaxslam.padding import padded
 from jaxslam.pose import to_local
 
 _LEAST_POINTS = 60
@@ -86,9 +87,7 @@ def recall(map: Map, keyframe_id: int, num_points: int) -> Recalled:
     seen = sightings_at(seen, order)
     X_world = map.points.X_world[:, rows(map.points.ids, seen.point)]
     weight = seen.weight * map.points.weight[rows(map.points.ids, seen.point)]
-    fit = lambda array, dtype: np.concatenate(
-        [array, np.zeros((*array.shape[:-1], num_points - len(order)))], axis=-1
-    ).astype(dtype)
+    fit = lambda array, dtype: padded(array, num_points, axis=-1).astype(dtype)
     return Recalled(
         keyframe_id,
         image,

@@ -164,6 +164,13 @@ class ThreadWorker(Generic[_Job, _Result]):
             self._thread.join(within_s)
 
 
+def make_worker(
+    work: Callable[[_Job], _Result], name: str, *, deterministic: bool, latency_frames: int
+) -> Worker[_Job, _Result]:
+    """A worker: on the fixed schedule of a deterministic run, else with a thread of its own."""
+    return InlineWorker(work, name, latency_frames) if deterministic else ThreadWorker(work, name)
+
+
 _running: "weakref.WeakSet[ThreadWorker[Any, Any]]" = weakref.WeakSet()
 
 

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxslam_kernels.dbscan import dbscan
 from jaxslam_kernels.image import Pyramid
-from jaxslam_kernels.lk_flow import FlowPlan, lk_flow
+from jaxslam_kernels.lk_flow import lk_flow
 from jaxslam_kernels.types import Mask, Pixels
 from jaxtyping import Array, Bool, Float, Int
 
@@ -25,7 +25,6 @@ from jaxslam.padding import padded
 
 CAPACITY = 256
 """Most points."""
-FLOW = FlowPlan()
 _NEIGHBOURS_PX = 40.0
 """Points of one object are at most so far apart in the image,"""
 _PX_PER_M = 200.0
@@ -80,7 +79,7 @@ def predicted_mask(
         followed: Its points.
         depth: Of the new frame, metres, 0 where missing.
     """
-    known, z = _depth_at(depth, followed)
+    known, z = depth_at(depth, followed)
     label = np.asarray(_clusters(followed.now, z, known))
     new = np.zeros_like(mask)
     _, piece = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
@@ -92,8 +91,8 @@ def predicted_mask(
     return new
 
 
-def _depth_at(depth: np.ndarray, followed: Followed) -> tuple[np.ndarray, np.ndarray]:
-    """Which points have depth, and what."""
+def depth_at(depth: np.ndarray, followed: Followed) -> tuple[np.ndarray, np.ndarray]:
+    """Which points have depth where they are now, and what; 0 for the others."""
     column, row = np.round(np.where(followed.ok, followed.now, 0)).astype(np.int64)
     inside = (row >= 0) & (row < depth.shape[0]) & (column >= 0) & (column < depth.shape[1])
     z = np.where(inside, depth[np.where(inside, row, 0), np.where(inside, column, 0)], 0)
@@ -139,7 +138,7 @@ def _add_object(
 
 @jax.jit
 def _flow(before: Pyramid, now: Pyramid, uv: Pixels, ok: Mask) -> tuple[Pixels, Mask]:
-    flow = lk_flow(before, now, uv, mask=ok, plan=FLOW)
+    flow = lk_flow(before, now, uv, mask=ok)
     return flow.points, flow.ok
 
 

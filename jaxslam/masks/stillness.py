@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxslam.camera import Camera
-from jaxslam.masks.propagation import Followed
+from jaxslam.masks.propagation import Followed, depth_at
 from jaxslam.masks.sampling import CELL_PX
 from jaxslam.pose import between, transform
 
@@ -43,13 +43,12 @@ def _still(
     followed: Followed, depth: np.ndarray, T_before_now: np.ndarray, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray]:
     """Which points stand still, and for which that is known."""
-    column, row = np.round(np.where(followed.ok, followed.now, 0)).astype(np.int64)
-    inside = (row >= 0) & (row < depth.shape[0]) & (column >= 0) & (column < depth.shape[1])
-    z = np.where(inside, depth[np.where(inside, row, 0), np.where(inside, column, 0)], 0).astype(np.float64)
+    known, measured = depth_at(depth, followed)
+    z = measured.astype(np.float64)
     u, v = followed.now.astype(np.float64)
     X_now = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z])
     x, y, ahead = transform(T_before_now, X_now)
-    known = followed.ok & inside & np.isfinite(z) & (z > 0) & (ahead > 0.05)
+    known &= ahead > 0.05
     ahead = np.where(known, ahead, 1.0)
     expected = np.stack([camera.fx * x / ahead + camera.cx, camera.fy * y / ahead + camera.cy])
     return known & (np.linalg.norm(expected - followed.before, axis=0) < _STILL_PX), known

@@ -5,19 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from jaxslam import known_models
 from jaxslam.errors import ModelError
 from jaxslam.known_models import DEFAULT_MODEL, KNOWN_MODELS, find_model, is_known, known_model, local_file
 
-
-@pytest.fixture(autouse=True)
-def cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """An empty cache folder, and no folder of the user's."""
-    monkeypatch.delenv("JAXSLAM_MODELS", raising=False)
-    monkeypatch.setattr(known_models.platformdirs, "user_cache_dir", lambda *_, **__: str(tmp_path / "cache"))
-    folder = tmp_path / "cache" / "models"
-    folder.mkdir(parents=True)
-    return folder
+pytestmark = pytest.mark.usefixtures("models_cache")
 
 
 @pytest.fixture
@@ -73,39 +64,39 @@ class TestFindModel:
         assert find_model(str(mine)) == mine
 
     @pytest.mark.parametrize("file", ["yolox_nano.onnx", "yolox-nano.onnx"])
-    def test_in_the_cache(self, cache: Path, file: str) -> None:
-        assert touch(cache / file) == find_model("yolox-nano")
+    def test_in_the_cache(self, models_cache: Path, file: str) -> None:
+        assert touch(models_cache / file) == find_model("yolox-nano")
 
     @pytest.mark.parametrize("file", ["yolox_nano.onnx", "yolox-nano.onnx"])
-    def test_in_the_chosen_folder_first(self, cache: Path, chosen: Path, file: str) -> None:
-        touch(cache / "yolox_nano.onnx")
+    def test_in_the_chosen_folder_first(self, models_cache: Path, chosen: Path, file: str) -> None:
+        touch(models_cache / "yolox_nano.onnx")
         assert touch(chosen / file) == find_model("yolox-nano")
 
     @pytest.mark.usefixtures("chosen")
-    def test_in_the_cache_if_not_in_the_chosen_folder(self, cache: Path) -> None:
-        assert touch(cache / "yolox_nano.onnx") == find_model("yolox-nano")
+    def test_in_the_cache_if_not_in_the_chosen_folder(self, models_cache: Path) -> None:
+        assert touch(models_cache / "yolox_nano.onnx") == find_model("yolox-nano")
 
-    def test_default(self, cache: Path) -> None:
-        assert touch(cache / known_model(DEFAULT_MODEL).file) == find_model()
+    def test_default(self, models_cache: Path) -> None:
+        assert touch(models_cache / known_model(DEFAULT_MODEL).file) == find_model()
 
     def test_folder_of_that_name_is_no_model(
-        self, monkeypatch: pytest.MonkeyPatch, cache: Path, tmp_path: Path
+        self, monkeypatch: pytest.MonkeyPatch, models_cache: Path, tmp_path: Path
     ) -> None:
         (tmp_path / "yolox-nano").mkdir()
         monkeypatch.chdir(tmp_path)
-        assert touch(cache / "yolox_nano.onnx") == find_model("yolox-nano")
+        assert touch(models_cache / "yolox_nano.onnx") == find_model("yolox-nano")
 
-    def test_missing_says_how_to_get_it(self, cache: Path) -> None:
+    def test_missing_says_how_to_get_it(self, models_cache: Path) -> None:
         with pytest.raises(ModelError) as error:
             find_model("yolox-nano")
         assert "jaxslam models get yolox-nano" in str(error.value)
-        assert str(cache / "yolox_nano.onnx") in str(error.value)
+        assert str(models_cache / "yolox_nano.onnx") in str(error.value)
 
-    def test_missing_and_not_published_says_how_to_make_it(self, cache: Path) -> None:
+    def test_missing_and_not_published_says_how_to_make_it(self, models_cache: Path) -> None:
         with pytest.raises(ModelError) as error:
             find_model("yolov8n")
         assert "yolo export model=yolov8n.pt format=onnx" in str(error.value)
-        assert str(cache / "yolov8n.onnx") in str(error.value)
+        assert str(models_cache / "yolov8n.onnx") in str(error.value)
         assert "models get" not in str(error.value)
 
     @pytest.mark.parametrize("name", ["nowhere.onnx", "yolox-nan"])

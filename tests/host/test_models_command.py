@@ -43,14 +43,7 @@ def two_people() -> Detections:
     return Detections(boxes, np.array([0.9, 0.4], np.float32), ("person", "dog"), masks, None)
 
 
-@pytest.fixture(autouse=True)
-def cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """An empty cache folder, and no folder of the user's."""
-    monkeypatch.delenv("JAXSLAM_MODELS", raising=False)
-    monkeypatch.setattr(known_models.platformdirs, "user_cache_dir", lambda *_, **__: str(tmp_path / "cache"))
-    folder = tmp_path / "cache" / "models"
-    folder.mkdir(parents=True)
-    return folder
+pytestmark = pytest.mark.usefixtures("models_cache")
 
 
 @pytest.fixture
@@ -78,13 +71,13 @@ class TestTable:
     def test_adapters_exist(self) -> None:
         assert {model.adapter for model in KNOWN_MODELS.values()} <= set(ADAPTERS)
 
-    def test_lists_them_all(self, capsys: pytest.CaptureFixture[str], cache: Path) -> None:
-        (cache / "FastestDet.onnx").write_bytes(CONTENT)
+    def test_lists_them_all(self, capsys: pytest.CaptureFixture[str], models_cache: Path) -> None:
+        (models_cache / "FastestDet.onnx").write_bytes(CONTENT)
         main(["models", "list"])
         out = capsys.readouterr().out
         assert all(name in out for name in KNOWN_MODELS)
         assert "(default)" in out
-        assert f"fastestdet: {cache / 'FastestDet.onnx'}" in out
+        assert f"fastestdet: {models_cache / 'FastestDet.onnx'}" in out
         assert "SHA-256" not in out
 
     def test_details(self, capsys: pytest.CaptureFixture[str]) -> None:
@@ -111,14 +104,14 @@ class TestGet:
         return asked
 
     def test_into_the_cache(
-        self, capsys: pytest.CaptureFixture[str], cache: Path, served: list[dict[str, Any]]
+        self, capsys: pytest.CaptureFixture[str], models_cache: Path, served: list[dict[str, Any]]
     ) -> None:
         main(["models", "get", "yolox-nano"])
         model = known_model("yolox-nano")
         assert served == [{"url": model.url, "sha256": model.sha256, "size": model.size_bytes}]
-        assert (cache / "yolox_nano.onnx").read_bytes() == CONTENT
+        assert (models_cache / "yolox_nano.onnx").read_bytes() == CONTENT
         out = capsys.readouterr().out
-        assert str(cache / "yolox_nano.onnx") in out
+        assert str(models_cache / "yolox_nano.onnx") in out
         assert "Apache-2.0" in out
         assert f"SHA-256 {HASH}, as expected" in out
 
@@ -130,16 +123,18 @@ class TestGet:
         main(["models", "get", "yolox-nano"])
         assert f"SHA-256 {HASH}, which nobody has checked" in capsys.readouterr().out
 
-    def test_only_once(self, capsys: pytest.CaptureFixture[str], cache: Path, served: list[dict[str, Any]]) -> None:
-        (cache / "yolox_nano.onnx").write_bytes(b"mine")
+    def test_only_once(
+        self, capsys: pytest.CaptureFixture[str], models_cache: Path, served: list[dict[str, Any]]
+    ) -> None:
+        (models_cache / "yolox_nano.onnx").write_bytes(b"mine")
         main(["models", "get", "yolox-nano"])
         assert not served
         out = capsys.readouterr().out
-        assert str(cache / "yolox_nano.onnx") in out
+        assert str(models_cache / "yolox_nano.onnx") in out
         assert "another file than the published one" in out
         main(["models", "get", "yolox-nano", "--force"])
         assert len(served) == 1
-        assert (cache / "yolox_nano.onnx").read_bytes() == CONTENT
+        assert (models_cache / "yolox_nano.onnx").read_bytes() == CONTENT
 
     @pytest.mark.usefixtures("served")
     def test_says_if_another_file_goes_first(
@@ -152,11 +147,11 @@ class TestGet:
 
     @pytest.mark.parametrize("name", [model.name for model in KNOWN_MODELS.values() if model.url is None])
     def test_what_must_be_made(
-        self, capsys: pytest.CaptureFixture[str], cache: Path, served: list[dict[str, Any]], name: str
+        self, capsys: pytest.CaptureFixture[str], models_cache: Path, served: list[dict[str, Any]], name: str
     ) -> None:
         message = fails(capsys, "get", name)
         assert KNOWN_MODELS[name].how in message
-        assert str(cache / KNOWN_MODELS[name].file) in message
+        assert str(models_cache / KNOWN_MODELS[name].file) in message
         assert not served
 
     def test_misspelt(self, capsys: pytest.CaptureFixture[str]) -> None:
