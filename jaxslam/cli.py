@@ -4,10 +4,11 @@ import itertools
 import logging
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 import tyro
 from rich.console import Console
@@ -20,16 +21,23 @@ from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.doctor import diagnose
 from jaxslam.errors import ConfigError, DatasetError, JaxSlamError, nearest
 from jaxslam.evaluation import Evaluation, evaluate
+from jaxslam.frame import Frame
 from jaxslam.map_export import write_colmap, write_keyframe_trajectory, write_ply
 from jaxslam.map_file import load_map
+from jaxslam.mask_pictures import MaskPictures
 from jaxslam.models_command import Models
-from jaxslam.results import RunInfo, Snapshots, write_results
+from jaxslam.results import RESULT_FILES, RunInfo, Snapshots, write_results
 from jaxslam.slam import Slam
+from jaxslam.tracked import Rejected, Tracked
 from jaxslam.trajectory import read
 from jaxslam.visualize import plot_trajectory
 from jaxslam.xla import prefer_one_thread
 
+if TYPE_CHECKING:
+    from jaxslam.viewer import Viewer
+
 _console = Console(soft_wrap=True)
+_OnFrame: TypeAlias = Callable[[Frame | None, Tracked | Rejected], None]
 _Settings: TypeAlias = Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction]
 
 
@@ -50,13 +58,19 @@ class Demo:
     """People walking through the room."""
     seed: int = 0
     """Seed of room, people, path and noise."""
+    viz: bool = False
+    """Watch it in the viewer of rerun."""
+    rrd: Path | None = None
+    """File to write a recording for that viewer to."""
 
     def main(self) -> None:
         """Run the command."""
         scene = SyntheticConfig(frames=self.frames, path=self.path, people=self.people, seed=self.seed)
         _console.print(f"Rendering a room with {self.people} people, the camera moving as in '{self.path}'.")
         dataset = SyntheticDataset(scene)
-        _track(dataset, Slam(dataset.camera, load_config()), "default", self.out)
+        slam = Slam(dataset.camera, load_config())
+        viewer = _viewer(slam, dataset, live=self.viz, path=self.rrd)
+        _track(dataset, slam, "default", self.out, viewer)
 
 
 @dataclass(frozen=True)
@@ -90,6 +104,10 @@ class Run:
     """Only find the camera in the map, which stays as it is."""
     save_map: Path | None = None
     """File to write the map to."""
+    viz: bool = False
+    """Watch it in the viewer of rerun."""
+    rrd: Path | None = None
+    """File to write a recording for that viewer to."""
     set: _Settings = ()
     """Settings, as in `--set track.num_points=400 run.seed=3`; may be given again."""
 
@@ -112,7 +130,8 @@ class Run:
             dataset = Subset(dataset, self.start, stop)
         start = None if self.map is None else load_map(self.map)
         slam = Slam(dataset.camera, config, map=start, localize_only=self.localize_only)
-        _track(dataset, slam, self.preset, self.out or Path("results") / self.recording.resolve().name)
+        viewer = _viewer(slam, dataset, live=self.viz, path=self.rrd)
+        _track(dataset, slam, self.preset, self.out or Path("results") / self.recording.resolve().name, viewer)
         if self.save_map is not None:
             slam.save(self.save_map)
             _console.print(f"Map in {self.save_map}: {len(slam.map.ids)} keyframes, {len(slam.map.points.ids)} points")
@@ -217,17 +236,27 @@ class _Meter:
 
     progress: Progress
     task: Any
-    snapshots: Any
+    watchers: Sequence[_OnFrame]
     statuses: dict[str, int] = field(default_factory=dict)
 
-    def __call__(self, frame: Any, result: Any) -> None:
-        self.snapshots(frame, result)
+    def __call__(self, frame: Frame | None, result: Tracked | Rejected) -> None:
+        for watcher in self.watchers:
+            watcher(frame, result)
         self.statuses[result.status.name] = self.statuses.get(result.status.name, 0) + 1
         text = "  ".join(f"{name.lower()} {count}" for name, count in self.statuses.items())
         self.progress.update(self.task, advance=1, status=text)
 
 
-def _track(dataset: Dataset, slam: Slam, preset: str, out: Path) -> None:
+def _viewer(slam: Slam, dataset: Dataset, *, live: bool, path: Path | None) -> "Viewer | None":
+    """What shows the run, if that is wanted; rerun is a large package that many will not have."""
+    if not live and path is None:
+        return None
+    from jaxslam.viewer import Viewer  # noqa: PLC0415
+
+    return Viewer(slam, dataset.ground_truth, path=path, live=live)
+
+
+def _track(dataset: Dataset, slam: Slam, preset: str, out: Path, viewer: "Viewer | None" = None) -> None:
     """Track, write the results, print them."""
     began = time.perf_counter()
     with _console.status("Compiling the tracker (some 15 s at the first start on a machine, then 2) ..."):
@@ -240,12 +269,13 @@ def _track(dataset: Dataset, slam: Slam, preset: str, out: Path) -> None:
         TimeRemainingColumn(),
         TextColumn("{task.fields[status]}"),
     )
-    snapshots = Snapshots(len(dataset))
-    with slam, Progress(*columns, console=_console) as progress:
-        meter = _Meter(progress, progress.add_task("track", total=len(dataset), status=""), snapshots)
+    snapshots, masks = Snapshots(len(dataset)), MaskPictures()
+    watchers = [snapshots, masks] if viewer is None else [snapshots, masks, viewer]
+    with slam, viewer or nullcontext(), Progress(*columns, console=_console) as progress:
+        meter = _Meter(progress, progress.add_task("track", total=len(dataset), status=""), watchers)
         records = slam.run(dataset, meter)
     info = RunInfo(dataset, preset, time.perf_counter() - began)
-    summary, evaluation = write_results(out, slam, records, info, snapshots.kept)
+    summary, evaluation = write_results(out, slam, records, info, snapshots.kept, masks.kept)
     _print_summary(summary, evaluation, out)
 
 
@@ -267,10 +297,7 @@ def _print_summary(summary: dict[str, Any], evaluation: Evaluation | None, out: 
         _console.print(f"Not evaluated: {summary['evaluation_problem']}.")
     for note in evaluation.notes if evaluation is not None else ():
         _console.print(f"Note: {note}.")
-    _console.print(
-        f"Results in {out}: trajectory.txt, trajectory_online.txt, trajectory_keyframes.txt, summary.json,"
-        " config.yaml, plot.png, map.png"
-    )
+    _console.print(f"Results in {out}: {', '.join(name for name in RESULT_FILES if (out / name).exists())}")
 
 
 def _number(value: float | None, digits: int) -> str:

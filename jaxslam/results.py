@@ -21,6 +21,7 @@ from jaxslam.evaluation import Evaluation, evaluate
 from jaxslam.files import write_atomically
 from jaxslam.frame import Frame
 from jaxslam.map_export import write_keyframe_trajectory
+from jaxslam.mask_pictures import write_mask_pictures
 from jaxslam.slam import Slam
 from jaxslam.state import TrackStatus
 from jaxslam.tracked import FrameRecord, Rejected, Tracked
@@ -29,6 +30,12 @@ from jaxslam.visualize import Snapshot, plot_map, plot_trajectory
 from jaxslam.xla import threads, usable_cores
 
 _PACKAGES = ("jaxslam", "jax", "jaxlib", "jaxlie", "equinox", "optimistix", "numpy", "opencv-python-headless")
+_ALWAYS = ("trajectory.txt", "trajectory_online.txt", "summary.json", "config.yaml")
+_OF_THE_PATH = ("plot.png",)
+_OF_THE_MAP = ("trajectory_keyframes.txt", "map.png")
+_OF_MASKS = ("masks.png", "masks.gif")
+RESULT_FILES = (*_ALWAYS, *_OF_THE_PATH, *_OF_THE_MAP, *_OF_MASKS)
+"""All that a run can leave behind: no path, no keyframes, no masks, none of their files."""
 _NUM_SNAPSHOTS = 4
 
 
@@ -59,16 +66,23 @@ class RunInfo:
 
 
 def write_results(
-    folder: Path, slam: Slam, records: Sequence[FrameRecord], info: RunInfo, snapshots: Sequence[Snapshot] = ()
+    folder: Path,
+    slam: Slam,
+    records: Sequence[FrameRecord],
+    info: RunInfo,
+    snapshots: Sequence[Snapshot] = (),
+    masks: Sequence[np.ndarray] = (),
 ) -> tuple[dict[str, Any], Evaluation | None]:
-    """Write three trajectories (final, online, keyframes), `summary.json`, `config.yaml`, `plot.png`, `map.png`.
+    """Write those of `RESULT_FILES` there is something for: trajectories, a summary, the settings, pictures.
 
     Args:
-        folder: Where they go; made if it is not there. Files of an earlier run are replaced, each in one piece.
+        folder: Where they go; made if it is not there. Files of an earlier run are replaced, each in one piece, or
+            removed if this one has none.
         slam: What tracked.
         records: From `Slam.run`.
         info: The recording and how it was run.
         snapshots: Frames to show below the plots.
+        masks: `MaskPictures.kept`.
 
     Returns:
         The summary, and the evaluation if there is ground truth to compare with.
@@ -84,13 +98,24 @@ def write_results(
     summary = _summary(slam, records, info, evaluation) | {"evaluation_problem": problem}
     write_tum(folder / "trajectory.txt", slam.trajectory)
     write_tum(folder / "trajectory_online.txt", slam.online_trajectory)
+    write_atomically(folder / "config.yaml", to_yaml(slam.config).encode())
+    write_atomically(folder / "summary.json", (json.dumps(summary, indent=2) + "\n").encode())
+    absent: list[str] = []
+    if len(slam.trajectory):
+        plot_trajectory(slam.trajectory, truth, evaluation, folder / "plot.png", snapshots)
+    else:
+        absent += _OF_THE_PATH
     if len(slam.map.ids):
         write_keyframe_trajectory(folder / "trajectory_keyframes.txt", slam.map)
         plot_map(slam.map, slam.trajectory, folder / "map.png")
-    write_atomically(folder / "config.yaml", to_yaml(slam.config).encode())
-    write_atomically(folder / "summary.json", (json.dumps(summary, indent=2) + "\n").encode())
-    if len(slam.trajectory):
-        plot_trajectory(slam.trajectory, truth, evaluation, folder / "plot.png", snapshots)
+    else:
+        absent += _OF_THE_MAP
+    if masks:
+        write_mask_pictures(folder, masks)
+    else:
+        absent += _OF_MASKS
+    for name in absent:
+        (folder / name).unlink(missing_ok=True)
     return summary, evaluation
 
 

@@ -9,3 +9,6 @@ FILES = {
     "plot.png",
     "map.png",
 }
+
+MASK_FILES = {"masks.png", "masks.gif"}
+"""What there is besides if a frame had a mask."""

@@ -1,18 +1,20 @@
 """The files of a run: on the small scene, and on real recordings through the command line."""
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from evo.tools import file_interface
-from result_files import FILES
+from PIL import Image
+from result_files import FILES, MASK_FILES
 from small_scene import CONFIG, clip
 
 from jaxslam.cli import main
 from jaxslam.config import load_config
-from jaxslam.results import RunInfo, Snapshots, write_results
+from jaxslam.results import RESULT_FILES, RunInfo, Snapshots, write_results
 from jaxslam.slam import Slam
 from jaxslam.trajectory import Trajectory, read_tum
 
@@ -65,9 +67,19 @@ class TestSmallScene:
         np.testing.assert_array_equal(written.timestamps_ns, slam.trajectory.timestamps_ns)
         np.testing.assert_allclose(written.T_world_cam, slam.trajectory.T_world_cam, atol=1e-8)
 
+    def test_masks_of_this_run_only(self, tmp_path: Path) -> None:
+        """Their pictures are there if there were masks, and go with the next run that has none."""
+        recording, slam = clip(), Slam(clip().camera, CONFIG)
+        records, info = slam.run(recording), RunInfo(recording, "default", 1.5)
+        write_results(tmp_path, slam, records, info, masks=[np.zeros((140, 320, 3), np.uint8)])
+        assert {path.name for path in tmp_path.iterdir()} == FILES | MASK_FILES == set(RESULT_FILES)
+        write_results(tmp_path, slam, records, info)
+        assert {path.name for path in tmp_path.iterdir()} == FILES
+
     def test_nothing_tracked_and_no_truth(self, tmp_path: Path) -> None:
         recording, slam = clip(), Slam(clip().camera, CONFIG)
         recording.ground_truth = None
+        (tmp_path / "plot.png").write_text("of an earlier run")
         summary, evaluation = write_results(tmp_path, slam, [], RunInfo(recording, "default", 0.1))
         assert evaluation is None
         assert summary["evaluation_problem"] == "no ground truth"
@@ -88,3 +100,16 @@ class TestRealRecordings:
         assert (summary["frames"], summary["tracked"]) == (frames, frames)
         assert summary["ate_rmse_m"] <= limit_m
         assert len(check_against_evo(tmp_path / "trajectory.txt")) == frames
+
+    def test_masks(self, data_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        """Two people in the picture, and a network that finds them."""
+        model = Path(os.environ.get("JAXSLAM_MODELS") or "nowhere", "yolox_nano.onnx")
+        if not model.is_file():
+            pytest.skip("JAXSLAM_MODELS is not set, or holds no yolox_nano.onnx")
+        part = ["--start", "300", "--max-frames", "10", "--set", f"semantics.model={model.resolve()}"]
+        main(["run", str(data_dir / "bonn/rgbd_bonn_crowd"), "--out", str(tmp_path), *part])
+        assert {path.name for path in tmp_path.iterdir()} == FILES | MASK_FILES
+        printed = capsys.readouterr().out
+        assert all(name in printed for name in FILES | MASK_FILES)
+        with Image.open(tmp_path / "masks.png") as sheet:
+            assert sheet.width == 4 * 320
