@@ -19,7 +19,7 @@ from jaxslam.essential_graph import compile_graph
 from jaxslam.feature_pose import MIN_INLIERS
 from jaxslam.features import Features, features_of, no_features
 from jaxslam.frame_arrays import FrameArrays
-from jaxslam.local_map import match_local_map
+from jaxslam.local_map import keyframes_in_view, match_local_map
 from jaxslam.local_mapping import LocalMapping, NewKeyframe, mapping_plan, with_new_keyframe
 from jaxslam.loop_closing import LoopClosing, LoopClosure
 from jaxslam.map import NONE, Map, empty_map
@@ -27,7 +27,7 @@ from jaxslam.map_link import Hung, MapLink, pose_of
 from jaxslam.place_index import PlaceIndex
 from jaxslam.place_recognition import compile_recognition, recognise
 from jaxslam.pose import IDENTITY, compose, inverse, transform
-from jaxslam.recall import Recalled, recall, worth_recalling
+from jaxslam.recall import Recalled, recall
 from jaxslam.state import TrackOutput, TrackParams, TrackPlan, TrackReason, TrackState, TrackStatus
 from jaxslam.state_edit import relocated
 from jaxslam.track import init_state
@@ -322,7 +322,7 @@ class BackEnd:
         return self._recalls(job)
 
     def _recalls(self, job: _Recall) -> tuple[Recalled, ...]:
-        wanted = worth_recalling(job.map, job.T_world_cam, job.submap, set(job.known), self._track_plan.num_recalled)
+        wanted = keyframes_in_view(job.map, job.T_world_cam, job.submap, set(job.known), self._track_plan.num_recalled)
         return tuple(recall(job.map, keyframe_id, self._track_plan.num_points) for keyframe_id in wanted)
 
     def _take_maps(self, updates: list[_MapUpdate], frame: int) -> bool:

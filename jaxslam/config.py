@@ -34,14 +34,19 @@ class TrackConfig(Checked):
     """Latest keyframes kept to look points up in again."""
     num_recalled: Annotated[int, Range(at_least=0, at_most=64)] = 4
     """Further keyframes to look into, recalled from the map where the camera comes back."""
-    num_sources: Annotated[int, Range(at_least=1, at_most=8)] = 2
-    """How many of the keyframes are looked into in a frame."""
+    num_sources: Annotated[int, Range(at_least=0, at_most=8)] = 2
+    """How many of the keyframes are looked into in a frame; 0 for following from frame to frame alone."""
     points_per_source: Annotated[int, Range(at_least=16, at_most=2048)] = 160
     """Points looked up from each of them."""
     num_hypotheses: Annotated[int, Range(at_least=16, at_most=1024)] = 64
     """Pose hypotheses a frame."""
     cell_px: Annotated[int, Range(at_least=8, at_most=80)] = 20
     """Side of the grid cells that each get at most one new corner, pixels, even."""
+    new_points: Literal["always", "keyframes"] = "always"
+    """In which frames new points are sought, where there are few."""
+    hold_to_map: Literal["weak", "keyframes", "always"] = "weak"
+    """Which frames are matched with the map by their ORB features too: those where few points are followed, besides
+    them keyframes, or all. All that flow has lost are in any case."""
 
     depth_sigma_m: Annotated[float, Positive] = 0.005
     """Standard deviation of measured depth close to the camera, metres."""
@@ -75,6 +80,8 @@ class TrackConfig(Checked):
     """A keyframe is made when no kept one shows more than this share of its points,"""
     keyframe_followed_below: Annotated[float, Share] = 0.1
     """when less than this share of the followed points was there at the last keyframe,"""
+    keyframe_points_below: Annotated[float, Share] = 0.0
+    """when less than this share of `num_points` is still followed,"""
     keyframe_after_s: Annotated[float, Positive] = 10.0
     """when the last one was made so many seconds ago,"""
     keyframe_weak_after_s: Annotated[float, Positive] = 0.3
@@ -136,6 +143,14 @@ class SemanticsConfig(Checked):
 
 
 @dataclass(frozen=True)
+class DynamicsConfig(Checked):
+    """Finding what moves without a network."""
+
+    newcomers: bool = True
+    """Leave out what has come before surfaces that were seen earlier: people, doors, things that are carried."""
+
+
+@dataclass(frozen=True)
 class RunConfig(Checked):
     """How a recording or a live stream is run."""
 
@@ -159,6 +174,7 @@ class Config(Checked):
     run: RunConfig = field(default_factory=RunConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
     semantics: SemanticsConfig = field(default_factory=SemanticsConfig)
+    dynamics: DynamicsConfig = field(default_factory=DynamicsConfig)
 
 
 def load_config(preset: str = "default", file: str | Path | None = None, overrides: Sequence[str] = ()) -> Config:

@@ -104,20 +104,29 @@ def matches_of(
     return Matches(*filled)
 
 
-def fit_pose(T_origin_cam: np.ndarray, matches: Matches, params: TrackParams) -> FeaturePose | None:
+def fit_pose(
+    T_origin_cam: np.ndarray,
+    matches: Matches,
+    params: TrackParams,
+    *,
+    min_inliers: int = MIN_INLIERS,
+    min_cells: int = MIN_CELLS,
+) -> FeaturePose | None:
     """The pose that most matches agree on; `None` where too few do, or in too small a part of the image.
 
     Args:
         T_origin_cam: `(7,)` a pose near it.
         matches: What was found.
         params: Camera, of which ideal pixels leave the pinhole, and the errors of its depth.
+        min_inliers: Fewest matches that agree in the end,
+        min_cells: and fewest cells of the image they lie in.
     """
     refined: PoseRefinement = jax.device_get(_refined(SE3(jnp.asarray(T_origin_cam, jnp.float32)), matches, params))
     used = np.asarray(matches.weight) > 0
     gate = np.where(np.asarray(matches.depth) > 0, _CHI2_GATES[1], _CHI2_GATES[0])
     agree = np.flatnonzero(used & (np.asarray(refined.chi2) < gate))
     share = len(agree) / max(np.count_nonzero(used), 1)
-    if refined.status != PoseStatus.OK or len(agree) < MIN_INLIERS or share < MIN_SHARE:
+    if refined.status != PoseStatus.OK or len(agree) < min_inliers or share < MIN_SHARE:
         return None
     pose = np.asarray(refined.T_world_cam.wxyz_xyz, np.float64)
     pose[:4] /= np.linalg.norm(pose[:4])
@@ -125,7 +134,7 @@ def fit_pose(T_origin_cam: np.ndarray, matches: Matches, params: TrackParams) ->
     covariance = np.asarray(refined.covariance, np.float64) * max(float(refined.residual_scale), 1.0) ** 2
     covariance = 0.5 * (covariance + covariance.T)
     sigma_m = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
-    if _cells(np.asarray(matches.uv)[:, agree], params) < MIN_CELLS or sigma_m > MAX_SIGMA_M:
+    if _cells(np.asarray(matches.uv)[:, agree], params) < min_cells or sigma_m > MAX_SIGMA_M:
         return None
     return FeaturePose(pose, covariance, agree, share)
 

@@ -1,6 +1,5 @@
 """Frames as the compiled step takes them: one, or a clip of them with time as the first axis."""
 
-import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -8,10 +7,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Num
 from numpy.typing import DTypeLike
 
+from jaxslam.aligned import aligned_array
 from jaxslam.errors import FrameError
 from jaxslam.frame import Frame, to_grey
-
-_ALIGNMENT = 64  # bytes
 
 
 class FrameArrays(NamedTuple):
@@ -49,14 +47,13 @@ def frame_arrays(frame: Frame, dt_s: float, dtype: DTypeLike = np.float32) -> Fr
 class FrameMemory:
     """Room for the arrays of one frame, filled anew with each.
 
-    It begins at multiples of 64 bytes. XLA computes on such arrays in place, in the calling thread; others it copies in
-    a thread of its own, where the step then waits for what mapping has XLA do.
+    XLA computes on it in place: see `aligned_array`.
     """
 
     def __init__(self, height: int, width: int) -> None:
         """Make room for frames of one size."""
-        self._image, self._depth = _aligned((height, width), np.uint8), _aligned((height, width), np.float32)
-        self._ignore, self._nothing = (_aligned((height, width), np.bool_) for _ in range(2))
+        self._image, self._depth = aligned_array((height, width), np.uint8), aligned_array((height, width), np.float32)
+        self._ignore, self._nothing = (aligned_array((height, width), np.bool_) for _ in range(2))
         self._nothing[:] = False
 
     @property
@@ -110,10 +107,3 @@ def stack_frames(frames: Sequence[Frame], previous_ns: int | None = None, dtype:
 def _times(frame: Frame, dt_s: float, dtype: DTypeLike) -> tuple[np.ndarray, np.ndarray]:
     delay_ns = 0 if frame.depth_timestamp_ns is None else frame.depth_timestamp_ns - frame.timestamp_ns
     return np.asarray(dt_s, dtype), np.asarray(delay_ns * 1e-9, dtype)
-
-
-def _aligned(shape: tuple[int, int], dtype: DTypeLike) -> np.ndarray:
-    size = math.prod(shape) * np.dtype(dtype).itemsize
-    room = np.empty(size + _ALIGNMENT, np.uint8)
-    begin = -room.ctypes.data % _ALIGNMENT
-    return room[begin : begin + size].view(dtype).reshape(shape)

@@ -63,6 +63,8 @@ def look_up(
     visible = _visible(predicted, X_cam[2], height, width) & alike & valid.reshape(-1)
     shown = jnp.sum(visible.reshape(k, n), axis=1)
     overlap = jnp.max((shown / jnp.maximum(jnp.sum(valid, axis=1), 1)).astype(predicted.dtype))
+    if plan.num_sources == 0:
+        return _nothing_found(overlap, keyframes)
     _, sources = jax.lax.top_k(shown, plan.num_sources)
     chosen = jax.vmap(lambda s: jnp.nonzero(visible.reshape(k, n)[s], size=plan.points_per_source, fill_value=n)[0])(
         sources
@@ -91,6 +93,12 @@ def look_up(
     found = match.converged & (match.correlation > params.min_correlation) & (shift < _MAX_SHIFT_PX**2)
     weight = jnp.where(found, take(keyframes.weight.reshape(-1)), 0)
     return LookedUp(X_world, match.points, weight, take(keyframes.id.reshape(-1)), overlap)
+
+
+def _nothing_found(overlap: Scalar, keyframes: Keyframes) -> LookedUp:
+    none = lambda like, rows: jnp.zeros((*rows, 0), like.dtype)
+    found = none(keyframes.X_world, (3,)), none(keyframes.uv, (2,)), none(keyframes.weight, ()), none(keyframes.id, ())
+    return LookedUp(*found, overlap)
 
 
 def _visible(uv: Pixels, depth: Weights, height: int, width: int) -> Mask:

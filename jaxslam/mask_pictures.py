@@ -19,6 +19,7 @@ MASK_RGB = {
     MaskSource.DETECTOR: (230, 159, 0),
     MaskSource.PROPAGATED: (86, 180, 233),
     MaskSource.CALLER: (204, 121, 167),
+    MaskSource.DEPTH: (0, 158, 115),
 }
 """The colour of a mask, by where it comes from."""
 

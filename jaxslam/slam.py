@@ -35,7 +35,9 @@ _log = logging.getLogger(__name__)
 _NEVER = 1e6
 """Frames of loss: fewer than those a fresh state counts, which starts at once."""
 _PREDICTED_S = 1.0
-"""Longest time for which a constant velocity is believed."""
+"""Longest time for which a constant velocity is believed,"""
+_EXTRAPOLATED_S = 0.1
+"""and for which it tells where the camera is now, to a degree or so."""
 
 _new_state = jax.jit(init_state, static_argnames=("height", "width", "plan"))
 """One program instead of some fifty."""
@@ -164,19 +166,19 @@ class Slam:
         self._state, correction = self._back.update(self._state, self._frame)
         dt_s = 1 / self.camera.fps if self._last_ns is None else (frame.timestamp_ns - self._last_ns) * 1e-9
         arrays = self._memory.hold(frame, dt_s)
-        arrays, mask = self._masked(frame, arrays)
+        arrays, mask = self._masked(frame, arrays, correction, dt_s)
         output, placed, num_matched = self._advance(arrays), None, 0
         if int(output.status) == TrackStatus.LOST:
             output, placed = self._regain(arrays, output, dt_s)
             num_matched = 0 if placed is None else placed.num_matched
-        elif int(output.status) == TrackStatus.WEAK:
+        elif self._to_be_matched(output):
             self._state, output, num_matched = self._back.held_to_map(self._state, arrays, output)
         if output.keyframe:
             hung = None if placed is None else placed.hung
             self._back.keyframe_made(frame.timestamp_ns, arrays, output, self._frame, hung)
         tracked = tracked_of(frame.timestamp_ns, output, correction, num_matched, mask, relocalised=placed is not None)
         self._last_ns = frame.timestamp_ns
-        tracked = self._recorded(tracked, dt_s)
+        tracked = self._recorded(tracked, dt_s, float(arrays.depth_delay_s))
         self._frame += 1
         return replace(tracked, track_ms=(time.perf_counter() - began) * 1e3)
 
@@ -255,16 +257,17 @@ class Slam:
             self._start_map,
             localize_only=self._localize_only,
         )
-        run, semantics = self.config.run, self.config.semantics
+        run, semantics, dynamics = self.config.run, self.config.semantics, self.config.dynamics
         self._masks = (
             None
-            if self._detector is None
+            if self._detector is None and not dynamics.newcomers
             else DynamicMasks(
                 self.camera,
                 self._detector,
                 deterministic=run.deterministic,
                 latency_frames=semantics.latency_frames,
                 propagate=semantics.propagate,
+                newcomers=dynamics.newcomers,
                 dilate_px=semantics.dilate_px,
                 seed=run.seed,
             )
@@ -282,20 +285,37 @@ class Slam:
     def _fresh_state(self) -> TrackState:
         return _new_state(self.camera.height, self.camera.width, self._plan, seed=self.config.run.seed)
 
-    def _masked(self, frame: Frame, arrays: FrameArrays) -> tuple[FrameArrays, FrameMask]:
+    def _masked(
+        self, frame: Frame, arrays: FrameArrays, correction: np.ndarray, dt_s: float
+    ) -> tuple[FrameArrays, FrameMask]:
         """The frame with what may move left out, and what that is."""
         given = frame.dynamic_mask
         if self._masks is None:
             source = MaskSource.NONE if given is None else MaskSource.CALLER
             return arrays, FrameMask(np.asarray(arrays.ignore), source, -1, "")
-        mask = self._masks.of_frame(self._frame, frame.image, np.asarray(arrays.image), np.asarray(arrays.depth))
+        # Where the depth image is taken: by then the camera may have turned by a degree or two.
+        ahead_s = min(dt_s, _EXTRAPOLATED_S) + float(arrays.depth_delay_s)
+        predicted = moved(compose(correction, self._last_pose), self._last_twist * ahead_s)
+        grey, depth = np.asarray(arrays.image), np.asarray(arrays.depth)
+        self._masks.corrected(correction)
+        time_s, turn = frame.timestamp_ns * 1e-9, _turn(self._last_twist)
+        mask = self._masks.of_frame(self._frame, time_s, frame.image, grey, depth, predicted, turn)
         if given is not None:
-            mask = mask._replace(mask=mask.mask | given)
+            mask = mask._replace(mask=mask.mask | given, source=mask.source or MaskSource.CALLER)
         return self._memory.ignoring(arrays, mask.mask), mask
 
     def _advance(self, arrays: FrameArrays) -> TrackOutput:
         self._state, output = _step(self._state, arrays, self._params, self._plan)
         return jax.tree.map(np.asarray, output)  # as `device_get`, in a tenth of its time
+
+    def _to_be_matched(self, output: TrackOutput) -> bool:
+        """Whether a frame that was tracked is matched with the map too."""
+        match self.config.track.hold_to_map:
+            case "always":
+                return int(output.status) != TrackStatus.STARTED
+            case "keyframes" if output.keyframe:
+                return int(output.status) != TrackStatus.STARTED
+        return int(output.status) == TrackStatus.WEAK
 
     def _regain(self, arrays: FrameArrays, lost: TrackOutput, dt_s: float) -> tuple[TrackOutput, Placed | None]:
         """The frame once more, from where the map shows it; or from the pose held, if the settings say so."""
@@ -317,17 +337,20 @@ class Slam:
         self._state = self._state._replace(lost_frames=jnp.zeros((), jnp.int32))  # not to start by itself
         return output, None
 
-    def _recorded(self, tracked: Tracked, dt_s: float) -> Tracked:
+    def _recorded(self, tracked: Tracked, dt_s: float, depth_delay_s: float) -> Tracked:
         """The result as it is given out, and remembered."""
         if tracked.status == TrackStatus.LOST:
             self._lost_s += dt_s
             self._last_pose = compose(tracked.correction, self._last_pose)
+            if self._masks is not None:
+                self._masks.lost()
             if self.config.run.on_loss == "predict":
                 ahead_s = min(self._lost_s, _PREDICTED_S)
                 tracked = replace(tracked, T_world_cam=moved(self._last_pose, self._last_twist * ahead_s))
             return tracked
         if self._masks is not None:
-            self._masks.tracked(self._frame, tracked.T_world_cam, self._memory.depth)
+            pose = moved(tracked.T_world_cam, tracked.twist * depth_delay_s)
+            self._masks.tracked(self._frame, tracked.timestamp_ns * 1e-9, pose, _turn(tracked.twist))
         self._unrecognised, self._lost_s = 0, 0.0
         self._last_pose, self._last_twist = tracked.T_world_cam, tracked.twist
         self._back.localize(tracked.T_world_cam, self._frame)
@@ -335,6 +358,11 @@ class Slam:
         self._times_ns.append(tracked.timestamp_ns)
         self._poses.append(tracked.T_world_cam)
         return tracked
+
+
+def _turn(twist: np.ndarray) -> float:
+    """Angular speed, rad/s."""
+    return float(np.linalg.norm(twist[3:]))
 
 
 def track_plan(config: TrackConfig) -> TrackPlan:

@@ -1,7 +1,7 @@
 """Everything the tracker carries from frame to frame, as pytrees of fixed capacity, and what it says of a frame."""
 
 import enum
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from jaxlie import SE3
 from jaxslam_kernels.camera import Intrinsics
@@ -42,6 +42,8 @@ class KeyframeReason(enum.IntEnum):
     """Tracking is weak here: more points are wanted."""
     TIME = 5
     """The last one was long ago."""
+    FEW_POINTS = 6
+    """Few points are left to follow."""
 
 
 class TrackReason(enum.IntEnum):
@@ -80,10 +82,11 @@ class TrackPlan(NamedTuple):
         num_levels: Levels of the image pyramid.
         num_keyframes: Latest keyframes kept to look points up in again.
         num_recalled: Further keyframes to look into, put there from a map by `recalled`.
-        num_sources: How many of them are looked into in a frame.
+        num_sources: How many of them are looked into in a frame; 0 for following alone.
         points_per_source: Points looked up from each.
         num_hypotheses: Pose hypotheses a frame.
         cell_px: Side of the cells that each get at most one new corner, even.
+        new_points: In which frames new points are sought: `always`, where there are few, or in `keyframes` only.
         flow: How points are followed from frame to frame.
         look_up: How points of keyframes are searched. A window of 21 takes 1 ms a frame more and is no more accurate;
             17, 15 and 13 are alike too: TUM `fr1_rpy` 10.2, 10.2, 10.2 mm, Bonn `crowd` (start) 9.7, 9.6, 9.5.
@@ -97,6 +100,7 @@ class TrackPlan(NamedTuple):
     points_per_source: int = 160
     num_hypotheses: int = 64
     cell_px: int = 20
+    new_points: Literal["always", "keyframes"] = "always"
     flow: FlowPlan = FlowPlan()
     look_up: LevelPlan = LevelPlan(15, 8, 0.05)
 
@@ -139,6 +143,7 @@ class TrackParams(NamedTuple):
         keyframe_below: A keyframe is made when no kept one shows more than this share of its points (`NEW_AREA`),
         keyframe_followed_below: when less than this share of the followed points was there at the last keyframe
             (`FEW_FOLLOWED`),
+        keyframe_points_below: when less than this share of the capacity is still followed (`FEW_POINTS`),
         keyframe_after_s: or when the last one was made this many seconds ago (`TIME`),
         keyframe_weak_after_s: or this many while tracking is weak (`WEAK`).
         probation_frames: Frames after which a point counts in full. What moves on its own is an outlier within a few
@@ -166,6 +171,7 @@ class TrackParams(NamedTuple):
     refill_below: Scalar
     keyframe_below: Scalar
     keyframe_followed_below: Scalar
+    keyframe_points_below: Scalar
     keyframe_after_s: Scalar
     keyframe_weak_after_s: Scalar
     probation_frames: Scalar

@@ -322,17 +322,21 @@ def _conclude(
     pose = choose(state.T_world_cam, refined.T_world_cam)
     twist = choose(jnp.zeros_like(state.twist), _twist(state.T_world_cam, pose, view.elapsed_s))
     points = choose(state.points._replace(valid=state.points.valid & held), kept)
+    since_keyframe_s = state.since_keyframe_s + jnp.maximum(view.frame.dt_s, 0)
+    reason_to_keep = lambda started: _keyframe_reason(
+        state, kept, looked_up, verdict, started, since_keyframe_s, params
+    )
     few = jnp.sum(points.valid, dtype=twist.dtype) < params.refill_below * plan.num_points
+    may = few if plan.new_points == "always" else few & (reason_to_keep(start) > 0)
     points = lax.cond(
-        start | (few & ~verdict.lost),
+        start | (may & ~verdict.lost),
         lambda p: refill(p, state.next_id, view, pose, twist, params, plan),
         lambda p: p,
         points,
     )
     failed = start & (jnp.sum(points.valid, dtype=twist.dtype) < params.min_inliers)
     started, stale = start & ~failed, held | failed
-    since_keyframe_s = state.since_keyframe_s + jnp.maximum(view.frame.dt_s, 0)
-    keyframe = _keyframe_reason(state, kept, looked_up, verdict, started, since_keyframe_s, params)
+    keyframe = reason_to_keep(started)
     make = keyframe > 0
     keyframes = with_keyframe(state.keyframes, make, view.frame.image, pose, points, _trust(points, params), plan)
     new_state = TrackState(
@@ -388,14 +392,14 @@ def _keyframe_reason(
 ) -> Code:
     """Why to keep the frame, if at all."""
     old = kept.valid & (kept.age > state.since_keyframe)
-    share = jnp.sum(old, dtype=since_keyframe_s.dtype) / jnp.maximum(
-        jnp.sum(kept.valid, dtype=since_keyframe_s.dtype), 1
-    )
+    num_kept = jnp.sum(kept.valid, dtype=since_keyframe_s.dtype)
+    share = jnp.sum(old, dtype=since_keyframe_s.dtype) / jnp.maximum(num_kept, 1)
     tracked = ~verdict.lost
     causes = (
         (started, KeyframeReason.STARTED),
         (tracked & (looked_up.overlap < params.keyframe_below), KeyframeReason.NEW_AREA),
         (tracked & (share < params.keyframe_followed_below), KeyframeReason.FEW_FOLLOWED),
+        (tracked & (num_kept < params.keyframe_points_below * kept.valid.shape[0]), KeyframeReason.FEW_POINTS),
         (verdict.weak & (since_keyframe_s > params.keyframe_weak_after_s), KeyframeReason.WEAK),
         (tracked & (since_keyframe_s > params.keyframe_after_s), KeyframeReason.TIME),
     )

@@ -40,6 +40,18 @@ _LEAST_SHARE = 0.1
 """A piece of the new mask holds at least this share of the cluster's points."""
 
 
+class MaskAt(NamedTuple):
+    """A mask of a frame of the past.
+
+    Attributes:
+        frame: Its number.
+        mask: `(h, w)` true where something moves or may.
+    """
+
+    frame: int
+    mask: Bool[np.ndarray, "h w"]
+
+
 class Followed(NamedTuple):
     """Points of a mask, now and before; padded to a fixed size.
 

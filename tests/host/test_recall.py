@@ -13,11 +13,12 @@ from jaxslam.camera import Camera
 from jaxslam.config import Config
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.frame import Frame
+from jaxslam.local_map import keyframes_in_view
 from jaxslam.local_mapping import recalled_id
 from jaxslam.map import NONE, Keyframe, Map, MapPoints, empty_map
 from jaxslam.map_edit import with_keyframe, with_points, with_sightings
 from jaxslam.pose import IDENTITY, between, to_local
-from jaxslam.recall import recall, worth_recalling
+from jaxslam.recall import recall
 from jaxslam.rotation import axis_rotation
 from jaxslam.slam import Slam
 from jaxslam.tracked import Tracked
@@ -61,30 +62,30 @@ class TestWorthRecalling:
         """Not from the other side, nor from so far or near that the pictures differ."""
         poses = [at(), at(x=0.3), BEHIND, at(z=-2.5), at(z=1.2), at(x=4.0, turn=-1.1), at(z=-1.5)]
         made = seen_from(poses, [POINTS] * len(poses))
-        assert sorted(worth_recalling(made, at(), 0, set(), 9)) == [0, 1, 6]
-        assert worth_recalling(made, BEHIND, 0, set(), 9) == [2]
+        assert sorted(keyframes_in_view(made, at(), 0, set(), 9)) == [0, 1, 6]
+        assert keyframes_in_view(made, BEHIND, 0, set(), 9) == [2]
 
     def test_most_points_first(self) -> None:
         made = seen_from([at(), at(x=0.1), at(x=0.2), at(x=0.3)], [70, 100, 50, 100])
-        assert worth_recalling(made, at(), 0, set(), 9) == [1, 3, 0]  # fifty are too few
-        assert worth_recalling(made, at(), 0, set(), 2) == [1, 3]
-        assert worth_recalling(made, at(), 0, {1}, 2) == [3, 0]
-        assert worth_recalling(made, at(), 0, {0, 1, 3}, 2) == []
+        assert keyframes_in_view(made, at(), 0, set(), 9) == [1, 3, 0]  # fifty are too few
+        assert keyframes_in_view(made, at(), 0, set(), 2) == [1, 3]
+        assert keyframes_in_view(made, at(), 0, {1}, 2) == [3, 0]
+        assert keyframes_in_view(made, at(), 0, {0, 1, 3}, 2) == []
 
     def test_only_what_is_in_view(self) -> None:
         made = seen_from([at()], [POINTS])
-        assert worth_recalling(made, at(x=3.0), 0, set(), 9) == []
-        assert worth_recalling(made, at(turn=np.pi), 0, set(), 9) == []
+        assert keyframes_in_view(made, at(x=3.0), 0, set(), 9) == []
+        assert keyframes_in_view(made, at(turn=np.pi), 0, set(), 9) == []
 
     def test_of_the_submap(self) -> None:
         """Another one has its own world: what is at the same place there is somewhere else."""
         made = seen_from([at(), at(x=0.1), at()], [POINTS] * 3, [0, 0, 1])
-        assert worth_recalling(made, at(), 0, set(), 9) == [0, 1]
-        assert worth_recalling(made, at(), 1, set(), 9) == [2]
-        assert worth_recalling(made, at(), 2, set(), 9) == []
+        assert keyframes_in_view(made, at(), 0, set(), 9) == [0, 1]
+        assert keyframes_in_view(made, at(), 1, set(), 9) == [2]
+        assert keyframes_in_view(made, at(), 2, set(), 9) == []
 
     def test_of_an_empty_map(self) -> None:
-        assert worth_recalling(empty_map(CAMERA), IDENTITY, 0, set(), 4) == []
+        assert keyframes_in_view(empty_map(CAMERA), IDENTITY, 0, set(), 4) == []
 
 
 class TestRecall:

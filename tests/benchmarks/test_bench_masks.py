@@ -1,0 +1,125 @@
+"""Carrying a person's mask to the next frame, and comparing depth images, beside OpenCV's LK on the same frames.
+
+`pytest -m benchmark -n 0 tests/benchmarks/test_bench_masks.py -s`
+"""
+
+from typing import NamedTuple
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from benchmarks.timing import Comparison, compare, compile_seconds
+from jaxlie import SE3
+from jaxslam_kernels.camera import make_intrinsics
+from jaxslam_kernels.depth_change import depth_change
+from jaxslam_kernels.image import Pyramid, build_pyramid
+
+from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
+from jaxslam.frame import to_grey
+from jaxslam.masks.propagation import CAPACITY, _clusters, depth_at, follow, predicted_mask
+from jaxslam.masks.sampling import sample_mask
+from jaxslam.pose import between
+
+pytestmark = pytest.mark.benchmark
+
+FRAME = 21
+"""In which the person fills a fifth of the image; the next is the one the mask is carried to."""
+EARLIER = (5, 10, 15)
+"""So many frames before are the depth images compared with."""
+STEP = 4
+"""Of whose pixels and rows every so many are used: 160 x 120."""
+CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.03)
+
+_pyramid = jax.jit(build_pyramid)
+
+
+class View(NamedTuple):
+    grey: np.ndarray
+    depth: np.ndarray
+    person: np.ndarray
+
+
+@pytest.fixture(scope="module")
+def dataset() -> SyntheticDataset:
+    return SyntheticDataset(SyntheticConfig(seed=1, people=1, frames=FRAME + 2))
+
+
+@pytest.fixture(scope="module")
+def views(dataset) -> tuple[View, View]:
+    before, now = (dataset.render(index) for index in (FRAME, FRAME + 1))
+    view = lambda frame: View(to_grey(frame.rgb), frame.depth_m, frame.instance_mask > 0)
+    return view(before), view(now)
+
+
+@pytest.fixture(scope="module")
+def opencv(views):
+    """What everything is compared with: flow of 1000 points, both pyramids included."""
+    before, now = (view.grey for view in views)
+    corners = cv2.goodFeaturesToTrack(before, 1000, 0.001, 7)
+    assert len(corners) == 1000
+    return lambda: cv2.calcOpticalFlowPyrLK(
+        before, now, corners, corners.copy(), winSize=(21, 21), maxLevel=3, criteria=CRITERIA
+    )
+
+
+def _carry(before: View, pyramid_before: Pyramid, now: View) -> np.ndarray:
+    """The new mask, from the old one and both frames, of which the earlier one's pyramid is there already."""
+    sampled = sample_mask(before.person, before.grey, CAPACITY, 0)
+    followed = follow([pyramid_before, _pyramid(now.grey)], sampled)
+    return predicted_mask(before.person, followed, now.depth)
+
+
+def test_carrying_a_mask(views, opencv, capsys):
+    """Half the time of OpenCV's flow at most; each piece alone is printed, clusters being a part of the new mask."""
+    before, now = views
+    pyramids = [_pyramid(view.grey) for view in views]
+    sampled = sample_mask(before.person, before.grey, CAPACITY, 0)
+    followed = follow(pyramids, sampled)
+    known, z = depth_at(now.depth, followed)
+    mask = _carry(before, pyramids[0], now)
+    overlap = np.count_nonzero(mask & now.person) / np.count_nonzero(mask | now.person)
+    assert 0.15 < before.person.mean() < 0.25
+    assert overlap > 0.8
+    pieces = {
+        "sampling": lambda: sample_mask(before.person, before.grey, CAPACITY, 0),
+        "pyramid": lambda: _pyramid(now.grey),
+        "flow": lambda: follow(pyramids, sampled),
+        "clusters": lambda: _clusters(followed.now, z, known),
+        "new mask": lambda: predicted_mask(before.person, followed, now.depth),
+    }
+    compared: dict[str, Comparison] = {name: compare(piece, opencv) for name, piece in pieces.items()}
+    whole = compare(lambda: _carry(before, pyramids[0], now), opencv)
+    with capsys.disabled():
+        print(f"\n{before.person.mean():.0%} of the image, {sampled.shape[1]} points, overlap {overlap:.2f}")
+        for name, comparison in compared.items():
+            print(f"  {name}: {comparison}")
+        print(f"  whole: {whole}")
+    assert whole.processor_ratio <= 0.5
+
+
+def test_comparing_depth(dataset, opencv, capsys):
+    """One image of 160 x 120 with three earlier ones."""
+    camera = dataset.camera
+    intrinsics = make_intrinsics(*(value / STEP for value in (camera.fx, camera.fy, camera.cx, camera.cy)))
+    now, *then = (
+        jnp.asarray(dataset.render(index).depth_m[::STEP, ::STEP]) for index in (FRAME, *(FRAME - k for k in EARLIER))
+    )
+    poses = [between(dataset.T_world_cam[FRAME - k], dataset.T_world_cam[FRAME]) for k in EARLIER]
+    arguments = (now, jnp.stack(then), SE3(jnp.asarray(np.stack(poses), jnp.float32)), intrinsics)
+    run = jax.vmap(depth_change, in_axes=(None, 0, 0, None))
+    ours = jax.jit(run)
+    change = ours(*arguments)
+    person = dataset.render(FRAME).instance_mask[::STEP, ::STEP] > 0
+    same, new = np.asarray(change.same), np.asarray(change.new)
+    assert now.shape == (120, 160)
+    assert same[:, ~person].mean() > 0.5  # the person hid much of the rest
+    assert new[-1][person].mean() > 0.5
+    assert new[:, ~person].mean() < 0.02
+    comparison = compare(lambda: ours(*arguments), opencv)
+    with capsys.disabled():
+        seconds = compile_seconds(run, *arguments)
+        print(f"\ndepth_change with {len(EARLIER)} images, compiled in {seconds:.2f} s: {comparison}")
+        print(f"  new of the person {new[-1][person].mean():.2f}, of the rest {new[-1][~person].mean():.3f}")
+    assert comparison.processor_ratio <= 0.2
