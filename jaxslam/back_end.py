@@ -138,7 +138,7 @@ class BackEnd:
         self._mapping.compile(frame, self._track_plan.num_points + num_looked_up)
         compile_recognition(self._params, self._plan.features)
         self._compile_edits(*frame.image.shape)
-        if not self._config.run.deterministic:
+        if not self._config.run.in_turn:
             compile_graph()  # while frames come, it would take seconds from them
 
     def update(self, state: TrackState, frame: int) -> tuple[TrackState, np.ndarray]:
@@ -300,7 +300,7 @@ class BackEnd:
     def _worker(self, work: Callable[[Any], Any], name: str, turn: int) -> Worker[Any, Any]:
         latency_frames = turn * self._config.mapping.latency_frames
         return make_worker(
-            work, f"jaxslam-{name}", deterministic=self._config.run.deterministic, latency_frames=latency_frames
+            work, f"jaxslam-{name}", deterministic=self._config.run.in_turn, latency_frames=latency_frames
         )
 
     def _map_job(self, job: NewKeyframe | LoopClosure) -> _MapUpdate:

@@ -126,8 +126,9 @@ class MappingConfig(Checked):
 class SemanticsConfig(Checked):
     """Finding what may move by a network, and following it."""
 
-    model: str | None = None
-    """Network: a name of `jaxslam models list`, or an ONNX file. Without one, geometry alone decides."""
+    model: str | None = "yolox-nano"
+    """Network: a name of `jaxslam models list`, or an ONNX file. With `null`, or where a known one is not on this
+    machine, which is said, geometry alone decides."""
     labels: tuple[str, ...] = ("person",)
     """What may move, as the network names it."""
     min_score: Annotated[float, Share] = 0.3
@@ -156,6 +157,9 @@ class RunConfig(Checked):
 
     deterministic: bool = True
     """Run every module in turn, so that two runs give the same bytes; `False` gives each its thread."""
+    realtime: bool = False
+    """Feed a recording at the rate it was taken at, each module in its thread whatever `deterministic` says: frames for
+    which there is no time are dropped."""
     seed: Annotated[int, Range(at_least=0, at_most=2**32 - 1)] = 0
     """Seed of every random choice."""
     on_loss: Literal["hold", "predict", "submap"] = "submap"
@@ -164,6 +168,11 @@ class RunConfig(Checked):
     the map when a place of it is recognised."""
     prefetch_frames: Annotated[int, Range(at_least=1, at_most=64)] = 4
     """Frames of a recording decoded ahead of the tracker."""
+
+    @property
+    def in_turn(self) -> bool:
+        """Whether every module runs in the thread of the tracker, on a fixed schedule."""
+        return self.deterministic and not self.realtime
 
 
 @dataclass(frozen=True)

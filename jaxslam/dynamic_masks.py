@@ -69,9 +69,9 @@ class _Seen:
     @property
     def pyramid(self) -> Pyramid:
         """Its pyramid; most frames need none, because nothing is in their mask."""
-        if self._pyramid is None:
-            self._pyramid = _pyramid(self.grey)
-        return self._pyramid
+        made = self._pyramid or _pyramid(self.grey)
+        self._pyramid = made
+        return made
 
 
 class DynamicMasks:

@@ -123,19 +123,24 @@ def _summary(
     slam: Slam, records: Sequence[FrameRecord], info: RunInfo, evaluation: Evaluation | None
 ) -> dict[str, Any]:
     statuses = Counter(record.status.name for record in records)
-    tracked = sum(record.status not in (TrackStatus.LOST, TrackStatus.REJECTED) for record in records)
     lost = [record for record in records if record.status in (TrackStatus.LOST, TrackStatus.REJECTED)]
+    dropped = statuses[TrackStatus.DROPPED.name]
+    given = len(records) - dropped
+    tracked = given - len(lost)
     figures = evaluation.summary() if evaluation is not None else {}
     wanted = ("ate_rmse_m", "ate_sim3_rmse_m", "sim3_scale", "rpe_trans_m_per_s", "rpe_rot_deg_per_s")
     return {
         "dataset": info.dataset.name,
         "camera": info.dataset.camera.name,
         "preset": info.preset,
-        "deterministic": slam.config.run.deterministic,
+        "deterministic": slam.config.run.in_turn,
+        "realtime": slam.config.run.realtime,
         "seed": slam.config.run.seed,
         "frames": len(records),
         "tracked": tracked,
-        "tracked_percent": round(100 * tracked / max(len(records), 1), 3),
+        "tracked_percent": round(100 * tracked / max(given, 1), 3),  # of the frames that were not dropped
+        "dropped": dropped,
+        "dropped_percent": round(100 * dropped / max(len(records), 1), 3),
         "status_counts": dict(sorted(statuses.items())),
         "first_loss_s": (lost[0].timestamp_ns - records[0].timestamp_ns) * 1e-9 if lost else None,
         "relocalised": statuses[TrackStatus.RELOCALISED.name],
@@ -146,6 +151,9 @@ def _summary(
         "submaps": len(set(slam.map.submap.tolist())),
         **{name: figures.get(name) for name in wanted},
         "evaluation": figures or None,
+        "mask_sources": dict(sorted(Counter(record.mask_source.name for record in records).items())),
+        "mask_age_frames": _distribution([record.mask_age for record in records if record.mask_age >= 0]),
+        "detector_errors": sum(bool(record.detector_error) for record in records),
         "track_ms": _distribution([record.track_ms for record in records if record.track_ms is not None]),
         "compile_s": round(slam.compile_s, 3),
         "wall_s": round(info.wall_s, 3),
@@ -158,17 +166,17 @@ def _summary(
     }
 
 
-def _distribution(milliseconds: Sequence[float]) -> dict[str, float] | None:
-    if not milliseconds:
+def _distribution(figures: Sequence[float]) -> dict[str, float] | None:
+    if not figures:
         return None
-    values = np.asarray(milliseconds)
-    figures = {
+    values = np.asarray(figures)
+    measures = {
         "mean": values.mean(),
         "median": np.median(values),
         "p95": np.percentile(values, 95),
         "max": values.max(),
     }
-    return {name: round(float(value), 3) for name, value in figures.items()}
+    return {name: round(float(value), 3) for name, value in measures.items()}
 
 
 def _peak_rss_mb() -> float:

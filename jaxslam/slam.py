@@ -14,6 +14,7 @@ from jaxslam.back_end import BackEnd, Placed
 from jaxslam.camera import Camera
 from jaxslam.config import Config, TrackConfig
 from jaxslam.datasets import Dataset, prefetch
+from jaxslam.datasets.realtime import in_real_time
 from jaxslam.detector_choice import detector_of
 from jaxslam.dynamic_masks import DynamicMasks, FrameMask, MaskSource
 from jaxslam.errors import DatasetError, FrameError, JaxSlamError, MapFileError
@@ -187,7 +188,8 @@ class Slam:
     ) -> list[FrameRecord]:
         """Track a whole recording.
 
-        A frame that cannot be read or does not fit is reported as `Rejected`, and the run goes on.
+        A frame that cannot be read or does not fit is reported as `Rejected`, and the run goes on. With `run.realtime`,
+        so are frames that come late, with the status `DROPPED`.
 
         Args:
             dataset: The recording; its camera must be this one.
@@ -195,14 +197,8 @@ class Slam:
         """
         self.warm_up()
         records: list[FrameRecord] = []
-        for timestamp_ns, frame in zip(dataset.timestamps_ns, _read_ahead(dataset, self.config), strict=True):
-            result: Tracked | Rejected
-            try:
-                result = Rejected(int(timestamp_ns), frame) if isinstance(frame, JaxSlamError) else self.track(frame)
-            except FrameError as error:
-                result = Rejected(int(timestamp_ns), error)
-            if isinstance(result, Rejected):
-                _log.warning("frame at %d ns rejected: %s", result.timestamp_ns, result.reason)
+        for timestamp_ns, frame in zip(dataset.timestamps_ns, _frames_of(dataset, self.config), strict=True):
+            result = self._tracked_or_rejected(int(timestamp_ns), frame)
             records.append(FrameRecord.of(result))
             if on_frame is not None:
                 on_frame(frame if isinstance(frame, Frame) else None, result)
@@ -264,7 +260,7 @@ class Slam:
             else DynamicMasks(
                 self.camera,
                 self._detector,
-                deterministic=run.deterministic,
+                deterministic=run.in_turn,
                 latency_frames=semantics.latency_frames,
                 propagate=semantics.propagate,
                 newcomers=dynamics.newcomers,
@@ -284,6 +280,19 @@ class Slam:
 
     def _fresh_state(self) -> TrackState:
         return _new_state(self.camera.height, self.camera.width, self._plan, seed=self.config.run.seed)
+
+    def _tracked_or_rejected(self, timestamp_ns: int, frame: Frame | JaxSlamError | None) -> Tracked | Rejected:
+        if frame is None:
+            late = FrameError("the next frame was there before there was time for this one")
+            return Rejected(timestamp_ns, late, TrackStatus.DROPPED)
+        try:
+            if not isinstance(frame, JaxSlamError):
+                return self.track(frame)
+            error = frame
+        except FrameError as unfit:
+            error = unfit
+        _log.warning("frame at %d ns rejected: %s", timestamp_ns, error)
+        return Rejected(timestamp_ns, error)
 
     def _masked(
         self, frame: Frame, arrays: FrameArrays, correction: np.ndarray, dt_s: float
@@ -393,5 +402,7 @@ class _Tolerant:
             return error
 
 
-def _read_ahead(dataset: Dataset, config: Config) -> Iterator[Frame | JaxSlamError]:
-    return prefetch(_Tolerant(dataset), ahead=config.run.prefetch_frames)
+def _frames_of(dataset: Dataset, config: Config) -> Iterator[Frame | JaxSlamError | None]:
+    """Every frame, or why there is none: it cannot be read, or it came late (`None`)."""
+    frames = prefetch(_Tolerant(dataset), ahead=config.run.prefetch_frames)
+    return in_real_time(frames, dataset.timestamps_ns) if config.run.realtime else frames

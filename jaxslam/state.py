@@ -25,6 +25,8 @@ class TrackStatus(enum.IntEnum):
     """The frame could not be read or does not fit; it never reached the tracker."""
     RELOCALISED = 5
     """After a loss, tracking goes on where the map shows this place: the same world as before."""
+    DROPPED = 6
+    """In a run in real time: the next frame was there before the tracker had time for this one."""
 
 
 class KeyframeReason(enum.IntEnum):

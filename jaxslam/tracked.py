@@ -74,15 +74,17 @@ class Tracked:
 
 @dataclass(frozen=True)
 class Rejected:
-    """A frame of a recording that could not be read or does not fit; tracking goes on with the next one."""
+    """A frame of a recording that never reached the tracker; tracking goes on with the next one.
+
+    Attributes:
+        timestamp_ns: Its time.
+        error: Why.
+        status: `REJECTED` if it could not be read or does not fit, `DROPPED` if it came late.
+    """
 
     timestamp_ns: int
     error: JaxSlamError
-
-    @property
-    def status(self) -> TrackStatus:
-        """Always `REJECTED`."""
-        return TrackStatus.REJECTED
+    status: TrackStatus = TrackStatus.REJECTED
 
     @property
     def reason(self) -> str:

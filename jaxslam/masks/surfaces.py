@@ -34,7 +34,7 @@ _NEW_RANGE_M = 0.2
 """How much nearer and farther than the surface that is new the rest of it may be."""
 _TIMING_S = 0.0125
 """How well it is known when a row of a depth image was taken: half the readout of a rolling shutter. A camera that
-turns shows edges displaced by that; on TUM `fr1_rpy`, at 2 rad/s, desks had newcomers of 20 pixels along their edges."""
+turns shows edges displaced by that: on TUM `fr1_rpy`, at 2 rad/s, desks had newcomers of 20 pixels along them."""
 _PERCENTILES = (5, 95)
 _LEAST_OVERLAP = 0.1
 """A piece of a newcomer holds at least this share of the surface that is new."""
@@ -124,7 +124,8 @@ class SurfaceMemory:
                 poses[slot] = between(then.T_world_cam, T_world_cam)
         turns = turn_rad_per_s + (0.0 if before[1] is None else before[1].turn_rad_per_s)
         displaced_px = float(self._intrinsics.fx) * turns * _TIMING_S
-        return Surfaces(self._depth, *self._compared(poses), displaced_px)
+        outside, still, unmoved, new = self._compared(poses)
+        return Surfaces(self._depth, outside, still, unmoved, new, displaced_px)
 
     def remember(
         self,

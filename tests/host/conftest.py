@@ -25,11 +25,19 @@ def compiled() -> Iterator[list[str]]:
     jax.monitoring.unregister_event_duration_listener(listener)
 
 
+@pytest.fixture(autouse=True)
+def _no_networks(request: pytest.FixtureRequest) -> None:
+    """The default network is not there, whatever there is on this machine; but for tests marked `networks`."""
+    if request.node.get_closest_marker("networks") is None:
+        request.getfixturevalue("models_cache")
+
+
 @pytest.fixture
-def models_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+def models_cache(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An empty cache folder for networks, and no folder of the user's."""
     monkeypatch.delenv("JAXSLAM_MODELS", raising=False)
-    monkeypatch.setattr(known_models.platformdirs, "user_cache_dir", lambda *_, **__: str(tmp_path / "cache"))
-    folder = tmp_path / "cache" / "models"
-    folder.mkdir(parents=True)
+    cache = tmp_path_factory.mktemp("cache")
+    monkeypatch.setattr(known_models.platformdirs, "user_cache_dir", lambda *_, **__: str(cache))
+    folder = cache / "models"
+    folder.mkdir()
     return folder

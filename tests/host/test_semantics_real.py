@@ -9,6 +9,7 @@ import pytest
 from jaxslam.datasets import open_dataset
 from jaxslam.semantics import Detections, load_detector
 
+pytestmark = pytest.mark.networks
 FRAMES = (400, 600, 800)
 BOXES = {"nanodet_m_320": "nanodet", "FastestDet": "fastestdet", "yolov8n-seg_int8": "yolov8_seg"}
 MAPS = ("deeplabv3_mobilenetv2_voc", "deeplabv3_mobilenetv2_dm05_voc")

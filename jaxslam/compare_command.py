@@ -1,0 +1,99 @@
+"""`jaxslam compare`: several presets on one recording, several times each, in one table."""
+
+import json
+import statistics
+from dataclasses import dataclass
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from jaxslam.config import presets
+from jaxslam.errors import ConfigError, nearest
+from jaxslam.files import write_atomically
+from jaxslam.run_command import OfRecording, number, track
+from jaxslam.slam import Slam
+from jaxslam.xla import prefer_one_thread
+
+_console = Console(soft_wrap=True)
+_COLUMNS = ("preset", "tracked", "dropped", "ATE, m", "from - to", "ATE Sim(3), m", "mean ms", "median ms", "p95 ms")
+
+
+@dataclass(frozen=True)
+class Compare(OfRecording):
+    """Track a recording with several presets and put their figures into one table.
+
+    With the presets given, it is Table V of NGD-SLAM: a static world, a detector whose every mask is waited for, masks
+    propagated to the present, and flow between keyframes.
+    """
+
+    presets: tuple[str, ...] = ("static", "ngd-detector", "ngd-propagation", "ngd")
+    """What to compare."""
+    runs: int = 1
+    """How often to run each, with the seeds 0, 1, 2, ..."""
+
+    def main(self) -> None:
+        """Run the command."""
+        if self.runs < 1:
+            raise ConfigError(f"--runs: expected at least 1, got {self.runs}")
+        for preset in self.presets:
+            if preset not in presets():
+                raise ConfigError(f"--presets: unknown preset '{preset}'{nearest(preset, presets())}")
+        dataset, out = self.opened(), self.folder()
+        prefer_one_thread()  # nothing else computes while a recording is tracked
+        rows: list[dict[str, Any]] = []
+        for preset in self.presets:
+            summaries = []
+            for seed in range(self.runs):
+                _console.print(f"{preset}, run {seed + 1} of {self.runs}")
+                slam = Slam(dataset.camera, self.settings(preset, f"run.seed={seed}"))
+                folder = out / preset / str(seed)
+                summaries.append(track(dataset, slam, preset, folder, quiet=True))
+            rows.append(_row(preset, summaries))
+        _console.print(_table(dataset.name, rows))
+        write_atomically(out / "comparison.json", (json.dumps(rows, indent=2) + "\n").encode())
+        write_atomically(out / "comparison.md", _markdown(rows).encode())
+        _console.print(f"Table in {out}: comparison.md, comparison.json; results of each run in {out}/PRESET/SEED")
+
+
+def _row(preset: str, summaries: list[dict[str, Any]]) -> dict[str, Any]:
+    """The figures of a preset over its runs; those of accuracy over the runs that could be evaluated."""
+    ates = [summary["ate_rmse_m"] for summary in summaries if summary["ate_rmse_m"] is not None]
+    similar = [summary["ate_sim3_rmse_m"] for summary in summaries if summary["ate_sim3_rmse_m"] is not None]
+    times = [summary["track_ms"] for summary in summaries if summary["track_ms"] is not None]
+    middle = lambda values: statistics.median(values) if values else None
+    return {
+        "preset": preset,
+        "runs": len(summaries),
+        "tracked_percent": min(summary["tracked_percent"] for summary in summaries),
+        "dropped_percent": max(summary["dropped_percent"] for summary in summaries),
+        "ate_rmse_m": middle(ates),
+        "ate_rmse_m_of_runs": ates,
+        "ate_sim3_rmse_m": middle(similar),
+        **{f"track_ms_{name}": middle([time[name] for time in times]) for name in ("mean", "median", "p95")},
+    }
+
+
+def _cells(row: dict[str, Any]) -> list[str]:
+    ates = row["ate_rmse_m_of_runs"]
+    return [
+        row["preset"],
+        f"{row['tracked_percent']:.1f} %",
+        f"{row['dropped_percent']:.1f} %",
+        number(row["ate_rmse_m"], 4),
+        f"{min(ates):.4f} - {max(ates):.4f}" if ates else "-",
+        number(row["ate_sim3_rmse_m"], 4),
+        *(number(row[f"track_ms_{name}"], 1) for name in ("mean", "median", "p95")),
+    ]
+
+
+def _table(title: str, rows: list[dict[str, Any]]) -> Table:
+    table = Table(*_COLUMNS, title=title, title_justify="left")
+    for row in rows:
+        table.add_row(*_cells(row))
+    return table
+
+
+def _markdown(rows: list[dict[str, Any]]) -> str:
+    lines = [_COLUMNS, ["---"] * len(_COLUMNS), *(_cells(row) for row in rows)]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)

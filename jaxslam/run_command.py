@@ -1,0 +1,234 @@
+"""`jaxslam demo` and `jaxslam run`: track, show how it goes, and leave the results behind."""
+
+import itertools
+import time
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from jaxslam.config import Config, load_config
+from jaxslam.datasets import Dataset, Subset, dataset_kinds, open_dataset
+from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
+from jaxslam.errors import ConfigError, nearest
+from jaxslam.evaluation import Evaluation
+from jaxslam.frame import Frame
+from jaxslam.map_file import load_map
+from jaxslam.mask_pictures import MaskPictures
+from jaxslam.results import RESULT_FILES, RunInfo, Snapshots, write_results
+from jaxslam.slam import Slam
+from jaxslam.tracked import Rejected, Tracked
+from jaxslam.xla import prefer_one_thread
+
+if TYPE_CHECKING:
+    from jaxslam.viewer import Viewer
+
+_console = Console(soft_wrap=True)
+_OnFrame: TypeAlias = Callable[[Frame | None, Tracked | Rejected], None]
+_Settings: TypeAlias = Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction]
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Render a room with walking people, track the camera through it, and evaluate.
+
+    Needs no data. Leaves the files of `run` in `--out`.
+    """
+
+    out: Path = Path("results/demo")
+    """Folder for the results."""
+    frames: int = 150
+    """Frames to render."""
+    path: Literal["xyz", "rpy", "halfsphere", "static", "loop"] = "xyz"
+    """How the camera moves."""
+    people: int = 2
+    """People walking through the room."""
+    seed: int = 0
+    """Seed of room, people, path and noise."""
+    viz: bool = False
+    """Watch it in the viewer of rerun."""
+    rrd: Path | None = None
+    """File to write a recording for that viewer to."""
+
+    def main(self) -> None:
+        """Run the command."""
+        scene = SyntheticConfig(frames=self.frames, path=self.path, people=self.people, seed=self.seed)
+        _console.print(f"Rendering a room with {self.people} people, the camera moving as in '{self.path}'.")
+        dataset = SyntheticDataset(scene)
+        slam = Slam(dataset.camera, load_config())
+        viewer = _viewer(slam, dataset, live=self.viz, path=self.rrd)
+        track(dataset, slam, "default", self.out, viewer)
+
+
+@dataclass(frozen=True)
+class OfRecording:
+    """What the commands that track recordings share."""
+
+    recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
+    """Folder of the recording."""
+    dataset: str = "auto"
+    """Kind of the recording: auto, tum, bonn."""
+    camera: str | None = None
+    """Known camera or camera file (jaxslam, ORB-SLAM2, ORB-SLAM3)."""
+    config: Path | None = None
+    """YAML file of settings that differ from the preset."""
+    out: Path | None = None
+    """Folder for the results; results/NAME if not given."""
+    max_frames: int | None = None
+    """Track at most this many frames."""
+    start: int = 0
+    """First frame to track."""
+    deterministic: bool = True
+    """Run everything in turn: two runs give the same bytes."""
+    realtime: bool = False
+    """Feed frames at the rate they were taken at, and drop those that come late; each module in its thread."""
+    set: _Settings = ()
+    """Settings, as in `--set track.num_points=400 run.seed=3`; may be given again."""
+
+    def settings(self, preset: str, *overrides: str) -> Config:
+        """The settings of a run, with more overrides if there are any."""
+        chosen = ["run.deterministic=false"] if not self.deterministic else []
+        chosen += ["run.realtime=true"] if self.realtime else []
+        return load_config(preset, self.config, (*chosen, *itertools.chain(*self.set), *overrides))
+
+    def opened(self) -> Dataset:
+        """The recording, or the part of it that is wanted."""
+        if self.dataset not in ("auto", *dataset_kinds()):
+            raise ConfigError(
+                f"--dataset: unknown kind '{self.dataset}'{nearest(self.dataset, ['auto', *dataset_kinds()])}"
+            )
+        if self.max_frames is not None and self.max_frames < 1:
+            raise ConfigError(f"--max-frames: expected at least 1, got {self.max_frames}")
+        dataset = open_dataset(self.recording, self.dataset, self.camera)
+        if not self.start and self.max_frames is None:
+            return dataset
+        return Subset(dataset, self.start, None if self.max_frames is None else self.start + self.max_frames)
+
+    def folder(self) -> Path:
+        """Where the results go."""
+        return self.out or Path("results") / self.recording.resolve().name
+
+
+@dataclass(frozen=True)
+class Run(OfRecording):
+    """Track a recording and, if it has ground truth, evaluate.
+
+    The dataset kind and the cameras of TUM (fr1, fr2, fr3) and Bonn are recognised from the folder.
+    """
+
+    preset: str = "default"
+    """Preset to start from."""
+    map: Path | None = None
+    """Map file to start with; the world is that of the map."""
+    localize_only: bool = False
+    """Only find the camera in the map, which stays as it is."""
+    save_map: Path | None = None
+    """File to write the map to."""
+    viz: bool = False
+    """Watch it in the viewer of rerun."""
+    rrd: Path | None = None
+    """File to write a recording for that viewer to."""
+
+    def main(self) -> None:
+        """Run the command."""
+        if self.localize_only and self.map is None:
+            raise ConfigError("--localize-only: needs the map to localise in: --map FILE")
+        config, dataset = self.settings(self.preset), self.opened()
+        prefer_one_thread()  # nothing else computes while a recording is tracked
+        start = None if self.map is None else load_map(self.map)
+        slam = Slam(dataset.camera, config, map=start, localize_only=self.localize_only)
+        viewer = _viewer(slam, dataset, live=self.viz, path=self.rrd)
+        track(dataset, slam, self.preset, self.folder(), viewer)
+        if self.save_map is not None:
+            slam.save(self.save_map)
+            _console.print(f"Map in {self.save_map}: {len(slam.map.ids)} keyframes, {len(slam.map.points.ids)} points")
+
+
+@dataclass
+class _Meter:
+    """A progress bar that also says how tracking goes."""
+
+    progress: Progress
+    task: Any
+    watchers: Sequence[_OnFrame]
+    statuses: dict[str, int] = field(default_factory=dict)
+
+    def __call__(self, frame: Frame | None, result: Tracked | Rejected) -> None:
+        for watcher in self.watchers:
+            watcher(frame, result)
+        self.statuses[result.status.name] = self.statuses.get(result.status.name, 0) + 1
+        text = "  ".join(f"{name.lower()} {count}" for name, count in self.statuses.items())
+        self.progress.update(self.task, advance=1, status=text)
+
+
+def _viewer(slam: Slam, dataset: Dataset, *, live: bool, path: Path | None) -> "Viewer | None":
+    """What shows the run, if that is wanted; rerun is a large package that many will not have."""
+    if not live and path is None:
+        return None
+    from jaxslam.viewer import Viewer  # noqa: PLC0415
+
+    return Viewer(slam, dataset.ground_truth, path=path, live=live)
+
+
+def track(
+    dataset: Dataset, slam: Slam, preset: str, out: Path, viewer: "Viewer | None" = None, *, quiet: bool = False
+) -> dict[str, Any]:
+    """Track with a progress bar, write the results, and print them unless `quiet`; gives the summary."""
+    began = time.perf_counter()
+    with _console.status("Compiling the tracker (some 15 s at the first start on a machine, then 2) ..."):
+        slam.warm_up()
+    if not quiet:
+        _console.print(f"Tracker ready after {slam.compile_s:.1f} s.")
+    columns = (
+        TextColumn("Tracking"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[status]}"),
+    )
+    snapshots, masks = Snapshots(len(dataset)), MaskPictures()
+    watchers = [snapshots, masks] if viewer is None else [snapshots, masks, viewer]
+    with slam, viewer or nullcontext(), Progress(*columns, console=_console) as progress:
+        meter = _Meter(progress, progress.add_task("track", total=len(dataset), status=""), watchers)
+        records = slam.run(dataset, meter)
+    info = RunInfo(dataset, preset, time.perf_counter() - began)
+    summary, evaluation = write_results(out, slam, records, info, snapshots.kept, masks.kept)
+    if not quiet:
+        _print_summary(summary, evaluation, out)
+    return summary
+
+
+def _print_summary(summary: dict[str, Any], evaluation: Evaluation | None, out: Path) -> None:
+    table = Table("figure", "value", "unit", title=summary["dataset"], title_justify="left")
+    statuses = ", ".join(f"{name} {count}" for name, count in summary["status_counts"].items())
+    table.add_row("tracked", f"{summary['tracked']} of {summary['frames']}", f"frames ({statuses})")
+    if summary["realtime"]:
+        table.add_row("dropped", f"{summary['dropped']} of {summary['frames']}", "frames, which came late")
+    if (age := summary["mask_age_frames"]) is not None:
+        table.add_row("age of masks, median", f"{age['median']:.0f}", f"frames ({age['p95']:.0f} at p95)")
+    table.add_row("map", str(summary["keyframes"]), f"keyframes, {summary['map_points']} points")
+    table.add_row("loops closed", str(summary["loops_closed"]), f"{summary['submaps']} submaps")
+    table.add_row("ATE (SE(3) aligned)", number(summary["ate_rmse_m"], 4), "m RMSE")
+    table.add_row("ATE (Sim(3) aligned)", number(summary["ate_sim3_rmse_m"], 4), "m RMSE")
+    table.add_row("RPE over 1 s", number(summary["rpe_trans_m_per_s"], 4), "m/s RMSE")
+    table.add_row("RPE over 1 s, rotation", number(summary["rpe_rot_deg_per_s"], 3), "deg/s RMSE")
+    if summary["track_ms"] is not None:
+        for name in ("median", "p95", "max"):
+            table.add_row(f"tracking time, {name}", number(summary["track_ms"][name], 1), "ms a frame")
+    _console.print(table)
+    if evaluation is None:
+        _console.print(f"Not evaluated: {summary['evaluation_problem']}.")
+    for note in evaluation.notes if evaluation is not None else ():
+        _console.print(f"Note: {note}.")
+    _console.print(f"Results in {out}: {', '.join(name for name in RESULT_FILES if (out / name).exists())}")
+
+
+def number(value: float | None, digits: int) -> str:
+    """A figure for a table, `-` if there is none."""
+    return "-" if value is None else f"{value:.{digits}f}"

@@ -1,0 +1,60 @@
+"""`jaxslam compare`: several presets in one table."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from jaxslam.cli import main
+from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset, write_tum
+
+FRAMES = 8
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recordings") / "room"
+    write_tum(SyntheticDataset(SyntheticConfig(width=320, height=240, frames=FRAMES, people=0)), folder)
+    return folder
+
+
+def test_a_table(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Two presets, twice each: every run has its folder, every preset its row."""
+    chosen = ["--presets", "static", "ngd", "--runs", "2", "--set", "track.num_points=128", "track.cell_px=16"]
+    main(["compare", str(recording), "--out", str(tmp_path), *chosen])
+    rows = json.loads((tmp_path / "comparison.json").read_text())
+    assert [row["preset"] for row in rows] == ["static", "ngd"]
+    for row in rows:
+        ates = [
+            json.loads((tmp_path / row["preset"] / seed / "summary.json").read_text())["ate_rmse_m"] for seed in "01"
+        ]
+        assert row["ate_rmse_m_of_runs"] == ates
+        assert row["ate_rmse_m"] == pytest.approx(sum(ates) / 2)
+        assert row["tracked_percent"] == 100
+        assert row["dropped_percent"] == 0
+        assert row["track_ms_p95"] >= row["track_ms_median"] > 0
+    lines = (tmp_path / "comparison.md").read_text().splitlines()
+    assert len(lines) == 4
+    assert lines[2].startswith("| static | 100.0 % |")
+    assert len({line.count("|") for line in lines}) == 1
+    printed = capsys.readouterr().out
+    assert "ngd, run 2 of 2" in printed
+    seeds = [(tmp_path / "ngd" / seed / "config.yaml").read_text().count(f"seed: {seed}\n") for seed in "01"]
+    assert seeds == [1, 1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--runs", "0"], "--runs: expected at least 1, got 0"),
+        (["--presets", "static", "ngt"], "--presets: unknown preset 'ngt' (did you mean 'ngd'?)"),
+        (["--max-frames", "0"], "--max-frames: expected at least 1, got 0"),
+    ],
+)
+def test_wrong_arguments(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    with pytest.raises(SystemExit):
+        main(["compare", str(recording), "--out", str(tmp_path), *arguments])
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
