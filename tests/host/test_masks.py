@@ -2,6 +2,7 @@
 
 import functools
 
+import cv2
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -13,15 +14,11 @@ from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.frame import to_grey
 from jaxslam.masks.box_mask import add_box, dilated, largest_parts, mask_of_detections, object_depth
 from jaxslam.masks.propagation import CAPACITY, Followed, follow, predicted_mask
-from jaxslam.masks.sampling import CELL_PX, sample_mask
-from jaxslam.masks.stillness import without_still_parts
-from jaxslam.pose import IDENTITY
+from jaxslam.masks.sampling import CELL_PX, sample_mask, spacing
 from jaxslam.semantics import Detections, no_detections
 
 HEIGHT, WIDTH = 240, 320
 FIRST, LAST = 10, 14
-WHOLE = WIDTH // CELL_PX * CELL_PX
-"""Columns of whole cells."""
 
 
 @functools.cache
@@ -126,7 +123,7 @@ class TestBoxMask:
 class TestSampleMask:
     def test_one_in_every_cell(self) -> None:
         grey, _, truth = seen(FIRST)
-        points = sample_mask(truth, grey, CAPACITY, 0)
+        points = sample_mask(truth, grey, WIDTH * HEIGHT, 0)
         column, row = points.astype(int)
         assert truth[row, column].all()
         cells = row // CELL_PX * 1000 + column // CELL_PX
@@ -140,6 +137,41 @@ class TestSampleMask:
         np.testing.assert_array_equal(same, again)
         assert (same != other).any()
 
+    def test_without_texture(self) -> None:
+        """Random pixels, of the mask only."""
+        mask = np.random.default_rng(0).random((HEIGHT, WIDTH)) < 0.05
+        column, row = sample_mask(mask, np.zeros(mask.shape, np.uint8), WIDTH * HEIGHT, 0).astype(int)
+        assert mask[row, column].all()
+        assert 6 < np.mean(row % CELL_PX) < 8
+        assert 6 < np.mean(column % CELL_PX) < 8
+
+    def test_best_corners_of_the_whole_image(self) -> None:
+        """Also at the edge of the mask, and of the image, of which only a part is looked at."""
+        grey = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH), np.uint8)
+        score = cv2.cornerMinEigenVal(grey, 5)
+        for rows, columns in ((slice(0, 40), slice(0, 100)), (slice(97, 152), slice(203, WIDTH)), (slice(0, 240),) * 2):
+            mask = np.zeros(grey.shape, bool)
+            mask[rows, columns] = True
+            column, row = sample_mask(mask, grey, WIDTH * HEIGHT, 0).astype(int)
+            masked = np.where(mask, score, -1)[:, : WIDTH // CELL_PX * CELL_PX]
+            best = masked.reshape(HEIGHT // CELL_PX, CELL_PX, -1, CELL_PX).max(axis=(1, 3)).ravel()
+            np.testing.assert_array_equal(score[row, column], best[best >= 0])
+
+    def test_fewer_than_cells(self) -> None:
+        """They are all over the mask, not only where the picture has most texture."""
+        grey, everywhere = np.zeros((HEIGHT, WIDTH), np.uint8), np.ones((HEIGHT, WIDTH), bool)
+        grey[:60, :80] = np.random.default_rng(0).integers(0, 256, (60, 80))
+        column, row = sample_mask(everywhere, grey, 60, 0)
+        num, _, _ = np.histogram2d(row, column, bins=[3, 4], range=[[0, HEIGHT], [0, WIDTH]])
+        print(num)
+        assert num.sum() == 60
+        assert num.min() >= 2
+
+    def test_spacing(self) -> None:
+        mask = np.zeros((HEIGHT, WIDTH), bool)
+        mask[: 10 * CELL_PX, : 10 * CELL_PX] = True
+        assert [spacing(mask, capacity) for capacity in (200, 100, 25)] == [1, 1, 2]
+
     def test_nothing(self) -> None:
         grey = seen(FIRST)[0]
         assert sample_mask(np.zeros(grey.shape, bool), grey, 20, 0).shape == (2, 0)
@@ -152,7 +184,56 @@ def carried(first: int, last: int) -> tuple[np.ndarray, Followed]:
     return predicted_mask(mask, followed, seen(last)[1]), followed
 
 
+def moved(mask: np.ndarray, shift_px: tuple[int, int]) -> Followed:
+    """Points of a mask that all moved by so much."""
+    before = sample_mask(mask, np.zeros(mask.shape, np.uint8), CAPACITY, 0)
+    before = np.pad(before, ((0, 0), (0, CAPACITY - before.shape[1])), constant_values=-1)
+    return Followed(before, before + np.array(shift_px, np.float32)[:, None], before[0] >= 0)
+
+
+def rectangle(left: int, top: int, right: int, bottom: int) -> np.ndarray:
+    mask = np.zeros((HEIGHT, WIDTH), bool)
+    mask[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)] = True
+    return mask
+
+
 class TestPropagation:
+    @pytest.mark.parametrize("shift_px", [(0, 0), (13, -6), (-90, 0), (140, 90), (30, -120)])
+    def test_what_depth_shows(self, shift_px: tuple[int, int]) -> None:
+        """An object before a wall, a little larger than its mask, also where it leaves the image."""
+        u, v = shift_px
+        mask, truth = rectangle(64, 64, 196, 176), rectangle(60 + u, 60 + v, 200 + u, 180 + v)
+        depth = np.where(truth, 1.5, 3.0).astype(np.float32)
+        np.testing.assert_array_equal(predicted_mask(mask, moved(mask, shift_px), depth), truth)
+
+    def test_pieces_without_points_do_not_move(self) -> None:
+        """Of two parts of a mask on one surface, points were followed of one only."""
+        followed_part, other = rectangle(20, 60, 110, 180), rectangle(140, 60, 260, 180)
+        depth = np.where(rectangle(20, 60, 260, 180), 1.5, 3.0).astype(np.float32)
+        new = predicted_mask(followed_part | other, moved(followed_part, (0, 0)), depth)
+        assert (new & followed_part).sum() == followed_part.sum()
+        assert not (new & other).any()
+
+    def test_objects_with_their_own_motion(self) -> None:
+        """Two parts of a mask at two depths, moving towards each other."""
+        parts, depths, shifts = (rectangle(20, 60, 110, 180), rectangle(170, 60, 260, 180)), (1.5, 2.5), (20, -30)
+        mask, depth, truth = parts[0] | parts[1], np.full((HEIGHT, WIDTH), 4.0, np.float32), np.zeros_like(parts[0])
+        followed = moved(mask, (0, 0))
+        for part, z, shift in zip(parts, depths, shifts, strict=True):
+            column, row = followed.before.astype(int)
+            followed.now[0, part[row, column]] += shift
+            depth[np.roll(part, shift, axis=1)] = z
+            truth |= np.roll(part, shift, axis=1)
+        np.testing.assert_array_equal(predicted_mask(mask, followed, depth), truth)
+
+    def test_points_far_apart(self) -> None:
+        """One object fills an image so large that its points are 48 pixels apart."""
+        mask, depth = np.ones((480, 640), bool), np.full((480, 640), 2.0, np.float32)
+        v, u = np.mgrid[24:480:48, 24:590:48]
+        uv = np.full((2, CAPACITY), -1, np.float32)
+        uv[:, : u.size] = u.ravel(), v.ravel()
+        assert predicted_mask(mask, Followed(uv, uv, uv[0] >= 0), depth).all()
+
     def test_people_are_followed(self) -> None:
         """Better than the mask left where it was."""
         new, _ = carried(FIRST, LAST)
@@ -178,36 +259,3 @@ class TestPropagation:
         followed = carried(FIRST, LAST)[1]
         gone = followed._replace(now=followed.now + np.float32(1000))
         assert not predicted_mask(mask, gone, depth).any()
-
-
-class TestStillness:
-    @staticmethod
-    def grid() -> np.ndarray:
-        v, u = np.mgrid[CELL_PX // 2 : HEIGHT : CELL_PX, CELL_PX // 2 : WIDTH : CELL_PX]
-        return np.stack([u.ravel(), v.ravel()]).astype(np.float32)
-
-    def test_what_stands_still_leaves(self) -> None:
-        """The left half moves by 5 pixels under a camera at rest."""
-        uv = self.grid()
-        moving = uv[0] < WIDTH // 2
-        followed = Followed(uv - np.where(moving, 5, 0).astype(np.float32)[None], uv, np.ones(uv.shape[1], bool))
-        mask, depth = np.ones((HEIGHT, WIDTH), bool), np.full((HEIGHT, WIDTH), 2.0, np.float32)
-        left = without_still_parts(mask, followed, depth, IDENTITY, IDENTITY, room().camera)
-        assert left[:, : WIDTH // 2 - CELL_PX].all()
-        assert not left[:, WIDTH // 2 + CELL_PX : WHOLE].any()
-
-    def test_camera_moves(self) -> None:
-        """What moves as the camera alone would have it stands still."""
-        camera, uv, z = room().camera, self.grid(), 2.0
-        shift_px = 10.0
-        now = np.array([1.0, 0, 0, 0, shift_px * z / camera.fx, 0, 0])
-        followed = Followed(uv + np.array([[shift_px], [0]], np.float32), uv, np.ones(uv.shape[1], bool))
-        mask, depth = np.ones((HEIGHT, WIDTH), bool), np.full((HEIGHT, WIDTH), z, np.float32)
-        assert not without_still_parts(mask, followed, depth, IDENTITY, now, camera)[:, :WHOLE].any()
-        assert without_still_parts(mask, followed, depth, IDENTITY, IDENTITY, camera).all()
-
-    def test_nothing_known(self) -> None:
-        uv = self.grid()
-        followed = Followed(uv, uv, np.ones(uv.shape[1], bool))
-        mask, depth = np.ones((HEIGHT, WIDTH), bool), np.zeros((HEIGHT, WIDTH), np.float32)
-        assert without_still_parts(mask, followed, depth, IDENTITY, IDENTITY, room().camera).all()
