@@ -1,21 +1,24 @@
 """Masks of every frame: when they come, how old they are, and what goes wrong; the tracker with and without them."""
 
 import functools
+import itertools
 import threading
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from small_scene import TRACK, Clip
 
-from jaxslam.config import Config, SemanticsConfig
+from jaxslam.config import Config, DynamicsConfig, SemanticsConfig
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.detector_choice import detector_of
 from jaxslam.dynamic_masks import DynamicMasks, FrameMask, MaskSource
 from jaxslam.errors import ModelError
 from jaxslam.evaluation import evaluate
 from jaxslam.frame import to_grey
+from jaxslam.pose import angle, between
 from jaxslam.semantics import Detections, no_detections
 from jaxslam.slam import Slam
 from jaxslam.state import TrackStatus
@@ -45,27 +48,44 @@ def knows_all(image: np.ndarray) -> Detections:
 
 
 def masks_of(
-    detector: Callable[[np.ndarray], Detections],
+    detector: Callable[[np.ndarray], Detections] | None,
     latency_frames: int = 2,
     *,
     deterministic: bool = True,
     propagate: bool = True,
+    newcomers: bool = False,
     num: int = 12,
 ) -> list[FrameMask]:
+    """The masks of the first frames, of a camera whose poses are known."""
     made = DynamicMasks(
         source().camera,
         detector,
         deterministic=deterministic,
         latency_frames=latency_frames,
         propagate=propagate,
+        newcomers=newcomers,
         dilate_px=0,
     )
     try:
-        return [
-            made.of_frame(i, f.image, to_grey(f.image), f.depth_m) for i, f in enumerate(rendered()[0].frames[:num])
-        ]
+        return [mask_of(made, index) for index in range(num)]
     finally:
         made.close()
+
+
+def mask_of(made: DynamicMasks, index: int, moved_to: np.ndarray | None = None) -> FrameMask:
+    frame, time_s = rendered()[0].frames[index], float(1e-9 * source().timestamps_ns[index])
+    pose: np.ndarray = source().T_world_cam[index] if moved_to is None else moved_to
+    turn = float(turns()[index])
+    mask = made.of_frame(index, time_s, frame.image, to_grey(frame.image), frame.depth_m, pose, turn)
+    made.tracked(index, time_s, pose, turn)
+    return mask
+
+
+@functools.cache
+def turns() -> np.ndarray:
+    """`(n,)` rad/s."""
+    angles = [float(angle(between(a, b))) for a, b in itertools.pairwise(source().T_world_cam)]
+    return np.array([*angles, angles[-1]]) * source().fps
 
 
 def overlaps(masks: list[FrameMask]) -> np.ndarray:
@@ -116,6 +136,79 @@ class TestSchedule:
         assert overlaps(masks)[-1] > 0.4
 
 
+def sees(until: int) -> Callable[[np.ndarray], Detections]:
+    """A detector that is right for so many looks and then blind."""
+    looks = itertools.count()
+    return lambda image: knows_all(image) if next(looks) < until else no_detections()
+
+
+class TestBlindDetector:
+    def test_for_a_second(self) -> None:
+        """People are followed on for thirty frames, a little better with what depth sees come."""
+        last = {}
+        for newcomers in (False, True):
+            masks = masks_of(sees(6), 0, newcomers=newcomers, num=36)
+            overlap = overlaps(masks)
+            blind, last[newcomers] = overlap[6:], overlap[-1]
+            print(f"newcomers {newcomers}: overlap with the truth {np.round(overlap[[5, 10, 15, 25, 35]], 2)}")
+            assert overlap[5] > 0.9
+            assert blind[:5].min() > 0.8
+            assert np.median(blind) > 0.5
+            assert blind.min() > 0.35
+            assert [mask.age for mask in masks] == [0] * 6 + list(range(1, 31))
+            assert {mask.source for mask in masks[6:]} == {MaskSource.PROPAGATED}
+        assert last[True] >= last[False]
+
+    def test_newcomers_are_added(self) -> None:
+        """Whom depth sees come is in the mask, also if no detector has ever found anything."""
+        masks = masks_of(lambda _: no_detections(), 0, newcomers=True, num=FRAMES)
+        assert {mask.source for mask in masks} == {MaskSource.NONE, MaskSource.DEPTH}
+        assert {mask.age for mask in masks} == {-1}
+        truth = rendered()[1]
+        wrong = sum((mask.mask & ~people).sum() for mask, people in zip(masks, truth, strict=True))
+        assert wrong <= 0.01 * sum(mask.mask.sum() for mask in masks)
+
+    def test_same_as_without_a_detector(self) -> None:
+        blind, none = (masks_of(detector, 0, newcomers=True) for detector in (lambda _: no_detections(), None))
+        assert any(mask.mask.any() for mask in none)
+        for a, b in zip(blind, none, strict=True):
+            np.testing.assert_array_equal(a.mask, b.mask)
+            assert (a.source, a.age, a.error) == (b.source, b.age, b.error)
+
+
+class TestWorld:
+    """What is told of the camera's place."""
+
+    @staticmethod
+    def made() -> DynamicMasks:
+        return DynamicMasks(source().camera, None, deterministic=True, latency_frames=2, dilate_px=0)
+
+    def test_corrected(self) -> None:
+        """The world is moved by a metre between two frames: it is as if nothing had happened."""
+        plain, corrected = self.made(), self.made()
+        shift = np.array([1.0, 0, 0, 0, 0.8, 0.0, -0.6])
+        here = np.concatenate([source().T_world_cam[:, :4], source().T_world_cam[:, 4:] + shift[4:]], axis=1)
+        any_masked = []
+        for index in range(FRAMES):
+            if index == 8:
+                corrected.corrected(shift)
+            one, other = mask_of(plain, index), mask_of(corrected, index, here[index] if index >= 8 else None)
+            assert (one.mask != other.mask).mean() < 1e-3  # where depth is just at the edge of a threshold
+            assert one.mask.any() == other.mask.any()
+            any_masked.append(one.mask.any())
+        assert any_masked[-1]
+
+    def test_lost(self) -> None:
+        """Nothing is new to who does not know where it is: for 0.13 s there is nothing to compare with."""
+        made = self.made()
+        for index in range(4):
+            mask_of(made, index)
+        made.lost()
+        masks = [mask_of(made, index) for index in range(4, 16)]
+        assert not any(mask.mask.any() for mask in masks[:4])
+        assert masks[-1].mask.any()
+
+
 class TestFailure:
     @pytest.mark.parametrize("deterministic", [True, False])
     def test_detector_raises(self, deterministic: bool) -> None:
@@ -131,9 +224,82 @@ class TestFailure:
         assert any(mask.error == "ValueError: no luck" for mask in masks)
         assert sum(mask.source is MaskSource.DETECTOR for mask in masks) >= 1
 
+    def test_is_told_once_and_logged_when_it_changes(self, caplog: pytest.LogCaptureFixture) -> None:
+        words = ["", "no luck", "no luck", "", "no luck", "worse", "", "worse", "no luck", ""]
+        looks = iter(words)
+
+        def detector(image: np.ndarray) -> Detections:
+            word = next(looks)
+            if word:
+                raise ValueError(word)
+            return knows_all(image)
+
+        masks = masks_of(detector, 0, num=len(words))
+        assert [mask.error for mask in masks] == [word and f"ValueError: {word}" for word in words]
+        assert [record.message for record in caplog.records] == [
+            f"detector failed: ValueError: {word}" for word in ("no luck", "worse", "no luck")
+        ]
+        assert [mask.age for mask in masks] == [0, 1, 2, 0, 1, 2, 0, 1, 2, 0]
+
+    @pytest.mark.parametrize("deterministic", [True, False])
+    def test_no_failure_is_told_twice(self, deterministic: bool) -> None:
+        looks, failures = itertools.count(), []
+
+        def detector(image: np.ndarray) -> Detections:
+            if (look := next(looks)) % 3 == 1:
+                failures.append(f"ValueError: look {look}")
+                raise ValueError(f"look {look}")
+            return knows_all(image)
+
+        told = [mask.error for mask in masks_of(detector, 2, deterministic=deterministic, num=FRAMES) if mask.error]
+        assert len(told) >= 1
+        assert told == failures[: len(told)]
+        assert len(told) >= len(failures) - 1  # the last one may come too late
+
+    @pytest.mark.parametrize(
+        "changes",
+        [
+            {"boxes": np.zeros(4, np.float32)},
+            {"boxes": np.zeros((3, 5), np.float32)},
+            {"class_mask": np.ones((HEIGHT // 2, WIDTH // 2), bool)},
+            {"class_mask": np.ones((HEIGHT, WIDTH, 1), bool)},
+            {"class_mask": np.ones((HEIGHT, WIDTH), np.float32)},
+            {"masks": np.ones((2, HEIGHT // 2, WIDTH // 2), bool)},
+            {"boxes": None},
+        ],
+        ids=["one box", "five sides", "half the size", "three axes", "numbers", "masks of half the size", "nothing"],
+    )
+    def test_wrong_shapes(self, changes: dict[str, Any]) -> None:
+        """Are told as what goes wrong; the mask of before is carried on."""
+        looks = itertools.count()
+        wrong = no_detections()._replace(**changes)
+        masks = masks_of(lambda image: wrong if next(looks) else knows_all(image), 0, num=4)
+        assert [bool(mask.error) for mask in masks] == [False, True, True, True]
+        assert [mask.age for mask in masks] == [0, 1, 2, 3]
+        assert overlaps(masks).min() > 0.6
+
+    def test_no_detections_at_all(self) -> None:
+        masks = masks_of(lambda _: None, 0, num=3)  # type: ignore[arg-type,return-value]
+        assert all(mask.error.startswith("AttributeError") for mask in masks)
+        assert not any(mask.mask.any() for mask in masks)
+
+    @pytest.mark.parametrize("side", [0, 1, 2, 3])
+    @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+    def test_boxes_that_are_no_numbers(self, side: int, value: float) -> None:
+        """They are nobody; the others are found."""
+        boxes = np.tile(np.array([[0, 0, WIDTH, HEIGHT]], np.float32), (2, 1))
+        boxes[0, side] = value
+        found = no_detections()._replace(boxes=boxes, scores=np.ones(2, np.float32), labels=("person",) * 2)
+        both = masks_of(lambda _: found, 0, num=1)[0]
+        alone = masks_of(lambda _: found._replace(boxes=boxes[1:]), 0, num=1)[0]
+        assert not both.error
+        assert alone.mask.any()
+        np.testing.assert_array_equal(both.mask, alone.mask)
+        assert not masks_of(lambda _: found._replace(boxes=boxes[:1]), 0, num=1)[0].mask.any()
+
     def test_detector_hangs(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """The first frame waits for a while, the others not at all; closing does not wait for ever."""
-        monkeypatch.setattr("jaxslam.dynamic_masks._FIRST_WAIT_S", 0.05)
+        monkeypatch.setattr("jaxslam.semantic_thread._PATIENCE_S", 0.05)
         ends = threading.Event()
 
         def detector(image: np.ndarray) -> Detections:
@@ -153,8 +319,9 @@ class TestFailure:
         assert masks_of(lambda _: found, num=2)[0].mask.any()
 
 
-def config(**semantics: object) -> Config:
-    return Config(track=PLAN, semantics=SemanticsConfig(**semantics))  # type: ignore[arg-type]
+def config(*, newcomers: bool = True, **semantics: Any) -> Config:
+    dynamics = DynamicsConfig(newcomers=newcomers)
+    return Config(track=PLAN, semantics=SemanticsConfig(model=None, **semantics), dynamics=dynamics)
 
 
 class TestSlam:
@@ -181,6 +348,29 @@ class TestSlam:
             result = slam.track(replace(clip[0], dynamic_mask=masks[0]))
         assert result.mask_source is MaskSource.CALLER
         np.testing.assert_array_equal(result.dynamic_mask, masks[0])
+
+    def test_callers_mask_where_there_is_no_other(self) -> None:
+        clip, masks = rendered()
+        for newcomers in (True, False):
+            with Slam(clip.camera, config(newcomers=newcomers)) as slam:
+                results = [slam.track(replace(clip[index], dynamic_mask=masks[index])) for index in range(3)]
+            assert [(result.mask_source, result.mask_age) for result in results] == [(MaskSource.CALLER, -1)] * 3
+            np.testing.assert_array_equal(results[-1].dynamic_mask, masks[2])
+
+    def test_without_a_detector(self) -> None:
+        """Masks are made nevertheless, unless the settings have none."""
+        clip, truth = rendered()
+        sources = {}
+        for newcomers in (True, False):
+            with Slam(clip.camera, config(newcomers=newcomers, dilate_px=0)) as slam:
+                results = [slam.track(frame) for frame in clip.frames]
+            sources[newcomers] = {result.mask_source for result in results}
+            masked = sum(result.dynamic_mask.sum() for result in results)
+            wrong = sum((r.dynamic_mask & ~people).sum() for r, people in zip(results, truth, strict=True))
+            assert masked > 0 or not newcomers
+            assert wrong <= 0.02 * masked
+            assert {result.mask_age for result in results} == {-1}
+        assert sources == {True: {MaskSource.NONE, MaskSource.DEPTH}, False: {MaskSource.NONE}}
 
     def test_callers_mask_is_added_to_the_detectors(self) -> None:
         clip, masks = rendered()
@@ -211,7 +401,7 @@ class TestSlam:
 
 class TestDetectorOfSettings:
     def test_none(self) -> None:
-        assert detector_of(SemanticsConfig()) is None
+        assert detector_of(SemanticsConfig(model=None)) is None
 
     def test_known_but_not_there(
         self, monkeypatch: pytest.MonkeyPatch, tmp_path: object, caplog: pytest.LogCaptureFixture

@@ -1,4 +1,4 @@
-"""The pose of a frame from the points of the map around it."""
+"""The pose of a frame from the points of the map around it, and which keyframes show what is in view."""
 
 import functools
 from dataclasses import replace
@@ -7,15 +7,18 @@ from typing import Any
 import numpy as np
 import pytest
 from room_round import TRACK, room
+from small_map import CAMERA
+from wall_map import BEHIND, POINTS, at, seen_from
 
 from jaxslam.config import Config
+from jaxslam.feature_pose import MIN_CELLS
 from jaxslam.features import Features, features_of
 from jaxslam.frame import Frame
 from jaxslam.frame_arrays import frame_arrays
-from jaxslam.local_map import local_keyframes, match_local_map
+from jaxslam.local_map import keyframes_in_view, local_keyframes, match_local_map
 from jaxslam.local_mapping import mapping_plan
-from jaxslam.map import Map, empty_map
-from jaxslam.pose import angle, between, compose, inverse, moved
+from jaxslam.map import Map, empty_map, sightings_at
+from jaxslam.pose import IDENTITY, angle, between, compose, inverse, moved
 from jaxslam.slam import Slam, track_params
 from jaxslam.state import TrackReason, TrackStatus
 from jaxslam.tracked import Tracked
@@ -58,6 +61,37 @@ def match(map: Map, index: int, error: np.ndarray, seen: Features | None = None)
     return match_local_map(map, keyframe_id, moved(true, error), seen, params(), PLAN), true
 
 
+class TestKeyframesInView:
+    def test_those_that_show_the_points_in_view_from_alike_directions(self) -> None:
+        """Not from the other side, nor from so far or near that the pictures differ."""
+        poses = [at(), at(x=0.3), BEHIND, at(z=-2.5), at(z=1.2), at(x=4.0, turn=-1.1), at(z=-1.5)]
+        made = seen_from(poses, [POINTS] * len(poses))
+        assert sorted(keyframes_in_view(made, at(), 0, set(), 9)) == [0, 1, 6]
+        assert keyframes_in_view(made, BEHIND, 0, set(), 9) == [2]
+
+    def test_most_points_first(self) -> None:
+        made = seen_from([at(), at(x=0.1), at(x=0.2), at(x=0.3)], [70, 100, 50, 100])
+        assert keyframes_in_view(made, at(), 0, set(), 9) == [1, 3, 0]  # fifty are too few
+        assert keyframes_in_view(made, at(), 0, set(), 2) == [1, 3]
+        assert keyframes_in_view(made, at(), 0, {1}, 2) == [3, 0]
+        assert keyframes_in_view(made, at(), 0, {0, 1, 3}, 2) == []
+
+    def test_only_what_is_in_view(self) -> None:
+        made = seen_from([at()], [POINTS])
+        assert keyframes_in_view(made, at(x=3.0), 0, set(), 9) == []
+        assert keyframes_in_view(made, at(turn=np.pi), 0, set(), 9) == []
+
+    def test_of_the_submap(self) -> None:
+        """Another one has its own world: what is at the same place there is somewhere else."""
+        made = seen_from([at(), at(x=0.1), at()], [POINTS] * 3, [0, 0, 1])
+        assert keyframes_in_view(made, at(), 0, set(), 9) == [0, 1]
+        assert keyframes_in_view(made, at(), 1, set(), 9) == [2]
+        assert keyframes_in_view(made, at(), 2, set(), 9) == []
+
+    def test_of_an_empty_map(self) -> None:
+        assert keyframes_in_view(empty_map(CAMERA), IDENTITY, 0, set(), 4) == []
+
+
 class TestMatchLocalMap:
     @pytest.mark.parametrize(
         "error",
@@ -98,6 +132,92 @@ class TestMatchLocalMap:
         near = local_keyframes(map, int(map.ids[-1]))
         assert near[0] == map.ids[-1]
         assert len(np.unique(near)) == len(near) > 1
+
+
+class TestPointsInView:
+    """Of keyframes that share nothing with the one the frame hangs on."""
+
+    @staticmethod
+    def alone() -> Map:
+        """The map, but the keyframe near `LATER` has no point."""
+        map = mapped()[0]
+        lonely = nearest_keyframe(map, mapped()[1][LATER].T_world_cam)
+        others = np.flatnonzero(map.sightings.keyframe != lonely)
+        map = map._replace(sightings=sightings_at(map.sightings, others))
+        assert local_keyframes(map, lonely).tolist() == [lonely]
+        return map
+
+    def test_are_used(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        found, true = match(self.alone(), LATER, np.array([0.03, -0.02, 0.02, 0, 0, 0]))
+        assert found is not None
+        off_m = np.linalg.norm(between(true, found.T_origin_cam)[4:])
+        print(f"{len(found.agree)} points, {off_m * 1e3:.1f} mm off")
+        assert off_m < 0.015
+        monkeypatch.setattr("jaxslam.local_map._IN_VIEW", 0)
+        assert match(self.alone(), LATER, np.zeros(6))[0] is None
+
+    def test_not_those_of_another_submap(self) -> None:
+        map = self.alone()
+        lonely = nearest_keyframe(map, mapped()[1][LATER].T_world_cam)
+        apart = map._replace(submap=np.where(map.ids == lonely, map.submap, map.submap + 1))
+        assert match(apart, LATER, np.zeros(6))[0] is None
+
+    def test_more_than_without(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Also where the keyframe shares something with some of them."""
+        with_them = match(mapped()[0], LATER, np.zeros(6))[0]
+        monkeypatch.setattr("jaxslam.local_map._IN_VIEW", 0)
+        monkeypatch.setattr("jaxslam.local_map.LOCAL_KEYFRAMES", 1)
+        without = match(mapped()[0], LATER, np.zeros(6))[0]
+        assert with_them is not None
+        assert without is not None
+        assert len(with_them.agree) > len(without.agree)
+
+
+class TestNotFarFromWhereItWasThoughtToBe:
+    """What is found further away is another place that looks alike."""
+
+    @pytest.mark.parametrize("off_m", [0.12, 0.2])
+    def test_metres(self, off_m: float, monkeypatch: pytest.MonkeyPatch) -> None:
+        ahead = np.array([0, 0, off_m, 0, 0, 0])
+        assert (match(mapped()[0], LATER, ahead)[0] is not None) == (off_m < 0.15)
+        monkeypatch.setattr("jaxslam.local_map._NEAR_M", 1.0)
+        assert match(mapped()[0], LATER, ahead)[0] is not None
+
+    @pytest.mark.parametrize("off_rad", [0.12, 0.2])
+    def test_radians(self, off_rad: float, monkeypatch: pytest.MonkeyPatch) -> None:
+        rolled = np.array([0, 0, 0, 0, 0, off_rad])
+        monkeypatch.setattr("jaxslam.local_map._RADII_PX", (40.0, 5.0))
+        assert (match(mapped()[0], LATER, rolled)[0] is not None) == (off_rad < 0.15)
+        monkeypatch.setattr("jaxslam.local_map._NEAR_RAD", 1.0)
+        assert match(mapped()[0], LATER, rolled)[0] is not None
+
+
+class TestFewFeatures:
+    @staticmethod
+    def within(width: int, height: int, at_most: int) -> Features:
+        """Those in the middle of the picture."""
+        seen = features(LATER)
+        u, v = seen.uv
+        middle = (abs(u - room().camera.cx) < width / 2) & (abs(v - room().camera.cy) < height / 2)
+        kept = np.flatnonzero(middle)[:at_most]
+        fields = {name: field[..., kept] for name, field in seen._asdict().items() if name != "descriptor"}
+        return Features(**fields, descriptor=seen.descriptor[kept])
+
+    def test_few_cells_are_enough(self) -> None:
+        """A person leaves little of the picture; a place is not recognised by so little."""
+        found, true = match(mapped()[0], LATER, np.zeros(6), self.within(78, 60, 1000))
+        assert found is not None
+        off_m = np.linalg.norm(between(true, found.T_origin_cam)[4:])
+        print(f"{len(found.agree)} points, {off_m * 1e3:.1f} mm off")
+        assert off_m < 0.03
+
+    def test_fewer_are_not_enough_to_recognise_a_place(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("jaxslam.local_map._MIN_CELLS", MIN_CELLS)
+        assert match(mapped()[0], LATER, np.zeros(6), self.within(78, 60, 1000))[0] is None
+
+    @pytest.mark.parametrize(("width", "height", "at_most"), [(50, 30, 1000), (320, 240, 14)])
+    def test_too_few(self, width: int, height: int, at_most: int) -> None:
+        assert match(mapped()[0], LATER, np.zeros(6), self.within(width, height, at_most))[0] is None
 
 
 class TestWeakFrames:

@@ -82,7 +82,7 @@ class TestRun:
     def test_all_in_time(self) -> None:
         """Ten times slower than it was taken."""
         recording = clip()
-        slow = Clip(recording, [at(f, 10**9 * i // 3) for i, f in enumerate(recording.frames[:6])])
+        slow = Clip(recording.source, [at(f, 10**9 * i // 3) for i, f in enumerate(recording.frames[:6])])
         with Slam(slow.camera, replace(CONFIG, run=replace(CONFIG.run, realtime=True))) as slam:
             began = time.monotonic()
             records = slam.run(slow)
@@ -92,7 +92,7 @@ class TestRun:
     def test_what_is_late_is_dropped(self, tmp_path) -> None:
         """A thousand frames a second: nobody can."""
         recording = clip()
-        fast = Clip(recording, [at(f, 10**6 * i) for i, f in enumerate(recording.frames)])
+        fast = Clip(recording.source, [at(f, 10**6 * i) for i, f in enumerate(recording.frames)])
         with Slam(fast.camera, replace(CONFIG, run=replace(CONFIG.run, realtime=True))) as slam:
             records = slam.run(fast)
             summary, _ = write_results(tmp_path, slam, records, RunInfo(fast, "default", 1.0))

@@ -1,6 +1,9 @@
 """`track_step` as a pure function: compiled or not, batched, scanned, traced once, in both precisions."""
 
+import itertools
+import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -8,11 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
-from small_scene import PLAN, QUICK_COMPILE, at, clip, new_state, params, stacked
+from small_scene import HEIGHT, PLAN, QUICK_COMPILE, TRACK, WIDTH, at, clip, new_state, params, stacked
 
+from jaxslam.config import Config, DynamicsConfig, SemanticsConfig, load_config
 from jaxslam.frame_arrays import FrameArrays
-from jaxslam.state import TrackOutput, TrackParams, TrackState, TrackStatus
-from jaxslam.track import track_step
+from jaxslam.semantics import Detections, no_detections
+from jaxslam.slam import Slam
+from jaxslam.state import KeyframeReason, TrackOutput, TrackParams, TrackState, TrackStatus
+from jaxslam.track import init_state, track_step
+from jaxslam.tracked import Tracked
 
 COUNT = 12
 SAME = {"twist": 1e-4 * 30, "covariance": 1e-7, "looked_up.uv": 1e-2}
@@ -145,3 +152,134 @@ class TestCompiled:
                 singles[which], output = counted.step(singles[which], pair[which], params())
                 np.testing.assert_allclose(outputs.T_world_cam.wxyz_xyz[which], output.T_world_cam.wxyz_xyz, atol=1e-4)
                 assert int(outputs.status[which]) == int(output.status)
+
+
+LONGER = 30
+
+
+RARE = {"keyframe_below": 0.0, "keyframe_followed_below": 0.0, "keyframe_after_s": 1e3, "keyframe_weak_after_s": 1e3}
+"""Thresholds under which no keyframe is made for want of what it shows."""
+ALONE = PLAN._replace(num_sources=0, new_points="keyframes")
+
+
+@pytest.fixture(scope="module")
+def step() -> Step:
+    return jax.jit(lambda s, f, p: track_step(s, f, p, ALONE), compiler_options=QUICK_COMPILE)
+
+
+class TestFollowingAlone:
+    """As the preset `static` has it: nothing is looked up, and new points come in keyframes only."""
+
+    def outputs(self, step: Step, **changes: float) -> list[TrackOutput]:
+        frames = stacked(clip(2).frames[:LONGER])
+        given = params()._replace(**{name: jnp.float32(value) for name, value in changes.items()})
+        state, outputs = init_state(HEIGHT, WIDTH, ALONE), []
+        for index in range(LONGER):
+            state, output = step(state, at(frames, index), given)
+            outputs.append(output)
+        return outputs
+
+    @staticmethod
+    def num_new(outputs: list[TrackOutput]) -> np.ndarray:
+        """How many points each frame has that no frame had before."""
+        seen: set[int] = set()
+        new = []
+        for output in outputs:
+            now = set(np.asarray(output.id)[np.asarray(output.weights) > 0].tolist())
+            new.append(len(now - seen))
+            seen |= now
+        return np.array(new)
+
+    def test_nothing_is_looked_up(self, step: Step) -> None:
+        outputs = self.outputs(step, keyframe_points_below=0.5)
+        assert [int(output.status) for output in outputs] == [TrackStatus.STARTED] + [TrackStatus.OK] * (LONGER - 1)
+        assert all(int(output.num_looked_up) == 0 and output.looked_up.uv.shape == (2, 0) for output in outputs)
+        off = np.linalg.norm(poses(outputs)[:, 4:] - poses(self.outputs(step))[:, 4:], axis=1)
+        assert off.max() < 0.05
+
+    def test_new_points_come_in_keyframes(self, step: Step) -> None:
+        outputs = self.outputs(step, keyframe_points_below=0.75)
+        new, kept = self.num_new(outputs), np.array([int(output.keyframe) > 0 for output in outputs])
+        print(f"{new.tolist()} new points, in keyframes {np.flatnonzero(kept).tolist()}")
+        assert kept[0]
+        assert kept[1:].any()
+        assert (new[kept] > 0).all()
+        assert not new[~kept].any()
+
+    def test_points_run_out_without_keyframes(self, step: Step) -> None:
+        outputs = self.outputs(step, **RARE)
+        assert [int(output.keyframe) for output in outputs] == [KeyframeReason.STARTED] + [0] * (LONGER - 1)
+        assert not self.num_new(outputs)[1:].any()
+        num = np.array([np.count_nonzero(output.weights) for output in outputs])
+        assert (np.diff(num) <= 0).all()
+
+    def test_few_points_make_a_keyframe(self, step: Step) -> None:
+        """The first time that fewer are followed than the share of the capacity, and never before."""
+        outputs = self.outputs(step, **RARE, keyframe_points_below=0.75)
+        followed = np.array([np.count_nonzero(output.tracked) for output in outputs])
+        reasons = [int(output.keyframe) for output in outputs]
+        few = followed < 0.75 * TRACK.num_points
+        assert few[1:].any()
+        assert reasons == [KeyframeReason.STARTED, *np.where(few[1:], KeyframeReason.FEW_POINTS, 0).tolist()]
+
+
+def slam_results(config: Config, num: int = LONGER, detector: Callable | None = None) -> list[Tracked]:
+    recording = clip(0)
+    with Slam(recording.camera, config, detector=detector) as slam:
+        results = [slam.track(frame) for frame in recording.frames[:num]]
+        slam.finish()
+    return results
+
+
+class TestHeldToMap:
+    @pytest.mark.parametrize("which", ["weak", "keyframes", "always"])
+    def test_which_frames(self, which: str) -> None:
+        """Matching begins as soon as the map has a keyframe."""
+        track = replace(TRACK, hold_to_map=which, keyframe_after_s=0.3)
+        alone = {"semantics": SemanticsConfig(model=None), "dynamics": DynamicsConfig(newcomers=False)}
+        results = slam_results(Config(track=track, **alone))
+        assert {result.status for result in results[1:]} == {TrackStatus.OK}
+        matched = np.array([result.num_matched > 0 for result in results])
+        kept = np.array([result.is_keyframe for result in results])
+        assert kept.any()
+        assert not kept.all()
+        print(f"{which}: matched {np.flatnonzero(matched).tolist()}, keyframes {np.flatnonzero(kept).tolist()}")
+        late = np.arange(LONGER) > 5
+        expected = {"weak": np.zeros(LONGER, bool), "keyframes": kept, "always": np.ones(LONGER, bool)}[which]
+        np.testing.assert_array_equal(matched[late], expected[late])
+
+
+class TestPresets:
+    SMALL = tuple(
+        f"track.{name}={getattr(TRACK, name)}"
+        for name in ("num_points", "num_levels", "num_keyframes", "points_per_source", "num_hypotheses", "cell_px")
+    )
+
+    @pytest.mark.parametrize(
+        ("name", "hold_to_map", "looks_every"),
+        [
+            ("static", "always", None),
+            ("ngd-detector", "always", 1),
+            ("ngd-propagation", "always", 2),
+            ("ngd", "keyframes", 2),
+        ],
+    )
+    def test_run(self, name: str, hold_to_map: str, looks_every: int | None) -> None:
+        config = load_config(name, overrides=self.SMALL)
+        assert (config.track.hold_to_map, config.track.num_sources) == (hold_to_map, 0)
+        assert not config.dynamics.newcomers
+        assert (config.semantics.model is None) == (looks_every is None)
+        looks = itertools.count()
+
+        def detector(image: np.ndarray) -> Detections:
+            next(looks)
+            return no_detections()
+
+        results = slam_results(config, LONGER, None if looks_every is None else detector)
+        assert results[0].status is TrackStatus.STARTED
+        assert all(result.status is TrackStatus.OK for result in results[1:])
+        assert not any(result.num_looked_up for result in results)
+        assert not any(result.dynamic_mask.any() for result in results)
+        assert next(looks) == (0 if looks_every is None else 1 + math.ceil((LONGER - 1) / looks_every))
+        matched = [result.num_matched > 0 for result in results[6:]]
+        assert all(matched) if hold_to_map == "always" else sum(matched) < len(matched)
