@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import pytest
@@ -37,7 +38,8 @@ def models_cache(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempP
     """An empty cache folder for networks, and no folder of the user's."""
     monkeypatch.delenv("JAXSLAM_MODELS", raising=False)
     cache = tmp_path_factory.mktemp("cache")
-    monkeypatch.setattr(known_models.platformdirs, "user_cache_dir", lambda *_, **__: str(cache))
+    # Only there: what is compiled stays in the user's own cache.
+    monkeypatch.setattr(known_models, "platformdirs", SimpleNamespace(user_cache_dir=lambda *_, **__: str(cache)))
     folder = cache / "models"
     folder.mkdir()
     return folder

@@ -13,7 +13,7 @@ FRAMES, WIDTH, HEIGHT = 60, 320, 240
 OVERRIDES = ("track.cell_px=12",)  # for a small image
 LATE_RATIO, STATIC_RATIO = 1.3, 5.0
 SCENES: list[tuple[CameraPathKind, int]] = [("xyz", 2), ("rpy", 3), ("halfsphere", 1)]
-"""Where `static` fails; measured on all sixteen: 4.8 to 70 times worse."""
+"""Some of those where `static` fails."""
 
 
 @pytest.mark.parametrize(("path", "people"), SCENES)
