@@ -5,6 +5,7 @@ goes wrong in the detector is told with the frame, and tracking goes on.
 """
 
 import enum
+import math
 from typing import NamedTuple
 
 import jax
@@ -86,6 +87,7 @@ class DynamicMasks:
         latency_frames: int,
         propagate: bool = True,
         newcomers: bool = True,
+        farthest_m: float = math.inf,
         dilate_px: int = 2,
         seed: int = 0,
     ) -> None:
@@ -98,6 +100,7 @@ class DynamicMasks:
             latency_frames: 0 has every frame wait for its own mask.
             propagate: Carry masks on from frame to frame; without it, an old mask is used where it was.
             newcomers: Add what has come before surfaces seen earlier.
+            farthest_m: Depth beyond says nothing of those.
             dilate_px: How far a mask reaches beyond what was found.
             seed: Of random choices.
         """
@@ -107,7 +110,7 @@ class DynamicMasks:
             if detector is None
             else SemanticThread(detector, deterministic=deterministic, latency_frames=latency_frames)
         )
-        self._surfaces = SurfaceMemory(camera)
+        self._surfaces = SurfaceMemory(camera, farthest_m)
         self._seen: dict[int, _Seen] = {}
         self._detected_in: int | None = None
         self._mask = np.zeros((camera.height, camera.width), bool)
@@ -127,7 +130,7 @@ class DynamicMasks:
         image: np.ndarray,
         grey: np.ndarray,
         depth: Float[np.ndarray, "h w"],
-        T_world_cam: Float[np.ndarray, "7"],
+        T_world_cam: Float[np.ndarray, "7"] | None,
         turn_rad_per_s: float,
     ) -> FrameMask:
         """The mask of the next frame.
@@ -138,7 +141,7 @@ class DynamicMasks:
             image: `(h, w, 3)` RGB or `(h, w)`.
             grey: `(h, w)` uint8; copied.
             depth: Metres.
-            T_world_cam: Where the camera is thought to be when the depth is taken,
+            T_world_cam: Where the camera is thought to be when the depth is taken, `None` if that is too uncertain,
             turn_rad_per_s: and how fast it turns.
         """
         self._seen[frame] = _Seen(grey)

@@ -74,12 +74,14 @@ class _Remembered(NamedTuple):
 class SurfaceMemory:
     """Keeps the depth, masks and poses of the last second, and compares new frames with them."""
 
-    def __init__(self, camera: Camera) -> None:
+    def __init__(self, camera: Camera, farthest_m: float = math.inf) -> None:
         """Begin with nothing seen.
 
         Args:
             camera: That takes the frames. Its distortion is left out: between frames so close it makes no difference.
+            farthest_m: Depth beyond is as good as missing: sensors that see nothing may say that it is far away.
         """
+        self._farthest_m = farthest_m
         self._step = max(1, round(camera.width / _COARSE_WIDTH))
         self._offset = self._step // 2
         self._fine = (camera.height, camera.width)
@@ -98,7 +100,7 @@ class SurfaceMemory:
     def compare(
         self,
         time_s: float,
-        T_world_cam: Float[np.ndarray, "7"],
+        T_world_cam: Float[np.ndarray, "7"] | None,
         turn_rad_per_s: float,
         depth: Float[np.ndarray, "h w"],
         since: MaskAt | None = None,
@@ -107,12 +109,14 @@ class SurfaceMemory:
 
         Args:
             time_s: Of the frame.
-            T_world_cam: Where the camera is by now, as well as that is known.
+            T_world_cam: Where the camera is by now, as well as that is known; `None` if it is not, and nothing is known
+                of the frame either.
             turn_rad_per_s: How fast it turns.
             depth: Metres, 0 where missing.
             since: What the mask is carried on from.
         """
-        np.copyto(self._depth, self._coarse(depth))
+        coarse = self._coarse(depth)
+        np.copyto(self._depth, np.where(coarse < self._farthest_m, coarse, 0))
         poses = np.tile(np.eye(1, 7), (len(self._depths_then), 1))
         self._depths_then[:] = 0  # says nothing
         first = None if since is None else self._seen.get(since.frame)
@@ -120,7 +124,7 @@ class SurfaceMemory:
             first = first._replace(mask=self._coarse(since.mask))
         before = [first, *(self._about(time_s - ago_s, ago_s / 2) for ago_s in _AGO_S)]
         for slot, then in enumerate(before):
-            if then is not None:
+            if then is not None and T_world_cam is not None:
                 self._depths_then[slot], self._masks_then[slot] = then.depth, then.mask
                 poses[slot] = between(then.T_world_cam, T_world_cam)
         turns = turn_rad_per_s + (0.0 if before[1] is None else before[1].turn_rad_per_s)
@@ -183,7 +187,7 @@ def newcomers(seen: Surfaces, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray,
 
     The rest has the depth of the new surface, hangs together with it, and is not known to stand where it is.
     """
-    side = max(3, 1 + math.ceil(seen.displaced_px))  # edges of depth are ragged
+    side = max(3, 1 + math.ceil(seen.displaced_px)) | 1  # edges of depth are ragged; an even side would shift the rest
     fresh = cv2.morphologyEx((seen.new & ~mask).view(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8))
     num, piece, measures, _ = cv2.connectedComponentsWithStats(fresh, connectivity=4)
     coming = np.zeros(mask.shape, bool)

@@ -1,5 +1,6 @@
 """What tests of the host share."""
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,20 +27,35 @@ def compiled() -> Iterator[list[str]]:
     jax.monitoring.unregister_event_duration_listener(listener)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _networks_hidden(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str | None]:
+    """The default network is not there, whatever there is on this machine; gives the folder that is hidden."""
+    chosen = os.environ.get("JAXSLAM_MODELS")
+    with pytest.MonkeyPatch.context() as patch:
+        _hide_networks(patch, tmp_path_factory.mktemp("cache"))
+        yield chosen
+
+
 @pytest.fixture(autouse=True)
-def _no_networks(request: pytest.FixtureRequest) -> None:
-    """The default network is not there, whatever there is on this machine; but for tests marked `networks`."""
-    if request.node.get_closest_marker("networks") is None:
-        request.getfixturevalue("models_cache")
+def _networks_shown(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, _networks_hidden: str | None
+) -> None:
+    """It is there for tests marked `networks`."""
+    if request.node.get_closest_marker("networks") is not None and _networks_hidden is not None:
+        monkeypatch.setenv("JAXSLAM_MODELS", _networks_hidden)
+
+
+def _hide_networks(patch: pytest.MonkeyPatch, cache: Path) -> None:
+    patch.delenv("JAXSLAM_MODELS", raising=False)
+    # Only there: what is compiled stays in the user's own cache.
+    patch.setattr(known_models, "platformdirs", SimpleNamespace(user_cache_dir=lambda *_, **__: str(cache)))
 
 
 @pytest.fixture
 def models_cache(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An empty cache folder for networks, and no folder of the user's."""
-    monkeypatch.delenv("JAXSLAM_MODELS", raising=False)
     cache = tmp_path_factory.mktemp("cache")
-    # Only there: what is compiled stays in the user's own cache.
-    monkeypatch.setattr(known_models, "platformdirs", SimpleNamespace(user_cache_dir=lambda *_, **__: str(cache)))
+    _hide_networks(monkeypatch, cache)
     folder = cache / "models"
     folder.mkdir()
     return folder
