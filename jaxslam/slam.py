@@ -40,8 +40,8 @@ _PREDICTED_S = 1.0
 _EXTRAPOLATED_S = 0.1
 """and for which it tells where the camera is now, to a degree or so."""
 _LONGEST_GAP_S = 0.12
-"""After a longer one depth is not compared with that of earlier frames: at 5 frames a second, turning as in the rendered
-path `rpy`, three quarters of an empty room were taken for newcomers."""
+"""After a longer one depth is not compared with that of earlier frames: at 5 frames a second, turning as in the path
+`rpy`, three quarters of an empty room were taken for newcomers."""
 
 _new_state = jax.jit(init_state, static_argnames=("height", "width", "plan"))
 """One program instead of some fifty."""

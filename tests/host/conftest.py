@@ -1,6 +1,5 @@
 """What tests of the host share."""
 
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -28,21 +27,11 @@ def compiled() -> Iterator[list[str]]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _networks_hidden(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str | None]:
-    """The default network is not there, whatever there is on this machine; gives the folder that is hidden."""
-    chosen = os.environ.get("JAXSLAM_MODELS")
+def _networks_hidden(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """The default network is not there, whatever there is on this machine; tests name the files they want."""
     with pytest.MonkeyPatch.context() as patch:
         _hide_networks(patch, tmp_path_factory.mktemp("cache"))
-        yield chosen
-
-
-@pytest.fixture(autouse=True)
-def _networks_shown(
-    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, _networks_hidden: str | None
-) -> None:
-    """It is there for tests marked `networks`."""
-    if request.node.get_closest_marker("networks") is not None and _networks_hidden is not None:
-        monkeypatch.setenv("JAXSLAM_MODELS", _networks_hidden)
+        yield
 
 
 def _hide_networks(patch: pytest.MonkeyPatch, cache: Path) -> None:
