@@ -109,8 +109,8 @@ def fit_pose(
     matches: Matches,
     params: TrackParams,
     *,
-    min_inliers: int = MIN_INLIERS,
-    min_cells: int = MIN_CELLS,
+    min_inliers: int | None = None,
+    min_cells: int | None = None,
 ) -> FeaturePose | None:
     """The pose that most matches agree on; `None` where too few do, or in too small a part of the image.
 
@@ -118,9 +118,11 @@ def fit_pose(
         T_origin_cam: `(7,)` a pose near it.
         matches: What was found.
         params: Camera, of which ideal pixels leave the pinhole, and the errors of its depth.
-        min_inliers: Fewest matches that agree in the end,
-        min_cells: and fewest cells of the image they lie in.
+        min_inliers: Fewest matches that agree in the end, `MIN_INLIERS` by default,
+        min_cells: and fewest cells of the image they lie in, `MIN_CELLS`.
     """
+    min_inliers = MIN_INLIERS if min_inliers is None else min_inliers
+    min_cells = MIN_CELLS if min_cells is None else min_cells
     refined: PoseRefinement = jax.device_get(_refined(SE3(jnp.asarray(T_origin_cam, jnp.float32)), matches, params))
     used = np.asarray(matches.weight) > 0
     gate = np.where(np.asarray(matches.depth) > 0, _CHI2_GATES[1], _CHI2_GATES[0])

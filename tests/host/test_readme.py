@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from result_files import FILES
+from result_files import FILES, MASK_FILES
 
 from jaxslam import Camera, TrackParams, TrackPlan, TrackStatus
 from jaxslam.xla import cache_dir
@@ -62,10 +62,10 @@ def test_blocks_run_in_order(tmp_path: Path) -> None:
     (tmp_path / ".venv").symlink_to(sys.prefix)
     printed = {block.line: _run_block(block, tmp_path) for block in _blocks(README)}
     text = "".join(printed.values())
-    assert len(printed) == 9
+    assert len(printed) == 10
     assert "ATE" in text
     left_behind = {path.name for path in (tmp_path / "results" / "demo").iterdir()}
-    assert left_behind == FILES
+    assert left_behind == FILES | MASK_FILES
     assert all(f"`{name}`" in README.read_text(encoding="utf-8") for name in left_behind)
     assert (tmp_path / "ate.png").is_file()
     assert Camera.load(tmp_path / "my_camera.yaml").depth_scale_per_m == 5000
