@@ -7,17 +7,13 @@ import cv2
 import numpy as np
 
 from jaxslam.semantics import Detections
+from jaxslam.tint import BLUE, GREEN, ORANGE, PURPLE, SKY_BLUE, VERMILION, YELLOW, Rgb, tint
 
 _Area: TypeAlias = tuple[int, int, int, int]
 """Left, top, right, bottom in pixels, the last two exclusive."""
 
-# Wong, "Points of view: Color blindness", Nature Methods 8 (2011): told apart by colour-blind eyes too
-_COLORS_RGB = np.array(
-    [(230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (0, 114, 178), (213, 94, 0), (204, 121, 167)],
-    np.uint8,
-)
-_CLASS_MAP_RGB = np.array((255, 0, 255), np.uint8)
-_OPACITY = 0.45
+_COLORS: tuple[Rgb, ...] = (ORANGE, SKY_BLUE, GREEN, YELLOW, BLUE, VERMILION, PURPLE)
+_CLASS_MAP: Rgb = (255, 0, 255)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
@@ -32,13 +28,13 @@ def draw_detections(image: np.ndarray, detections: Detections) -> np.ndarray:
         `(h, w, 3)` uint8 RGB.
     """
     picture = image.copy()
+    colors = [_COLORS[k % len(_COLORS)] for k in range(len(detections.scores))]
     if detections.class_mask is not None:
-        _tint(picture, detections.class_mask, _CLASS_MAP_RGB)
+        tint(picture, detections.class_mask, _CLASS_MAP)
     order = np.argsort(detections.scores, kind="stable").tolist()
     if detections.masks is not None:
         for k in order:
-            _tint(picture, detections.masks[k], _COLORS_RGB[k % len(_COLORS_RGB)])
-    colors = [tuple(_COLORS_RGB[k % len(_COLORS_RGB)].tolist()) for k in range(len(order))]
+            tint(picture, detections.masks[k], colors[k])
     boxes, line = _outermost_pixels(detections.boxes, picture), 1 + round(max(picture.shape) / 640)
     inset = line - 1  # OpenCV's line is 2 line - 1 wide; it shall end where its box does
     for k in order:
@@ -48,13 +44,6 @@ def draw_detections(image: np.ndarray, detections: Detections) -> np.ndarray:
         text = f"{detections.labels[k]} {detections.scores[k]:.2f}"
         taken.append(_write(picture, text, boxes[k, :2].tolist(), colors[k], taken))
     return picture
-
-
-def _tint(picture: np.ndarray, mask: np.ndarray, color: np.ndarray) -> None:
-    """Mix a colour into the pixels of a mask, in place, and draw its outline."""
-    picture[mask] = np.round((1 - _OPACITY) * picture[mask] + _OPACITY * color).astype(np.uint8)
-    outline, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    cv2.drawContours(picture, outline, -1, color.tolist(), 1)
 
 
 def _outermost_pixels(boxes: np.ndarray, picture: np.ndarray) -> np.ndarray:

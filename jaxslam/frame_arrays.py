@@ -56,11 +56,6 @@ class FrameMemory:
         self._ignore, self._nothing = (aligned_array((height, width), np.bool_) for _ in range(2))
         self._nothing[:] = False
 
-    @property
-    def depth(self) -> np.ndarray:
-        """`(h, w)` depth of the frame held, metres."""
-        return self._depth
-
     def hold(self, frame: Frame, dt_s: float) -> FrameArrays:
         """The arrays of a frame, as of `frame_arrays`, until the next one is held."""
         to_grey(frame.image, out=self._image)

@@ -24,25 +24,25 @@ class KnownModel:
     Attributes:
         name: What commands and settings call it.
         file: Name of its file.
-        url: Where the file is published; `None` if it must be made.
-        size_bytes: Of the published file, if known.
-        sha256: Of the published file, if known.
         licence: Of the weights, as an SPDX identifier.
         page: Who made it.
         adapter: What reads its outputs.
         about: What it is.
+        url: Where the file is published; `None` if it must be made.
+        size_bytes: Of the published file, if known.
+        sha256: Of the published file, if known.
         how: How to come by the file, where there is no `url`.
     """
 
     name: str
     file: str
-    url: str | None
-    size_bytes: int | None
-    sha256: str | None
     licence: str
     page: str
     adapter: str
     about: str
+    url: str | None = None
+    size_bytes: int | None = None
+    sha256: str | None = None
     how: str = ""
 
 
@@ -77,7 +77,6 @@ KNOWN_MODELS: dict[str, KnownModel] = {
             name="nanodet-plus-m",
             file="nanodet-plus-m_416.onnx",
             url=f"{_NANODET}/releases/download/v1.0.0-alpha-1/nanodet-plus-m_416.onnx",
-            size_bytes=None,
             sha256="59d2f166088889c902f523bf08079391993491324f0d84847e3c4016a8f7cc3d",
             licence="Apache-2.0",
             page=_NANODET,
@@ -87,9 +86,6 @@ KNOWN_MODELS: dict[str, KnownModel] = {
         KnownModel(
             name="nanodet-m",
             file="nanodet_m_320.onnx",
-            url=None,
-            size_bytes=None,
-            sha256=None,
             licence="Apache-2.0",
             page=_NANODET,
             adapter="nanodet",
@@ -112,9 +108,6 @@ KNOWN_MODELS: dict[str, KnownModel] = {
             KnownModel(
                 name=name,
                 file=file,
-                url=None,
-                size_bytes=None,
-                sha256=None,
                 licence="Apache-2.0",
                 page=_DEEPLAB,
                 adapter="class_map",
@@ -135,9 +128,6 @@ KNOWN_MODELS: dict[str, KnownModel] = {
             KnownModel(
                 name=name,
                 file=f"{name}.onnx",
-                url=None,
-                size_bytes=None,
-                sha256=None,
                 licence="AGPL-3.0",
                 page=_ULTRALYTICS,
                 adapter="yolov8_seg" if name.endswith("-seg") else "yolov8",

@@ -11,21 +11,20 @@ from PIL import Image, ImageDraw, ImageFont
 from jaxslam.dynamic_masks import MaskSource
 from jaxslam.files import write_atomically
 from jaxslam.frame import Frame
+from jaxslam.tint import GREEN, ORANGE, PURPLE, SKY_BLUE, Rgb, tint
 from jaxslam.tracked import Rejected, Tracked
 
-# Wong, "Points of view: Color blindness", Nature Methods 8 (2011): told apart by colour-blind eyes too
-MASK_RGB = {
+MASK_RGB: dict[MaskSource, Rgb] = {
     MaskSource.NONE: (120, 120, 120),
-    MaskSource.DETECTOR: (230, 159, 0),
-    MaskSource.PROPAGATED: (86, 180, 233),
-    MaskSource.CALLER: (204, 121, 167),
-    MaskSource.DEPTH: (0, 158, 115),
+    MaskSource.DETECTOR: ORANGE,
+    MaskSource.PROPAGATED: SKY_BLUE,
+    MaskSource.CALLER: PURPLE,
+    MaskSource.DEPTH: GREEN,
 }
 """The colour of a mask, by where it comes from."""
 
 _MOST_PICTURES = 60
 _WIDTH_PX, _BAR_PX, _FONT_PX = 320, 20, 14
-_OPACITY = 0.5
 _FRAME_MS, _GIF_COLORS, _MOST_GIF_BYTES = 150, 128, 3_000_000
 _SHEET_PICTURES, _SHEET_COLUMNS = 12, 4
 
@@ -80,10 +79,7 @@ def draw_mask(image: np.ndarray, tracked: Tracked, title: str) -> np.ndarray:
     picture = picture if picture.ndim == 3 else np.repeat(picture[..., None], 3, axis=2)
     color = MASK_RGB[tracked.mask_source]
     mask = cv2.resize(tracked.dynamic_mask.view(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-    inside = mask > 0
-    picture[inside] = np.round((1 - _OPACITY) * picture[inside] + _OPACITY * np.array(color)).astype(np.uint8)
-    outline, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    cv2.drawContours(picture, outline, -1, color, 1)
+    tint(picture, mask.view(bool), color)
     age = f", age {tracked.mask_age}" if tracked.mask_age >= 0 else ""
     text = f"{title}: {tracked.mask_source.name.lower()}{age}, {100 * tracked.dynamic_ratio:.0f} %"
     return np.concatenate([_bar(text, color), picture])

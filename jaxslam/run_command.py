@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import tyro
 from rich.console import Console
@@ -16,6 +16,7 @@ from rich.table import Table
 from jaxslam.config import Config, load_config
 from jaxslam.datasets import Dataset, Subset, dataset_kinds, open_dataset
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
+from jaxslam.datasets.synthetic.camera_path import CameraPathKind
 from jaxslam.errors import ConfigError, nearest
 from jaxslam.evaluation import Evaluation
 from jaxslam.frame import Frame
@@ -45,7 +46,7 @@ class Demo:
     """Folder for the results."""
     frames: int = 150
     """Frames to render."""
-    path: Literal["xyz", "rpy", "halfsphere", "static", "loop"] = "xyz"
+    path: CameraPathKind = "xyz"
     """How the camera moves."""
     people: int = 2
     """People walking through the room."""

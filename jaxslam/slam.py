@@ -306,13 +306,15 @@ class Slam:
         if self._masks is None:
             source = MaskSource.NONE if given is None else MaskSource.CALLER
             return arrays, FrameMask(np.asarray(arrays.ignore), source, -1, "")
-        # Where the depth image is taken: by then the camera may have turned by a degree or two.
-        ahead_s = min(dt_s, _EXTRAPOLATED_S) + float(arrays.depth_delay_s)
-        predicted = moved(compose(correction, self._last_pose), self._last_twist * ahead_s)
+        if not np.array_equal(correction, IDENTITY):
+            self._masks.corrected(correction)
+        about = None
+        if dt_s < _LONGEST_GAP_S:
+            # Where the depth image is taken: by then the camera may have turned by a degree or two.
+            ahead_s = min(dt_s, _EXTRAPOLATED_S) + float(arrays.depth_delay_s)
+            about = moved(compose(correction, self._last_pose), self._last_twist * ahead_s)
         grey, depth = np.asarray(arrays.image), np.asarray(arrays.depth)
-        self._masks.corrected(correction)
         time_s, turn = frame.timestamp_ns * 1e-9, _turn(self._last_twist)
-        about = predicted if dt_s < _LONGEST_GAP_S else None
         mask = self._masks.of_frame(self._frame, time_s, frame.image, grey, depth, about, turn)
         if given is not None:
             mask = mask._replace(mask=mask.mask | given, source=mask.source or MaskSource.CALLER)
@@ -324,12 +326,9 @@ class Slam:
 
     def _to_be_matched(self, output: TrackOutput) -> bool:
         """Whether a frame that was tracked is matched with the map too."""
-        match self.config.track.hold_to_map:
-            case "always":
-                return int(output.status) != TrackStatus.STARTED
-            case "keyframes" if output.keyframe:
-                return int(output.status) != TrackStatus.STARTED
-        return int(output.status) == TrackStatus.WEAK
+        status, frames = int(output.status), self.config.track.hold_to_map
+        chosen = frames == "always" or (frames == "keyframes" and bool(output.keyframe))
+        return status == TrackStatus.WEAK or (chosen and status != TrackStatus.STARTED)
 
     def _regain(self, arrays: FrameArrays, lost: TrackOutput, dt_s: float) -> tuple[TrackOutput, Placed | None]:
         """The frame once more, from where the map shows it; or from the pose held, if the settings say so."""
