@@ -9,10 +9,10 @@ import time
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
-from jaxslam.masks.box_mask import mask_of_detections
-from jaxslam.masks.propagation import MaskAt
+from jaxslam.masks.box_mask import mask_of_detections, reduced_detections
+from jaxslam.masks.propagation import Origin, make_origin
+from jaxslam.masks.reduced import Reduced
 from jaxslam.semantics import Detector
 from jaxslam.worker import InlineWorker, Worker, make_worker
 
@@ -22,10 +22,32 @@ _PATIENCE_S = 2.0
 """Longest wait for the mask of a frame that has to wait."""
 
 
-class _Look(NamedTuple):
+class Seen(NamedTuple):
+    """A frame for the detector.
+
+    Attributes:
+        frame: Its number.
+        image: `(h, w, 3)` RGB or `(h, w)`.
+        grey: `(h', w')` uint8, of the size of masks.
+        depth: `(h', w')` metres.
+    """
+
     frame: int
     image: np.ndarray
+    grey: np.ndarray
     depth: np.ndarray
+
+
+class Found(NamedTuple):
+    """What the detector has found.
+
+    Attributes:
+        frame: The frame it looked at.
+        origin: The mask, and the points it is followed by.
+    """
+
+    frame: int
+    origin: Origin
 
 
 class SemanticThread:
@@ -35,54 +57,56 @@ class SemanticThread:
         looking_at: The frame it has not finished; `None` if it is idle.
     """
 
-    def __init__(self, detector: Detector, *, deterministic: bool, latency_frames: int) -> None:
+    def __init__(
+        self, detector: Detector, reduced: Reduced, *, deterministic: bool, latency_frames: int, seed: int = 0
+    ) -> None:
         """Begin idle.
 
         Args:
             detector: What looks.
+            reduced: The size of masks.
             deterministic: Have it look in turn, its masks `latency_frames` later; else in a thread.
             latency_frames: 0 has every frame wait for its mask, in a thread too.
+            seed: Of random choices.
         """
         self.looking_at: int | None = None
-        self._detector = detector
+        self._offered: int | None = None
+        self._detector, self._reduced, self._seed = detector, reduced, seed
         self._all_wait, self._begun, self._said = latency_frames == 0, False, ""
-        self._worker: Worker[_Look, MaskAt] = make_worker(
+        self._worker: Worker[Seen, Found] = make_worker(
             self._look, "jaxslam-semantics", deterministic=deterministic, latency_frames=latency_frames
         )
 
-    def of_frame(self, frame: int, image: np.ndarray, depth: Float[np.ndarray, "h w"]) -> tuple[MaskAt | None, str]:
+    def newest(self, seen: Seen) -> tuple[Found | None, str]:
         """The newest mask there is by a frame, if it is newer than the last one, and what went wrong; told once.
 
-        If the detector is idle, it begins with this frame. The first one of all waits for its mask: whatever the
-        tracker starts with would else be taken for static.
-
-        Args:
-            frame: Its number.
-            image: `(h, w, 3)` RGB or `(h, w)`; copied.
-            depth: Metres; copied.
+        The first frame of all waits for its mask: whatever the tracker starts with would else be taken for static.
         """
-        found, error = self._newest(frame)
-        if self.looking_at is None:
-            self._offer(frame, image, depth)
-            if self._all_wait or not self._begun:
-                later, failed = self._awaited(frame)
-                found, error = later or found, failed or error
+        found, error = self._newest(seen.frame)
+        if self._all_wait or not self._begun:
+            self.offer(seen)
+            later, failed = self._awaited(seen.frame)
+            found, error = later or found, failed or error
         self._begun = True
         return found, error
+
+    def offer(self, seen: Seen) -> None:
+        """Have it look at a frame, if it is idle and has not yet; image and depth are copied."""
+        if self.looking_at is None and seen.frame != self._offered:
+            rgb = seen.image.copy() if seen.image.ndim == 3 else np.repeat(seen.image[..., None], 3, axis=2)
+            self._worker.offer(seen._replace(image=rgb, depth=seen.depth.copy()), seen.frame)
+            self.looking_at = self._offered = seen.frame
 
     def close(self) -> None:
         """End the thread."""
         self._worker.close()
 
-    def _look(self, job: _Look) -> MaskAt:
-        return MaskAt(job.frame, mask_of_detections(self._detector(job.image), job.depth, dilate_px=0))
+    def _look(self, job: Seen) -> Found:
+        detections = reduced_detections(self._detector(job.image), self._reduced)
+        mask = mask_of_detections(detections, job.depth, dilate_px=0)
+        return Found(job.frame, make_origin(mask, job.grey, self._seed + job.frame))
 
-    def _offer(self, frame: int, image: np.ndarray, depth: np.ndarray) -> None:
-        rgb = image.copy() if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
-        self._worker.offer(_Look(frame, rgb, depth.copy()), frame)
-        self.looking_at = frame
-
-    def _newest(self, frame: int) -> tuple[MaskAt | None, str]:
+    def _newest(self, frame: int) -> tuple[Found | None, str]:
         try:
             done = self._worker.take(frame)
         except Exception as error:
@@ -100,7 +124,7 @@ class SemanticThread:
         self._said = error
         return error
 
-    def _awaited(self, frame: int) -> tuple[MaskAt | None, str]:
+    def _awaited(self, frame: int) -> tuple[Found | None, str]:
         """The mask of this very frame, if it comes in time."""
         until_s = time.monotonic() + _PATIENCE_S
         inline = isinstance(self._worker, InlineWorker)

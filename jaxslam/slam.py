@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -26,32 +27,31 @@ from jaxslam.map_link import Hung
 from jaxslam.pose import IDENTITY, compose, moved
 from jaxslam.semantics import Detector
 from jaxslam.state import TrackOutput, TrackParams, TrackPlan, TrackState, TrackStatus
-from jaxslam.track import init_state, track_step
+from jaxslam.track import Followed, follow_points, init_state, track_followed
 from jaxslam.tracked import FrameRecord, Rejected, Tracked, tracked_of
 from jaxslam.trajectory import PathLike, Trajectory
-from jaxslam.xla import enable_compile_cache
+from jaxslam.worker import Worker, make_worker
+from jaxslam.xla import IN_ITS_THREAD, enable_compile_cache
 
 _log = logging.getLogger(__name__)
 
 _NEVER = 1e6
 """Frames of loss: fewer than those a fresh state counts, which starts at once."""
 _PREDICTED_S = 1.0
-"""Longest time for which a constant velocity is believed,"""
-_EXTRAPOLATED_S = 0.1
-"""and for which it tells where the camera is now, to a degree or so."""
-_LONGEST_GAP_S = 0.12
-"""After a longer one depth is not compared with that of earlier frames: at 5 frames a second, turning as in the path
-`rpy`, three quarters of an empty room were taken for newcomers."""
+"""Longest time for which a constant velocity is believed."""
 
 _new_state = jax.jit(init_state, static_argnames=("height", "width", "plan"))
 """One program instead of some fifty."""
 
 
+_follow_points = jax.jit(follow_points, static_argnames="plan", compiler_options=IN_ITS_THREAD)
+
+
 @partial(jax.jit, static_argnames="plan", donate_argnums=0)
-def _step(
-    state: TrackState, frame: FrameArrays, params: TrackParams, plan: TrackPlan
+def _track_followed(
+    state: TrackState, frame: FrameArrays, followed: Followed, params: TrackParams, plan: TrackPlan
 ) -> tuple[TrackState, TrackOutput]:
-    return track_step(state, frame, params, plan)
+    return track_followed(state, frame, followed, params, plan)
 
 
 class Slam:
@@ -140,7 +140,9 @@ class Slam:
             began = time.perf_counter()
             shape = (self.camera.height, self.camera.width)
             nothing = self._memory.hold(Frame(0, np.zeros(shape, np.uint8), np.zeros(shape, np.float32)), 0.0)
-            jax.block_until_ready(_step(self._fresh_state(), nothing, self._params, self._plan))
+            state = self._fresh_state()
+            followed = _follow_points(state, nothing, self._params, self._plan)
+            jax.block_until_ready(_track_followed(state, nothing, followed, self._params, self._plan))
             self._back.compile(nothing)
             if self._masks is not None:
                 self._masks.compile()
@@ -170,8 +172,12 @@ class Slam:
         self._state, correction = self._back.update(self._state, self._frame)
         dt_s = 1 / self.camera.fps if self._last_ns is None else (frame.timestamp_ns - self._last_ns) * 1e-9
         arrays = self._memory.hold(frame, dt_s)
-        arrays, mask = self._masked(frame, arrays, correction, dt_s)
-        output, placed, num_matched = self._advance(arrays), None, 0
+        # Neither needs the other, and on two cores masks are ready before flow is.
+        self._beside.offer(partial(self._mask_of, frame, arrays, correction), self._frame)
+        followed = _follow_points(self._state, arrays, self._params, self._plan)
+        mask: FrameMask = self._beside.drain()[-1]
+        arrays = self._memory.ignoring(arrays, mask.mask)
+        output, placed, num_matched = self._advance(arrays, followed), None, 0
         if int(output.status) == TrackStatus.LOST:
             output, placed = self._regain(arrays, output, dt_s)
             num_matched = 0 if placed is None else placed.num_matched
@@ -183,6 +189,8 @@ class Slam:
         tracked = tracked_of(frame.timestamp_ns, output, correction, num_matched, mask, relocalised=placed is not None)
         self._last_ns = frame.timestamp_ns
         tracked = self._recorded(tracked, dt_s, float(arrays.depth_delay_s))
+        if self._masks is not None:
+            self._masks.look(self._frame, frame.image)
         self._frame += 1
         return replace(tracked, track_ms=(time.perf_counter() - began) * 1e3)
 
@@ -217,6 +225,7 @@ class Slam:
         self._back.close()
         if self._masks is not None:
             self._masks.close()
+        self._beside.close()
 
     def __enter__(self) -> "Slam":
         return self
@@ -272,6 +281,9 @@ class Slam:
                 seed=run.seed,
             )
         )
+        self._beside: Worker[Callable[[], Any], Any] = make_worker(
+            lambda job: job(), "jaxslam-masks", deterministic=run.in_turn, latency_frames=0, urgent=True
+        )
         self._state = self._fresh_state()
         if self._start_map is not None:
             self._state = self._state._replace(lost_frames=jnp.zeros((), jnp.int32))
@@ -298,30 +310,22 @@ class Slam:
         _log.warning("frame at %d ns rejected: %s", timestamp_ns, error)
         return Rejected(timestamp_ns, error)
 
-    def _masked(
-        self, frame: Frame, arrays: FrameArrays, correction: np.ndarray, dt_s: float
-    ) -> tuple[FrameArrays, FrameMask]:
-        """The frame with what may move left out, and what that is."""
+    def _mask_of(self, frame: Frame, arrays: FrameArrays, correction: np.ndarray) -> FrameMask:
+        """What of a frame is to be left out because it may move."""
         given = frame.dynamic_mask
         if self._masks is None:
             source = MaskSource.NONE if given is None else MaskSource.CALLER
-            return arrays, FrameMask(np.asarray(arrays.ignore), source, -1, "")
+            return FrameMask(np.asarray(arrays.ignore), source, -1, "")
         if not np.array_equal(correction, IDENTITY):
             self._masks.corrected(correction)
-        about = None
-        if dt_s < _LONGEST_GAP_S:
-            # Where the depth image is taken: by then the camera may have turned by a degree or two.
-            ahead_s = min(dt_s, _EXTRAPOLATED_S) + float(arrays.depth_delay_s)
-            about = moved(compose(correction, self._last_pose), self._last_twist * ahead_s)
         grey, depth = np.asarray(arrays.image), np.asarray(arrays.depth)
-        time_s, turn = frame.timestamp_ns * 1e-9, _turn(self._last_twist)
-        mask = self._masks.of_frame(self._frame, time_s, frame.image, grey, depth, about, turn)
+        mask = self._masks.of_frame(self._frame, frame.image, grey, depth)
         if given is not None:
             mask = mask._replace(mask=mask.mask | given, source=mask.source or MaskSource.CALLER)
-        return self._memory.ignoring(arrays, mask.mask), mask
+        return mask
 
-    def _advance(self, arrays: FrameArrays) -> TrackOutput:
-        self._state, output = _step(self._state, arrays, self._params, self._plan)
+    def _advance(self, arrays: FrameArrays, followed: Followed) -> TrackOutput:
+        self._state, output = _track_followed(self._state, arrays, followed, self._params, self._plan)
         return jax.tree.map(np.asarray, output)  # as `device_get`, in a tenth of its time
 
     def _to_be_matched(self, output: TrackOutput) -> bool:
@@ -344,7 +348,7 @@ class Slam:
             self._state = self._back.restarted(self._state, np.asarray(lost.T_world_cam.wxyz_xyz))
         else:
             return lost, None
-        output = self._advance(arrays)
+        output = self._advance(arrays, _follow_points(self._state, arrays, self._params, self._plan))
         if int(output.status) == TrackStatus.STARTED:
             return output, placed
         self._state = self._state._replace(lost_frames=jnp.zeros((), jnp.int32))  # not to start by itself
@@ -356,14 +360,15 @@ class Slam:
             self._lost_s += dt_s
             self._last_pose = compose(tracked.correction, self._last_pose)
             if self._masks is not None:
-                self._masks.lost()
+                self._beside.offer(partial(self._masks.lost, self._frame), self._frame)
             if self.config.run.on_loss == "predict":
                 ahead_s = min(self._lost_s, _PREDICTED_S)
                 tracked = replace(tracked, T_world_cam=moved(self._last_pose, self._last_twist * ahead_s))
             return tracked
         if self._masks is not None:
             pose = moved(tracked.T_world_cam, tracked.twist * depth_delay_s)
-            self._masks.tracked(self._frame, tracked.timestamp_ns * 1e-9, pose, _turn(tracked.twist))
+            when = self._frame, tracked.timestamp_ns * 1e-9
+            self._beside.offer(partial(self._masks.tracked, *when, pose, _turn(tracked.twist)), self._frame)
         self._unrecognised, self._lost_s = 0, 0.0
         self._last_pose, self._last_twist = tracked.T_world_cam, tracked.twist
         self._back.localize(tracked.T_world_cam, self._frame)

@@ -15,7 +15,7 @@ from jax import lax
 from jaxlie import SE3
 from jaxslam_kernels.camera import to_pixels, without_distortion
 from jaxslam_kernels.depth_image import believable
-from jaxslam_kernels.image import build_pyramid
+from jaxslam_kernels.image import Pyramid, build_pyramid
 from jaxslam_kernels.lk_flow import lk_flow
 from jaxslam_kernels.pnp import ransac_pnp
 from jaxslam_kernels.pose_refine import PoseRefinement, refine_pose
@@ -45,6 +45,22 @@ _MAX_PREDICTION_S = 0.1
 """A constant velocity says nothing about longer gaps."""
 _MAX_FUSED = 4
 _UNKNOWN_VARIANCE = 1e2
+
+
+class Followed(NamedTuple):
+    """The points of a state in a frame.
+
+    Attributes:
+        pyramid: Of the frame's image.
+        predicted: Where the camera should be by constant velocity.
+        uv: `(2, n)` where optical flow has the points, in pixels.
+        ok: `(n,)` which it has found.
+    """
+
+    pyramid: Pyramid
+    predicted: SE3
+    uv: Pixels
+    ok: Mask
 
 
 class _Verdict(NamedTuple):
@@ -119,9 +135,44 @@ def track_step(
         The new state and what is known of the frame. Nothing raises: a frame that cannot be used leaves points and
         pose as they were and says so in `status` and `reason`.
     """
-    view = _prepare(state, frame, params, plan)
-    predicted = _predict(state, view)
-    uv, followed = _follow(state, view, predicted, params, plan)
+    return track_followed(state, frame, follow_points(state, frame, params, plan), params, plan)
+
+
+def follow_points(
+    state: TrackState, frame: FrameArrays, params: TrackParams, plan: TrackPlan = DEFAULT_PLAN
+) -> Followed:
+    """The first part of `track_step`: the points of the state followed into a frame by optical flow.
+
+    It takes nothing of the frame but image and time: what is to be ignored may be found out meanwhile.
+    """
+    height, width = frame.image.shape
+    elapsed_s = state.elapsed_s + frame.dt_s
+    pyramid = build_pyramid(frame.image, num_levels=plan.num_levels, dtype=state.twist.dtype)
+    # Constant velocity.
+    predicted = moved(state.T_world_cam, state.twist * jnp.clip(elapsed_s, 0, _MAX_PREDICTION_S))
+    points = state.points
+    before = predict_pixels(to_camera(state.T_world_cam, points.X_world), state.twist, height, params)
+    after = predict_pixels(to_camera(predicted, points.X_world), state.twist, height, params)
+    guess = points.uv + lax.stop_gradient(after - before)
+    inside = jnp.all((guess > 0) & (guess < jnp.array([[width - 1], [height - 1]], guess.dtype)), axis=0)
+    guess = jnp.where(inside[None, :], guess, points.uv)
+    flow = lk_flow(state.pyramid, pyramid, points.uv, guess, points.valid, plan=plan.flow)
+    return Followed(pyramid, predicted, flow.points, flow.ok & (points.weight > 0))
+
+
+def track_followed(
+    state: TrackState,
+    frame: FrameArrays,
+    followed_points: Followed,
+    params: TrackParams,
+    plan: TrackPlan = DEFAULT_PLAN,
+) -> tuple[TrackState, TrackOutput]:
+    """The second part of `track_step`: pose, points, keyframe, from where `follow_points` has them."""
+    pyramid, predicted, uv, followed = followed_points
+    depth = believable(frame.depth, params.min_depth_m, params.max_depth_m)
+    view = View(frame, pyramid, depth, state.elapsed_s + frame.dt_s)
+    column, row = jnp.round(lax.stop_gradient(uv)).astype(jnp.int32)
+    followed &= ~frame.ignore.at[row, column].get(mode="fill", fill_value=True)
     params = _widened(params, state.points.uv, uv, followed)
     coarse, agreeing = _coarse_pose(state, view, uv, followed, predicted, params, plan)
     twist = _twist(state.T_world_cam, coarse, view.elapsed_s)
@@ -130,32 +181,6 @@ def track_step(
     verdict = _judge(state, view, refined, followed, inliers, params)
     kept = _update_points(state, view, uv, inliers, refined.T_world_cam, params)
     return _conclude(state, view, kept, refined, looked_up, verdict, params, plan)
-
-
-def _prepare(state: TrackState, frame: FrameArrays, params: TrackParams, plan: TrackPlan) -> View:
-    pyramid = build_pyramid(frame.image, num_levels=plan.num_levels, dtype=state.twist.dtype)
-    depth = believable(frame.depth, params.min_depth_m, params.max_depth_m)
-    return View(frame, pyramid, depth, state.elapsed_s + frame.dt_s)
-
-
-def _predict(state: TrackState, view: View) -> SE3:
-    """Constant velocity."""
-    return moved(state.T_world_cam, state.twist * jnp.clip(view.elapsed_s, 0, _MAX_PREDICTION_S))
-
-
-def _follow(state: TrackState, view: View, predicted: SE3, params: TrackParams, plan: TrackPlan) -> tuple[Pixels, Mask]:
-    """Follow the points into the frame by optical flow, starting where the prediction puts them."""
-    points = state.points
-    height, width = view.pyramid.size()
-    before = predict_pixels(to_camera(state.T_world_cam, points.X_world), state.twist, height, params)
-    after = predict_pixels(to_camera(predicted, points.X_world), state.twist, height, params)
-    guess = points.uv + lax.stop_gradient(after - before)
-    inside = jnp.all((guess > 0) & (guess < jnp.array([[width - 1], [height - 1]], guess.dtype)), axis=0)
-    guess = jnp.where(inside[None, :], guess, points.uv)
-    flow = lk_flow(state.pyramid, view.pyramid, points.uv, guess, points.valid, plan=plan.flow)
-    column, row = jnp.round(lax.stop_gradient(flow.points)).astype(jnp.int32)
-    ignored = view.frame.ignore.at[row, column].get(mode="fill", fill_value=True)
-    return flow.points, flow.ok & ~ignored & (points.weight > 0)
 
 
 def _widened(params: TrackParams, before: Pixels, after: Pixels, followed: Mask) -> TrackParams:

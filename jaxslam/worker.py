@@ -121,9 +121,12 @@ class ThreadWorker(Generic[_Job, _Result]):
     Those left when the interpreter ends are closed first: a thread stopped within compiled code ends the process badly.
     """
 
-    def __init__(self, work: Callable[[_Job], _Result], name: str) -> None:
-        """Do jobs by calling `work` in a thread of this name, started with the first job."""
-        self._work, self._name = work, name
+    def __init__(self, work: Callable[[_Job], _Result], name: str, *, urgent: bool = False) -> None:
+        """Do jobs by calling `work` in a thread of this name, started with the first job.
+
+        It lets others go first, unless it is urgent.
+        """
+        self._work, self._name, self._urgent = work, name, urgent
         self._jobs: queue.Queue[tuple[Callable[[Any], Any], Any] | None] = queue.Queue()
         self._outcomes: deque[_Result | _Failed] = deque()
         self._stopped = threading.Event()
@@ -135,7 +138,7 @@ class ThreadWorker(Generic[_Job, _Result]):
         if self._stopped.is_set():
             raise RuntimeError(f"{self._name} is closed")
         if self._thread is None:
-            arguments = (self._jobs, self._outcomes, self._stopped)
+            arguments = (self._jobs, self._outcomes, self._stopped, self._urgent)
             self._thread = threading.Thread(target=_serve, args=arguments, name=self._name, daemon=True)
             self._thread.start()
             _running.add(self)
@@ -165,10 +168,10 @@ class ThreadWorker(Generic[_Job, _Result]):
 
 
 def make_worker(
-    work: Callable[[_Job], _Result], name: str, *, deterministic: bool, latency_frames: int
+    work: Callable[[_Job], _Result], name: str, *, deterministic: bool, latency_frames: int, urgent: bool = False
 ) -> Worker[_Job, _Result]:
-    """A worker: on the fixed schedule of a deterministic run, else with a thread of its own."""
-    return InlineWorker(work, name, latency_frames) if deterministic else ThreadWorker(work, name)
+    """A worker: on the fixed schedule of a deterministic run, else with a thread of its own, urgent or not."""
+    return InlineWorker(work, name, latency_frames) if deterministic else ThreadWorker(work, name, urgent=urgent)
 
 
 _running: "weakref.WeakSet[ThreadWorker[Any, Any]]" = weakref.WeakSet()
@@ -185,9 +188,10 @@ def _stop(jobs: "queue.Queue[Any]", stopped: threading.Event) -> None:
         jobs.put(None)
 
 
-def _serve(jobs: "queue.Queue[Any]", outcomes: "deque[Any]", stopped: threading.Event) -> None:
+def _serve(jobs: "queue.Queue[Any]", outcomes: "deque[Any]", stopped: threading.Event, urgent: bool) -> None:
     """Do jobs until there comes none; those that come after a stop are not done."""
-    _step_back()
+    if not urgent:
+        _step_back()
     while (entry := jobs.get()) is not None:
         work, job = entry
         try:

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxslam.masks.reduced import Reduced
 from jaxslam.semantics import Detections
 
 _LEAST_SIDE_PX = 4
@@ -44,6 +45,14 @@ def mask_of_detections(
         for box in detections.boxes:
             add_box(mask, depth, box)
     return dilated(mask, dilate_px)
+
+
+def reduced_detections(detections: Detections, reduced: Reduced) -> Detections:
+    """What was found, in the pixels of a smaller image."""
+    masks, class_mask = (
+        None if each is None else reduced.every(each) for each in (detections.masks, detections.class_mask)
+    )
+    return detections._replace(boxes=detections.boxes / reduced.step, masks=masks, class_mask=class_mask)
 
 
 def add_box(mask: Bool[np.ndarray, "h w"], depth: Float[np.ndarray, "h w"], box: Iterable[float]) -> None:

@@ -7,6 +7,7 @@ moves by.
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import cv2
@@ -18,9 +19,9 @@ from jaxslam_kernels.depth_change import depth_change
 from jaxtyping import Array, Bool, Float
 
 from jaxslam.aligned import aligned_array
-from jaxslam.camera import Camera
-from jaxslam.masks.propagation import MaskAt
+from jaxslam.masks.reduced import Raster, Reduced
 from jaxslam.pose import between, compose
+from jaxslam.xla import IN_ITS_THREAD
 
 _COARSE_WIDTH = 160
 """Images are compared at about so many columns."""
@@ -74,23 +75,20 @@ class _Remembered(NamedTuple):
 class SurfaceMemory:
     """Keeps the depth, masks and poses of the last second, and compares new frames with them."""
 
-    def __init__(self, camera: Camera, farthest_m: float = math.inf) -> None:
+    def __init__(self, raster: Raster, farthest_m: float = math.inf) -> None:
         """Begin with nothing seen.
 
         Args:
-            camera: That takes the frames. Its distortion is left out: between frames so close it makes no difference.
+            raster: Of the images. Distortion is left out: between frames so close it makes no difference.
             farthest_m: Depth beyond is as good as missing: sensors that see nothing may say that it is far away.
         """
         self._farthest_m = farthest_m
-        self._step = max(1, round(camera.width / _COARSE_WIDTH))
-        self._offset = self._step // 2
-        self._fine = (camera.height, camera.width)
-        self._shape = tuple(len(range(self._offset, side, self._step)) for side in self._fine)
-        self._intrinsics = _coarse_intrinsics(camera, self._step, self._offset)
+        self._reduced = Reduced(raster, _COARSE_WIDTH)
+        self._intrinsics, shape = self._reduced.raster.intrinsics, self._reduced.raster.shape
         num = 1 + len(_AGO_S)
-        self._depth = aligned_array(self._shape, np.float32)
-        self._depths_then = aligned_array((num, *self._shape), np.float32)
-        self._masks_then = aligned_array((num, *self._shape), np.bool_)
+        self._depth = aligned_array(shape, np.float32)
+        self._depths_then = aligned_array((num, *shape), np.float32)
+        self._masks_then = aligned_array((num, *shape), np.bool_)
         self._seen: dict[int, _Remembered] = {}
 
     def compile(self) -> None:
@@ -100,31 +98,30 @@ class SurfaceMemory:
     def compare(
         self,
         time_s: float,
-        T_world_cam: Float[np.ndarray, "7"] | None,
+        T_world_cam: Float[np.ndarray, "7"],
         turn_rad_per_s: float,
         depth: Float[np.ndarray, "h w"],
-        since: MaskAt | None = None,
+        since: tuple[int, Bool[np.ndarray, "h w"]] | None = None,
     ) -> Surfaces:
         """Compare a frame with those before.
 
         Args:
             time_s: Of the frame.
-            T_world_cam: Where the camera is by now, as well as that is known; `None` if it is not, and nothing is known
-                of the frame either.
+            T_world_cam: Where the camera was when the depth was taken.
             turn_rad_per_s: How fast it turns.
             depth: Metres, 0 where missing.
-            since: What the mask is carried on from.
+            since: Number and mask of the frame that the mask is carried on from.
         """
-        coarse = self._coarse(depth)
+        coarse = self._reduced.every(depth)
         np.copyto(self._depth, np.where(coarse < self._farthest_m, coarse, 0))
         poses = np.tile(np.eye(1, 7), (len(self._depths_then), 1))
         self._depths_then[:] = 0  # says nothing
-        first = None if since is None else self._seen.get(since.frame)
+        first = None if since is None else self._seen.get(since[0])
         if since is not None and first is not None:
-            first = first._replace(mask=self._coarse(since.mask))
+            first = first._replace(mask=self._reduced.every(since[1]))
         before = [first, *(self._about(time_s - ago_s, ago_s / 2) for ago_s in _AGO_S)]
         for slot, then in enumerate(before):
-            if then is not None and T_world_cam is not None:
+            if then is not None:
                 self._depths_then[slot], self._masks_then[slot] = then.depth, then.mask
                 poses[slot] = between(then.T_world_cam, T_world_cam)
         turns = turn_rad_per_s + (0.0 if before[1] is None else before[1].turn_rad_per_s)
@@ -141,7 +138,7 @@ class SurfaceMemory:
         mask: Bool[np.ndarray, "h w"],
     ) -> None:
         """Keep the frame compared last, now that it is known where it was taken."""
-        coarse = self._depth.copy(), self._coarse(mask).copy()
+        coarse = self._depth.copy(), self._reduced.every(mask).copy()
         self._seen[frame] = _Remembered(time_s, T_world_cam, turn_rad_per_s, *coarse)
         for old in [number for number, seen in self._seen.items() if not 0 <= time_s - seen.time_s <= _KEPT_S]:
             del self._seen[old]
@@ -158,12 +155,12 @@ class SurfaceMemory:
     def without(self, mask: Bool[np.ndarray, "h w"], drop: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
         """A mask without pixels of the coarse size; single ones of those stay."""
         smooth = cv2.medianBlur(drop.view(np.uint8), 3)
-        return mask & ~self._whole(smooth) if smooth.any() else mask
+        return mask & ~self._reduced.whole(smooth.view(bool)) if smooth.any() else mask
 
     def with_newcomers(self, mask: Bool[np.ndarray, "h w"], seen: Surfaces) -> Bool[np.ndarray, "h w"]:
         """A mask with what has come into the picture: what is new, and what hangs together with it."""
-        coming = newcomers(seen, self._coarse(mask))
-        return mask | self._whole(coming.view(np.uint8)) if coming.any() else mask
+        coming = newcomers(seen, self._reduced.every(mask))
+        return mask | self._reduced.whole(coming) if coming.any() else mask
 
     def _about(self, time_s: float, within_s: float) -> _Remembered | None:
         """The frame taken nearest to a time; `None` if there is none within so many seconds."""
@@ -174,12 +171,6 @@ class SurfaceMemory:
         poses = T_then_now.astype(np.float32)
         compared = _compared(self._depth, self._depths_then, self._masks_then, poses, self._intrinsics)
         return [np.asarray(each) for each in compared]
-
-    def _coarse(self, image: np.ndarray) -> np.ndarray:
-        return image[self._offset :: self._step, self._offset :: self._step]
-
-    def _whole(self, coarse: np.ndarray) -> np.ndarray:
-        return cv2.resize(coarse, self._fine[::-1], interpolation=cv2.INTER_NEAREST).view(bool)
 
 
 def newcomers(seen: Surfaces, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
@@ -205,7 +196,7 @@ def newcomers(seen: Surfaces, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray,
     return coming
 
 
-@jax.jit
+@partial(jax.jit, compiler_options=IN_ITS_THREAD)
 def _compared(
     depth: Float[Array, "h w"],
     depths_then: Float[Array, "k h w"],
@@ -218,12 +209,3 @@ def _compared(
     masked = jax.vmap(lambda mask, then: mask.reshape(-1)[then])(masks_then, change.then)
     outside = change.same & ~masked
     return outside[0], change.same[2], outside[1], change.new[1]
-
-
-def _coarse_intrinsics(camera: Camera, step: int, offset: int) -> Intrinsics:
-    """Of every `step`-th pixel, from the one at `offset` on."""
-    whole = camera.intrinsics(np.float32)
-    scale, first = np.float32(1 / step), np.float32(offset)
-    return Intrinsics(
-        whole.fx * scale, whole.fy * scale, (whole.cx - first) * scale, (whole.cy - first) * scale, whole.distortion
-    )

@@ -3,6 +3,7 @@
 `pytest -m benchmark -n 0 tests/benchmarks/test_bench_masks.py -s`
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import cv2
@@ -17,9 +18,10 @@ from jaxslam_kernels.depth_change import depth_change
 from jaxslam_kernels.image import Pyramid, build_pyramid
 
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
+from jaxslam.dynamic_masks import WIDTH_PX
 from jaxslam.frame import to_grey
-from jaxslam.masks.propagation import CAPACITY, _clusters, depth_at, follow, predicted_mask
-from jaxslam.masks.sampling import sample_mask
+from jaxslam.masks.propagation import PYRAMID_LEVELS, Origin, follow, make_origin, predicted_mask
+from jaxslam.masks.reduced import Raster, Reduced
 from jaxslam.pose import between
 
 pytestmark = pytest.mark.benchmark
@@ -32,7 +34,7 @@ STEP = 4
 """Of whose pixels and rows every so many are used: 160 x 120."""
 CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.03)
 
-_pyramid = jax.jit(build_pyramid)
+_pyramid = jax.jit(partial(build_pyramid, num_levels=PYRAMID_LEVELS))
 
 
 class View(NamedTuple):
@@ -64,35 +66,36 @@ def opencv(views):
     )
 
 
-def _carry(before: View, pyramid_before: Pyramid, now: View) -> np.ndarray:
-    """The new mask, from the old one and both frames, of which the earlier one's pyramid is there already."""
-    sampled = sample_mask(before.person, before.grey, CAPACITY, 0)
-    followed = follow([pyramid_before, _pyramid(now.grey)], sampled)
-    return predicted_mask(before.person, followed, now.depth)
+def _carry(reduced: Reduced, before: Pyramid, origin: Origin, now: View) -> np.ndarray:
+    """The new mask, from the old one and its points, and both frames, of which the earlier one's pyramid is there."""
+    depth = np.ascontiguousarray(reduced.every(now.depth))
+    _, followed = follow(origin, [before], reduced.mean(now.grey), depth)
+    return reduced.whole(predicted_mask(origin, followed, depth))
 
 
-def test_carrying_a_mask(views, opencv, capsys):
-    """Half the time of OpenCV's flow at most; each piece alone is printed, clusters being a part of the new mask."""
+def test_carrying_a_mask(dataset, views, opencv, capsys):
+    """Half the time of OpenCV's flow at most, all that the tracker may wait for included."""
     before, now = views
-    pyramids = [_pyramid(view.grey) for view in views]
-    sampled = sample_mask(before.person, before.grey, CAPACITY, 0)
-    followed = follow(pyramids, sampled)
-    known, z = depth_at(now.depth, followed)
-    mask = _carry(before, pyramids[0], now)
+    reduced = Reduced(Raster.of(dataset.camera), WIDTH_PX)
+    small, mask_before = reduced.mean(before.grey), np.ascontiguousarray(reduced.every(before.person))
+    pyramid, origin = _pyramid(small), make_origin(mask_before, small, 0)
+    grey, depth = reduced.mean(now.grey), np.ascontiguousarray(reduced.every(now.depth))
+    _, followed = follow(origin, [pyramid], grey, depth)
+    mask = _carry(reduced, pyramid, origin, now)
     overlap = np.count_nonzero(mask & now.person) / np.count_nonzero(mask | now.person)
     assert 0.15 < before.person.mean() < 0.25
     assert overlap > 0.8
     pieces = {
-        "sampling": lambda: sample_mask(before.person, before.grey, CAPACITY, 0),
-        "pyramid": lambda: _pyramid(now.grey),
-        "flow": lambda: follow(pyramids, sampled),
-        "clusters": lambda: _clusters(followed.now, z, known),
-        "new mask": lambda: predicted_mask(before.person, followed, now.depth),
+        "points of the mask": lambda: make_origin(mask_before, small, 0),
+        "smaller image": lambda: reduced.mean(now.grey),
+        "flow, objects": lambda: follow(origin, [pyramid], grey, depth),
+        "new mask": lambda: predicted_mask(origin, followed, depth),
+        "larger mask": lambda: reduced.whole(mask_before),
     }
     compared: dict[str, Comparison] = {name: compare(piece, opencv) for name, piece in pieces.items()}
-    whole = compare(lambda: _carry(before, pyramids[0], now), opencv)
+    whole = compare(lambda: _carry(reduced, pyramid, make_origin(mask_before, small, 0), now), opencv)
     with capsys.disabled():
-        print(f"\n{before.person.mean():.0%} of the image, {sampled.shape[1]} points, overlap {overlap:.2f}")
+        print(f"\n{before.person.mean():.0%} of the image, {origin.ok.sum()} points, overlap {overlap:.2f}")
         for name, comparison in compared.items():
             print(f"  {name}: {comparison}")
         print(f"  whole: {whole}")

@@ -76,8 +76,9 @@ def mask_of(made: DynamicMasks, index: int, moved_to: np.ndarray | None = None) 
     frame, time_s = rendered()[0].frames[index], float(1e-9 * source().timestamps_ns[index])
     pose: np.ndarray = source().T_world_cam[index] if moved_to is None else moved_to
     turn = float(turns()[index])
-    mask = made.of_frame(index, time_s, frame.image, to_grey(frame.image), frame.depth_m, pose, turn)
+    mask = made.of_frame(index, frame.image, to_grey(frame.image), frame.depth_m)
     made.tracked(index, time_s, pose, turn)
+    made.look(index, frame.image)
     return mask
 
 
@@ -203,7 +204,7 @@ class TestWorld:
         made = self.made()
         for index in range(4):
             mask_of(made, index)
-        made.lost()
+        made.lost(3)
         masks = [mask_of(made, index) for index in range(4, 16)]
         assert not any(mask.mask.any() for mask in masks[:4])
         assert masks[-1].mask.any()

@@ -13,8 +13,17 @@ from jaxslam_kernels.image import Pyramid, build_pyramid
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.frame import to_grey
 from jaxslam.masks.box_mask import add_box, dilated, largest_parts, mask_of_detections, object_depth
-from jaxslam.masks.propagation import CAPACITY, Followed, follow, predicted_mask
-from jaxslam.masks.sampling import CELL_PX, sample_mask, spacing
+from jaxslam.masks.propagation import (
+    CAPACITY,
+    PYRAMID_LEVELS,
+    Followed,
+    Origin,
+    as_objects,
+    follow,
+    make_origin,
+    predicted_mask,
+)
+from jaxslam.masks.sampling import CELL_PX, sample_mask
 from jaxslam.semantics import Detections, no_detections
 
 HEIGHT, WIDTH = 240, 320
@@ -42,7 +51,7 @@ def detections(boxes: list[list[float]]) -> Detections:
 
 
 def pyramid(grey: np.ndarray) -> Pyramid:
-    return build_pyramid(jnp.asarray(grey))
+    return build_pyramid(jnp.asarray(grey), num_levels=PYRAMID_LEVELS)
 
 
 def overlap(a: np.ndarray, b: np.ndarray) -> float:
@@ -123,7 +132,8 @@ class TestBoxMask:
 class TestSampleMask:
     def test_one_in_every_cell(self) -> None:
         grey, _, truth = seen(FIRST)
-        points = sample_mask(truth, grey, WIDTH * HEIGHT, 0)
+        points, spacing = sample_mask(truth, grey, WIDTH * HEIGHT, 0)
+        assert spacing == 1
         column, row = points.astype(int)
         assert truth[row, column].all()
         cells = row // CELL_PX * 1000 + column // CELL_PX
@@ -132,18 +142,18 @@ class TestSampleMask:
 
     def test_capacity_and_seed(self) -> None:
         flat, everywhere = np.zeros((HEIGHT, WIDTH), np.uint8), np.ones((HEIGHT, WIDTH), bool)
-        assert sample_mask(everywhere, flat, 20, 0).shape == (2, 20)
-        same, again, other = (sample_mask(everywhere, flat, CAPACITY, seed) for seed in (1, 1, 2))
+        assert sample_mask(everywhere, flat, 20, 0).uv.shape == (2, 20)
+        same, again, other = (sample_mask(everywhere, flat, CAPACITY, seed).uv for seed in (1, 1, 2))
         np.testing.assert_array_equal(same, again)
         assert (same != other).any()
 
     def test_without_texture(self) -> None:
         """Random pixels, of the mask only."""
         mask = np.random.default_rng(0).random((HEIGHT, WIDTH)) < 0.05
-        column, row = sample_mask(mask, np.zeros(mask.shape, np.uint8), WIDTH * HEIGHT, 0).astype(int)
+        column, row = sample_mask(mask, np.zeros(mask.shape, np.uint8), WIDTH * HEIGHT, 0).uv.astype(int)
         assert mask[row, column].all()
-        assert 6 < np.mean(row % CELL_PX) < 8
-        assert 6 < np.mean(column % CELL_PX) < 8
+        assert 3 < np.mean(row % CELL_PX) < 4
+        assert 3 < np.mean(column % CELL_PX) < 4
 
     def test_best_corners_of_the_whole_image(self) -> None:
         """Also at the edge of the mask, and of the image, of which only a part is looked at."""
@@ -152,7 +162,7 @@ class TestSampleMask:
         for rows, columns in ((slice(0, 40), slice(0, 100)), (slice(97, 152), slice(203, WIDTH)), (slice(0, 240),) * 2):
             mask = np.zeros(grey.shape, bool)
             mask[rows, columns] = True
-            column, row = sample_mask(mask, grey, WIDTH * HEIGHT, 0).astype(int)
+            column, row = sample_mask(mask, grey, WIDTH * HEIGHT, 0).uv.astype(int)
             masked = np.where(mask, score, -1)[:, : WIDTH // CELL_PX * CELL_PX]
             best = masked.reshape(HEIGHT // CELL_PX, CELL_PX, -1, CELL_PX).max(axis=(1, 3)).ravel()
             np.testing.assert_array_equal(score[row, column], best[best >= 0])
@@ -161,34 +171,53 @@ class TestSampleMask:
         """They are all over the mask, not only where the picture has most texture."""
         grey, everywhere = np.zeros((HEIGHT, WIDTH), np.uint8), np.ones((HEIGHT, WIDTH), bool)
         grey[:60, :80] = np.random.default_rng(0).integers(0, 256, (60, 80))
-        column, row = sample_mask(everywhere, grey, 60, 0)
+        column, row = sample_mask(everywhere, grey, 60, 0).uv
         num, _, _ = np.histogram2d(row, column, bins=[3, 4], range=[[0, HEIGHT], [0, WIDTH]])
         print(num)
         assert num.sum() == 60
         assert num.min() >= 2
 
     def test_spacing(self) -> None:
-        mask = np.zeros((HEIGHT, WIDTH), bool)
+        mask, grey = np.zeros((HEIGHT, WIDTH), bool), np.zeros((HEIGHT, WIDTH), np.uint8)
         mask[: 10 * CELL_PX, : 10 * CELL_PX] = True
-        assert [spacing(mask, capacity) for capacity in (200, 100, 25)] == [1, 1, 2]
+        assert [sample_mask(mask, grey, capacity, 0).spacing for capacity in (200, 100, 25)] == [1, 1, 2]
+
+    def test_small_pieces_keep_their_points(self) -> None:
+        """Somebody far away beside somebody near: the one has all he can have, the other gives way."""
+        mask, grey = np.zeros((HEIGHT, WIDTH), bool), np.zeros((HEIGHT, WIDTH), np.uint8)
+        near, far = (slice(0, 26 * CELL_PX), slice(0, 16 * CELL_PX)), (slice(CELL_PX, 5 * CELL_PX), slice(200, 216))
+        mask[near] = mask[far] = True
+        (column, row), spacing = sample_mask(mask, grey, 72, 0)
+        is_far = column >= 200
+        assert (np.sum(is_far), np.sum(~is_far)) == (8, 64)
+        assert spacing == pytest.approx(np.sqrt(26 * 16 / 64))
+        assert np.ptp(row[~is_far]) > 20 * CELL_PX
+
+    def test_more_pieces_than_points(self) -> None:
+        mask, grey = np.zeros((HEIGHT, WIDTH), bool), np.zeros((HEIGHT, WIDTH), np.uint8)
+        mask[::16, ::16] = True
+        column, row = sample_mask(mask, grey, 50, 0).uv.astype(int)
+        assert len(column) == 50
+        assert mask[row, column].all()
 
     def test_nothing(self) -> None:
         grey = seen(FIRST)[0]
-        assert sample_mask(np.zeros(grey.shape, bool), grey, 20, 0).shape == (2, 0)
+        assert sample_mask(np.zeros(grey.shape, bool), grey, 20, 0).uv.shape == (2, 0)
 
 
-def carried(first: int, last: int) -> tuple[np.ndarray, Followed]:
+def carried(first: int, last: int) -> tuple[np.ndarray, Origin, Followed]:
     grey, _, mask = seen(first)
-    pyramids = [pyramid(seen(index)[0]) for index in range(first, last + 1)]
-    followed = follow(pyramids, sample_mask(mask, grey, CAPACITY, 0))
-    return predicted_mask(mask, followed, seen(last)[1]), followed
+    origin = make_origin(mask, grey, 0)
+    pyramids = [pyramid(seen(index)[0]) for index in range(first, last)]
+    _, followed = follow(origin, pyramids, seen(last)[0], seen(last)[1])
+    return predicted_mask(origin, followed, seen(last)[1]), origin, followed
 
 
-def moved(mask: np.ndarray, shift_px: tuple[int, int]) -> Followed:
-    """Points of a mask that all moved by so much."""
-    before = sample_mask(mask, np.zeros(mask.shape, np.uint8), CAPACITY, 0)
-    before = np.pad(before, ((0, 0), (0, CAPACITY - before.shape[1])), constant_values=-1)
-    return Followed(before, before + np.array(shift_px, np.float32)[:, None], before[0] >= 0)
+def moved(mask: np.ndarray, shift_px: tuple[int, int], depth: np.ndarray) -> tuple[Origin, Followed]:
+    """A mask, and its points, all moved by so much."""
+    origin = make_origin(mask, np.zeros(mask.shape, np.uint8), 0)
+    now = origin.uv + np.array(shift_px, np.float32)[:, None]
+    return origin, as_objects(now, origin.ok, depth, origin.spacing)
 
 
 def rectangle(left: int, top: int, right: int, bottom: int) -> np.ndarray:
@@ -204,13 +233,17 @@ class TestPropagation:
         u, v = shift_px
         mask, truth = rectangle(64, 64, 196, 176), rectangle(60 + u, 60 + v, 200 + u, 180 + v)
         depth = np.where(truth, 1.5, 3.0).astype(np.float32)
-        np.testing.assert_array_equal(predicted_mask(mask, moved(mask, shift_px), depth), truth)
+        np.testing.assert_array_equal(predicted_mask(*moved(mask, shift_px, depth), depth), truth)
 
     def test_pieces_without_points_do_not_move(self) -> None:
         """Of two parts of a mask on one surface, points were followed of one only."""
         followed_part, other = rectangle(20, 60, 110, 180), rectangle(140, 60, 260, 180)
         depth = np.where(rectangle(20, 60, 260, 180), 1.5, 3.0).astype(np.float32)
-        new = predicted_mask(followed_part | other, moved(followed_part, (0, 0)), depth)
+        points, followed = moved(followed_part, (0, 0), depth)
+        origin = make_origin(followed_part | other, np.zeros(depth.shape, np.uint8), 0)
+        column, row = points.uv.astype(int) - origin.corner[:, None]
+        origin = origin._replace(uv=points.uv, held=np.where(points.ok, origin.piece[row, column], 0))
+        new = predicted_mask(origin, followed, depth)
         assert (new & followed_part).sum() == followed_part.sum()
         assert not (new & other).any()
 
@@ -218,25 +251,36 @@ class TestPropagation:
         """Two parts of a mask at two depths, moving towards each other."""
         parts, depths, shifts = (rectangle(20, 60, 110, 180), rectangle(170, 60, 260, 180)), (1.5, 2.5), (20, -30)
         mask, depth, truth = parts[0] | parts[1], np.full((HEIGHT, WIDTH), 4.0, np.float32), np.zeros_like(parts[0])
-        followed = moved(mask, (0, 0))
+        origin = make_origin(mask, np.zeros(mask.shape, np.uint8), 0)
+        (column, row), now = origin.uv.astype(int), origin.uv.copy()
         for part, z, shift in zip(parts, depths, shifts, strict=True):
-            column, row = followed.before.astype(int)
-            followed.now[0, part[row, column]] += shift
+            now[0, part[row, column]] += shift
             depth[np.roll(part, shift, axis=1)] = z
             truth |= np.roll(part, shift, axis=1)
-        np.testing.assert_array_equal(predicted_mask(mask, followed, depth), truth)
+        followed = as_objects(now, origin.ok, depth, origin.spacing)
+        np.testing.assert_array_equal(predicted_mask(origin, followed, depth), truth)
 
     def test_points_far_apart(self) -> None:
-        """One object fills an image so large that its points are 48 pixels apart."""
-        mask, depth = np.ones((480, 640), bool), np.full((480, 640), 2.0, np.float32)
-        v, u = np.mgrid[24:480:48, 24:590:48]
-        uv = np.full((2, CAPACITY), -1, np.float32)
-        uv[:, : u.size] = u.ravel(), v.ravel()
-        assert predicted_mask(mask, Followed(uv, uv, uv[0] >= 0), depth).all()
+        """One object fills an image of which every third cell has a point."""
+        mask, depth = np.ones((HEIGHT, WIDTH), bool), np.full((HEIGHT, WIDTH), 2.0, np.float32)
+        assert make_origin(mask, np.zeros(mask.shape, np.uint8), 0).spacing > 3
+        assert predicted_mask(*moved(mask, (0, 0), depth), depth).all()
+
+    def test_piece_too_small_for_a_cluster(self) -> None:
+        """Three cells high: it is followed nevertheless, and it alone."""
+        near, far, beside = rectangle(10, 10, 170, 230), rectangle(250, 90, 257, 112), rectangle(230, 90, 250, 112)
+        depth = np.where(near, 1.2, np.where(far, 3.5, np.where(beside, 4.2, 5.0))).astype(np.float32)
+        np.testing.assert_array_equal(predicted_mask(*moved(near | far, (0, 0), depth), depth), near | far)
+
+    def test_far_beside_near(self) -> None:
+        """Both are followed, though one has a twentieth of the other's pixels."""
+        near, far = rectangle(10, 10, 170, 230), rectangle(250, 90, 274, 162)
+        depth = np.where(near, 1.2, np.where(far, 3.5, 5.0)).astype(np.float32)
+        np.testing.assert_array_equal(predicted_mask(*moved(near | far, (0, 0), depth), depth), near | far)
 
     def test_people_are_followed(self) -> None:
         """Better than the mask left where it was."""
-        new, _ = carried(FIRST, LAST)
+        new, _, _ = carried(FIRST, LAST)
         truth, old = seen(LAST)[2], seen(FIRST)[2]
         print(f"overlap {overlap(new, truth):.3f}, left where it was {overlap(old, truth):.3f}")
         assert overlap(new, truth) > 0.7
@@ -244,18 +288,16 @@ class TestPropagation:
 
     def test_nothing_to_follow(self) -> None:
         grey, depth, _ = seen(FIRST)
-        nothing = np.zeros((2, 0), np.float32)
-        followed = follow([pyramid(grey)] * 2, nothing)
-        assert not followed.ok.any()
-        assert not predicted_mask(np.zeros(grey.shape, bool), followed, depth).any()
+        origin = make_origin(np.zeros(grey.shape, bool), grey, 0)
+        _, followed = follow(origin, [pyramid(grey)], grey, depth)
+        assert (np.asarray(followed.label) == -1).all()
+        assert not predicted_mask(origin, followed, depth).any()
 
     @pytest.mark.parametrize("value", [0.0, np.nan])
     def test_without_depth(self, value: float) -> None:
         mask, depth = seen(FIRST)[2], np.full((HEIGHT, WIDTH), value, np.float32)
-        assert not predicted_mask(mask, carried(FIRST, LAST)[1], depth).any()
+        assert not predicted_mask(*moved(mask, (0, 0), depth), depth).any()
 
     def test_out_of_the_image(self) -> None:
-        mask, depth = seen(FIRST)[2], seen(FIRST)[1]
-        followed = carried(FIRST, LAST)[1]
-        gone = followed._replace(now=followed.now + np.float32(1000))
-        assert not predicted_mask(mask, gone, depth).any()
+        depth, mask = seen(FIRST)[1:]
+        assert not predicted_mask(*moved(mask, (1000, 1000), depth), depth).any()

@@ -16,6 +16,7 @@ from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset, Synthe
 from jaxslam.datasets.synthetic.camera_path import CameraPathKind
 from jaxslam.dynamic_masks import DynamicMasks, FrameMask, MaskSource
 from jaxslam.frame import Frame, to_grey
+from jaxslam.masks.reduced import Raster
 from jaxslam.masks.surfaces import SurfaceMemory, Surfaces, newcomers
 from jaxslam.pose import IDENTITY, angle, between, compose
 from jaxslam.slam import Slam
@@ -58,7 +59,7 @@ class Watcher:
 
     def __init__(self, camera: Camera | None = None) -> None:
         self.camera = camera or small_camera()
-        self.memory, self.frame = SurfaceMemory(self.camera), 0
+        self.memory, self.frame = SurfaceMemory(Raster.of(self.camera)), 0
 
     def look(
         self, time_s: float, depth: np.ndarray, pose: np.ndarray = IDENTITY, turn_rad_per_s: float = 0.0
@@ -216,7 +217,7 @@ class TestMemory:
 
     def test_without_still_pixels(self) -> None:
         """Whole areas leave a mask; single pixels of the coarse size do not."""
-        memory, everywhere = SurfaceMemory(small_camera()), np.ones((HEIGHT, WIDTH), bool)
+        memory, everywhere = SurfaceMemory(Raster.of(small_camera())), np.ones((HEIGHT, WIDTH), bool)
         drop = np.zeros((HEIGHT // STEP_PX, WIDTH // STEP_PX), bool)
         drop[5, 7] = True
         assert memory.without(everywhere, drop).all()
@@ -317,7 +318,7 @@ def masks_at_true_poses(source: SyntheticDataset, frames: tuple[SyntheticFrame, 
     made = []
     for index, (frame, turn) in enumerate(zip(frames, turns.tolist(), strict=True)):
         known = (index, 1e-9 * frame.timestamp_ns)
-        made.append(masks.of_frame(*known, frame.rgb, to_grey(frame.rgb), frame.depth_m, frame.T_world_cam, turn))
+        made.append(masks.of_frame(index, frame.rgb, to_grey(frame.rgb), frame.depth_m))
         masks.tracked(*known, frame.T_world_cam, turn)
     return made
 
@@ -341,7 +342,7 @@ class TestRoomWithNobodyInIt:
 
     @pytest.mark.parametrize(("path", "fps", "seconds"), CLIPS)
     def test_nothing_is_new_to_the_tracker(self, path: CameraPathKind, fps: float, seconds: float) -> None:
-        """Which has to predict where the camera is; with few frames a second, that is too far off to compare with."""
+        """Whose poses are not those of the truth, and worse with few frames a second."""
         with Slam(room(path, fps, 0, 0, seconds).camera, TRACKER) as slam:
             frames = rendered(path, fps, seconds=seconds)
             results = [slam.track(Frame(frame.timestamp_ns, frame.rgb, frame.depth_m)) for frame in frames]
