@@ -135,7 +135,9 @@ class DynamicMasks:
         """Compile all that masks need."""
         blank = np.zeros(self._mask.shape, np.uint8)
         pyramid = _pyramid(blank)
-        follow(make_origin(blank.view(bool), blank, 0), [pyramid, pyramid], blank, blank.astype(np.float32))
+        origin = make_origin(blank.view(bool), blank, 0)
+        for pyramids in ([pyramid], [pyramid] * 2):
+            follow(origin, pyramids, blank, blank.astype(np.float32))
         self._surfaces.compile()
 
     def of_frame(self, frame: int, image: np.ndarray, grey: np.ndarray, depth: Float[np.ndarray, "h w"]) -> FrameMask:
