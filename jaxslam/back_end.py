@@ -119,6 +119,7 @@ class BackEnd:
         self._waiting: list[Recalled] = []
         self._wanted: set[int] = set()
         self._correction = IDENTITY
+        self._features: Features | None = None  # of the present frame, once they have been sought
         self._loops_closed = 0
         self._closed = False
 
@@ -153,6 +154,7 @@ class BackEnd:
         """
         if self._closed:
             raise RuntimeError("the back end is closed")
+        self._features = None
         self._take_places(self._to_places.take(frame), frame)
         more = self._take_maps(self._to_mapping.take(frame), frame)
         state = self._carried(state)
@@ -175,7 +177,7 @@ class BackEnd:
         """
         if not self._localize_only:
             new = self._link.keyframe_made(timestamp_ns, _copied(arrays), output, recognised)
-            self._to_mapping.offer(new, frame)
+            self._to_mapping.offer(new._replace(features=self._features), frame)
 
     def held_to_map(
         self, state: TrackState, arrays: FrameArrays, output: TrackOutput
@@ -186,9 +188,8 @@ class BackEnd:
             State and output, and how many points agree on the pose; as they were and 0 if too few do.
         """
         pose = pose_of(output)
-        placed = self._in_local_map(
-            features_of(arrays, np.asarray(output.twist), self._params, self._plan.features), pose
-        )
+        self._features = features_of(arrays, np.asarray(output.twist), self._params, self._plan.features)
+        placed = self._in_local_map(self._features, pose)
         if placed is None:
             return state, output, 0
         T_world_cam = self._link.pose(placed.hung)

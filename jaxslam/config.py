@@ -81,11 +81,11 @@ class TrackConfig(Checked):
     keyframe_followed_below: Annotated[float, Share] = 0.1
     """when less than this share of the followed points was there at the last keyframe,"""
     keyframe_points_below: Annotated[float, Share] = 0.0
-    """when less than this share of `num_points` is still followed,"""
+    """when less than this share of `num_points` is still followed; at once if it is less than half of that,"""
     keyframe_after_s: Annotated[float, Positive] = 10.0
     """when the last one was made so many seconds ago,"""
     keyframe_weak_after_s: Annotated[float, Positive] = 0.3
-    """or so many while tracking is weak."""
+    """or so many while tracking is weak or has few points."""
     probation_frames: Annotated[float, Range(at_least=1)] = 8
     """Frames after which a point counts in full: what moves on its own is an outlier before that."""
     restart_after: Annotated[float, Range(at_least=0)] = 15

@@ -71,6 +71,7 @@ class NewKeyframe(NamedTuple):
         submap: Number of its submap.
         twist: `(6,)` velocity of the camera in its own axes.
         tracks: Points seen.
+        features: Found in it, if that has been done.
     """
 
     id: int
@@ -81,6 +82,7 @@ class NewKeyframe(NamedTuple):
     submap: int
     twist: np.ndarray
     tracks: Tracks
+    features: Features | None = None
 
 
 class MappingPlan(NamedTuple):
@@ -136,7 +138,9 @@ class LocalMapping:
 
     def add(self, new: NewKeyframe) -> Map:
         """Take in a keyframe; gives the new map."""
-        features = features_of(new.frame, new.twist, self._params, self._plan.features)
+        features = new.features
+        if features is None:
+            features = features_of(new.frame, new.twist, self._params, self._plan.features)
         whole = with_new_keyframe(self.map, new, features)
         known = self._known(new.tracks)
         part = _part(whole, new.id, known[has(whole.points.ids, known)])

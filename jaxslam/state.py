@@ -145,9 +145,10 @@ class TrackParams(NamedTuple):
         keyframe_below: A keyframe is made when no kept one shows more than this share of its points (`NEW_AREA`),
         keyframe_followed_below: when less than this share of the followed points was there at the last keyframe
             (`FEW_FOLLOWED`),
-        keyframe_points_below: when less than this share of the capacity is still followed (`FEW_POINTS`),
+        keyframe_points_below: when less than this share of the capacity is still followed (`FEW_POINTS`), half of it
+            if the last one was made just now,
         keyframe_after_s: or when the last one was made this many seconds ago (`TIME`),
-        keyframe_weak_after_s: or this many while tracking is weak (`WEAK`).
+        keyframe_weak_after_s: or this many while tracking is weak (`WEAK`) or has few points.
         probation_frames: Frames after which a point counts in full. What moves on its own is an outlier within a few
             frames, so that it never counts for much.
         restart_after: Frames of loss after which tracking starts anew at the held pose.

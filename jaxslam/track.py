@@ -420,11 +420,13 @@ def _keyframe_reason(
     num_kept = jnp.sum(kept.valid, dtype=since_keyframe_s.dtype)
     share = jnp.sum(old, dtype=since_keyframe_s.dtype) / jnp.maximum(num_kept, 1)
     tracked = ~verdict.lost
+    enough = params.keyframe_points_below * kept.valid.shape[0]
+    few, hardly_any = tracked & (num_kept < enough), num_kept < 0.5 * enough
     causes = (
         (started, KeyframeReason.STARTED),
         (tracked & (looked_up.overlap < params.keyframe_below), KeyframeReason.NEW_AREA),
         (tracked & (share < params.keyframe_followed_below), KeyframeReason.FEW_FOLLOWED),
-        (tracked & (num_kept < params.keyframe_points_below * kept.valid.shape[0]), KeyframeReason.FEW_POINTS),
+        (few & (hardly_any | (since_keyframe_s > params.keyframe_weak_after_s)), KeyframeReason.FEW_POINTS),
         (verdict.weak & (since_keyframe_s > params.keyframe_weak_after_s), KeyframeReason.WEAK),
         (tracked & (since_keyframe_s > params.keyframe_after_s), KeyframeReason.TIME),
     )

@@ -191,7 +191,7 @@ class TestFollowingAlone:
         return np.array(new)
 
     def test_nothing_is_looked_up(self, step: Step) -> None:
-        outputs = self.outputs(step, keyframe_points_below=0.5)
+        outputs = self.outputs(step, keyframe_points_below=0.5, keyframe_weak_after_s=0.0)
         assert [int(output.status) for output in outputs] == [TrackStatus.STARTED] + [TrackStatus.OK] * (LONGER - 1)
         assert all(int(output.num_looked_up) == 0 and output.looked_up.uv.shape == (2, 0) for output in outputs)
         off = np.linalg.norm(poses(outputs)[:, 4:] - poses(self.outputs(step))[:, 4:], axis=1)
@@ -215,12 +215,27 @@ class TestFollowingAlone:
 
     def test_few_points_make_a_keyframe(self, step: Step) -> None:
         """The first time that fewer are followed than the share of the capacity, and never before."""
-        outputs = self.outputs(step, **RARE, keyframe_points_below=0.75)
+        outputs = self.outputs(step, **{**RARE, "keyframe_weak_after_s": 0.0}, keyframe_points_below=0.75)
         followed = np.array([np.count_nonzero(output.tracked) for output in outputs])
         reasons = [int(output.keyframe) for output in outputs]
         few = followed < 0.75 * TRACK.num_points
         assert few[1:].any()
         assert reasons == [KeyframeReason.STARTED, *np.where(few[1:], KeyframeReason.FEW_POINTS, 0).tolist()]
+
+    @pytest.mark.parametrize(("share", "sooner"), [(0.4, False), (0.75, True)])
+    def test_few_points_wait_for_a_while(self, step: Step, share: float, sooner: bool) -> None:
+        """For a keyframe soon after another less than half as many must be followed."""
+        wait_s, fps = 0.2, clip(2).camera.fps
+        outputs = self.outputs(step, **{**RARE, "keyframe_weak_after_s": wait_s}, keyframe_points_below=share)
+        followed = np.array([np.count_nonzero(output.tracked) for output in outputs])
+        made = np.flatnonzero([int(output.keyframe) for output in outputs])
+        gaps_s = np.diff(made) / fps
+        soon = gaps_s <= wait_s
+        print(f"keyframes {made.tolist()}, followed {followed[made].tolist()}")
+        assert len(made) > 1
+        assert (followed[made[1:]] < share * TRACK.num_points).all()
+        assert (followed[made[1:]][soon] < 0.5 * share * TRACK.num_points).all()
+        assert soon.any() == sooner
 
 
 def slam_results(config: Config, num: int = LONGER, detector: Callable | None = None) -> list[Tracked]:
