@@ -1,6 +1,6 @@
 """The mask of an object from its box: what lies about as far away as most of the box, in one piece.
 
-Source: NGD-SLAM (Zhang, Cheng and Kaess 2025), section III-B.2: depth inside the box, connected components, dilation.
+Source: NGD-SLAM (Zhang, Bujanca and Luján 2025), section III-B.2: depth inside the box, connected components, dilation.
 The object must fill most of the box.
 """
 

@@ -1,6 +1,6 @@
 """A mask carried from one frame to a later one: its points followed by flow, and its outline found anew by depth.
 
-Source: NGD-SLAM (Zhang, Cheng and Kaess 2025), section III-B: dynamic flow, clustering by DBSCAN, prediction of the
+Source: NGD-SLAM (Zhang, Bujanca and Luján 2025), section III-B: dynamic flow, clustering by DBSCAN, prediction of the
 mask from the depth of each cluster. The paper leaves open how the mask grows from a cluster: here it is where its part
 of the old mask has moved to, and a little around, as far as it has the cluster's depth and hangs together with its
 points. By that alone what people touch joins them: on Bonn `crowd`, thirty frames after the last detection, the mask

@@ -1,6 +1,6 @@
 """Points to follow a mask by: one in every cell, where the picture has most texture.
 
-Source: NGD-SLAM (Zhang, Cheng and Kaess 2025), section III-B.3; there, cells have 15 pixels of an image of 640.
+Source: NGD-SLAM (Zhang, Bujanca and Luján 2025), section III-B.3; there, cells have 15 pixels of an image of 640.
 """
 
 from typing import NamedTuple
