@@ -1,4 +1,4 @@
-"""The command line: `jaxslam demo`, `run`, `compare`, `eval`, `doctor`, `export`, `models`."""
+"""The command line: `jaxslam demo`, `run`, `compare`, `bench`, `eval`, `doctor`, `export`, `models`, `data`."""
 
 import logging
 import sys
@@ -10,7 +10,9 @@ from typing import Annotated, Any, Literal
 import tyro
 from rich.console import Console
 
+from jaxslam.bench_command import Bench
 from jaxslam.compare_command import Compare
+from jaxslam.data_command import Data
 from jaxslam.doctor import diagnose
 from jaxslam.errors import ConfigError, DatasetError, JaxSlamError
 from jaxslam.evaluation import evaluate
@@ -102,7 +104,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """The `jaxslam` command: known errors are one line and exit code 1."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
     command: Any = tyro.cli(
-        Demo | Run | Compare | Eval | Doctor | Export | Models, prog="jaxslam", args=arguments, description=_DESCRIPTION
+        Demo | Run | Compare | Bench | Eval | Doctor | Export | Models | Data,
+        prog="jaxslam",
+        args=arguments,
+        description=_DESCRIPTION,
     )
     try:
         command.main()

@@ -40,6 +40,10 @@ class DownloadError(JaxSlamError):
     """A file that cannot be fetched, or is not the one expected; the message says where to place it by hand."""
 
 
+class BenchmarkError(JaxSlamError):
+    """A suite, a baseline or the results of a benchmark that are missing, damaged or do not fit together."""
+
+
 def nearest(name: str, valid: Iterable[str]) -> str:
     """A hint for a misspelt name: ` (did you mean 'x'?)` or, when nothing is close, the valid names."""
     choices = sorted(valid)

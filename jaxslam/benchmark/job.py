@@ -1,0 +1,239 @@
+"""One run of a suite, in a process of its own: whatever it does to itself, the others and the report go on.
+
+`python -m jaxslam.benchmark.job FOLDER [ROOT]` runs the one that is written in a folder.
+"""
+
+import dataclasses
+import hashlib
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from jaxslam.benchmark.suite import Sequence as Clip
+from jaxslam.config import Config, load_config, to_yaml
+from jaxslam.datasets import Dataset, Subset, open_dataset
+from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
+from jaxslam.datasets.synthetic.sensor import SensorConfig
+from jaxslam.errors import BenchmarkError, JaxSlamError
+from jaxslam.files import write_atomically
+from jaxslam.frame import to_grey
+from jaxslam.mask_pictures import MaskPictures
+from jaxslam.recordings import find_recording
+from jaxslam.results import RunInfo, Snapshots, write_results
+from jaxslam.slam import Slam
+from jaxslam.xla import prefer_one_thread
+
+RESULT = "result.json"
+"""The last file of a run to be written: where it is, the run is done."""
+_JOB = "job.json"
+_FLOW_PAIRS = 20
+_FLOW_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.03)
+_MOST_HASHED_BYTES = 5_000_000
+_LAST_WORDS = 400
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run.
+
+    Attributes:
+        clip: What is tracked.
+        preset: With what.
+        variant: The name of further settings; empty for none.
+        settings: `key=value`, in the order in which they are applied.
+        seed: Of every random choice.
+    """
+
+    clip: Clip
+    preset: str
+    variant: str
+    settings: tuple[str, ...]
+    seed: int
+
+    @property
+    def label(self) -> str:
+        """Preset and variant."""
+        return f"{self.preset}@{self.variant}" if self.variant else self.preset
+
+    @property
+    def folder(self) -> Path:
+        """Where its results go, seen from those of the suite."""
+        return Path(self.clip.name) / self.label / str(self.seed)
+
+    @property
+    def config(self) -> Config:
+        """Every setting of it."""
+        return load_config(self.preset, overrides=(*self.settings, f"run.seed={self.seed}"))
+
+    def to_json(self) -> str:
+        """As text, from which `of_json` makes an equal one."""
+        return json.dumps(dataclasses.asdict(self), sort_keys=True)
+
+    @classmethod
+    def of_json(cls, text: str) -> "Job":
+        """The job of which this is the text."""
+        fields = json.loads(text)
+        clip = fields.pop("clip")
+        room = clip.pop("room")
+        if room is not None:
+            room = SyntheticConfig(**room | {"sensor": SensorConfig(**room["sensor"])})
+        return cls(Clip(room=room, **clip), **fields | {"settings": tuple(fields["settings"])})
+
+
+def opened(clip: Clip, root: Path | None) -> Dataset:
+    """What a job tracks.
+
+    Raises:
+        BenchmarkError: If its recording is not on this machine.
+    """
+    if clip.room is not None:
+        dataset: Dataset = SyntheticDataset(clip.room)
+    else:
+        folder = find_recording(clip.recording, root)
+        if folder is None:
+            raise BenchmarkError(f"{clip.recording}: not on this machine; to get it: jaxslam data get {clip.recording}")
+        dataset = open_dataset(folder, camera=clip.camera)
+    return dataset if clip.whole else Subset(dataset, clip.start, clip.stop)
+
+
+def finished(job: Job, out: Path) -> dict[str, Any] | None:
+    """What came of a job, if it has been run to its end, with the settings that it has now."""
+    folder = out / job.folder
+    try:
+        if (folder / _JOB).read_text() != job.to_json() or (folder / "config.yaml").read_text() != to_yaml(job.config):
+            return None
+        return json.loads((folder / RESULT).read_text())
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as problem:
+        raise BenchmarkError(f"{folder}: expected the results of a run, got something unreadable: {problem}") from None
+
+
+def run_in_process(job: Job, out: Path, root: Path | None) -> dict[str, Any]:
+    """Run a job in a process of its own.
+
+    Returns:
+        Its figures. If the process failed, `status` is `failed` and `problem` says how; that is kept in no file, so
+        that the run is tried again.
+    """
+    folder = out / job.folder
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / RESULT).unlink(missing_ok=True)
+    write_atomically(folder / _JOB, job.to_json().encode(), BenchmarkError)
+    command = [sys.executable, "-m", "jaxslam.benchmark.job", str(folder), *([] if root is None else [str(root)])]
+    done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
+    (folder / "log.txt").write_text(done.stdout + done.stderr)
+    result = finished(job, out)
+    if result is not None and done.returncode == 0:
+        return result
+    return _figures(job) | {"status": "failed", "problem": _problem(done)}
+
+
+def run_here(folder: Path, root: Path | None) -> None:
+    """Run the job that is written in a folder; its results go there.
+
+    Raises:
+        JaxSlamError: If its recording is not there or not fit to be tracked, or a file cannot be written.
+    """
+    prefer_one_thread()
+    job = Job.of_json((folder / _JOB).read_text())
+    dataset = opened(job.clip, root)
+    flow_ms = flow_time_ms(dataset)
+    snapshots, masks = Snapshots(len(dataset)), MaskPictures()
+    slam = Slam(dataset.camera, job.config)
+    slam.warm_up()
+    began = time.perf_counter()
+
+    def watch(frame: Any, result: Any) -> None:
+        for watcher in (snapshots, masks):
+            watcher(frame, result)
+
+    with slam:
+        records = slam.run(dataset, watch)
+    info = RunInfo(dataset, job.preset, time.perf_counter() - began)
+    summary, _ = write_results(folder, slam, records, info, snapshots.kept, masks.kept)
+    times = summary["track_ms"]
+    ratios = {} if times is None else {f"flow_ratio_{name}": round(times[name] / flow_ms, 4) for name in times}
+    result = _figures(job) | {
+        "status": "done",
+        "problem": None,
+        **summary,
+        "flow_ms": round(flow_ms, 4),
+        **ratios,
+        "data_sha256": _fingerprint(job.clip, root),
+    }
+    write_atomically(folder / RESULT, (json.dumps(result, indent=2) + "\n").encode(), BenchmarkError)
+
+
+def flow_time_ms(dataset: Dataset) -> float:
+    """What a frame costs on this machine, whatever is done with it: OpenCV's optical flow of 1000 corners.
+
+    The median over pairs of frames all over the recording, in one thread, with both pyramids.
+    """
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        first = np.linspace(0, max(len(dataset) - 2, 0), _FLOW_PAIRS).astype(int)
+        return float(np.median([_flow_of_pair_ms(dataset, int(index)) for index in np.unique(first)]))
+    finally:
+        cv2.setNumThreads(before)
+
+
+def _flow_of_pair_ms(dataset: Dataset, index: int) -> float:
+    a, b = (to_grey(dataset[min(i, len(dataset) - 1)].image) for i in (index, index + 1))
+    corners = cv2.goodFeaturesToTrack(a, 1000, 0.001, 7)
+    if corners is None:
+        corners = np.random.default_rng(index).uniform(0, min(a.shape), (1000, 1, 2)).astype(np.float32)
+    began = time.perf_counter()
+    cv2.calcOpticalFlowPyrLK(a, b, corners, corners.copy(), winSize=(21, 21), maxLevel=3, criteria=_FLOW_CRITERIA)
+    return 1e3 * (time.perf_counter() - began)
+
+
+def _figures(job: Job) -> dict[str, Any]:
+    """What a result says of its job."""
+    return {
+        "sequence": job.clip.name,
+        "label": job.label,
+        "preset": job.preset,
+        "variant": job.variant,
+        "seed": job.seed,
+    }
+
+
+def _fingerprint(clip: Clip, root: Path | None) -> str | None:
+    """A hash of the text files of a recording, and of names and sizes of the others; `None` for a rendered room."""
+    folder = find_recording(clip.recording, root) if clip.recording else None
+    if folder is None:
+        return None
+    digest = hashlib.sha256()
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        digest.update(f"{path.relative_to(folder)} {path.stat().st_size}\n".encode())
+        if path.suffix in (".txt", ".yaml", ".csv") and path.stat().st_size <= _MOST_HASHED_BYTES:
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def _problem(done: "subprocess.CompletedProcess[str]") -> str:
+    words = done.stderr.strip().splitlines()
+    last = words[-1][-_LAST_WORDS:] if words else "nothing was said"
+    how = f"killed by signal {-done.returncode}" if done.returncode < 0 else f"ended with {done.returncode}"
+    return f"{how}: {last}"
+
+
+def _main(arguments: Sequence[str]) -> None:
+    try:
+        run_here(Path(arguments[0]), Path(arguments[1]) if len(arguments) > 1 else None)
+    except JaxSlamError as error:
+        sys.exit(f"error: {error}")
+
+
+if __name__ == "__main__":
+    _main(sys.argv[1:])

@@ -1,0 +1,199 @@
+"""Suites: which sequences are run with which presets, how often. They are YAML files in `configs/benchmarks`.
+
+about: One line for the list of suites.
+presets: [static, ngd, default]
+runs: 5
+set: [semantics.model=null]          # settings of all runs
+sequences:
+  - recording: rgbd_bonn_crowd       # a folder of that name
+    stop: 220                        # frames from `start` to before `stop`
+  - name: room                       # what it is called in tables; a recording's own name if not given
+    room: {frames: 90, people: 2}    # rendered, see `SyntheticConfig`
+variants:                            # every preset with each of these settings too
+  few-points: [track.num_points=256]
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
+
+from jaxslam.checked import Checked, Range
+from jaxslam.config import configs_dir, load_config, presets, updated
+from jaxslam.datasets.synthetic import SyntheticConfig
+from jaxslam.errors import BenchmarkError, JaxSlamError, nearest
+from jaxslam.yaml_file import read_mapping
+
+_Positive = Range(at_least=1)
+
+
+@dataclass(frozen=True)
+class Sequence(Checked):
+    """A recording or a part of one, or a rendered room.
+
+    Attributes:
+        name: What it is called in tables and folders.
+        recording: The name of its folder; empty for a room.
+        room: What is rendered; `None` for a recording.
+        start: First frame.
+        stop: The frame after the last; `None` for all.
+        camera: Known camera or camera file of the recording; `None` if its folder tells.
+    """
+
+    _error: ClassVar[type[JaxSlamError]] = BenchmarkError
+
+    name: str
+    recording: str = ""
+    room: SyntheticConfig | None = None
+    start: Annotated[int, Range(at_least=0)] = 0
+    stop: Annotated[int, _Positive] | None = None
+    camera: str | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if bool(self.recording) == (self.room is not None):
+            raise BenchmarkError(f"sequence {self.name}: expected either `recording` or `room`, got both or neither")
+        if not self.name or "/" in self.name or self.name.startswith("."):
+            raise BenchmarkError(f"sequence: expected a name that can be a folder's, got '{self.name}'")
+
+    @property
+    def whole(self) -> bool:
+        """Whether all of it is run, as published figures are of."""
+        return self.start == 0 and self.stop is None
+
+
+@dataclass(frozen=True)
+class Suite:
+    """What is run.
+
+    Attributes:
+        name: Of its file.
+        about: One line.
+        sequences: What is tracked.
+        presets: With what.
+        runs: How often each, with the seeds 0, 1, 2, ...
+        settings: `key=value` of all runs.
+        variants: More settings by name; every preset is run with each, and not without.
+    """
+
+    name: str
+    about: str
+    sequences: tuple[Sequence, ...]
+    presets: tuple[str, ...] = ("default",)
+    runs: int = 1
+    settings: tuple[str, ...] = ()
+    variants: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+
+def suites() -> dict[str, Path]:
+    """The suites that come with jaxslam: files by name."""
+    return {path.stem: path for path in sorted((configs_dir() / "benchmarks").glob("*.yaml"))}
+
+
+def load_suite(name_or_path: str) -> Suite:
+    """A suite that comes with jaxslam, one in a file, or all recordings in a folder.
+
+    Args:
+        name_or_path: A name in `suites()`, a YAML file, or a folder of recordings, which are run with `static`, `ngd`
+            and `default`.
+
+    Raises:
+        BenchmarkError: If there is no such suite, or the file is wrong; the message names the place.
+    """
+    path = Path(name_or_path)
+    if name_or_path in suites():
+        path = suites()[name_or_path]
+    elif path.is_dir():
+        return _suite_of_folder(path)
+    elif not path.is_file():
+        hint = nearest(name_or_path, suites())
+        raise BenchmarkError(f"suite: expected a known one, a YAML file or a folder, got '{name_or_path}'{hint}")
+    content = read_mapping(path, BenchmarkError)
+    try:
+        return _suite(path.stem, content)
+    except JaxSlamError as error:
+        raise BenchmarkError(f"{path}: {error}") from None
+
+
+def checked_presets(names: tuple[str, ...]) -> tuple[str, ...]:
+    """The names, if all of them are presets.
+
+    Raises:
+        BenchmarkError: If one is not, or there is none.
+    """
+    if not names:
+        raise BenchmarkError("presets: expected at least one")
+    for name in names:
+        if name not in presets():
+            raise BenchmarkError(f"presets: unknown preset '{name}'{nearest(name, presets())}")
+    return names
+
+
+def _suite_of_folder(folder: Path) -> Suite:
+    recordings = sorted(path.parent for path in folder.glob("**/rgb.txt"))
+    if not recordings:
+        raise BenchmarkError(f"{folder}: expected a folder with recordings in it (rgb.txt), got none")
+    return Suite(
+        folder.resolve().name,
+        f"all recordings in {folder}",
+        tuple(Sequence(path.resolve().name, path.resolve().name) for path in recordings),
+        ("static", "ngd", "default"),
+    )
+
+
+def _suite(name: str, content: Mapping[str, Any]) -> Suite:
+    known = ("about", "presets", "runs", "set", "sequences", "variants")
+    for key in content:
+        if key not in known:
+            raise BenchmarkError(f"{key}: unknown key{nearest(key, known)}")
+    runs = content.get("runs", 1)
+    if isinstance(runs, bool) or not isinstance(runs, int) or runs < 1:
+        raise BenchmarkError(f"runs: expected an integer >= 1, got {runs!r}")
+    sequences = content.get("sequences")
+    if not isinstance(sequences, list) or not sequences:
+        raise BenchmarkError("sequences: expected a list of at least one")
+    made = tuple(_sequence(f"sequences[{index}]", entry) for index, entry in enumerate(sequences))
+    names = [sequence.name for sequence in made]
+    for name_of_one in names:
+        if names.count(name_of_one) > 1:
+            raise BenchmarkError(f"sequences: '{name_of_one}' stands twice; give one of them another `name`")
+    variants = content.get("variants", {})
+    if not isinstance(variants, Mapping):
+        raise BenchmarkError(f"variants: expected names with lists of settings, got {variants!r}")
+    suite = Suite(
+        name,
+        str(content.get("about", "")),
+        made,
+        checked_presets(_texts("presets", content.get("presets", ["default"]))),
+        runs,
+        _texts("set", content.get("set", [])),
+        {str(key): _texts(f"variants.{key}", value) for key, value in variants.items()},
+    )
+    for variant in suite.variants.values() or [()]:
+        for preset in suite.presets:
+            load_config(preset, overrides=(*suite.settings, *variant))  # an error now, not after hours
+    return suite
+
+
+def _sequence(place: str, entry: object) -> Sequence:
+    known = ("name", "recording", "room", "start", "stop", "camera")
+    if not isinstance(entry, Mapping):
+        raise BenchmarkError(f"{place}: expected `recording: NAME` or `room: ...`, got {entry!r}")
+    fields = dict(entry)
+    for key in fields:
+        if key not in known:
+            raise BenchmarkError(f"{place}.{key}: unknown key{nearest(str(key), known)}")
+    if "room" in fields:
+        if not isinstance(fields["room"], Mapping):
+            raise BenchmarkError(f"{place}.room: expected settings of the rendered room, got {fields['room']!r}")
+        fields["room"] = updated(SyntheticConfig(), fields["room"], f"{place}.room")
+    if "name" not in fields and "recording" not in fields:
+        raise BenchmarkError(f"{place}: expected a name, got none")
+    fields.setdefault("name", fields.get("recording"))
+    return Sequence(**fields)
+
+
+def _texts(place: str, value: object) -> tuple[str, ...]:
+    if not isinstance(value, list) or not all(isinstance(text, str) for text in value):
+        raise BenchmarkError(f"{place}: expected a list of texts, got {value!r}")
+    return tuple(value)

@@ -1,0 +1,191 @@
+"""`jaxslam data list` and `get`: the public recordings, and how one comes onto this machine."""
+
+import shlex
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, TypeAlias
+
+import tyro
+from rich import box
+from rich.console import Console
+from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
+from rich.table import Table
+
+from jaxslam.download import download, sha256_of
+from jaxslam.errors import DatasetError
+from jaxslam.recordings import (
+    Recording,
+    find_recording,
+    found_recordings,
+    known_recording,
+    known_recordings,
+    recordings_dir,
+)
+from jaxslam.unpack import unpack
+
+_console = Console(soft_wrap=True, markup=False, highlight=False)
+_UNPACKED_PER_ARCHIVE = 1.2
+"""Images hardly get smaller in an archive: two of TUM unpack to 1.07 and 1.08 times its size."""
+_WIDEST = 4000
+
+
+@dataclass(frozen=True)
+class ListRecordings:
+    """Print the known public recordings: dataset, size of the download, licence, and where they lie here."""
+
+    missing: bool = False
+    """Only those that are not on this machine, with their addresses."""
+
+    def main(self) -> None:
+        """Run the command."""
+        found, known = found_recordings(), known_recordings()
+        shown = [recording for recording in known.values() if not (self.missing and recording.name in found)]
+        last = "source" if self.missing else "here"
+        table = Table("name", "dataset", "size", "licence", last, box=box.SIMPLE)
+        for recording in shown:
+            place = (recording.url or recording.page) if self.missing else str(found.get(recording.name, "no"))
+            table.add_row(recording.name, recording.dataset, _size(recording), recording.licence, place)
+        # As wide as its longest path, whatever the terminal: names and paths are there to be copied.
+        Console(width=_WIDEST, markup=False, highlight=False, soft_wrap=True).print(table)
+        here = sum(name in found for name in known)
+        _console.print(f"{here} of {len(known)} are on this machine. To download one: jaxslam data get NAME")
+        pages = dict.fromkeys((recording.dataset, recording.page) for recording in shown)
+        for dataset, page in pages:
+            _console.print(f"{dataset}: {page}")
+        _console.print(f"Downloads go to {recordings_dir()}; a folder named by JAXSLAM_DATA is looked at first.")
+
+
+@dataclass(frozen=True)
+class GetRecording:
+    """Download a recording and unpack it, or go on with a download that was cut."""
+
+    name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]
+    """Name of a known recording, as `data list` prints it."""
+    out: Path | None = None
+    """Folder to put it into; the user's cache folder if not given."""
+    keep_archive: bool = False
+    """Leave the archive beside it."""
+
+    def main(self) -> None:
+        """Run the command."""
+        recording = known_recording(self.name)
+        root = self.out if self.out is not None and self.out.is_dir() else None
+        if (found := find_recording(recording.name, root)) is not None:
+            _console.print(f"{recording.name} is on this machine: {found}")
+            _print_next(recording, found)
+            return
+        if recording.url is None:
+            raise DatasetError(f"{recording.name} cannot be downloaded alone; {recording.how}. See {recording.page}")
+        folder = self.out or recordings_dir()
+        target, archive = folder / recording.name, folder / recording.archive
+        _console.print(f"{recording.dataset}, licence: {recording.licence}, see {recording.page}")
+        _fetch_and_unpack(recording, recording.url, archive, target)
+        if not self.keep_archive:
+            _delete(archive)
+        _console.print(f"{recording.name}: {target}")
+        if self.keep_archive:
+            _console.print(f"Archive: {archive}")
+        _print_next(recording, target)
+
+
+_Command: TypeAlias = (
+    Annotated[ListRecordings, tyro.conf.subcommand("list")] | Annotated[GetRecording, tyro.conf.subcommand("get")]
+)
+
+
+@dataclass(frozen=True)
+class Data:
+    """Public recordings to track: list them, get one."""
+
+    command: tyro.conf.OmitSubcommandPrefixes[_Command]
+
+    def main(self) -> None:
+        """Run the command."""
+        self.command.main()
+
+
+def _size(recording: Recording) -> str:
+    return recording.typical_size if recording.size_bytes is None else f"{recording.size_bytes / 1e9:.2f} GB"
+
+
+def _print_next(recording: Recording, folder: Path) -> None:
+    if recording.kind != "kitti":
+        _console.print(f"To track it: jaxslam run {shlex.quote(str(folder))}")
+
+
+def _fetch_and_unpack(recording: Recording, url: str, archive: Path, target: Path) -> None:
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        DownloadColumn(),
+        TransferSpeedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=_console) as progress:
+        was_there = archive.is_file()
+        if was_there:
+            _check(recording, archive)
+        else:
+            _download(recording, url, archive, progress)
+        _require_space(target.parent, _UNPACKED_PER_ARCHIVE * archive.stat().st_size)
+        task = progress.add_task("Unpacking", total=None)
+        try:
+            unpack(
+                archive,
+                target,
+                holds=("rgb.txt", "depth.txt"),
+                progress=lambda done, total: progress.update(task, completed=done, total=total),
+            )
+        except DatasetError as failure:
+            raise DatasetError(f"{failure}. To begin anew, delete {archive}") from failure
+
+
+def _download(recording: Recording, url: str, archive: Path, progress: Progress) -> None:
+    """Fetch the archive; as soon as its size is known, there must be space for it and what it holds."""
+    task = progress.add_task("Downloading", total=recording.size_bytes)
+    checked = False
+
+    def show(done: int, total: int | None) -> None:
+        nonlocal checked
+        if total is not None and not checked:
+            checked = True
+            _require_space(archive.parent, total - done + _UNPACKED_PER_ARCHIVE * total)
+        progress.update(task, completed=done, total=total)
+
+    if recording.size_bytes is not None:
+        part = archive.with_name(f"{archive.name}.part")
+        show(part.stat().st_size if part.is_file() else 0, recording.size_bytes)
+    download(url, archive, sha256=recording.sha256, size=recording.size_bytes, progress=show)
+
+
+def _check(recording: Recording, archive: Path) -> None:
+    """Raise if an archive that was there already is not the one expected."""
+    problem = None
+    try:
+        size = archive.stat().st_size
+        if recording.size_bytes not in (None, size):
+            problem = f"expected {recording.size_bytes} bytes, got {size}"
+        elif recording.sha256 is not None and (got := sha256_of(archive)) != recording.sha256:
+            problem = f"expected SHA-256 {recording.sha256}, got {got}"
+    except OSError as failure:
+        raise DatasetError(f"{archive}: cannot be read: {failure}") from failure
+    if problem is not None:
+        raise DatasetError(f"{archive}: {problem}: another file, or a damaged one. To begin anew, delete it")
+
+
+def _require_space(folder: Path, needed: float) -> None:
+    existing = next(place for place in (folder.absolute(), *folder.absolute().parents) if place.exists())
+    free = shutil.disk_usage(existing).free
+    if free < needed:
+        raise DatasetError(
+            f"{folder}: expected {needed / 1e9:.2f} GB of free space for the archive and what it holds,"
+            f" got {free / 1e9:.2f} GB; --out names another folder"
+        )
+
+
+def _delete(archive: Path) -> None:
+    try:
+        archive.unlink()
+    except OSError as failure:
+        raise DatasetError(f"{archive}: unpacked, but cannot be deleted: {failure}") from failure

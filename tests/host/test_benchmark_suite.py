@@ -1,0 +1,114 @@
+"""Suites: what is in their files, what is wrong with them, and the runs they come to."""
+
+from pathlib import Path
+
+import pytest
+
+from jaxslam.benchmark.job import Job
+from jaxslam.benchmark.runner import plan, swept
+from jaxslam.benchmark.suite import Sequence, load_suite, suites
+from jaxslam.datasets.synthetic import SyntheticConfig
+from jaxslam.errors import BenchmarkError
+
+SUITE = """
+about: two rooms
+presets: [static, default]
+runs: 3
+set: [semantics.model=null]
+sequences:
+  - name: room
+    room: {frames: 5, people: 1}
+  - recording: rgbd_bonn_crowd
+    name: start
+    stop: 20
+"""
+
+
+def suite_file(folder: Path, text: str) -> str:
+    path = folder / "mine.yaml"
+    path.write_text(text)
+    return str(path)
+
+
+class TestSuite:
+    @pytest.mark.parametrize("name", suites())
+    def test_that_comes_with_jaxslam(self, name: str) -> None:
+        suite = load_suite(name)
+        assert suite.about
+        assert plan(suite)
+
+    def test_of_a_file(self, tmp_path: Path) -> None:
+        suite = load_suite(suite_file(tmp_path, SUITE))
+        assert (suite.name, suite.about, suite.presets, suite.runs) == ("mine", "two rooms", ("static", "default"), 3)
+        assert suite.sequences[0] == Sequence("room", room=SyntheticConfig(frames=5, people=1))
+        assert suite.sequences[1] == Sequence("start", "rgbd_bonn_crowd", stop=20)
+        assert [clip.whole for clip in suite.sequences] == [True, False]
+
+    def test_of_a_folder(self, tmp_path: Path) -> None:
+        for name in ("b", "a"):
+            (tmp_path / "some" / name).mkdir(parents=True)
+            (tmp_path / "some" / name / "rgb.txt").touch()
+        suite = load_suite(str(tmp_path))
+        assert [clip.recording for clip in suite.sequences] == ["a", "b"]
+
+    @pytest.mark.parametrize(
+        ("text", "what"),
+        [
+            ("sequences: []", "sequences: expected a list of at least one"),
+            (SUITE + "seqences: []", "seqences: unknown key .did you mean 'sequences'"),
+            (SUITE.replace("runs: 3", "runs: 0"), "runs: expected an integer >= 1, got 0"),
+            (SUITE.replace("static, default", "statik"), "unknown preset 'statik' .did you mean 'static'"),
+            (SUITE.replace("static, default", ""), "presets: expected at least one"),
+            (SUITE.replace("frames: 5", "frame: 5"), r"sequences\[0\].room.frame: unknown key"),
+            (SUITE.replace("    stop: 20", "    stop: -1"), "stop"),
+            (SUITE.replace("name: start", "name: room"), "'room' stands twice"),
+            (SUITE.replace("name: start", "name: a/b"), "expected a name that can be a folder's"),
+            (SUITE.replace("recording: rgbd_bonn_crowd\n", "name: x\n").replace("    name: start\n", ""), "either"),
+            (SUITE.replace("semantics.model", "semantic.model"), "semantic: unknown key"),
+            (SUITE.replace("[semantics.model=null]", "semantics"), "set: expected a list of texts"),
+            (SUITE + "variants: [a]", "variants: expected names with lists"),
+            (SUITE + "variants: {a: [track.num_points=x]}", "num_points"),
+            ("- 1", "expected `key: value` lines"),
+        ],
+    )
+    def test_wrong(self, tmp_path: Path, text: str, what: str) -> None:
+        with pytest.raises(BenchmarkError, match=what) as raised:
+            load_suite(suite_file(tmp_path, text))
+        assert "mine.yaml" in str(raised.value)
+
+    def test_unknown(self, tmp_path: Path) -> None:
+        with pytest.raises(BenchmarkError, match="did you mean 'smoke'"):
+            load_suite("smok")
+        with pytest.raises(BenchmarkError, match="expected a folder with recordings"):
+            load_suite(str(tmp_path))
+
+
+class TestPlan:
+    def test_all_runs(self, tmp_path: Path) -> None:
+        jobs = plan(load_suite(suite_file(tmp_path, SUITE)))
+        assert len(jobs) == 2 * 2 * 3
+        assert len({job.folder for job in jobs}) == len(jobs)
+        assert str(jobs[-1].folder) == "start/default/2"
+        assert all(job.settings == ("semantics.model=null",) for job in jobs)
+
+    def test_chosen(self, tmp_path: Path) -> None:
+        jobs = plan(load_suite(suite_file(tmp_path, SUITE)), presets=("ngd",), runs=1)
+        assert [str(job.folder) for job in jobs] == ["room/ngd/0", "start/ngd/0"]
+
+    def test_sweep(self, tmp_path: Path) -> None:
+        suite = swept(load_suite(suite_file(tmp_path, SUITE)), ["track.num_points=256,512", "run.prefetch_frames=2,3"])
+        jobs = plan(suite, presets=("default",), runs=1)
+        assert len(jobs) == 2 * 4
+        assert jobs[1].label == "default@num_points=256,prefetch_frames=3"
+        assert jobs[1].settings == ("semantics.model=null", "track.num_points=256", "run.prefetch_frames=3")
+
+    @pytest.mark.parametrize("sweep", ["", "track.num_points", "track.num_points=", "=1,2", "track.num_points=1,,2"])
+    def test_wrong_sweep(self, tmp_path: Path, sweep: str) -> None:
+        with pytest.raises(BenchmarkError, match="--sweep: expected key=value,value"):
+            swept(load_suite(suite_file(tmp_path, SUITE)), [sweep])
+
+    def test_job_as_text(self, tmp_path: Path) -> None:
+        for job in plan(load_suite(suite_file(tmp_path, SUITE))):
+            again = Job.of_json(job.to_json())
+            assert again == job
+            assert again.to_json() == job.to_json()
