@@ -37,6 +37,8 @@ _relocated = jax.jit(relocated, donate_argnums=0)
 
 _RECALL_EVERY = 10
 """Frames after which a tracker that only localises gets other keyframes."""
+_MOST_ON_THE_WAY = 2
+"""Keyframes: one that mapping is at, and one that is done when it is looked for next."""
 _PATIENCE_S = 0.02
 """Longest wait for the index of places, while lost; the next frame asks again."""
 
@@ -132,6 +134,11 @@ class BackEnd:
     def loops_closed(self) -> int:
         """Loops that have been closed, submaps that became one included."""
         return self._loops_closed
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether keyframes wait that mapping has not begun with; never on the schedule of a deterministic run."""
+        return not self._config.run.in_turn and self._link.num_on_the_way > _MOST_ON_THE_WAY
 
     def compile(self, frame: FrameArrays) -> None:
         """Compile all that is needed while frames of this kind come."""

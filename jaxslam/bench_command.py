@@ -1,6 +1,6 @@
 """`jaxslam bench`: run a suite of recordings with presets, and write a report."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from jaxslam.benchmark.gate import complaints, load_baseline, make_baseline, save_baseline
 from jaxslam.benchmark.job import Job
 from jaxslam.benchmark.page import html_report
 from jaxslam.benchmark.report import markdown_report
@@ -20,14 +21,18 @@ from jaxslam.files import write_atomically
 
 _console = Console(soft_wrap=True)
 _REPORT, _PAGE = "report.md", "report.html"
+_GATE = "gate"
 
 
 @dataclass(frozen=True)
 class Bench:
-    """Run a suite: recordings or rendered rooms, presets, several seeds. Without a suite, list those there are."""
+    """Run a suite: recordings or rendered rooms, presets, several seeds. Without a suite, list those there are.
+
+    `jaxslam bench gate --baseline FILE` runs the suite of a baseline, and fails if it has become worse.
+    """
 
     suite: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="SUITE")] = None
-    """A known suite, a YAML file, or a folder of recordings."""
+    """A known suite, a YAML file, a folder of recordings, or `gate`."""
     root: Path | None = None
     """Folder in which recordings are looked for first."""
     presets: tuple[str, ...] = ()
@@ -45,11 +50,63 @@ class Bench:
     sweep: tuple[str, ...] = ()
     """Settings with several values each, all combinations of which are run: `track.num_points=256,512`."""
 
+    baseline: Path | None = None
+    """Of the gate: the file of what to keep to."""
+    update: str | None = None
+    """Of the gate: make the figures of now those to keep to, for this reason."""
+    of: str | None = None
+    """Of the gate: the suite, where there is no baseline yet."""
+
     def main(self) -> None:
         """Run the command."""
         if self.suite is None:
             _list()
+        elif self.suite == _GATE:
+            self._gate()
+        elif self.baseline is not None or self.update is not None or self.of is not None:
+            raise BenchmarkError(f"--baseline, --update and --of: expected with `bench {_GATE}`, got '{self.suite}'")
+        else:
+            self._bench()
+
+    def _gate(self) -> None:
+        """Run the suite of a baseline, and compare."""
+        if self.baseline is None:
+            raise BenchmarkError(f"bench {_GATE}: expected --baseline FILE")
+        before = load_baseline(self.baseline) if self.baseline.exists() or self.update is None else None
+        suite = self.of or (None if before is None else before.suite)
+        if suite is None:
+            raise BenchmarkError(f"{self.baseline}: not there yet; --of SUITE says of what to make it")
+        if before is not None:
+            plain = replace(self, suite=suite, presets=self.presets or before.presets, runs=self.runs or before.runs)
+        else:
+            plain = replace(self, suite=suite)
+        out = self.out or Path("results") / "bench" / _GATE
+        plain = replace(plain, out=out)
+        results = plain._results()
+        if self.update is not None:
+            presets = tuple(dict.fromkeys(result["preset"] for result in results))
+            runs = 1 + max((result["seed"] for result in results), default=0)
+            save_baseline(self.baseline, make_baseline(suite, presets, runs, self.update, results))
+            _console.print(f"Baseline: {self.baseline}")
             return
+        assert before is not None
+        worse = complaints(before, results)
+        for complaint in worse:
+            _console.print(f"worse: {complaint}", highlight=False)
+        if worse:
+            raise BenchmarkError(f"{len(worse)} figures are worse than in {self.baseline} ({before.reason})")
+        _console.print(f"Nothing is worse than in {self.baseline}.")
+
+    def _bench(self) -> None:
+        """Run the suite, and write its report."""
+        results = self._results()
+        failed = sum(result["status"] != "done" for result in results)
+        if failed or not results:
+            raise BenchmarkError(f"{failed} of {len(results)} runs failed" if results else "nothing could be run")
+
+    def _results(self) -> list[dict[str, Any]]:
+        """Run what has not been run; the report is written, and the results given back."""
+        assert self.suite is not None
         for name, value in (("--runs", self.runs), ("--workers", self.workers)):
             if value is not None and value < 1:
                 raise BenchmarkError(f"{name}: expected at least 1, got {value}")
@@ -73,8 +130,7 @@ class Bench:
         _console.print(
             f"Report: {out / _PAGE}, {out / _REPORT}; figures: {out / RESULTS}; each run in {out}/SEQUENCE/PRESET/SEED"
         )
-        if failed or not results:
-            raise BenchmarkError(f"{failed} of {len(results)} runs failed" if results else "nothing could be run")
+        return results
 
     def _root(self) -> Path | None:
         """Where recordings are looked for first: the suite itself, if it is a folder of them."""

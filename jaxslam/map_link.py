@@ -100,6 +100,11 @@ class MapLink:
         hung = self.in_map(IDENTITY)
         return self._submap if hung is None else int(self.map.submap[self.map.row(hung.keyframe)])
 
+    @property
+    def num_on_the_way(self) -> int:
+        """Keyframes handed over that are not in the map yet."""
+        return len(self._on_the_way)
+
     def keyframe_made(
         self, timestamp_ns: int, frame: FrameArrays, output: TrackOutput, recognised: Hung | None
     ) -> NewKeyframe:

@@ -1,8 +1,10 @@
 """`Slam`: what a robot calls with every frame, and what runs a whole recording."""
 
+import gc
 import logging
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -37,6 +39,9 @@ _log = logging.getLogger(__name__)
 
 _NEVER = 1e6
 """Frames of loss: fewer than those a fresh state counts, which starts at once."""
+_PATIENT_S = 0.5
+"""Seconds from one keyframe to the next for want of points, while mapping is behind. With the preset `ngd` at the rate
+of the camera there was one every tenth of a second, and the threads held each other up."""
 _PREDICTED_S = 1.0
 """Longest time for which a constant velocity is believed."""
 
@@ -95,6 +100,9 @@ class Slam:
             )
         self._start_map, self._localize_only = map, localize_only
         self._params = track_params(camera, self.config.track)._replace(restart_after=jnp.float32(_NEVER))
+        # ORB-SLAM's local mapping does not accept keyframes either while it is busy.
+        patient = max(_PATIENT_S, self.config.track.keyframe_weak_after_s)
+        self._patient_params = self._params._replace(keyframe_weak_after_s=jnp.float32(patient))
         self._plan = track_plan(self.config.track)
         self._detector = detector or detector_of(self.config.semantics)
         self._memory = FrameMemory(camera.height, camera.width)
@@ -208,11 +216,12 @@ class Slam:
         """
         self.warm_up()
         records: list[FrameRecord] = []
-        for timestamp_ns, frame in zip(dataset.timestamps_ns, _frames_of(dataset, self.config), strict=True):
-            result = self._tracked_or_rejected(int(timestamp_ns), frame)
-            records.append(FrameRecord.of(result))
-            if on_frame is not None:
-                on_frame(frame if isinstance(frame, Frame) else None, result)
+        with _no_old_garbage():
+            for timestamp_ns, frame in zip(dataset.timestamps_ns, _frames_of(dataset, self.config), strict=True):
+                result = self._tracked_or_rejected(int(timestamp_ns), frame)
+                records.append(FrameRecord.of(result))
+                if on_frame is not None:
+                    on_frame(frame if isinstance(frame, Frame) else None, result)
         self.finish()
         return records
 
@@ -325,7 +334,8 @@ class Slam:
         return mask
 
     def _advance(self, arrays: FrameArrays, followed: Followed) -> TrackOutput:
-        self._state, output = _track_followed(self._state, arrays, followed, self._params, self._plan)
+        params = self._patient_params if self._back.is_behind else self._params
+        self._state, output = _track_followed(self._state, arrays, followed, params, self._plan)
         return jax.tree.map(np.asarray, output)  # as `device_get`, in a tenth of its time
 
     def _to_be_matched(self, output: TrackOutput) -> bool:
@@ -376,6 +386,17 @@ class Slam:
         self._times_ns.append(tracked.timestamp_ns)
         self._poses.append(tracked.T_world_cam)
         return tracked
+
+
+@contextmanager
+def _no_old_garbage() -> Iterator[None]:
+    """Have the garbage collector leave alone what was there before: to look through it all takes 0.3 s of a frame."""
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
 
 
 def _turn(twist: np.ndarray) -> float:

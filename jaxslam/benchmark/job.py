@@ -1,13 +1,15 @@
 """One run of a suite, in a process of its own: whatever it does to itself, the others and the report go on.
 
-`python -m jaxslam.benchmark.job FOLDER [ROOT]` runs the one that is written in a folder.
+`python -m jaxslam.benchmark.job FOLDER [ROOT]` runs the one that is written in a folder, as long as its input lasts.
 """
 
 import dataclasses
 import hashlib
 import json
+import os
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -101,7 +103,7 @@ def opened(clip: Clip, root: Path | None) -> Dataset:
         if folder is None:
             raise BenchmarkError(f"{clip.recording}: not on this machine; to get it: jaxslam data get {clip.recording}")
         dataset = open_dataset(folder, camera=clip.camera)
-    return dataset if clip.whole else Subset(dataset, clip.start, clip.stop)
+    return dataset if clip.whole else Subset(dataset, clip.start, clip.stop, clip.every)
 
 
 def finished(job: Job, out: Path) -> dict[str, Any] | None:
@@ -129,7 +131,12 @@ def run_in_process(job: Job, out: Path, root: Path | None) -> dict[str, Any]:
     (folder / RESULT).unlink(missing_ok=True)
     write_atomically(folder / _JOB, job.to_json().encode(), BenchmarkError)
     command = [sys.executable, "-m", "jaxslam.benchmark.job", str(folder), *([] if root is None else [str(root)])]
-    done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
+    reading, writing = os.pipe()  # which closes if this process ends, however it does
+    try:
+        done = subprocess.run(command, stdin=reading, capture_output=True, text=True, errors="replace", check=False)
+    finally:
+        os.close(reading)
+        os.close(writing)
     (folder / "log.txt").write_text(done.stdout + done.stderr)
     result = finished(job, out)
     if result is not None and done.returncode == 0:
@@ -228,7 +235,19 @@ def _problem(done: "subprocess.CompletedProcess[str]") -> str:
     return f"{how}: {last}"
 
 
+def _end_with_parent() -> None:
+    """End when the input does: a suite that was killed must not go on writing where its successor writes."""
+
+    def wait() -> None:
+        while os.read(0, 1):  # not through `sys.stdin`, whose lock would be held when the process ends
+            pass
+        os._exit(1)
+
+    threading.Thread(target=wait, name="jaxslam-parent", daemon=True).start()
+
+
 def _main(arguments: Sequence[str]) -> None:
+    _end_with_parent()
     try:
         run_here(Path(arguments[0]), Path(arguments[1]) if len(arguments) > 1 else None)
     except JaxSlamError as error:

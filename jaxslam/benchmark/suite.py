@@ -37,6 +37,7 @@ class Sequence(Checked):
         room: What is rendered; `None` for a recording.
         start: First frame.
         stop: The frame after the last; `None` for all.
+        every: All frames, or every nth, as if the camera were slower.
         camera: Known camera or camera file of the recording; `None` if its folder tells.
     """
 
@@ -47,6 +48,7 @@ class Sequence(Checked):
     room: SyntheticConfig | None = None
     start: Annotated[int, Range(at_least=0)] = 0
     stop: Annotated[int, _Positive] | None = None
+    every: Annotated[int, _Positive] = 1
     camera: str | None = None
 
     def __post_init__(self) -> None:
@@ -59,7 +61,7 @@ class Sequence(Checked):
     @property
     def whole(self) -> bool:
         """Whether all of it is run, as published figures are of."""
-        return self.start == 0 and self.stop is None
+        return self.start == 0 and self.stop is None and self.every == 1
 
 
 @dataclass(frozen=True)
@@ -176,7 +178,7 @@ def _suite(name: str, content: Mapping[str, Any]) -> Suite:
 
 
 def _sequence(place: str, entry: object) -> Sequence:
-    known = ("name", "recording", "room", "start", "stop", "camera")
+    known = ("name", "recording", "room", "start", "stop", "every", "camera")
     if not isinstance(entry, Mapping):
         raise BenchmarkError(f"{place}: expected `recording: NAME` or `room: ...`, got {entry!r}")
     fields = dict(entry)

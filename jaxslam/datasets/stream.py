@@ -18,19 +18,20 @@ _Item_co = TypeVar("_Item_co", covariant=True)
 
 
 class Subset:
-    """Frames `start` to `stop - 1` of another recording, with its camera and its whole ground truth."""
+    """Frames `start` to `stop - 1` of another recording, all or every nth, with its camera and whole ground truth."""
 
-    def __init__(self, dataset: Dataset, start: int = 0, stop: int | None = None) -> None:
-        """Choose the frames as a slice does: negative numbers count from the end.
+    def __init__(self, dataset: Dataset, start: int = 0, stop: int | None = None, step: int = 1) -> None:
+        """Choose the frames as a slice does: negative numbers of frames count from the end.
 
         Raises:
             DatasetError: If no frame is left.
         """
         self._dataset = dataset
-        self._indices = range(len(dataset))[start:stop]
+        self._indices = range(len(dataset))[start:stop:step]
         if not self._indices:
             raise DatasetError(f"{dataset.name}: expected a part of {len(dataset)} frames, got {start}:{stop}")
-        self.name = f"{dataset.name}[{self._indices.start}:{self._indices.stop}]"
+        every = f":{step}" if step > 1 else ""
+        self.name = f"{dataset.name}[{self._indices.start}:{self._indices.stop}{every}]"
 
     @property
     def camera(self) -> Camera:
@@ -40,7 +41,7 @@ class Subset:
     @property
     def timestamps_ns(self) -> np.ndarray:
         """`(n,)` int64 nanoseconds of the chosen frames."""
-        return self._dataset.timestamps_ns[self._indices.start : self._indices.stop]
+        return self._dataset.timestamps_ns[self._indices.start : self._indices.stop : self._indices.step]
 
     @property
     def ground_truth(self) -> Trajectory | None:

@@ -1,9 +1,7 @@
 """`jaxslam bench`: runs in processes of their own, reports, and going on where it was broken off."""
 
 import json
-import os
 import re
-import signal
 import subprocess
 import sys
 import time
@@ -114,13 +112,11 @@ class TestGoingOn:
         suite, folder = suite_file(tmp_path), tmp_path / "out"
         program = "from jaxslam.cli import main; main()"
         command = [sys.executable, "-c", program, "bench", suite, "--out", str(folder)]
-        process = subprocess.Popen(
-            command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
-        )
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         until = time.monotonic() + 120
         while not (done := sorted(folder.rglob("result.json"))) and time.monotonic() < until:
             time.sleep(0.05)
-        os.killpg(process.pid, signal.SIGKILL)
+        process.kill()  # its child notices by itself
         process.wait()
         assert done
         done = sorted(folder.rglob("result.json"))
@@ -172,6 +168,50 @@ class TestTrouble:
         text = capsys.readouterr().out
         assert "smoke" in text
         assert "bonn_dynamic" in text
+
+
+class TestGate:
+    """Of one preset, run once."""
+
+    @pytest.fixture(scope="class")
+    def command(self, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+        folder = tmp_path_factory.mktemp("gate")
+        command = [
+            "bench",
+            "gate",
+            "--baseline",
+            str(folder / "baseline.json"),
+            "--out",
+            str(folder / "out"),
+            "--resume",
+        ]
+        chosen = ["--presets", "default", "--runs", "1", "--of", suite_file(folder)]
+        main([*command, *chosen, "--update", "as it is now"])
+        return command
+
+    def test_nothing_is_worse(self, command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+        main(command)
+        assert "Nothing is worse" in capsys.readouterr().out
+
+    @pytest.mark.parametrize(("figure", "factor"), [("ate_rmse_m", 0.95), ("flow_ratio_median", 1 / 1.5)])
+    def test_planted_loss(
+        self, command: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path, figure: str, factor: float
+    ) -> None:
+        """As if it had been 5 % better, or 1.5 times as fast, before."""
+        better = json.loads(Path(command[3]).read_text())
+        better["rows"]["room, default"][figure] *= factor
+        (tmp_path / "better.json").write_text(json.dumps(better))
+        error = fails(capsys, "gate", "--baseline", str(tmp_path / "better.json"), *command[4:])
+        assert "1 figures are worse" in error
+        assert "as it is now" in error
+
+    def test_wrong_options(self, command: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+        nowhere = ["--baseline", str(tmp_path / "nowhere.json")]
+        assert "expected --baseline FILE" in fails(capsys, "gate")
+        assert "cannot be read" in fails(capsys, "gate", *nowhere)
+        assert "--of SUITE" in fails(capsys, "gate", *nowhere, "--update", "why")
+        assert "expected with `bench gate`" in fails(capsys, "smoke", *nowhere)
+        assert "expected a reason" in fails(capsys, *command[1:], "--update", " ")
 
 
 class TestPublished:

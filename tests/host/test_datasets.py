@@ -286,6 +286,10 @@ class TestSubset:
     def test_ends(self, tmp_path: Path) -> None:
         whole = open_tiny(write_recording(tmp_path / "walk"))
         assert len(Subset(whole)) == 6
+        slower = Subset(whole, 1, 6, 2)
+        assert (slower.name, len(slower)) == ("walk[1:6:2]", 3)
+        assert [slower[index].timestamp_ns for index in range(3)] == whole.timestamps_ns[1:6:2].tolist()
+        np.testing.assert_array_equal(slower.timestamps_ns, whole.timestamps_ns[1:6:2])
         assert Subset(whole, -2, 99).name == "walk[4:6]"
         assert Subset(Subset(whole, 1, 5), 1, 3)[0].timestamp_ns == whole.timestamps_ns[2]
         with pytest.raises(DatasetError, match="walk: expected a part of 6 frames, got 6:9"):

@@ -1,0 +1,154 @@
+"""The gate: whether a suite has become worse than it was when somebody last looked at it and said it was good.
+
+Runs are deterministic and have the same seeds, so that on one machine their errors are equal to the last digit as long
+as nothing has changed. Times are not, even as ratios to OpenCV's flow: the best run of each row is compared.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from jaxslam.benchmark.rows import rows_of
+from jaxslam.errors import BenchmarkError
+from jaxslam.files import write_atomically
+
+_WORSE_ATE, _WORSE_TIME = 0.02, 0.2
+"""Shares by which the median error, and the time of the median frame, may be greater."""
+_LEAST_ATE_M = 1e-5
+"""Smaller differences are of no interest to anybody."""
+_LEAST_PERCENT = 1e-6
+_ATE, _TRACKED, _TIME = "ate_rmse_m", "tracked_percent", "flow_ratio_median"
+_FIGURES: dict[str, str] = {_ATE: "median", _TRACKED: "least", _TIME: "least"}
+"""What is compared, and which run's: the median one's, or that of the least figure."""
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """What a suite once showed.
+
+    Attributes:
+        suite: Name of the suite, or its file.
+        presets: With what it was run.
+        runs: How often each.
+        reason: Why these figures are the ones to keep to.
+        machine: On which they were measured.
+        rows: Figures by sequence and label.
+    """
+
+    suite: str
+    presets: tuple[str, ...]
+    runs: int
+    reason: str
+    machine: str
+    rows: Mapping[str, Mapping[str, float]]
+
+
+@dataclass(frozen=True)
+class Complaint:
+    """A figure that has become worse.
+
+    Attributes:
+        row: Sequence and label.
+        figure: Which.
+        before: What it was; `None` if it is about something else than a figure.
+        now: What it is.
+    """
+
+    row: str
+    figure: str
+    before: float | None
+    now: float | None
+
+    def __str__(self) -> str:
+        if self.before is None or self.now is None:
+            return f"{self.row}: {self.figure}"
+        change = f", {100 * (self.now / self.before - 1):+.1f} %" if self.before else ""
+        return f"{self.row}: {self.figure} {self.now:.5g}, was {self.before:.5g}{change}"
+
+
+def make_baseline(
+    suite: str, presets: Sequence[str], runs: int, reason: str, results: Sequence[Mapping[str, Any]]
+) -> Baseline:
+    """The figures of runs, to keep to.
+
+    Raises:
+        BenchmarkError: If a run failed, none was made, or no reason is given.
+    """
+    if not reason.strip():
+        raise BenchmarkError("--update: expected a reason, got none")
+    failed = [result for result in results if result["status"] != "done"]
+    if failed or not results:
+        raise BenchmarkError(f"baseline: expected runs that all ended well, got {len(failed)} of {len(results)} failed")
+    machines = sorted({f"{result['cpu']}, {result['cores']} cores" for result in results})
+    return Baseline(suite, tuple(presets), runs, reason, "; ".join(machines), _figures_of(results))
+
+
+def complaints(baseline: Baseline, results: Sequence[Mapping[str, Any]]) -> list[Complaint]:
+    """What has become worse: errors by over 2 %, tracked frames at all, time by over 20 %; and what is missing."""
+    found = [
+        Complaint(f"{result['sequence']}, {result['label']}, seed {result['seed']}", result["problem"], None, None)
+        for result in results
+        if result["status"] != "done"
+    ]
+    now = _figures_of(results)
+    for row, before in baseline.rows.items():
+        if row not in now:
+            found.append(Complaint(row, "is missing", None, None))
+            continue
+        for figure, was in before.items():
+            value = now[row].get(figure)
+            if value is None:
+                found.append(Complaint(row, f"{figure} is missing", None, None))
+            elif _is_worse(figure, was, value):
+                found.append(Complaint(row, figure, was, value))
+    return found
+
+
+def load_baseline(path: Path) -> Baseline:
+    """The baseline in a file.
+
+    Raises:
+        BenchmarkError: If it is missing, or no baseline.
+    """
+    try:
+        content = json.loads(path.read_text())
+        presets = tuple(str(preset) for preset in content["presets"])
+        rows = {str(row): {str(k): float(v) for k, v in figures.items()} for row, figures in content["rows"].items()}
+        texts = (str(content[key]) for key in ("reason", "machine"))
+        return Baseline(str(content["suite"]), presets, int(content["runs"]), *texts, rows)
+    except OSError as problem:
+        raise BenchmarkError(f"{path}: expected a baseline, cannot be read: {problem.strerror}") from None
+    except (ValueError, KeyError, TypeError, AttributeError) as problem:
+        raise BenchmarkError(
+            f"{path}: expected a baseline as `bench gate --update` writes it, got {problem!r}"
+        ) from None
+
+
+def save_baseline(path: Path, baseline: Baseline) -> None:
+    """Write a baseline.
+
+    Raises:
+        BenchmarkError: If it cannot be written.
+    """
+    text = json.dumps({**vars(baseline), "rows": dict(baseline.rows)}, indent=1)
+    write_atomically(path, (text + "\n").encode(), BenchmarkError)
+
+
+def _figures_of(results: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, float]]:
+    return {
+        f"{row['sequence']}, {row['label']}": {
+            figure: round(row[figure][which], 7) for figure, which in _FIGURES.items() if row[figure] is not None
+        }
+        for row in rows_of(results)
+        if row["done"]
+    }
+
+
+def _is_worse(figure: str, before: float, now: float) -> bool:
+    if figure == _TRACKED:
+        return now < before - _LEAST_PERCENT
+    if figure == _TIME:
+        return now > before * (1 + _WORSE_TIME)
+    return now > before * (1 + _WORSE_ATE) + _LEAST_ATE_M

@@ -1,0 +1,107 @@
+"""The gate: what it lets pass and what it does not."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jaxslam.benchmark.gate import Baseline, complaints, load_baseline, make_baseline, save_baseline
+from jaxslam.errors import BenchmarkError
+
+LABELS = ("static", "default")
+
+
+def results(
+    *, ate: float = 1.0, time: float = 1.0, tracked: float = 100.0, jitter: float = 0.0
+) -> list[dict[str, Any]]:
+    """Two runs of each of two presets, their figures multiplied by so much."""
+    random = np.random.default_rng(0 if not jitter else None)
+    return [
+        {
+            "sequence": "room",
+            "label": label,
+            "seed": seed,
+            "status": "done",
+            "problem": None,
+            "cpu": "any",
+            "cores": 2,
+            "ate_rmse_m": ate * (0.01 + 0.002 * seed),
+            "tracked_percent": tracked,
+            "flow_ratio_median": time * (1 + 0.05 * seed + jitter * random.uniform()),
+        }
+        for label in LABELS
+        for seed in range(2)
+    ]
+
+
+def baseline() -> Baseline:
+    return make_baseline("smoke", LABELS, 2, "first", results())
+
+
+class TestComplaints:
+    @pytest.mark.parametrize(
+        "changes",
+        [{}, {"ate": 0.5}, {"ate": 1.015}, {"time": 0.3}, {"time": 1.15}],
+        ids=["nothing", "better", "a little worse", "faster", "a little slower"],
+    )
+    def test_none(self, changes: Mapping[str, float]) -> None:
+        assert not complaints(baseline(), results(**changes))
+
+    @pytest.mark.parametrize("run", range(20))
+    def test_times_that_jitter(self, run: int) -> None:
+        assert not complaints(baseline(), results(jitter=0.19)), f"run {run}"
+
+    @pytest.mark.parametrize(
+        ("changes", "figure"),
+        [({"ate": 1.05}, "ate_rmse_m"), ({"time": 1.5}, "flow_ratio_median"), ({"tracked": 99.9}, "tracked_percent")],
+    )
+    def test_what_is_worse(self, changes: Mapping[str, float], figure: str) -> None:
+        found = complaints(baseline(), results(**changes))
+        assert [(complaint.row, complaint.figure) for complaint in found] == [
+            (f"room, {label}", figure) for label in LABELS
+        ]
+        assert all(f"{figure} " in str(complaint) and "was" in str(complaint) for complaint in found)
+
+    def test_failed_and_missing_runs(self) -> None:
+        failed = [{**run, "status": "failed", "problem": "killed by signal 9"} for run in results()]
+        assert "killed by signal 9" in " ".join(map(str, complaints(baseline(), failed)))
+        assert [str(complaint) for complaint in complaints(baseline(), results()[:2])] == ["room, default: is missing"]
+        lost = [{**run, "ate_rmse_m": None} for run in results()]
+        assert {complaint.figure for complaint in complaints(baseline(), lost)} == {"ate_rmse_m is missing"}
+
+
+class TestFile:
+    def test_there_and_back(self, tmp_path: Path) -> None:
+        save_baseline(tmp_path / "baseline.json", baseline())
+        assert load_baseline(tmp_path / "baseline.json") == baseline()
+
+    @pytest.mark.parametrize(
+        "text", ["", "[]", "{}", '{"suite": "smoke", "presets": 3}', '{"rows": {"a": {"b": "c"}}}']
+    )
+    def test_damaged(self, tmp_path: Path, text: str) -> None:
+        path = tmp_path / "baseline.json"
+        path.write_text(text)
+        with pytest.raises(BenchmarkError, match="expected a baseline"):
+            load_baseline(path)
+        with pytest.raises(BenchmarkError, match="cannot be read"):
+            load_baseline(tmp_path / "nowhere.json")
+
+    def test_reason_and_whole_results(self) -> None:
+        with pytest.raises(BenchmarkError, match="expected a reason"):
+            make_baseline("smoke", LABELS, 2, " ", results())
+        with pytest.raises(BenchmarkError, match="ended well"):
+            make_baseline("smoke", LABELS, 2, "so", [{**results()[0], "status": "failed"}])
+        with pytest.raises(BenchmarkError, match="ended well"):
+            make_baseline("smoke", LABELS, 2, "so", [])
+
+    def test_is_plain(self, tmp_path: Path) -> None:
+        save_baseline(tmp_path / "baseline.json", baseline())
+        content = json.loads((tmp_path / "baseline.json").read_text())
+        assert content["rows"]["room, static"] == {
+            "ate_rmse_m": 0.011,
+            "tracked_percent": 100.0,
+            "flow_ratio_median": 1.0,
+        }
