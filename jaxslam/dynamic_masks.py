@@ -136,8 +136,7 @@ class DynamicMasks:
         blank = np.zeros(self._mask.shape, np.uint8)
         pyramid = _pyramid(blank)
         origin = make_origin(blank.view(bool), blank, 0)
-        for frames in (1, 2, 3):  # programs differ by whether they get NumPy's arrays or those of the one before
-            follow(origin, [pyramid] * frames, blank, blank.astype(np.float32))
+        follow(origin, [pyramid] * 2, blank, blank.astype(np.float32))
         self._surfaces.compile()
 
     def of_frame(self, frame: int, image: np.ndarray, grey: np.ndarray, depth: Float[np.ndarray, "h w"]) -> FrameMask:

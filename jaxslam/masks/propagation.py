@@ -123,7 +123,7 @@ def follow(
     """
     uv, ok = origin.uv, origin.ok
     for a, b in itertools.pairwise(pyramids):
-        uv, ok = _follow_between(a, b, uv, ok)
+        uv, ok = map(np.asarray, _follow_between(a, b, uv, ok))  # for JAX's own, programs would be compiled again
     now, followed = _follow_last(pyramids[-1], grey, uv, ok, depth, origin.spacing)
     return now, followed
 

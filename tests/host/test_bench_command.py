@@ -170,25 +170,17 @@ class TestTrouble:
         assert "bonn_dynamic" in text
 
 
+@pytest.fixture(scope="module")
+def command(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """Of a gate whose baseline is what one preset, run once, shows now."""
+    folder = tmp_path_factory.mktemp("gate")
+    command = ["bench", "gate", "--baseline", str(folder / "baseline.json"), "--out", str(folder / "out"), "--resume"]
+    chosen = ["--presets", "default", "--runs", "1", "--of", suite_file(folder)]
+    main([*command, *chosen, "--update", "as it is now"])
+    return command
+
+
 class TestGate:
-    """Of one preset, run once."""
-
-    @pytest.fixture(scope="class")
-    def command(self, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
-        folder = tmp_path_factory.mktemp("gate")
-        command = [
-            "bench",
-            "gate",
-            "--baseline",
-            str(folder / "baseline.json"),
-            "--out",
-            str(folder / "out"),
-            "--resume",
-        ]
-        chosen = ["--presets", "default", "--runs", "1", "--of", suite_file(folder)]
-        main([*command, *chosen, "--update", "as it is now"])
-        return command
-
     def test_nothing_is_worse(self, command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
         main(command)
         assert "Nothing is worse" in capsys.readouterr().out
