@@ -116,8 +116,8 @@ def load_baseline(path: Path) -> Baseline:
         content = json.loads(path.read_text())
         presets = tuple(str(preset) for preset in content["presets"])
         rows = {str(row): {str(k): float(v) for k, v in figures.items()} for row, figures in content["rows"].items()}
-        texts = (str(content[key]) for key in ("reason", "machine"))
-        return Baseline(str(content["suite"]), presets, int(content["runs"]), *texts, rows)
+        suite, reason, machine = (str(content[key]) for key in ("suite", "reason", "machine"))
+        return Baseline(suite, presets, int(content["runs"]), reason, machine, rows)
     except OSError as problem:
         raise BenchmarkError(f"{path}: expected a baseline, cannot be read: {problem.strerror}") from None
     except (ValueError, KeyError, TypeError, AttributeError) as problem:
