@@ -113,7 +113,7 @@ class Bench:
         suite = swept(load_suite(self.suite), self.sweep)
         root = self._root()
         chosen = checked_presets(self.presets) if self.presets else ()
-        jobs = [self._with_settings(job) for job in plan(suite, presets=chosen, runs=self.runs)]
+        jobs = plan(replace(suite, settings=(*self.set, *suite.settings)), presets=chosen, runs=self.runs)
         for preset, settings in {(job.preset, job.settings) for job in jobs}:
             load_config(preset, overrides=settings)  # an error now, not after hours
         absent = missing(suite, root)
@@ -140,9 +140,6 @@ class Bench:
         if root is not None and not root.is_dir():
             raise BenchmarkError(f"--root: expected a folder, got '{root}'")
         return root
-
-    def _with_settings(self, job: Job) -> Job:
-        return Job(job.clip, job.preset, job.variant, (*self.set, *job.settings), job.seed)
 
     def _prepare(self, out: Path) -> None:
         if not self.resume and out.is_dir() and any(out.iterdir()):

@@ -8,6 +8,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from jaxslam.benchmark.report import table
 from jaxslam.config import presets
 from jaxslam.errors import ConfigError, nearest
 from jaxslam.files import write_atomically
@@ -52,7 +53,7 @@ class Compare(OfRecording):
             rows.append(_row(preset, summaries))
         _console.print(_table(dataset.name, rows))
         write_atomically(out / "comparison.json", (json.dumps(rows, indent=2) + "\n").encode())
-        write_atomically(out / "comparison.md", _markdown(rows).encode())
+        write_atomically(out / "comparison.md", table(_COLUMNS, [_cells(row) for row in rows]).encode())
         _console.print(f"Table in {out}: comparison.md, comparison.json; results of each run in {out}/PRESET/SEED")
 
 
@@ -88,12 +89,7 @@ def _cells(row: dict[str, Any]) -> list[str]:
 
 
 def _table(title: str, rows: list[dict[str, Any]]) -> Table:
-    table = Table(*_COLUMNS, title=title, title_justify="left")
+    drawn = Table(*_COLUMNS, title=title, title_justify="left")
     for row in rows:
-        table.add_row(*_cells(row))
-    return table
-
-
-def _markdown(rows: list[dict[str, Any]]) -> str:
-    lines = [_COLUMNS, ["---"] * len(_COLUMNS), *(_cells(row) for row in rows)]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+        drawn.add_row(*_cells(row))
+    return drawn

@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -11,7 +12,7 @@ from jaxslam.benchmark.job import Job, finished, run_in_process
 from jaxslam.benchmark.suite import Suite
 from jaxslam.errors import BenchmarkError
 from jaxslam.files import write_atomically
-from jaxslam.recordings import find_recording
+from jaxslam.recordings import found_recordings
 
 RESULTS = "results.json"
 
@@ -45,7 +46,8 @@ def plan(suite: Suite, *, presets: Sequence[str] = (), runs: int | None = None) 
 def missing(suite: Suite, root: Path | None) -> list[str]:
     """Names of recordings that are not on this machine."""
     wanted = dict.fromkeys(clip.recording for clip in suite.sequences if clip.recording)
-    return [name for name in wanted if find_recording(name, root) is None]
+    found = found_recordings(root)
+    return [name for name in wanted if name not in found]
 
 
 def swept(suite: Suite, sweeps: Iterable[str]) -> Suite:
@@ -69,7 +71,7 @@ def swept(suite: Suite, sweeps: Iterable[str]) -> Suite:
             for name, settings in variants.items()
             for value in values.split(",")
         }
-    return Suite(suite.name, suite.about, suite.sequences, suite.presets, suite.runs, suite.settings, variants)
+    return replace(suite, variants=variants)
 
 
 def run_jobs(

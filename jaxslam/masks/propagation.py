@@ -96,7 +96,8 @@ def make_origin(mask: Bool[np.ndarray, "h w"], grey: UInt8[np.ndarray, "h w"], s
     """
     sampled = sample_mask(mask, grey, CAPACITY, seed)
     count, region = sampled.uv.shape[1], _bounded(mask)
-    uv, ok, spacing = aligned_array((2, CAPACITY), np.float32), aligned_array((CAPACITY,), np.bool_), _scalar()
+    uv, spacing = (aligned_array(shape, np.float32) for shape in ((2, CAPACITY), ()))
+    ok = aligned_array((CAPACITY,), np.bool_)
     uv[:, :count], uv[:, count:] = sampled.uv, 0
     ok[:], spacing[...] = np.arange(CAPACITY) < count, sampled.spacing
     num, piece = 1, np.zeros((0, 0), np.int32)
@@ -124,8 +125,7 @@ def follow(
     uv, ok = origin.uv, origin.ok
     for a, b in itertools.pairwise(pyramids):
         uv, ok = map(np.asarray, _follow_between(a, b, uv, ok))  # for JAX's own, programs would be compiled again
-    now, followed = _follow_last(pyramids[-1], grey, uv, ok, depth, origin.spacing)
-    return now, followed
+    return _follow_last(pyramids[-1], grey, uv, ok, depth, origin.spacing)
 
 
 @jax.jit
@@ -246,10 +246,6 @@ def _pieces(piece: Int32[np.ndarray, "h w"], wanted: Bool[np.ndarray, " num"]) -
     """Where one of the wanted pieces is. Mostly there is one, and to compare is faster than to look up in a table."""
     numbers = np.flatnonzero(wanted)
     return piece == numbers[0] if len(numbers) == 1 else wanted[piece]
-
-
-def _scalar() -> np.ndarray:
-    return aligned_array((), np.float32)
 
 
 def _flow(before: Pyramid, now: Pyramid, uv: Pixels, ok: Mask) -> tuple[Pixels, Mask]:
