@@ -202,7 +202,6 @@ class TestGate:
         assert "expected --baseline FILE" in fails(capsys, "gate")
         assert "cannot be read" in fails(capsys, "gate", *nowhere)
         assert "--of SUITE" in fails(capsys, "gate", *nowhere, "--update", "why")
-        assert "expected with `bench gate`" in fails(capsys, "smoke", *nowhere)
         assert "expected a reason" in fails(capsys, *command[1:], "--update", " ")
 
 

@@ -40,10 +40,10 @@ def trajectories(tmp_path: Path) -> tuple[str, str]:
 
 
 class TestHelp:
-    @pytest.mark.parametrize("command", ["demo", "run", "eval", "doctor"])
+    @pytest.mark.parametrize("command", ["demo", "run", "eval", "doctor", "bench", "bench gate"])
     def test_of_a_command(self, capsys: pytest.CaptureFixture[str], command: str) -> None:
         with pytest.raises(SystemExit) as stop:
-            main([command, "--help"])
+            main([*command.split(), "--help"])
         assert stop.value.code == 0
         assert f"usage: jaxslam {command}" in " ".join(capsys.readouterr().out.split())
 

@@ -17,8 +17,9 @@ import numpy as np
 import pytest
 from tiny_recording import write_recording
 
-from jaxslam import data_command, recordings
+from jaxslam import recordings
 from jaxslam.cli import main
+from jaxslam.commands import data as data_command
 from jaxslam.datasets import open_dataset
 from jaxslam.download import download
 from jaxslam.recordings import Recording, find_recording

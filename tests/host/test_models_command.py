@@ -11,8 +11,9 @@ import cv2
 import numpy as np
 import pytest
 
-from jaxslam import known_models, models_command
+from jaxslam import known_models
 from jaxslam.cli import main
+from jaxslam.commands import models as models_command
 from jaxslam.draw_detections import draw_detections
 from jaxslam.errors import DownloadError
 from jaxslam.known_models import KNOWN_MODELS, known_model

@@ -10,10 +10,10 @@ from typing import Annotated, Any, TypeAlias
 import cv2
 import numpy as np
 import tyro
-from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 from rich.table import Table
 
+from jaxslam.commands.console import plain_console
 from jaxslam.datasets.image_file import read_color
 from jaxslam.download import download, sha256_of
 from jaxslam.draw_detections import draw_detections
@@ -30,7 +30,6 @@ from jaxslam.known_models import (
 )
 from jaxslam.semantics import Detections, load_detector
 
-_console = Console(soft_wrap=True, markup=False, highlight=False)
 _REPEATS = 5
 
 
@@ -50,13 +49,13 @@ class ListModels:
             mark = " (default)" if model.name == DEFAULT_MODEL else ""
             absent = "no" if model.url else "no, to be made by hand"
             table.add_row(model.name + mark, size, model.licence, model.adapter, "yes" if files[model.name] else absent)
-        _console.print(table)
+        plain_console.print(table)
         for name, file in files.items():
             if file is not None:
-                _console.print(f"{name}: {file}")
+                plain_console.print(f"{name}: {file}")
         if self.details:
             _print_details()
-        _console.print(f"Downloads go to {models_dir()}; a folder named by JAXSLAM_MODELS is looked at first.")
+        plain_console.print(f"Downloads go to {models_dir()}; a folder named by JAXSLAM_MODELS is looked at first.")
 
 
 @dataclass(frozen=True)
@@ -72,19 +71,19 @@ class GetModel:
         """Run the command."""
         model, found = known_model(self.name), local_file(known_model(self.name))
         if found is not None and not self.force:
-            _console.print(f"{model.name} is on this machine: {found}")
+            plain_console.print(f"{model.name} is on this machine: {found}")
             if model.sha256 is not None and sha256_of(found) != model.sha256:
-                _console.print("It is another file than the published one, which --force downloads.")
+                plain_console.print("It is another file than the published one, which --force downloads.")
             return
         target = models_dir() / model.file
         if model.url is None:
             raise ModelError(f"{model.name} cannot be downloaded; {model.how}. Then place the file at {target}")
         _download(model, model.url, target)
         checked = "as expected" if model.sha256 else "which nobody has checked: no published one is known"
-        _console.print(f"{model.name}: {target}, {model.licence}, see {model.page}")
-        _console.print(f"SHA-256 {sha256_of(target)}, {checked}")
+        plain_console.print(f"{model.name}: {target}, {model.licence}, see {model.page}")
+        plain_console.print(f"SHA-256 {sha256_of(target)}, {checked}")
         if local_file(model) != target:
-            _console.print(f"Used before it is, as JAXSLAM_MODELS says: {local_file(model)}")
+            plain_console.print(f"Used before it is, as JAXSLAM_MODELS says: {local_file(model)}")
 
 
 @dataclass(frozen=True)
@@ -117,10 +116,10 @@ class CheckModel:
         detector = load_detector(path, labels=labels, min_score=self.min_score, adapter=self.adapter)
         found, first_ms, median_ms = _timed(detector, image)
         _print_found(found, labels, self.min_score)
-        _console.print(f"{median_ms:.1f} ms an image, the first {first_ms:.1f} ms ({path})")
+        plain_console.print(f"{median_ms:.1f} ms an image, the first {first_ms:.1f} ms ({path})")
         bgr = cv2.cvtColor(draw_detections(image, found), cv2.COLOR_RGB2BGR)
         write_atomically(self.out, cv2.imencode(".png", bgr)[1].tobytes())
-        _console.print(f"Picture: {self.out}")
+        plain_console.print(f"Picture: {self.out}")
 
 
 _Command: TypeAlias = (
@@ -143,16 +142,16 @@ class Models:
 
 def _print_details() -> None:
     for model in KNOWN_MODELS.values():
-        _console.print(f"\n{model.name}: {model.about}; {model.page}")
-        _console.print(f"  {model.url or model.how}")
+        plain_console.print(f"\n{model.name}: {model.about}; {model.page}")
+        plain_console.print(f"  {model.url or model.how}")
         if model.sha256 is not None:
-            _console.print(f"  SHA-256 {model.sha256}")
-    _console.print()
+            plain_console.print(f"  SHA-256 {model.sha256}")
+    plain_console.print()
 
 
 def _download(model: KnownModel, url: str, target: Path) -> None:
     columns = (TextColumn(model.name), BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=_console) as progress:
+    with Progress(*columns, console=plain_console) as progress:
         task = progress.add_task("download", total=model.size_bytes)
         show: Callable[[int, int | None], None] = lambda done, total: progress.update(task, completed=done, total=total)
         download(url, target, sha256=model.sha256, size=model.size_bytes, progress=show)
@@ -177,8 +176,8 @@ def _print_found(found: Detections, labels: tuple[str, ...], min_score: float) -
         )
         for label, score, box, share in zip(found.labels, found.scores, found.boxes, shares, strict=True):
             table.add_row(label, f"{score:.2f}", *(f"{edge:.0f}" for edge in box), share)
-        _console.print(table)
+        plain_console.print(table)
     elif found.class_mask is None:
-        _console.print(f"Found nothing: no {' or '.join(labels)} with a score of at least {min_score}.")
+        plain_console.print(f"Found nothing: no {' or '.join(labels)} with a score of at least {min_score}.")
     if found.class_mask is not None:
-        _console.print(f"{' or '.join(labels)}: {found.class_mask.mean():.1%} of the picture, by class map")
+        plain_console.print(f"{' or '.join(labels)}: {found.class_mask.mean():.1%} of the picture, by class map")

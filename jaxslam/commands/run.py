@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import tyro
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from jaxslam.commands.console import console
 from jaxslam.config import Config, load_config
 from jaxslam.datasets import Dataset, Subset, dataset_kinds, open_dataset
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
@@ -30,7 +30,6 @@ from jaxslam.xla import prefer_one_thread
 if TYPE_CHECKING:
     from jaxslam.viewer import Viewer
 
-_console = Console(soft_wrap=True)
 _OnFrame: TypeAlias = Callable[[Frame | None, Tracked | Rejected], None]
 _Settings: TypeAlias = Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction]
 
@@ -60,7 +59,7 @@ class Demo:
     def main(self) -> None:
         """Run the command."""
         scene = SyntheticConfig(frames=self.frames, path=self.path, people=self.people, seed=self.seed)
-        _console.print(f"Rendering a room with {self.people} people, the camera moving as in '{self.path}'.")
+        console.print(f"Rendering a room with {self.people} people, the camera moving as in '{self.path}'.")
         dataset = SyntheticDataset(scene)
         slam = Slam(dataset.camera, load_config())
         viewer = _viewer(slam, dataset, live=self.viz, path=self.rrd)
@@ -148,7 +147,7 @@ class Run(OfRecording):
         track(dataset, slam, self.preset, self.folder(), viewer)
         if self.save_map is not None:
             slam.save(self.save_map)
-            _console.print(f"Map in {self.save_map}: {len(slam.map.ids)} keyframes, {len(slam.map.points.ids)} points")
+            console.print(f"Map in {self.save_map}: {len(slam.map.ids)} keyframes, {len(slam.map.points.ids)} points")
 
 
 @dataclass
@@ -182,10 +181,10 @@ def track(
 ) -> dict[str, Any]:
     """Track with a progress bar, write the results, and print them unless `quiet`; gives the summary."""
     began = time.perf_counter()
-    with _console.status("Compiling the tracker (some 15 s at the first start on a machine, then 2) ..."):
+    with console.status("Compiling the tracker (some 15 s at the first start on a machine, then 2) ..."):
         slam.warm_up()
     if not quiet:
-        _console.print(f"Tracker ready after {slam.compile_s:.1f} s.")
+        console.print(f"Tracker ready after {slam.compile_s:.1f} s.")
     columns = (
         TextColumn("Tracking"),
         BarColumn(),
@@ -195,7 +194,7 @@ def track(
     )
     snapshots, masks = Snapshots(len(dataset)), MaskPictures()
     watchers = [snapshots, masks] if viewer is None else [snapshots, masks, viewer]
-    with slam, viewer or nullcontext(), Progress(*columns, console=_console) as progress:
+    with slam, viewer or nullcontext(), Progress(*columns, console=console) as progress:
         meter = _Meter(progress, progress.add_task("track", total=len(dataset), status=""), watchers)
         records = slam.run(dataset, meter)
     info = RunInfo(dataset, preset, time.perf_counter() - began)
@@ -222,12 +221,12 @@ def _print_summary(summary: dict[str, Any], evaluation: Evaluation | None, out: 
     if summary["track_ms"] is not None:
         for name in ("median", "p95", "max"):
             table.add_row(f"tracking time, {name}", number(summary["track_ms"][name], 1), "ms a frame")
-    _console.print(table)
+    console.print(table)
     if evaluation is None:
-        _console.print(f"Not evaluated: {summary['evaluation_problem']}.")
+        console.print(f"Not evaluated: {summary['evaluation_problem']}.")
     for note in evaluation.notes if evaluation is not None else ():
-        _console.print(f"Note: {note}.")
-    _console.print(f"Results in {out}: {', '.join(name for name in RESULT_FILES if (out / name).exists())}")
+        console.print(f"Note: {note}.")
+    console.print(f"Results in {out}: {', '.join(name for name in RESULT_FILES if (out / name).exists())}")
 
 
 def number(value: float | None, digits: int) -> str:

@@ -5,18 +5,17 @@ import statistics
 from dataclasses import dataclass
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
 from jaxslam.benchmark.report import table
+from jaxslam.commands.console import console
+from jaxslam.commands.run import OfRecording, number, track
 from jaxslam.config import presets
 from jaxslam.errors import ConfigError, nearest
 from jaxslam.files import write_atomically
-from jaxslam.run_command import OfRecording, number, track
 from jaxslam.slam import Slam
 from jaxslam.xla import prefer_one_thread
 
-_console = Console(soft_wrap=True)
 _COLUMNS = ("preset", "tracked", "dropped", "ATE, m", "from - to", "ATE Sim(3), m", "mean ms", "median ms", "p95 ms")
 
 
@@ -46,15 +45,15 @@ class Compare(OfRecording):
         for preset in self.presets:
             summaries = []
             for seed in range(self.runs):
-                _console.print(f"{preset}, run {seed + 1} of {self.runs}")
+                console.print(f"{preset}, run {seed + 1} of {self.runs}")
                 slam = Slam(dataset.camera, self.settings(preset, f"run.seed={seed}"))
                 folder = out / preset / str(seed)
                 summaries.append(track(dataset, slam, preset, folder, quiet=True))
             rows.append(_row(preset, summaries))
-        _console.print(_table(dataset.name, rows))
+        console.print(_table(dataset.name, rows))
         write_atomically(out / "comparison.json", (json.dumps(rows, indent=2) + "\n").encode())
         write_atomically(out / "comparison.md", table(_COLUMNS, [_cells(row) for row in rows]).encode())
-        _console.print(f"Table in {out}: comparison.md, comparison.json; results of each run in {out}/PRESET/SEED")
+        console.print(f"Table in {out}: comparison.md, comparison.json; results of each run in {out}/PRESET/SEED")
 
 
 def _row(preset: str, summaries: list[dict[str, Any]]) -> dict[str, Any]:

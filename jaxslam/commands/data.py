@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 from rich.table import Table
 
+from jaxslam.commands.console import plain_console
 from jaxslam.download import download, sha256_of
 from jaxslam.errors import DatasetError
 from jaxslam.recordings import (
@@ -24,7 +25,6 @@ from jaxslam.recordings import (
 )
 from jaxslam.unpack import unpack
 
-_console = Console(soft_wrap=True, markup=False, highlight=False)
 _UNPACKED_PER_ARCHIVE = 1.2
 """Images hardly get smaller in an archive: two of TUM unpack to 1.07 and 1.08 times its size."""
 _WIDEST = 4000
@@ -49,11 +49,11 @@ class ListRecordings:
         # As wide as its longest path, whatever the terminal: names and paths are there to be copied.
         Console(width=_WIDEST, markup=False, highlight=False, soft_wrap=True).print(table)
         here = sum(name in found for name in known)
-        _console.print(f"{here} of {len(known)} are on this machine. To download one: jaxslam data get NAME")
+        plain_console.print(f"{here} of {len(known)} are on this machine. To download one: jaxslam data get NAME")
         pages = dict.fromkeys((recording.dataset, recording.page) for recording in shown)
         for dataset, page in pages:
-            _console.print(f"{dataset}: {page}")
-        _console.print(f"Downloads go to {recordings_dir()}; a folder named by JAXSLAM_DATA is looked at first.")
+            plain_console.print(f"{dataset}: {page}")
+        plain_console.print(f"Downloads go to {recordings_dir()}; a folder named by JAXSLAM_DATA is looked at first.")
 
 
 @dataclass(frozen=True)
@@ -72,20 +72,20 @@ class GetRecording:
         recording = known_recording(self.name)
         root = self.out if self.out is not None and self.out.is_dir() else None
         if (found := find_recording(recording.name, root)) is not None:
-            _console.print(f"{recording.name} is on this machine: {found}")
+            plain_console.print(f"{recording.name} is on this machine: {found}")
             _print_next(recording, found)
             return
         if recording.url is None:
             raise DatasetError(f"{recording.name} cannot be downloaded alone; {recording.how}. See {recording.page}")
         folder = self.out or recordings_dir()
         target, archive = folder / recording.name, folder / recording.archive
-        _console.print(f"{recording.dataset}, licence: {recording.licence}, see {recording.page}")
+        plain_console.print(f"{recording.dataset}, licence: {recording.licence}, see {recording.page}")
         _fetch_and_unpack(recording, recording.url, archive, target)
         if not self.keep_archive:
             _delete(archive)
-        _console.print(f"{recording.name}: {target}")
+        plain_console.print(f"{recording.name}: {target}")
         if self.keep_archive:
-            _console.print(f"Archive: {archive}")
+            plain_console.print(f"Archive: {archive}")
         _print_next(recording, target)
 
 
@@ -111,7 +111,7 @@ def _size(recording: Recording) -> str:
 
 def _print_next(recording: Recording, folder: Path) -> None:
     if recording.kind != "kitti":
-        _console.print(f"To track it: jaxslam run {shlex.quote(str(folder))}")
+        plain_console.print(f"To track it: jaxslam run {shlex.quote(str(folder))}")
 
 
 def _fetch_and_unpack(recording: Recording, url: str, archive: Path, target: Path) -> None:
@@ -122,7 +122,7 @@ def _fetch_and_unpack(recording: Recording, url: str, archive: Path, target: Pat
         TransferSpeedColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=_console) as progress:
+    with Progress(*columns, console=plain_console) as progress:
         was_there = archive.is_file()
         if was_there:
             _check(recording, archive)

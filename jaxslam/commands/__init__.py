@@ -1,0 +1,1 @@
+"""The commands of `jaxslam`, one file each; `cli.py` chooses."""

@@ -1,0 +1,51 @@
+"""`jaxslam bench gate`: whether a suite has become worse than its baseline."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from jaxslam.benchmark.gate import complaints, load_baseline, make_baseline, save_baseline
+from jaxslam.commands.bench import RunsOfSuite
+from jaxslam.commands.console import console
+from jaxslam.errors import BenchmarkError
+
+_OUT = Path("results") / "bench" / "gate"
+
+
+@dataclass(frozen=True)
+class Gate(RunsOfSuite):
+    """Run the suite of a baseline, and fail if errors, coverage or times have become worse."""
+
+    baseline: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """What to keep to."""
+    update: str | None = None
+    """Make the figures of now those to keep to, for this reason."""
+    of: str | None = None
+    """The suite, where there is no baseline yet."""
+
+    def main(self) -> None:
+        """Run the command."""
+        if self.baseline is None:
+            raise BenchmarkError("bench gate: expected --baseline FILE")
+        before = load_baseline(self.baseline) if self.baseline.exists() or self.update is None else None
+        suite = self.of or (None if before is None else before.suite)
+        if suite is None:
+            raise BenchmarkError(f"{self.baseline}: not there yet; --of SUITE says of what to make it")
+        presets, runs = (self.presets, self.runs) if before is None else (before.presets, before.runs)
+        options = replace(self, presets=self.presets or presets, runs=self.runs or runs, out=self.out or _OUT)
+        results = options.results(suite)
+        if self.update is not None:
+            ran = tuple(dict.fromkeys(result["preset"] for result in results))
+            repeats = 1 + max((result["seed"] for result in results), default=0)
+            save_baseline(self.baseline, make_baseline(suite, ran, repeats, self.update, results))
+            console.print(f"Baseline: {self.baseline}")
+            return
+        assert before is not None
+        worse = complaints(before, results)
+        for complaint in worse:
+            console.print(f"worse: {complaint}", highlight=False)
+        if worse:
+            raise BenchmarkError(f"{len(worse)} figures are worse than in {self.baseline} ({before.reason})")
+        console.print(f"Nothing is worse than in {self.baseline}.")
