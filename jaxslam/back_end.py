@@ -28,6 +28,7 @@ from jaxslam.place_index import PlaceIndex
 from jaxslam.place_recognition import compile_recognition, recognise
 from jaxslam.pose import IDENTITY, compose, inverse, transform
 from jaxslam.recall import Recalled, recall
+from jaxslam.stage_times import StageTimes
 from jaxslam.state import TrackOutput, TrackParams, TrackPlan, TrackReason, TrackState, TrackStatus
 from jaxslam.state_edit import relocated
 from jaxslam.track import init_state
@@ -97,6 +98,7 @@ class BackEnd:
         map: Map | None = None,
         *,
         localize_only: bool = False,
+        times: StageTimes | None = None,
     ) -> None:
         """Start with a map, empty by default.
 
@@ -107,7 +109,9 @@ class BackEnd:
             config: Settings.
             map: To start with.
             localize_only: Leave the map as it is.
+            times: Where to keep how long the jobs of the threads take.
         """
+        self._times = times or StageTimes()
         self._params, self._track_plan, self._plan = params, plan, mapping_plan(config.mapping, config.track)
         self._camera, self._config, self._localize_only = camera, config, localize_only
         start = empty_map(camera) if map is None else map
@@ -308,7 +312,10 @@ class BackEnd:
     def _worker(self, work: Callable[[Any], Any], name: str, turn: int) -> Worker[Any, Any]:
         latency_frames = turn * self._config.mapping.latency_frames
         return make_worker(
-            work, f"jaxslam-{name}", deterministic=self._config.run.in_turn, latency_frames=latency_frames
+            self._times.timed(name, work),
+            f"jaxslam-{name}",
+            deterministic=self._config.run.in_turn,
+            latency_frames=latency_frames,
         )
 
     def _map_job(self, job: NewKeyframe | LoopClosure) -> _MapUpdate:

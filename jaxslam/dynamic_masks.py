@@ -22,6 +22,7 @@ from jaxslam.masks.reduced import Raster, Reduced
 from jaxslam.masks.surfaces import SurfaceMemory
 from jaxslam.semantic_thread import Found, Seen, SemanticThread
 from jaxslam.semantics import Detector
+from jaxslam.stage_times import StageTimes
 from jaxslam.xla import IN_ITS_THREAD
 
 _MOST_FRAMES = 30
@@ -100,6 +101,7 @@ class DynamicMasks:
         farthest_m: float = math.inf,
         dilate_px: int = 2,
         seed: int = 0,
+        times: StageTimes | None = None,
     ) -> None:
         """Start with no mask.
 
@@ -113,6 +115,7 @@ class DynamicMasks:
             farthest_m: Depth beyond says nothing of those.
             dilate_px: How far a mask reaches beyond what was found.
             seed: Of random choices.
+            times: Where to keep how long the detector takes.
         """
         self._propagate, self._newcomers, self._dilate_px, self._seed = propagate, newcomers, dilate_px, seed
         self._reduced = Reduced(Raster.of(camera), WIDTH_PX)
@@ -120,7 +123,12 @@ class DynamicMasks:
             None
             if detector is None
             else SemanticThread(
-                detector, self._reduced, deterministic=deterministic, latency_frames=latency_frames, seed=seed
+                detector,
+                self._reduced,
+                deterministic=deterministic,
+                latency_frames=latency_frames,
+                seed=seed,
+                times=times,
             )
         )
         self._surfaces = SurfaceMemory(self._reduced.raster, farthest_m)

@@ -1,4 +1,4 @@
-"""What a run leaves behind: trajectories, a summary, the settings in effect, and a picture."""
+"""What a run leaves behind: trajectories, a log of its frames, a summary, the settings in effect, and pictures."""
 
 import json
 import platform
@@ -19,41 +19,25 @@ from jaxslam.datasets import Dataset
 from jaxslam.errors import TrajectoryError
 from jaxslam.evaluation import Evaluation, evaluate
 from jaxslam.files import write_atomically
-from jaxslam.frame import Frame
+from jaxslam.frame_log import write_errors, write_frames
 from jaxslam.map_export import write_keyframe_trajectory
 from jaxslam.mask_pictures import write_mask_pictures
+from jaxslam.run_pictures import RunPictures
 from jaxslam.slam import Slam
 from jaxslam.state import TrackStatus
-from jaxslam.tracked import FrameRecord, Rejected, Tracked
+from jaxslam.tracked import FrameRecord
 from jaxslam.trajectory import write_tum
-from jaxslam.visualize import Snapshot, plot_map, plot_trajectory
+from jaxslam.visualize import Snapshot, plot_map, plot_snapshots, plot_trajectory
 from jaxslam.xla import threads, usable_cores
 
 _PACKAGES = ("jaxslam", "jax", "jaxlib", "jaxlie", "equinox", "optimistix", "numpy", "opencv-python-headless")
-_ALWAYS = ("trajectory.txt", "trajectory_online.txt", "summary.json", "config.yaml")
+_ALWAYS = ("trajectory.txt", "trajectory_online.txt", "frames.csv", "summary.json", "config.yaml")
 _OF_THE_PATH = ("plot.png",)
 _OF_THE_MAP = ("trajectory_keyframes.txt", "map.png")
+_ERRORS, _FAILURES = "errors.csv", "failures.png"
 _OF_MASKS = ("masks.png", "masks.gif")
-RESULT_FILES = (*_ALWAYS, *_OF_THE_PATH, *_OF_THE_MAP, *_OF_MASKS)
-"""All that a run can leave behind: no path, no keyframes, no masks, none of their files."""
-_NUM_SNAPSHOTS = 4
-
-
-class Snapshots:
-    """Keeps a few frames of a run, evenly spread, with their points: the `on_frame` of `Slam.run`."""
-
-    def __init__(self, num_frames: int) -> None:
-        """Choose which of `num_frames` frames to keep."""
-        self._wanted = set(np.linspace(0, num_frames - 1, _NUM_SNAPSHOTS + 1)[1:].round().astype(int).tolist())
-        self._seen = 0
-        self.kept: list[Snapshot] = []
-
-    def __call__(self, frame: Frame | None, result: Tracked | Rejected) -> None:
-        """Look at one frame."""
-        if self._seen in self._wanted and frame is not None and isinstance(result, Tracked):
-            title = f"frame {self._seen}: {result.status.name}, {result.num_inliers} inliers"
-            self.kept.append(Snapshot(title, frame.image, result.uv, result.weights, result.followed))
-        self._seen += 1
+RESULT_FILES = (*_ALWAYS, *_OF_THE_PATH, *_OF_THE_MAP, _ERRORS, _FAILURES, *_OF_MASKS)
+"""All that a run can leave behind: no path, no keyframes, no truth, no masks, none of their files."""
 
 
 @dataclass(frozen=True)
@@ -70,8 +54,7 @@ def write_results(
     slam: Slam,
     records: Sequence[FrameRecord],
     info: RunInfo,
-    snapshots: Sequence[Snapshot] = (),
-    masks: Sequence[np.ndarray] = (),
+    pictures: RunPictures | None = None,
 ) -> tuple[dict[str, Any], Evaluation | None]:
     """Write those of `RESULT_FILES` there is something for: trajectories, a summary, the settings, pictures.
 
@@ -81,8 +64,7 @@ def write_results(
         slam: What tracked.
         records: From `Slam.run`.
         info: The recording and how it was run.
-        snapshots: Frames to show below the plots.
-        masks: `MaskPictures.kept`.
+        pictures: What was kept of its frames, to be shown.
 
     Returns:
         The summary, and the evaluation if there is ground truth to compare with.
@@ -98,25 +80,51 @@ def write_results(
     summary = _summary(slam, records, info, evaluation) | {"evaluation_problem": problem}
     write_tum(folder / "trajectory.txt", slam.trajectory)
     write_tum(folder / "trajectory_online.txt", slam.online_trajectory)
+    write_frames(folder / "frames.csv", records)
     write_atomically(folder / "config.yaml", to_yaml(slam.config).encode())
     write_atomically(folder / "summary.json", (json.dumps(summary, indent=2) + "\n").encode())
-    absent: list[str] = []
-    if len(slam.trajectory):
-        plot_trajectory(slam.trajectory, truth, evaluation, folder / "plot.png", snapshots)
-    else:
-        absent += _OF_THE_PATH
-    if len(slam.map.ids):
-        write_keyframe_trajectory(folder / "trajectory_keyframes.txt", slam.map)
-        plot_map(slam.map, slam.trajectory, folder / "map.png")
-    else:
-        absent += _OF_THE_MAP
-    if masks:
-        write_mask_pictures(folder, masks)
-    else:
-        absent += _OF_MASKS
-    for name in absent:
+    there = {*_ALWAYS, *_write_pictures(folder, slam, info, evaluation, pictures or RunPictures(0))}
+    if evaluation is not None:
+        write_errors(folder / _ERRORS, evaluation)
+        there.add(_ERRORS)
+    for name in there.symmetric_difference(RESULT_FILES):
         (folder / name).unlink(missing_ok=True)
     return summary, evaluation
+
+
+def _write_pictures(
+    folder: Path, slam: Slam, info: RunInfo, evaluation: Evaluation | None, pictures: RunPictures
+) -> list[str]:
+    """Write the pictures there is something for; gives the names of the files."""
+    written: list[str] = []
+    if len(slam.trajectory):
+        plot_trajectory(
+            slam.trajectory, info.dataset.ground_truth, evaluation, folder / _OF_THE_PATH[0], pictures.snapshots
+        )
+        written += _OF_THE_PATH
+    if len(slam.map.ids):
+        write_keyframe_trajectory(folder / _OF_THE_MAP[0], slam.map)
+        plot_map(slam.map, slam.trajectory, folder / _OF_THE_MAP[1])
+        written += _OF_THE_MAP
+    failures = [*pictures.losses, *_worst(info.dataset, evaluation)]
+    if failures:
+        plot_snapshots(failures, folder / _FAILURES)
+        written.append(_FAILURES)
+    if pictures.masks:
+        write_mask_pictures(folder, pictures.masks)
+        written += _OF_MASKS
+    return written
+
+
+def _worst(dataset: Dataset, evaluation: Evaluation | None) -> list[Snapshot]:
+    """The frame of the largest error, without points, if errors are known."""
+    if evaluation is None:
+        return []
+    index = int(np.argmax(evaluation.errors_m))
+    frame = int(np.searchsorted(dataset.timestamps_ns, evaluation.timestamps_ns[index]))
+    title = f"frame {frame}: the largest error, {evaluation.errors_m[index]:.4f} m"
+    nothing = np.zeros((2, 0)), np.zeros(0), np.zeros(0, bool)
+    return [Snapshot(title, dataset[frame].image, *nothing)]
 
 
 def _summary(
@@ -154,6 +162,7 @@ def _summary(
         "mask_sources": dict(sorted(Counter(record.mask_source.name for record in records).items())),
         "mask_age_frames": _distribution([record.mask_age for record in records if record.mask_age >= 0]),
         "detector_errors": sum(bool(record.detector_error) for record in records),
+        "stage_ms": {stage: _distribution(times.tolist()) for stage, times in slam.times.ms.items()},
         "track_ms": _distribution([record.track_ms for record in records if record.track_ms is not None]),
         "compile_s": round(slam.compile_s, 3),
         "wall_s": round(info.wall_s, 3),

@@ -14,6 +14,7 @@ from jaxslam.masks.box_mask import mask_of_detections, reduced_detections
 from jaxslam.masks.propagation import Origin, make_origin
 from jaxslam.masks.reduced import Reduced
 from jaxslam.semantics import Detector
+from jaxslam.stage_times import StageTimes
 from jaxslam.worker import InlineWorker, Worker, make_worker
 
 _log = logging.getLogger(__name__)
@@ -58,7 +59,14 @@ class SemanticThread:
     """
 
     def __init__(
-        self, detector: Detector, reduced: Reduced, *, deterministic: bool, latency_frames: int, seed: int = 0
+        self,
+        detector: Detector,
+        reduced: Reduced,
+        *,
+        deterministic: bool,
+        latency_frames: int,
+        seed: int = 0,
+        times: StageTimes | None = None,
     ) -> None:
         """Begin idle.
 
@@ -68,13 +76,17 @@ class SemanticThread:
             deterministic: Have it look in turn, its masks `latency_frames` later; else in a thread.
             latency_frames: 0 has every frame wait for its mask, in a thread too.
             seed: Of random choices.
+            times: Where to keep how long a look takes.
         """
         self.looking_at: int | None = None
         self._offered: int | None = None
         self._detector, self._reduced, self._seed = detector, reduced, seed
         self._all_wait, self._begun, self._said = latency_frames == 0, False, ""
         self._worker: Worker[Seen, Found] = make_worker(
-            self._look, "jaxslam-semantics", deterministic=deterministic, latency_frames=latency_frames
+            (times or StageTimes()).timed("detector", self._look),
+            "jaxslam-semantics",
+            deterministic=deterministic,
+            latency_frames=latency_frames,
         )
 
     def newest(self, seen: Seen) -> tuple[Found | None, str]:

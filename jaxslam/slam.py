@@ -28,6 +28,7 @@ from jaxslam.map_file import load_map, save_map
 from jaxslam.map_link import Hung
 from jaxslam.pose import IDENTITY, compose, moved
 from jaxslam.semantics import Detector
+from jaxslam.stage_times import StageTimes
 from jaxslam.state import TrackOutput, TrackParams, TrackPlan, TrackState, TrackStatus
 from jaxslam.track import Followed, follow_points, init_state, track_followed
 from jaxslam.tracked import FrameRecord, Rejected, Tracked, tracked_of
@@ -65,6 +66,15 @@ class Slam:
     The world is the camera's place at the first frame, or that of the map it starts with. Calls must come from one
     thread at a time. With `run.deterministic` everything happens in that thread, on a fixed schedule; without it,
     mapping and loop closing have threads of their own, and `close` (or `with`) ends them.
+
+    Attributes:
+        camera: That takes the frames.
+        config: Settings in effect.
+        compile_s: Seconds that compiling took.
+        times: Of the stages of every frame: `take over` what mapping has done, `flow`, `wait for mask`, `pose`, `match
+            with map`, `hand over` to mapping and the detector; and of the jobs beside them: `masks`, `detector`,
+            `mapping`, `places`. In a deterministic run those are parts of stages: `masks` in `flow` and `hand over`,
+            the others in `hand over`.
     """
 
     def __init__(
@@ -176,21 +186,26 @@ class Slam:
         """
         check_frame(frame, self.camera.width, self.camera.height, self._last_ns)
         self.warm_up()
-        began = time.perf_counter()
+        began, watch = time.perf_counter(), self.times.stopwatch()
         self._state, correction = self._back.update(self._state, self._frame)
         dt_s = 1 / self.camera.fps if self._last_ns is None else (frame.timestamp_ns - self._last_ns) * 1e-9
         arrays = self._memory.hold(frame, dt_s)
+        watch.ends("take over")
         # Neither needs the other, and on two cores masks are ready before flow is.
         self._beside.offer(partial(self._mask_of, frame, arrays, correction), self._frame)
         followed = _follow_points(self._state, arrays, self._params, self._plan)
+        watch.ends("flow")
         mask: FrameMask = self._beside.drain()[-1]
         arrays = self._memory.ignoring(arrays, mask.mask)
+        watch.ends("wait for mask")
         output, placed, num_matched = self._advance(arrays, followed), None, 0
+        watch.ends("pose")
         if int(output.status) == TrackStatus.LOST:
             output, placed = self._regain(arrays, output, dt_s)
             num_matched = 0 if placed is None else placed.num_matched
         elif self._to_be_matched(output):
             self._state, output, num_matched = self._back.held_to_map(self._state, arrays, output)
+        watch.ends("match with map")
         if output.keyframe:
             hung = None if placed is None else placed.hung
             self._back.keyframe_made(frame.timestamp_ns, arrays, output, self._frame, hung)
@@ -200,6 +215,7 @@ class Slam:
         if self._masks is not None:
             self._masks.look(self._frame, frame.image)
         self._frame += 1
+        watch.ends("hand over")
         return replace(tracked, track_ms=(time.perf_counter() - began) * 1e3)
 
     def run(
@@ -266,6 +282,7 @@ class Slam:
         return Trajectory(np.array(self._times_ns, np.int64), poses)
 
     def _begin(self) -> None:
+        self.times = StageTimes()
         self._back = BackEnd(
             self.camera,
             self._params,
@@ -273,6 +290,7 @@ class Slam:
             self.config,
             self._start_map,
             localize_only=self._localize_only,
+            times=self.times,
         )
         run, semantics, dynamics = self.config.run, self.config.semantics, self.config.dynamics
         self._masks = (
@@ -288,10 +306,15 @@ class Slam:
                 farthest_m=self.config.track.max_depth_m,
                 dilate_px=semantics.dilate_px,
                 seed=run.seed,
+                times=self.times,
             )
         )
         self._beside: Worker[Callable[[], Any], Any] = make_worker(
-            lambda job: job(), "jaxslam-masks", deterministic=run.in_turn, latency_frames=0, urgent=True
+            self.times.timed("masks", lambda job: job()),
+            "jaxslam-masks",
+            deterministic=run.in_turn,
+            latency_frames=0,
+            urgent=True,
         )
         self._state = self._fresh_state()
         if self._start_map is not None:

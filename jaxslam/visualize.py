@@ -128,6 +128,21 @@ def plot_map(map: Map, trajectory: Trajectory, path: str | os.PathLike[str]) -> 
     _write_png(figure, path)
 
 
+def plot_snapshots(snapshots: Sequence[Snapshot], path: str | os.PathLike[str]) -> None:
+    """Write one PNG: frames with their points, two side by side.
+
+    Args:
+        snapshots: One at least.
+        path: Where the picture goes.
+
+    Raises:
+        TrajectoryError: If the file cannot be written.
+    """
+    figure = Figure(figsize=(8, 3.2 * ((len(snapshots) + 1) // 2)), layout="constrained")
+    _draw_snapshots(figure, snapshots)
+    _write_png(figure, path)
+
+
 def _write_png(figure: Figure, path: str | os.PathLike[str]) -> None:
     picture = io.BytesIO()
     FigureCanvasAgg(figure).print_png(picture)
@@ -145,7 +160,7 @@ def _draw_links(axes: Axes, map: Map, plane: list[int]) -> None:
             axes.add_collection(LineCollection(list(ends), colors=color, linewidths=1.0, label=label))
 
 
-def _draw_snapshots(figure: SubFigure, snapshots: Sequence[Snapshot]) -> None:
+def _draw_snapshots(figure: Figure | SubFigure, snapshots: Sequence[Snapshot]) -> None:
     every = figure.subplots((len(snapshots) + 1) // 2, 2, squeeze=False).ravel()
     for axes in every:
         axes.set_axis_off()

@@ -27,9 +27,9 @@ from jaxslam.datasets.synthetic.sensor import SensorConfig
 from jaxslam.errors import BenchmarkError, JaxSlamError
 from jaxslam.files import write_atomically
 from jaxslam.frame import to_grey
-from jaxslam.mask_pictures import MaskPictures
 from jaxslam.recordings import find_recording
-from jaxslam.results import RunInfo, Snapshots, write_results
+from jaxslam.results import RunInfo, write_results
+from jaxslam.run_pictures import RunPictures
 from jaxslam.slam import Slam
 from jaxslam.xla import prefer_one_thread
 
@@ -154,19 +154,14 @@ def run_here(folder: Path, root: Path | None) -> None:
     job = Job.of_json((folder / _JOB).read_text())
     dataset = opened(job.clip, root)
     flow_ms = flow_time_ms(dataset)
-    snapshots, masks = Snapshots(len(dataset)), MaskPictures()
+    pictures = RunPictures(len(dataset))
     slam = Slam(dataset.camera, job.config)
     slam.warm_up()
     began = time.perf_counter()
-
-    def watch(frame: Any, result: Any) -> None:
-        for watcher in (snapshots, masks):
-            watcher(frame, result)
-
     with slam:
-        records = slam.run(dataset, watch)
+        records = slam.run(dataset, pictures)
     info = RunInfo(dataset, job.preset, time.perf_counter() - began)
-    summary, _ = write_results(folder, slam, records, info, snapshots.kept, masks.kept)
+    summary, _ = write_results(folder, slam, records, info, pictures)
     times = summary["track_ms"]
     ratios = {} if times is None else {f"flow_ratio_{name}": round(times[name] / flow_ms, 4) for name in times}
     result = _figures(job) | {

@@ -21,8 +21,8 @@ from jaxslam.errors import ConfigError, nearest
 from jaxslam.evaluation import Evaluation
 from jaxslam.frame import Frame
 from jaxslam.map_file import load_map
-from jaxslam.mask_pictures import MaskPictures
-from jaxslam.results import RESULT_FILES, RunInfo, Snapshots, write_results
+from jaxslam.results import RESULT_FILES, RunInfo, write_results
+from jaxslam.run_pictures import RunPictures
 from jaxslam.slam import Slam
 from jaxslam.tracked import Rejected, Tracked
 from jaxslam.xla import prefer_one_thread
@@ -192,13 +192,13 @@ def track(
         TimeRemainingColumn(),
         TextColumn("{task.fields[status]}"),
     )
-    snapshots, masks = Snapshots(len(dataset)), MaskPictures()
-    watchers = [snapshots, masks] if viewer is None else [snapshots, masks, viewer]
+    pictures = RunPictures(len(dataset))
+    watchers = [pictures] if viewer is None else [pictures, viewer]
     with slam, viewer or nullcontext(), Progress(*columns, console=console) as progress:
         meter = _Meter(progress, progress.add_task("track", total=len(dataset), status=""), watchers)
         records = slam.run(dataset, meter)
     info = RunInfo(dataset, preset, time.perf_counter() - began)
-    summary, evaluation = write_results(out, slam, records, info, snapshots.kept, masks.kept)
+    summary, evaluation = write_results(out, slam, records, info, pictures)
     if not quiet:
         _print_summary(summary, evaluation, out)
     return summary

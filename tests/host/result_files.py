@@ -1,14 +1,9 @@
 """What a run leaves in its folder."""
 
-FILES = {
-    "trajectory.txt",
-    "trajectory_online.txt",
-    "trajectory_keyframes.txt",
-    "summary.json",
-    "config.yaml",
-    "plot.png",
-    "map.png",
-}
+ALWAYS = {"trajectory.txt", "trajectory_online.txt", "frames.csv", "summary.json", "config.yaml"}
+
+FILES = ALWAYS | {"trajectory_keyframes.txt", "plot.png", "map.png", "errors.csv", "failures.png"}
+"""Of a run with poses, keyframes and a ground truth."""
 
 MASK_FILES = {"masks.png", "masks.gif"}
 """What there is besides if a frame had a mask."""

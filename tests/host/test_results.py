@@ -1,7 +1,9 @@
 """The files of a run: on the small scene, and on real recordings through the command line."""
 
+import csv
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,12 +11,15 @@ import numpy as np
 import pytest
 from evo.tools import file_interface
 from PIL import Image
-from result_files import FILES, MASK_FILES
+from result_files import ALWAYS, FILES, MASK_FILES
 from small_scene import CONFIG, clip
 
 from jaxslam.cli import main
 from jaxslam.config import load_config
-from jaxslam.results import RESULT_FILES, RunInfo, Snapshots, write_results
+from jaxslam.errors import TrajectoryError
+from jaxslam.frame_log import read_errors, read_track_ms
+from jaxslam.results import RESULT_FILES, RunInfo, write_results
+from jaxslam.run_pictures import RunPictures
 from jaxslam.slam import Slam
 from jaxslam.trajectory import Trajectory, read_tum
 
@@ -40,6 +45,15 @@ def check_summary(summary: dict[str, Any]) -> None:
     assert summary["cpu"]
 
 
+def masked(pictures: RunPictures) -> Any:
+    """Shows them frames in which something is left out."""
+
+    def show(frame: Any, result: Any) -> None:
+        pictures(frame, replace(result, dynamic_mask=np.ones_like(result.dynamic_mask)))
+
+    return show
+
+
 def check_against_evo(path: Path) -> Trajectory:
     """What evo reads is what was written: positions, `xyzw` quaternions and seconds."""
     ours, theirs = read_tum(path), file_interface.read_tum_trajectory_file(path)
@@ -49,20 +63,69 @@ def check_against_evo(path: Path) -> Trajectory:
     return ours
 
 
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The files of a run that loses ten frames."""
+    recording, folder = clip(), tmp_path_factory.mktemp("dark")
+    for index in range(30, 40):
+        dark = np.zeros_like(recording[index].image)
+        recording.frames[index] = replace(recording[index], image=dark)
+    slam, pictures = Slam(recording.camera, CONFIG), RunPictures(len(recording))
+    records = slam.run(recording, pictures)
+    assert [picture.title for picture in pictures.losses] == [f"frame 30: LOST, {records[30].reason}"]
+    write_results(folder, slam, records, RunInfo(recording, "default", 1.5), pictures)
+    return folder
+
+
+class TestTables:
+    def test_a_row_a_frame(self, out: Path) -> None:
+        rows = list(csv.DictReader((out / "frames.csv").read_text().splitlines()))
+        assert [row["status"] for row in rows[28:42]] == ["OK"] * 2 + ["LOST"] * 10 + ["OK"] * 2
+        assert all(row["reason"] for row in rows[30:40])
+        np.testing.assert_allclose(read_track_ms(out / "frames.csv"), [float(row["track_ms"]) for row in rows])
+        assert [float(row["timestamp_s"]) for row in rows] == sorted(float(row["timestamp_s"]) for row in rows)
+
+    def test_errors(self, out: Path) -> None:
+        errors, poses = read_errors(out / "errors.csv"), read_tum(out / "trajectory.txt")
+        np.testing.assert_array_equal(errors.timestamps_ns, poses.timestamps_ns)
+        distances = np.linalg.norm(errors.positions_m - errors.reference_m, axis=1)
+        np.testing.assert_allclose(errors.errors_m, distances, atol=1e-8)
+        summary = json.loads((out / "summary.json").read_text())
+        assert np.sqrt(np.mean(np.square(errors.errors_m))) == pytest.approx(summary["ate_rmse_m"], abs=1e-8)
+
+    def test_stages_fill_the_frame(self, out: Path) -> None:
+        """Those of the tracking thread, together, are the time of a frame."""
+        summary = json.loads((out / "summary.json").read_text())
+        stages = ("take over", "flow", "wait for mask", "pose", "match with map", "hand over")
+        together = sum(summary["stage_ms"][stage]["mean"] for stage in stages)
+        assert together == pytest.approx(summary["track_ms"]["mean"], rel=0.05)
+        assert {"masks", "mapping", "places"} <= set(summary["stage_ms"])
+
+    @pytest.mark.parametrize("text", ["", "a,b\n1,2\n", None])
+    def test_other_files(self, tmp_path: Path, text: str | None) -> None:
+        path = tmp_path / "table.csv"
+        if text is not None:
+            path.write_text(text)
+        for read in (read_errors, read_track_ms):
+            with pytest.raises(TrajectoryError, match=r"table\.csv: "):
+                read(path)
+
+
 class TestSmallScene:
     def test_files_and_summary(self, tmp_path: Path) -> None:
         recording, slam = clip(), Slam(clip().camera, CONFIG)
-        snapshots = Snapshots(len(recording))
-        records = slam.run(recording, snapshots)
+        pictures = RunPictures(len(recording))
+        records = slam.run(recording, pictures)
         info = RunInfo(recording, "default", 1.5)
-        summary, evaluation = write_results(tmp_path / "out", slam, records, info, snapshots.kept)
+        summary, evaluation = write_results(tmp_path / "out", slam, records, info, pictures)
         assert {path.name for path in (tmp_path / "out").iterdir()} == FILES
         assert json.loads((tmp_path / "out/summary.json").read_text()) == summary
         check_summary(summary)
         assert evaluation is not None
         assert summary["ate_rmse_m"] == evaluation.ate_rmse_m
         assert (summary["frames"], summary["tracked"], summary["first_loss_s"]) == (60, 60, None)
-        assert len(snapshots.kept) == 4
+        assert len(pictures.snapshots) == 4
+        assert pictures.losses == []
         assert load_config(file=tmp_path / "out/config.yaml") == CONFIG
         written = check_against_evo(tmp_path / "out/trajectory.txt")
         np.testing.assert_array_equal(written.timestamps_ns, slam.trajectory.timestamps_ns)
@@ -71,8 +134,9 @@ class TestSmallScene:
     def test_masks_of_this_run_only(self, tmp_path: Path) -> None:
         """Their pictures are there if there were masks, and go with the next run that has none."""
         recording, slam = clip(), Slam(clip().camera, CONFIG)
-        records, info = slam.run(recording), RunInfo(recording, "default", 1.5)
-        write_results(tmp_path, slam, records, info, masks=[np.zeros((140, 320, 3), np.uint8)])
+        pictures = RunPictures(len(recording))
+        records, info = slam.run(recording, masked(pictures)), RunInfo(recording, "default", 1.5)
+        write_results(tmp_path, slam, records, info, pictures)
         assert {path.name for path in tmp_path.iterdir()} == FILES | MASK_FILES == set(RESULT_FILES)
         write_results(tmp_path, slam, records, info)
         assert {path.name for path in tmp_path.iterdir()} == FILES
@@ -85,7 +149,7 @@ class TestSmallScene:
         assert evaluation is None
         assert summary["evaluation_problem"] == "no ground truth"
         assert (summary["frames"], summary["tracked_percent"], summary["track_ms"]) == (0, 0, None)
-        assert {path.name for path in tmp_path.iterdir()} == FILES - {"plot.png", "map.png", "trajectory_keyframes.txt"}
+        assert {path.name for path in tmp_path.iterdir()} == ALWAYS
 
 
 class TestRealRecordings:
