@@ -1,7 +1,8 @@
-"""How far an estimated trajectory is from the true one: ATE, RPE and coverage.
+"""How far an estimated trajectory is from the true one: ATE, RPE, drift as KITTI measures it, and coverage.
 
 Figures are computed in float64 whatever JAX is set to, and depend on nothing but the two trajectories and the
-settings. Source: Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012.
+settings. Source: Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012; for KITTI's figures
+see `jaxslam_kernels.segments`.
 """
 
 import math
@@ -21,6 +22,7 @@ from jaxslam_kernels.alignment import (
     ate,
     rpe,
 )
+from jaxslam_kernels.segments import KITTI_LENGTHS_M, KITTI_STEP, SegmentErrors, segment_errors
 
 from jaxslam.errors import TrajectoryError, nearest
 from jaxslam.rotation import matrices
@@ -67,6 +69,12 @@ class Evaluation:
         rpe_pairs: How many such pairs there are.
         rpe_trans_m_per_frame: Error of the motion from one matched pose to the next; `None` with a single match.
         rpe_rot_deg_per_frame: The same for the angle.
+        kitti_trans_percent: KITTI's `t_rel`: the error of the motion over a segment of 100, 200, ... or 800 m of the
+            true path, divided by that length; the mean of all. `None` if the path of the matched poses is too short for
+            any. A segment begins at every 10th matched pose, as it does at every 10th frame in the benchmark: with gaps
+            fewer begin there.
+        kitti_rot_deg_per_100m: KITTI's `r_rel`, the same for the angle.
+        kitti_segments: How many such segments there are.
         notes: Reservations about the figures, in words.
         timestamps_ns: `(m,)` stamps of the matched poses of the estimate.
         positions_m: `(m, 3)` their positions, aligned.
@@ -97,6 +105,9 @@ class Evaluation:
     rpe_pairs: int
     rpe_trans_m_per_frame: float | None
     rpe_rot_deg_per_frame: float | None
+    kitti_trans_percent: float | None
+    kitti_rot_deg_per_100m: float | None
+    kitti_segments: int
     notes: tuple[str, ...]
     timestamps_ns: np.ndarray
     positions_m: np.ndarray
@@ -137,6 +148,11 @@ class Evaluation:
             lines.append(
                 f"  RPE  rmse {self.rpe_trans_m_per_frame:.6f} m/frame  {self.rpe_rot_deg_per_frame:.6f} deg/frame"
             )
+        if self.kitti_trans_percent is not None:
+            lines.append(
+                f"  KITTI  {self.kitti_trans_percent:.6f} %  {self.kitti_rot_deg_per_100m:.6f} deg/100 m"
+                f"  (mean of {self.kitti_segments} segments of {KITTI_LENGTHS_M[0]:g} to {KITTI_LENGTHS_M[-1]:g} m)"
+            )
         lines.append(
             f"  matched {self.num_matched} of {self.num_estimate} estimated and {self.num_reference} true poses;"
             f" {self.coverage_percent:.1f} % of the time covered"
@@ -155,7 +171,7 @@ def evaluate(
 
     Poses are matched by time (`trajectory.associate`), never interpolated. A straight line or a camera that stands
     still leaves the rotation of the alignment open but not the errors: the figures are right and a note says so.
-    With `align='sim3'` the RPE is that of the scaled estimate.
+    With `align='sim3'` RPE and KITTI's figures are those of the scaled estimate.
 
     Args:
         estimate: Estimated poses, in any world frame.
@@ -187,6 +203,7 @@ def evaluate(
         coverage_percent=coverage,
         **_absolute_figures(errors, align),
         **_relative_figures(errors, rpe_delta_s),
+        **_kitti_figures(errors.per_length),
         notes=_notes(errors) + _notes_on_frames(matched, truth, errors, rpe_delta_s),
         timestamps_ns=matched.timestamps_ns,
         positions_m=scale * matched.positions @ matrices(T[None, :4])[0].T + T[4:],
@@ -204,6 +221,7 @@ class _Errors(NamedTuple):
     absolute: dict[str, AbsoluteErrors]
     per_second: RelativeErrors
     per_frame: RelativeErrors
+    per_length: SegmentErrors
 
 
 def _errors(estimate: Trajectory, truth: np.ndarray, align: AlignmentKind, delta_s: float) -> _Errors:
@@ -233,7 +251,8 @@ def _padded_errors(P: jax.Array, Q: jax.Array, mask: jax.Array, later: jax.Array
     P = P.at[:, 4:].multiply(jnp.where(scaled, absolute["sim3"].alignment.scale, 1.0))
     index, end = jnp.arange(len(mask), dtype=jnp.int32), jnp.sum(mask, dtype=jnp.int32)
     drift = lambda other: rpe(SE3(P), SE3(Q), index, other, mask & (other < end))
-    return _Errors(absolute, drift(later), drift(index + 1))
+    per_length = segment_errors(SE3(P), SE3(Q), mask, jnp.array(KITTI_LENGTHS_M, P.dtype), step=KITTI_STEP)
+    return _Errors(absolute, drift(later), drift(index + 1), per_length)
 
 
 def _absolute_figures(errors: _Errors, align: AlignmentKind) -> dict[str, float | None]:
@@ -261,6 +280,15 @@ def _relative_figures(errors: _Errors, delta_s: float) -> dict[str, Any]:
         "rpe_pairs": int(second.num_pairs),
         "rpe_trans_m_per_frame": rate(frame.translation.rmse, frame.num_pairs),
         "rpe_rot_deg_per_frame": rate(np.degrees(frame.rotation.rmse), frame.num_pairs),
+    }
+
+
+def _kitti_figures(errors: SegmentErrors) -> dict[str, Any]:
+    found = int(errors.num_segments)
+    return {
+        "kitti_trans_percent": 100 * float(errors.translation) if found else None,
+        "kitti_rot_deg_per_100m": 100 * math.degrees(float(errors.rotation)) if found else None,
+        "kitti_segments": found,
     }
 
 

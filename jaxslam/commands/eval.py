@@ -14,7 +14,10 @@ from jaxslam.visualize import plot_trajectory
 
 @dataclass(frozen=True)
 class Eval:
-    """Compare an estimated trajectory with the truth: ATE and RPE. Formats (TUM, KITTI) are recognised."""
+    """Compare an estimated trajectory with the truth: ATE, RPE, and KITTI's t_rel and r_rel if it is 100 m long.
+
+    Formats (TUM, KITTI) are recognised.
+    """
 
     estimate: tyro.conf.Positional[Path]
     """The estimate."""

@@ -166,8 +166,8 @@ def rpe(
         second: `(m,)` indices j; a pair with an index out of range does not count.
         mask: `(m,)` which pairs count.
     """
-    P, P_known = _usable_poses(estimate)
-    Q, Q_known = _usable_poses(reference)
+    P, P_known = usable_poses(estimate)
+    Q, Q_known = usable_poses(reference)
     known = P_known & Q_known
     inside = (jnp.minimum(first, second) >= 0) & (jnp.maximum(first, second) < known.shape[0])
     counts = mask & inside & known[first] & known[second]
@@ -312,7 +312,7 @@ def _median(errors: Weights, weights: Weights) -> Scalar:
     return 0.5 * (errors[order[lower]] + errors[order[upper]])
 
 
-def _usable_poses(T: SE3) -> tuple[SE3, Mask]:
+def usable_poses(T: SE3) -> tuple[SE3, Mask]:
     """The batch with unit quaternions and the identity for poses that cannot be used, and which ones can."""
     wxyz, xyz = T.wxyz_xyz[:, :4], T.wxyz_xyz[:, 4:]
     largest = jnp.max(jnp.abs(wxyz), axis=1)

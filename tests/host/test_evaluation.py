@@ -1,13 +1,16 @@
-"""ATE, RPE and coverage against evo and NumPy, on real trajectories and on hard cases."""
+"""ATE, RPE, KITTI's drift and coverage against evo and NumPy, on hard cases; for real ones see test_evaluation_evo."""
 
 import json
 
 import jax
 import numpy as np
 import pytest
+from evo_figures import Evo
+from kitti_drift import kitti_drift
 from scipy.spatial.transform import Rotation
 
 from jaxslam import evaluation
+from jaxslam.cli import main
 from jaxslam.errors import TrajectoryError
 from jaxslam.evaluation import evaluate
 from jaxslam.trajectory import Trajectory, associate, read
@@ -37,6 +40,13 @@ def on_a_line(n=50, noise=0.0):
     return Trajectory(EPOCH_NS + STEP_NS * np.arange(n), poses)
 
 
+def straight_road(n):
+    """A metre a frame."""
+    poses = np.zeros((n, 7))
+    poses[:, 0], poses[:, 6] = 1, np.arange(n)
+    return Trajectory(STEP_NS * np.arange(n), poses)
+
+
 def _matrices(trajectory):
     T = np.tile(np.eye(4), (len(trajectory), 1, 1))
     T[:, :3, :3] = Rotation.from_quat(trajectory.T_world_cam[:, :4], scalar_first=True).as_matrix()
@@ -54,36 +64,6 @@ def reference_rpe(estimate, reference, delta_s):
             lengths.append(np.linalg.norm(E[:3, 3]))
             angles.append(np.degrees(Rotation.from_matrix(E[:3, :3]).magnitude()))
     return np.sqrt(np.mean(np.square(lengths))), np.sqrt(np.mean(np.square(angles))), len(lengths)
-
-
-class Evo:
-    """evo (GPL: in tests only) on matched poses."""
-
-    def __init__(self, estimate, reference, align):
-        from evo.core import metrics, trajectory  # noqa: PLC0415
-
-        self.metrics = metrics
-        self.estimate, self.reference = (
-            trajectory.PosePath3D(t.positions.copy(), t.T_world_cam[:, :4].copy()) for t in (estimate, reference)
-        )
-        self.scale = 1.0
-        if align != "none":
-            *_, self.scale = self.estimate.align(self.reference, correct_scale=align == "sim3")
-
-    def ate(self):
-        metric = self.metrics.APE(self.metrics.PoseRelation.translation_part)
-        metric.process_data((self.reference, self.estimate))
-        return metric.get_all_statistics()
-
-    def rpe(self, relation, delta=1, all_pairs=False):
-        metric = self.metrics.RPE(
-            getattr(self.metrics.PoseRelation, relation),
-            delta,
-            self.metrics.Unit.frames,
-            all_pairs=all_pairs,
-        )
-        metric.process_data((self.reference, self.estimate))
-        return metric.get_all_statistics()["rmse"]
 
 
 def assert_equals_evo(result, estimate, reference, align):
@@ -105,21 +85,6 @@ class TestAgainstEvo:
     def test_made_up_trajectory(self, align):
         estimate, reference = make_pair()
         assert_equals_evo(evaluate(estimate, reference, align), estimate, reference, align)
-
-    @pytest.mark.parametrize("align", ["none", "se3", "sim3"])
-    @pytest.mark.parametrize(
-        ("estimate", "reference"),
-        [
-            ("freiburg1_xyz-rgbdslam.txt", "freiburg1_xyz-groundtruth.txt"),
-            ("fr2_desk_ORB.txt", "fr2_desk_groundtruth.txt"),
-            ("KITTI_00_ORB.txt", "KITTI_00_gt.txt"),
-        ],
-    )
-    def test_real_trajectories(self, data_dir, estimate, reference, align):
-        estimate, reference = (read(data_dir / "trajectories" / name) for name in (estimate, reference))
-        index = associate(estimate.timestamps_ns, reference.timestamps_ns)
-        result = evaluate(estimate, reference, align)
-        assert_equals_evo(result, estimate.select(index[0]), reference.select(index[1]), align)
 
     def test_from_file_to_figure(self, data_dir):
         """evo's own reading and matching too, at its own default gap."""
@@ -182,6 +147,48 @@ class TestRpe:
         assert result.rpe_pairs == 0
         assert result.rpe_trans_m_per_frame is not None
         assert "m/s" not in str(result)
+
+
+class TestKitti:
+    def test_of_a_real_drive(self, data_dir, capsys):
+        """As the command prints it; and what ORB-SLAM2's paper has for this sequence: 0.70 % and 0.25 deg/100 m."""
+        paths = [data_dir / "trajectories" / f"KITTI_00_{name}.txt" for name in ("ORB", "gt")]
+        estimate, reference = (read(path) for path in paths)
+        lengths = np.arange(1, 9) * 100.0
+        translations, rotations, count = kitti_drift(estimate.T_world_cam, reference.T_world_cam, lengths, 10)
+        percent, degrees = 100 * translations.sum() / count, 100 * np.degrees(rotations.sum() / count)
+        result = evaluate(estimate, reference)
+        assert result.kitti_segments == count
+        assert result.kitti_trans_percent == pytest.approx(percent, abs=1e-9)
+        assert result.kitti_rot_deg_per_100m == pytest.approx(degrees, abs=1e-6)
+        assert (round(percent, 2), round(degrees, 2)) == (0.70, 0.25)
+        main(["eval", *(str(path) for path in paths)])
+        line = f"KITTI  {percent:.6f} %  {degrees:.6f} deg/100 m  (mean of {count} segments of 100 to 800 m)"
+        assert line in capsys.readouterr().out
+
+    def test_two_percent_too_long(self):
+        """A straight road, 1 m a frame; and a segment of 100 m ends at 101 m, so that 2 % become 2.02 %."""
+        reference = straight_road(120)
+        estimate = Trajectory(reference.timestamps_ns, reference.T_world_cam * [1, 1, 1, 1, 1, 1, 1.02])
+        result = evaluate(estimate, reference)
+        assert result.kitti_trans_percent == pytest.approx(2.02, rel=1e-9)
+        assert result.kitti_rot_deg_per_100m == pytest.approx(0, abs=1e-9)
+        assert result.kitti_segments == 2  # from 0 and from 10 m
+        assert evaluate(estimate, reference, "sim3").kitti_trans_percent == pytest.approx(0, abs=1e-9)
+
+    def test_counts_matched_poses(self):
+        """Of a drive of which half the poses are missing, every tenth of the others begins a segment."""
+        reference = straight_road(220)
+        result = evaluate(reference.select(np.arange(0, 220, 2)), reference)
+        assert result.kitti_segments == 6 + 1  # of 100 m from 0, 20, ... 100 m, of 200 m from 0
+        assert result.kitti_trans_percent == pytest.approx(0, abs=1e-9)
+
+    def test_absent_on_short_paths(self):
+        result = evaluate(straight_road(101), straight_road(101))
+        assert result.kitti_trans_percent is result.kitti_rot_deg_per_100m is None
+        assert result.kitti_segments == 0
+        assert "KITTI" not in str(result)
+        assert evaluate(straight_road(102), straight_road(102)).kitti_segments == 1
 
 
 class TestHardCases:
@@ -354,6 +361,8 @@ class TestReport:
         assert summary["ate_rmse_m"] == result.ate_rmse_m
         assert summary["align"] == "se3"
         assert summary["rpe_trans_m_per_s"] is None
+        assert summary["kitti_trans_percent"] is None
+        assert evaluate(straight_road(200), straight_road(200)).summary()["kitti_segments"] == 10
         assert "errors_m" not in summary
 
     def test_arrays_belong_together(self):
