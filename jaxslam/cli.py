@@ -9,6 +9,7 @@ import tyro
 
 from jaxslam.commands.bench import Bench
 from jaxslam.commands.bench_gate import Gate
+from jaxslam.commands.bench_kernels import Kernels
 from jaxslam.commands.compare import Compare
 from jaxslam.commands.data import Data
 from jaxslam.commands.doctor import Doctor
@@ -19,7 +20,7 @@ from jaxslam.commands.run import Demo, Run
 from jaxslam.errors import JaxSlamError
 
 _DESCRIPTION = "Real-time visual SLAM for dynamic scenes. Start with: jaxslam demo"
-_OF_BENCH: dict[str, type[Any]] = {"gate": Gate}
+_OF_BENCH: dict[str, type[Any]] = {"gate": Gate, "kernels": Kernels}
 """What `jaxslam bench` does that is no suite, with options of its own."""
 
 

@@ -167,8 +167,16 @@ def _summary(
         "compile_s": round(slam.compile_s, 3),
         "wall_s": round(info.wall_s, 3),
         "peak_rss_mb": round(_peak_rss_mb(), 1),
+        **machine(),
+    }
+
+
+def machine() -> dict[str, Any]:
+    """What computed: versions of packages, the processor, cores and threads of this process, the commit."""
+    return {
         "versions": {"python": platform.python_version(), **{name: version(name) for name in _PACKAGES}},
         "cpu": _cpu_model(),
+        "vectors": _vectors(),
         "cores": usable_cores(),
         "threads": threads(),
         "commit": _commit(),
@@ -200,6 +208,13 @@ def _cpu_model() -> str:
             if line.startswith("model name"):
                 return line.partition(":")[2].strip()
     return platform.processor() or platform.machine()
+
+
+def _vectors() -> str:
+    """The widest instructions of the processor that matter to rounding and speed; its architecture if unknown."""
+    info = Path("/proc/cpuinfo")
+    flags = set(info.read_text().split()) if info.is_file() else set()
+    return next((name for name in ("avx512f", "avx2", "avx", "sse4_2") if name in flags), platform.machine())
 
 
 def _commit() -> str | None:

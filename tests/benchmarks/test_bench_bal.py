@@ -10,9 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from benchmarks.timing import pinned_to_one_core
 from jaxslam_kernels.bundle_adjust import BundleStatus, bundle_adjust
 from jaxslam_kernels.bundle_cost import Observations
+
+from jaxslam.benchmark.timing import pinned_to_one_core
 
 pytestmark = pytest.mark.benchmark
 

@@ -10,46 +10,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from benchmarks.timing import compare, compile_seconds, pinned_to_one_core
 from jaxslam_kernels.bundle_adjust import BundleStatus, bundle_adjust
-from jaxslam_kernels.bundle_cost import Observations, observe
-from jaxslam_kernels.camera import make_intrinsics
-from kernels.posed_scene import pose_error, to_wxyz_xyz
-from scipy.spatial.transform import Rotation
+
+from jaxslam.benchmark.kernels.bundle_window import make_window, without_depth
+from jaxslam.benchmark.kernels.posed_scene import pose_error
+from jaxslam.benchmark.timing import compare, compile_seconds, pinned_to_one_core
 
 pytestmark = pytest.mark.benchmark
 
 K, N, M = 12, 1500, 7000
-
-
-def _window() -> tuple[np.ndarray, tuple[jax.Array, jax.Array, Observations]]:
-    """The true poses, and where to start with what is seen."""
-    rng = np.random.default_rng(0)
-    X_world = rng.uniform([[-2.0], [-1.5], [2.0]], [[2.0], [1.5], [5.0]], (3, N))
-    rotations = [Rotation.from_rotvec(0.05 * rng.normal(size=3)) for _ in range(K)]
-    positions = np.linspace([-0.5, 0.0, 0.0], [0.5, 0.0, 0.2], K)
-    X_cam = np.stack([r.inv().apply(X_world.T - t).T for r, t in zip(rotations, positions, strict=True)])
-    camera, point = np.divmod(np.sort(rng.choice(K * N, M, replace=False)), N)
-    X, Y, Z = X_cam[camera, :, point].T
-    uv = 500.0 * np.stack([X / Z, Y / Z]) + [[320.0], [240.0]] + rng.normal(size=(2, M))
-    sigma_depth = 0.005 * Z**2
-    depth = Z + sigma_depth * rng.normal(size=M)
-    truth = np.stack([to_wxyz_xyz(r, t) for r, t in zip(rotations, positions, strict=True)])
-    start = truth.copy()
-    start[1:, 4:] += 0.02 * rng.normal(size=(K - 1, 3))
-    single = lambda x: jnp.asarray(x, jnp.float32)
-    observations = observe(
-        jnp.asarray(camera, jnp.int32),
-        jnp.asarray(point, jnp.int32),
-        single(uv),
-        make_intrinsics(500.0, 500.0, 320.0, 240.0),
-        depth=single(depth),
-        sigma_depth=single(sigma_depth),
-    )
-    return truth, (single(start), single(X_world + 0.05 * rng.normal(size=X_world.shape)), observations)
-
-
-TRUTH, ARGUMENTS = _window()
+WINDOW = make_window(K, N, M)
+ARGUMENTS = WINDOW.poses, WINDOW.X_world, WINDOW.observations
 FIXED = jnp.arange(K) < 1
 
 
@@ -75,23 +46,15 @@ def test_one_step():
 
 def test_one_step_against_ceres():
     """Without depth, which COLMAP's cost functions lack, and so with two poses fixed. Ceres times its steps itself."""
-    ceres_window = pytest.importorskip("benchmarks.ceres_window")
-    poses, X_world, seen = (jax.tree.map(np.asarray, x) for x in ARGUMENTS)
-    often = np.bincount(seen.point, minlength=N)[seen.point] > 1
-    camera, point, steps = seen.camera[often], seen.point[often], 10
-    uv = seen.xy[:, often] * 500.0 + [[320.0], [240.0]]
-    fixed = jnp.arange(K) < 2
-    observations = ARGUMENTS[2]._replace(depth=jnp.zeros(M), valid=jnp.asarray(often))
+    ceres_window = pytest.importorskip("jaxslam.benchmark.kernels.ceres_window")
+    window, fixed, steps = without_depth(WINDOW), jnp.arange(K) < 2, 10
     ours = {n: jax.jit(partial(bundle_adjust, fixed_poses=fixed, tolerance=0.0, max_steps=n)) for n in (1, steps + 1)}
-    inputs = *ARGUMENTS[:2], observations
-    start = np.concatenate(
-        [poses.astype(float)[:, :4] / np.linalg.norm(poses[:, :4], axis=1)[:, None], poses[:, 4:]], 1
-    )
+    inputs = window.poses, window.X_world, window.observations
     for f in ours.values():
         jax.block_until_ready(f(*inputs))
 
     def one_round():
-        adjuster, model = ceres_window.ceres_problem(start, X_world.astype(float), camera, point, uv, 2)
+        adjuster, model = ceres_window.ceres_problem(window, 2)
         one, (result, *all_steps) = (_timed(partial(ours[n], *inputs)) for n in (1, steps + 1))
         summary = ceres_window.solve(adjuster, steps)
         del model  # not before: Ceres works on its memory
@@ -103,7 +66,8 @@ def test_one_step_against_ceres():
     result, summary, _ = rounds[-1]
     times = np.array([r[2] for r in rounds[2:]])
     (wall, processor, theirs), least = np.median(times, axis=0), times.min(axis=0)
-    print(f"\na step of {K} keyframes, {point.size} observations without depth: ours {wall:.2f} ms", end="")
+    num = int(window.observations.valid.sum())
+    print(f"\na step of {K} keyframes, {num} observations without depth: ours {wall:.2f} ms", end="")
     print(
         f" ({processor:.2f} ms of processor time, least {least[0]:.2f}), Ceres {theirs:.2f} ms (least {least[2]:.2f})"
     )
@@ -123,7 +87,7 @@ def _timed(function):
 
 def test_it_arrives():
     result = jax.jit(partial(bundle_adjust, fixed_poses=FIXED))(*ARGUMENTS)
-    errors = [pose_error(a, b) for a, b in zip(result.poses, TRUTH, strict=True)]
+    errors = [pose_error(a, b) for a, b in zip(result.poses, WINDOW.truth, strict=True)]
     print(f"\n  {result.num_steps} steps, cost {result.initial_cost:.0f} to {result.cost:.0f}")
     print(f"  largest error {1e3 * max(e[0] for e in errors):.2f} mm, {1e3 * max(e[1] for e in errors):.2f} mrad")
     assert BundleStatus(int(result.status)) == BundleStatus.OK

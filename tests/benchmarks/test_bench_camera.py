@@ -8,9 +8,10 @@ import cv2
 import jax
 import numpy as np
 import pytest
-from benchmarks.timing import compare
 from jaxslam_kernels.camera import normalise, project
-from kernels.posed_scene import DISTORTION, MATRIX, camera, make_scene
+
+from jaxslam.benchmark.kernels.posed_scene import DISTORTION, MATRIX, camera, make_scene
+from jaxslam.benchmark.timing import compare
 
 pytestmark = pytest.mark.benchmark
 

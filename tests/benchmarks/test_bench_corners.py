@@ -5,9 +5,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from benchmarks.timing import compare
 from jaxslam_kernels.corners import corner_score, grid_corners
-from known_warps import picture
+
+from jaxslam.benchmark.kernels.known_warps import picture
+from jaxslam.benchmark.timing import compare
 
 pytestmark = pytest.mark.benchmark
 

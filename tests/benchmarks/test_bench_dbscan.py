@@ -4,19 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from benchmarks.timing import compare, compile_seconds
 from jaxslam_kernels.dbscan import dbscan
 from sklearn.cluster import DBSCAN
 
+from jaxslam.benchmark.kernels.point_cases import movers
+from jaxslam.benchmark.timing import compare, compile_seconds
+
 pytestmark = pytest.mark.benchmark
-
-
-def _movers(n: int) -> np.ndarray:
-    """`(2, n)` pixels: six groups on people, and a quarter of outliers."""
-    random = np.random.default_rng(0)
-    centres = random.uniform([[50], [50]], [[590], [430]], (2, 6))
-    points = centres[:, random.integers(0, 6, n)] + 20 * random.normal(size=(2, n))
-    return np.where(random.uniform(size=n) < 0.25, random.uniform([[0], [0]], [[640], [480]], (2, n)), points)
 
 
 def _scattered(n: int) -> np.ndarray:
@@ -32,7 +26,7 @@ def _chain(n: int) -> np.ndarray:
 @pytest.mark.parametrize("n", [256, 512])
 @pytest.mark.parametrize(
     ("make", "radius", "min_points"),
-    [(_movers, 20.0, 5), (_scattered, 0.5, 4), (_chain, 1.0, 2)],
+    [(movers, 20.0, 5), (_scattered, 0.5, 4), (_chain, 1.0, 2)],
     ids=["movers", "scattered", "chain"],
 )
 def test_is_faster_than_scikit_learn(make, radius, min_points, n, capsys):

@@ -8,9 +8,9 @@ import time
 import cv2
 import numpy as np
 import pytest
-from benchmarks.timing import compare
 from host.room_views import STILL, features, params, picture
 
+from jaxslam.benchmark.timing import compare
 from jaxslam.features import Features, extract, features_of
 from jaxslam.frame import to_grey
 from jaxslam.frame_arrays import frame_arrays

@@ -3,9 +3,10 @@
 import cv2
 import jax
 import pytest
-from benchmarks.timing import compare
 from jaxslam_kernels.image import build_pyramid
-from known_warps import picture
+
+from jaxslam.benchmark.kernels.known_warps import picture
+from jaxslam.benchmark.timing import compare
 
 pytestmark = pytest.mark.benchmark
 

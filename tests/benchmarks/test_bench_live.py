@@ -13,12 +13,12 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import pytest
-from benchmarks.timing import prefer_one_thread
 
 from jaxslam import Slam, evaluate, load_config, open_dataset
 from jaxslam.datasets import Dataset
 from jaxslam.frame import Frame, to_grey
 from jaxslam.semantics import Detections, Detector, no_detections
+from jaxslam.xla import prefer_one_thread
 
 pytestmark = pytest.mark.benchmark
 

@@ -4,11 +4,12 @@ import cv2
 import jax
 import numpy as np
 import pytest
-from benchmarks.timing import compare
 from jax.extend.backend import clear_backends
 from jaxslam_kernels.image import build_pyramid
 from jaxslam_kernels.lk_flow import lk_flow
-from known_warps import corners, picture, warp
+
+from jaxslam.benchmark.kernels.known_warps import corners, picture, warp
+from jaxslam.benchmark.timing import compare
 
 pytestmark = pytest.mark.benchmark
 

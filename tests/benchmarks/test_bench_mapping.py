@@ -12,9 +12,9 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from benchmarks.timing import pinned_to_one_core
 
 from jaxslam import local_mapping as module
+from jaxslam.benchmark.timing import pinned_to_one_core
 from jaxslam.config import Config
 from jaxslam.datasets import open_dataset
 from jaxslam.local_mapping import LocalMapping, NewKeyframe, mapping_plan

@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
-from benchmarks.timing import compare, compile_seconds
 from jaxlie import SE3
 from jaxslam_kernels.pose_cost import pose_problem
 from jaxslam_kernels.pose_refine import refine_pose
-from kernels.posed_scene import DISTORTION, MATRIX, camera, make_scene, pose_error, pose_of
 from scipy.spatial.transform import Rotation
+
+from jaxslam.benchmark.kernels.posed_scene import DISTORTION, MATRIX, camera, make_scene, pose_error, pose_of
+from jaxslam.benchmark.timing import compare, compile_seconds
 
 pytestmark = pytest.mark.benchmark
 

@@ -5,9 +5,9 @@ import itertools
 import cv2
 import jax
 import pytest
-from benchmarks.timing import compare
 
 from jaxslam import Slam, frame_arrays, open_dataset, track_params, track_plan, track_step
+from jaxslam.benchmark.timing import compare
 from jaxslam.config import Config, TrackConfig
 from jaxslam.frame import to_grey
 

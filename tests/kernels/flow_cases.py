@@ -9,7 +9,8 @@ import numpy as np
 from equinox.debug import assert_max_traces
 from jaxslam_kernels.image import build_pyramid
 from jaxslam_kernels.lk_flow import DEFAULT_PLAN, Flow, FlowStatus, lk_flow
-from known_warps import corners, picture, warp
+
+from jaxslam.benchmark.kernels.known_warps import corners, picture, warp
 
 WIDTH, HEIGHT = 160, 120
 N = 45  # not a multiple of the chunk

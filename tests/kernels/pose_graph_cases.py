@@ -1,42 +1,12 @@
-"""Pose graphs for tests: made ones, g2o files, and optima found without JAX."""
+"""Pose graphs for tests: g2o files, and optima found without JAX."""
 
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-
-class Graph(NamedTuple):
-    """Arrays of a graph; a node or measurement is `wxyz_xyz` and a scale."""
-
-    nodes: np.ndarray
-    source: np.ndarray
-    target: np.ndarray
-    measured: np.ndarray
-    information: np.ndarray
-    truth: np.ndarray
-
-
-def loop_graph(seed: int, k: int, *, noise: float = 0.02, sim3: bool = False) -> Graph:
-    """One round with odometry, three loop closings, initial poses off the truth; scales if asked for."""
-    rng = np.random.default_rng(seed)
-    angles = np.linspace(0, 2 * np.pi, k, endpoint=False)
-    turns = Rotation.from_rotvec(np.stack([0.2 * np.sin(3 * angles), 0.1 * np.cos(angles), angles], 1))
-    places = np.stack([4 * np.cos(angles), 4 * np.sin(angles), 0.3 * np.sin(2 * angles)], 1)
-    truth = np.concatenate([_wxyz(turns), places, np.exp(0.1 * sim3 * rng.normal(size=(k, 1)))], axis=1)
-    truth[0, 7] = 1.0
-    source = np.concatenate([np.arange(k - 1), [k - 1, k - 2, k // 2]])
-    target = np.concatenate([np.arange(1, k), [0, 1, 0]])
-    m = len(source)
-    measured = np.empty((m, 8))
-    for i in range(m):
-        a, b = truth[source[i]], truth[target[i]]
-        measured[i] = _disturbed(rng, _relative(a[None], b[None]), noise)[0]
-    root = rng.normal(size=(m, 7, 7)) + 3.0 * np.eye(7)
-    information = 100.0 * root @ root.swapaxes(1, 2)
-    return Graph(_disturbed(rng, truth, 0.08, first=1), source, target, measured, information, truth)
+from jaxslam.benchmark.kernels.loop_graph import Graph, relative, rotation_of, wxyz_of
 
 
 def read_g2o(path: Path) -> Graph:
@@ -75,17 +45,10 @@ def isotropic(information: np.ndarray) -> np.ndarray:
     return np.repeat(np.stack(precisions, 1), 3, axis=1)[:, :, None] * np.eye(6)
 
 
-def between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """`wxyz_xyz` of poses b in the frames of poses a, real part not negative."""
-    Ra, Rb = _rotation(a), _rotation(b)
-    q = _wxyz(Ra.inv() * Rb)
-    return np.concatenate([np.where(q[:, :1] < 0, -q, q), Ra.inv().apply(b[:, 4:7] - a[:, 4:7])], axis=1)
-
-
 def move(motion: np.ndarray, nodes: np.ndarray) -> np.ndarray:
     """A rigid motion of the world applied to all nodes."""
-    R = _rotation(motion[None])[0]
-    return np.concatenate([_wxyz(R * _rotation(nodes)), R.apply(nodes[:, 4:7]) + motion[4:7], nodes[:, 7:]], axis=1)
+    R = rotation_of(motion[None])[0]
+    return np.concatenate([wxyz_of(R * rotation_of(nodes)), R.apply(nodes[:, 4:7]) + motion[4:7], nodes[:, 7:]], axis=1)
 
 
 def scipy_optimum(
@@ -102,12 +65,12 @@ def scipy_optimum(
     def nodes_at(x: np.ndarray) -> np.ndarray:
         steps = np.zeros((k, 7))
         steps[1:, :d] = x.reshape(k - 1, d)
-        R = _rotation(start) * Rotation.from_rotvec(steps[:, 3:6])
-        return np.concatenate([_wxyz(R), start[:, 4:7] + steps[:, :3], start[:, 7:] * np.exp(steps[:, 6:])], axis=1)
+        R = rotation_of(start) * Rotation.from_rotvec(steps[:, 3:6])
+        return np.concatenate([wxyz_of(R), start[:, 4:7] + steps[:, :3], start[:, 7:] * np.exp(steps[:, 6:])], axis=1)
 
     def whitened(x: np.ndarray) -> np.ndarray:
         nodes = nodes_at(x)
-        e = _relative(measured, _relative(nodes[graph.source], nodes[graph.target]))
+        e = relative(measured, relative(nodes[graph.source], nodes[graph.target]))
         sign = np.where(e[:, :1] < 0, -1.0, 1.0)
         error = np.concatenate([e[:, 4:7], 2.0 * sign * e[:, 1:4], np.log(e[:, 7:])], axis=1)[:, :d]
         return np.einsum("mji,mj->mi", roots, error)
@@ -122,28 +85,6 @@ def scipy_optimum(
         residuals, np.zeros((k - 1) * d), method="trf", x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-12
     )
     return nodes_at(found.x), float(found.cost), np.square(whitened(found.x)).sum(axis=1)
-
-
-def _relative(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Similarities b in the frames of similarities a."""
-    e = between(a, b)
-    e[:, 4:] /= a[:, 7:]
-    return np.concatenate([e, b[:, 7:] / a[:, 7:]], axis=1)
-
-
-def _disturbed(rng: np.random.Generator, nodes: np.ndarray, noise: float, first: int = 0) -> np.ndarray:
-    steps = noise * rng.normal(size=(len(nodes), 7))
-    steps[:first] = 0.0
-    R = _rotation(nodes) * Rotation.from_rotvec(steps[:, 3:6])
-    return np.concatenate([_wxyz(R), nodes[:, 4:7] + steps[:, :3], nodes[:, 7:] * np.exp(steps[:, 6:])], axis=1)
-
-
-def _rotation(nodes: np.ndarray) -> Rotation:
-    return Rotation.from_quat(np.roll(nodes[:, :4], -1, axis=1))
-
-
-def _wxyz(R: Rotation) -> np.ndarray:
-    return np.roll(R.as_quat(), 1, axis=1)
 
 
 def _planar(xyt: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

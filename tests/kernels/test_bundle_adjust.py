@@ -15,9 +15,10 @@ from jaxslam_kernels.bundle_cost import Observations, observe
 from jaxslam_kernels.camera import make_intrinsics
 from jaxslam_kernels.pose_cost import UNKNOWN_CHI2
 from jaxslam_kernels.robust import Loss
-from kernels.posed_scene import pose_error, to_wxyz_xyz
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+
+from jaxslam.benchmark.kernels.posed_scene import pose_error, to_wxyz_xyz
 
 K, N = 4, 25
 SPARE = 5  # slots without an observation

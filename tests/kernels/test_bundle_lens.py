@@ -11,9 +11,10 @@ import pytest
 from jaxslam_kernels.bundle_adjust import BundleAdjustment, BundleStatus, bundle_adjust
 from jaxslam_kernels.bundle_cost import Observations
 from jaxslam_kernels.robust import Loss
-from kernels.posed_scene import pose_error, to_wxyz_xyz
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+
+from jaxslam.benchmark.kernels.posed_scene import pose_error, to_wxyz_xyz
 
 K, N = 4, 25
 M = K * N

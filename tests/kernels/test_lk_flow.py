@@ -25,7 +25,8 @@ from kernels.flow_cases import (
     with_gradient,
     within,
 )
-from known_warps import corners, picture, warp
+
+from jaxslam.benchmark.kernels.known_warps import corners, picture, warp
 
 _both_ways = quick_compile(flow_of(lk_flow_forward_backward, 2))
 _fast_gradient = quick_compile(with_gradient(track))

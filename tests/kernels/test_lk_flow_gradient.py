@@ -21,7 +21,8 @@ from kernels.flow_cases import (
     with_gradient,
     within,
 )
-from known_warps import corners, picture, warp
+
+from jaxslam.benchmark.kernels.known_warps import corners, picture, warp
 
 EXACT = FlowPlan(LevelPlan(21, 40, 1e-3), LevelPlan(11, 5, 0.2), LevelPlan(21, 100, 1e-12), chunk=32)
 """Iterates until the slope is zero to rounding, as the derivative presumes."""

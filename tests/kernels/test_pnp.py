@@ -18,8 +18,18 @@ from jaxslam_kernels.p3p import p3p
 from jaxslam_kernels.pnp import PnpResult, draw_samples, ransac_pnp, score_poses
 from jaxslam_kernels.pose_cost import pose_cost, pose_problem
 from jaxslam_kernels.pose_refine import PoseStatus
-from kernels.posed_scene import DISTORTION, MATRIX, Scene, camera, make_scene, pose_error, pose_of, to_wxyz_xyz
 from scipy.spatial.transform import Rotation
+
+from jaxslam.benchmark.kernels.posed_scene import (
+    DISTORTION,
+    MATRIX,
+    Scene,
+    camera,
+    make_scene,
+    pose_error,
+    pose_of,
+    to_wxyz_xyz,
+)
 
 N = 60
 THRESHOLD_PX = 3.0

@@ -34,7 +34,9 @@ from jaxslam_kernels.pose_graph_cost import (
 )
 from jaxslam_kernels.pose_graph_sparse import solve_on_host
 from jaxslam_kernels.robust import Loss
-from kernels.pose_graph_cases import Graph, between, isotropic, loop_graph, move, read_g2o, scipy_optimum
+from kernels.pose_graph_cases import isotropic, move, read_g2o, scipy_optimum
+
+from jaxslam.benchmark.kernels.loop_graph import Graph, between, loop_graph
 
 GROUP = 4  # small, so that the loop does not fit into the band and iterations are needed
 

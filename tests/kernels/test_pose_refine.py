@@ -17,9 +17,19 @@ from jaxslam_kernels.camera import Intrinsics
 from jaxslam_kernels.pose_cost import PosePrior, pose_cost, pose_problem, retract
 from jaxslam_kernels.pose_refine import UNKNOWN_VARIANCE, PoseRefinement, PoseStatus, refine_pose, solve_pose
 from jaxslam_kernels.robust import Loss
-from kernels.posed_scene import DISTORTION, MATRIX, Scene, camera, make_scene, pose_error, pose_of, to_wxyz_xyz
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+
+from jaxslam.benchmark.kernels.posed_scene import (
+    DISTORTION,
+    MATRIX,
+    Scene,
+    camera,
+    make_scene,
+    pose_error,
+    pose_of,
+    to_wxyz_xyz,
+)
 
 N = 60
 SIGMA_PX = 1.3

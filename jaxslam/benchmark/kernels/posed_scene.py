@@ -1,4 +1,4 @@
-"""Points seen by one camera whose pose is known: made with OpenCV and SciPy, for tests of pose estimation."""
+"""Points seen by one camera whose pose is known: made with OpenCV and SciPy, for pose estimation."""
 
 from dataclasses import dataclass
 
@@ -6,6 +6,7 @@ import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike, DTypeLike
 from jaxlie import SE3
 from jaxslam_kernels.camera import Intrinsics, make_intrinsics
 from scipy.spatial.transform import Rotation
@@ -27,7 +28,7 @@ class Scene:
     sigma_depth: np.ndarray
     outlier: np.ndarray
 
-    def arrays(self, dtype=None) -> tuple[jax.Array, ...]:
+    def arrays(self, dtype: DTypeLike | None = None) -> tuple[jax.Array, ...]:
         """`X_world, uv, depth, sigma_depth` for JAX, in its default precision."""
         return tuple(jnp.asarray(a, dtype) for a in (self.X_world, self.uv, self.depth, self.sigma_depth))
 
@@ -61,20 +62,22 @@ def make_scene(
     )
 
 
-def camera(dtype=None) -> Intrinsics:
+def camera(dtype: DTypeLike | None = None) -> Intrinsics:
     """The colour camera of TUM's fr1 recordings, lens distortion included."""
     return make_intrinsics(*TUM_FR1, dtype=jnp.zeros(()).dtype if dtype is None else dtype)
 
 
 def to_wxyz_xyz(rotation: Rotation, position: np.ndarray) -> np.ndarray:
+    """A pose as seven numbers, the quaternion's real part first."""
     return np.concatenate([np.roll(rotation.as_quat(), 1), position])
 
 
-def pose_of(wxyz_xyz) -> SE3:
+def pose_of(wxyz_xyz: ArrayLike) -> SE3:
+    """The pose, in JAX's default precision."""
     return SE3(jnp.asarray(wxyz_xyz, jnp.zeros(()).dtype))
 
 
-def pose_error(estimate, truth) -> tuple[float, float]:
+def pose_error(estimate: ArrayLike, truth: ArrayLike) -> tuple[float, float]:
     """Distance in metres and angle in radians between two `wxyz_xyz`."""
     a, b = (np.asarray(p, np.float64) for p in (estimate, truth))
     turn = Rotation.from_quat(np.roll(a[:4], -1)).inv() * Rotation.from_quat(np.roll(b[:4], -1))

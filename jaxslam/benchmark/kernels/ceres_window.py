@@ -4,26 +4,23 @@ import numpy as np
 import pyceres
 import pycolmap
 
+from jaxslam.benchmark.kernels.bundle_window import CENTRE_PX, FOCAL_PX, Window
 
-def ceres_problem(
-    poses: np.ndarray, X_world: np.ndarray, camera: np.ndarray, point: np.ndarray, uv: np.ndarray, num_fixed: int
-) -> tuple[pycolmap.CeresBundleAdjuster, pycolmap.Reconstruction]:
-    """Reprojection of ideal cameras (focal length 500, centre 320, 240), Cauchy's loss, the first poses fixed.
 
-    Args:
-        poses: `(k, 7)` `wxyz_xyz` of T_world_cam.
-        X_world: `(3, n)`.
-        camera: `(m,)` index of the pose.
-        point: `(m,)` index of the point, each seen at least twice.
-        uv: `(2, m)` pixels.
-        num_fixed: Poses that do not move.
+def ceres_problem(window: Window, num_fixed: int) -> tuple[pycolmap.CeresBundleAdjuster, pycolmap.Reconstruction]:
+    """Reprojection of a window from `without_depth`, Cauchy's loss, the first poses fixed.
 
     Returns:
         The problem, and the model whose memory it works on.
     """
+    seen, valid = window.observations, np.asarray(window.observations.valid)
+    camera, point = np.asarray(seen.camera)[valid], np.asarray(seen.point)[valid]
+    uv = FOCAL_PX * np.asarray(seen.xy, np.float64)[:, valid] + np.array(CENTRE_PX)[:, None]
+    poses, X_world = (np.asarray(a, np.float64) for a in (window.poses, window.X_world))
+    poses = np.concatenate([poses[:, :4] / np.linalg.norm(poses[:, :4], axis=1)[:, None], poses[:, 4:]], axis=1)
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(
-        pycolmap.Camera(model="PINHOLE", width=640, height=480, params=[500.0, 500.0, 320.0, 240.0], camera_id=1)
+        pycolmap.Camera(model="PINHOLE", width=640, height=480, params=[FOCAL_PX, FOCAL_PX, *CENTRE_PX], camera_id=1)
     )
     slot = np.zeros(len(camera), int)
     for i, pose in enumerate(poses):
@@ -32,9 +29,11 @@ def ceres_problem(
         image = pycolmap.Image(name=str(i), keypoints=uv[:, rows].T.copy(), camera_id=1, image_id=i + 1)
         world_from_cam = pycolmap.Rigid3d(pycolmap.Rotation3d(np.roll(pose[:4], -1)), pose[4:])
         model.add_image_with_trivial_frame(image, world_from_cam.inverse())
-    for j in np.unique(point):
+    seen_points, first = np.unique(np.sort(point), return_index=True)
+    rows_of_points = np.split(np.argsort(point, kind="stable"), first[1:])
+    for j, rows in zip(seen_points, rows_of_points, strict=True):
         track = pycolmap.Track()
-        for row in np.flatnonzero(point == j):
+        for row in rows:
             track.add_element(int(camera[row]) + 1, int(slot[row]))
         model.add_point3D(X_world[:, j], track)
     config = pycolmap.BundleAdjustmentConfig()

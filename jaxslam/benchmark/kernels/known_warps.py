@@ -1,6 +1,6 @@
 """Pairs of images with known motion: a real picture, warped by homographies, with noise."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -14,20 +14,20 @@ class Warp(NamedTuple):
     current: np.ndarray
     homography: np.ndarray
 
-    def move(self, points):
+    def move(self, points: np.ndarray) -> np.ndarray:
         """Where `(2, n)` points of the first image are in the second."""
         moved = self.homography @ np.vstack([points, np.ones_like(points[:1])])
         return moved[:2] / moved[2]
 
-    def visible(self, points):
+    def visible(self, points: np.ndarray) -> np.ndarray:
         """Which points stay inside the image."""
         height, width = self.current.shape
         u, v = self.move(points)
         return (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
 
 
-def picture(width, height):
-    """A real picture, part of scikit-image; it is not downloaded."""
+def picture(width: int, height: int) -> np.ndarray:
+    """The middle of a real picture that comes with scikit-image; nothing is downloaded. At most 741x500."""
     if width > 256:
         source = cv2.cvtColor(stereo_motorcycle()[0], cv2.COLOR_RGB2GRAY)
     else:
@@ -36,7 +36,7 @@ def picture(width, height):
     return np.ascontiguousarray(source[top : top + height, left : left + width])
 
 
-def homography(rng, width, height, shift_px):
+def homography(rng: np.random.Generator, width: int, height: int, shift_px: float) -> np.ndarray:
     """A rotation of up to 2.5 degrees, a scale of up to 3 %, some perspective, and a shift of `shift_px`."""
     angle, scale = rng.uniform(-0.045, 0.045), rng.uniform(0.97, 1.03)
     cos, sin = scale * np.cos(angle), scale * np.sin(angle)
@@ -47,7 +47,7 @@ def homography(rng, width, height, shift_px):
     return np.linalg.inv(to_centre) @ about_centre @ to_centre
 
 
-def warp(image, shift_px, seed, noise=2.0):
+def warp(image: np.ndarray, shift_px: float, seed: int, noise: float = 2.0) -> Warp:
     """`image` moved by a random homography, both 8 bit."""
     rng = np.random.default_rng(seed)
     height, width = image.shape
@@ -57,8 +57,9 @@ def warp(image, shift_px, seed, noise=2.0):
     return Warp(image, noisy.round().astype(np.uint8), H)
 
 
-def corners(image, n, distance=7):
+def corners(image: np.ndarray, n: int, distance: float = 7) -> np.ndarray:
     """The `n` best corners as `(2, n)`; the weaker ones are textured just enough."""
-    found = cv2.goodFeaturesToTrack(image, n, 0.001, distance)[:, 0].T
-    assert found.shape == (2, n)
-    return np.ascontiguousarray(found)
+    found: Any = cv2.goodFeaturesToTrack(image, n, 0.001, distance)
+    points = found[:, 0].T
+    assert points.shape == (2, n)
+    return np.ascontiguousarray(points)

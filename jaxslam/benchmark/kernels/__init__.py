@@ -1,0 +1,1 @@
+"""Kernels beside other libraries, over sizes: what is compared, and how the times are taken and shown."""

@@ -1,0 +1,30 @@
+"""All kernels that are compared with other libraries."""
+
+from collections.abc import Sequence
+
+from jaxslam.benchmark.kernels.case import Case, installed
+from jaxslam.benchmark.kernels.graph_cases import GRAPH_CASES
+from jaxslam.benchmark.kernels.image_cases import IMAGE_CASES
+from jaxslam.benchmark.kernels.point_cases import POINT_CASES
+from jaxslam.benchmark.kernels.pose_cases import POSE_CASES
+from jaxslam.errors import BenchmarkError, nearest
+
+CASES: dict[str, Case] = {case.name: case for case in (*IMAGE_CASES, *POSE_CASES, *GRAPH_CASES, *POINT_CASES)}
+
+
+def versions() -> dict[str, str | None]:
+    """Of the libraries that jaxslam is compared with, beside those that every run names."""
+    names = dict.fromkeys(("scipy", *(name for case in CASES.values() for name in case.packages)))
+    return {name: installed(name) for name in names}
+
+
+def chosen(names: Sequence[str]) -> list[Case]:
+    """The kernels of these names, each once, or all of them if there are no names.
+
+    Raises:
+        BenchmarkError: If there is none of a name.
+    """
+    for name in names:
+        if name not in CASES:
+            raise BenchmarkError(f"--only: unknown kernel '{name}'{nearest(name, CASES)}")
+    return [case for name, case in CASES.items() if not names or name in names]

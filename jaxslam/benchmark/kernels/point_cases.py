@@ -1,0 +1,106 @@
+"""Kernels on sets of points beside SciPy and scikit-learn: alignment of paths, clusters by density."""
+
+import math
+from functools import cache
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxslam_kernels.alignment import ate
+from jaxslam_kernels.dbscan import dbscan
+from scipy.spatial.transform import Rotation
+
+from jaxslam.benchmark.kernels.case import Case, Problem
+
+_MIN_POINTS, _RADIUS_OF_512_PX = 5, 20.0
+
+
+def scipy_ate(estimate: np.ndarray, reference: np.ndarray) -> float:
+    """Root of the mean squared distance of `(3, n)` positions after alignment, as a user of SciPy would write it."""
+    x, y = estimate.T - estimate.mean(axis=1), reference.T - reference.mean(axis=1)
+    rotation = Rotation.align_vectors(y, x)[0]
+    return float(np.sqrt(np.square(rotation.apply(x) - y).sum(axis=1).mean()))
+
+
+def paths(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """`(3, n)` estimated and true positions of a walk, the estimate off by 0.1 m and in a frame of its own."""
+    random = np.random.default_rng(0)
+    reference = np.cumsum(random.normal(size=(3, n)), axis=1)
+    estimate = Rotation.random(rng=random).apply((reference + 0.1 * random.normal(size=(3, n))).T).T + 5.0
+    return estimate, reference
+
+
+def movers(n: int) -> np.ndarray:
+    """`(2, n)` pixels: six groups on people, and a quarter of outliers."""
+    random = np.random.default_rng(0)
+    centres = random.uniform([[50], [50]], [[590], [430]], (2, 6))
+    points = centres[:, random.integers(0, 6, n)] + 20 * random.normal(size=(2, n))
+    return np.where(random.uniform(size=n) < 0.25, random.uniform([[0], [0]], [[640], [480]], (2, n)), points)
+
+
+def _alignment(num_poses: int) -> Problem:
+    estimate, reference = paths(num_poses)
+    x, y = (jnp.asarray(positions, jnp.float32) for positions in (estimate, reference))
+    return Problem(
+        lambda x, y, weights: ate(x, y, weights).statistics.rmse,
+        (x, y, jnp.ones(num_poses, jnp.float32)),
+        lambda: scipy_ate(estimate, reference),
+        lambda ours, theirs: abs(float(ours) / theirs - 1),
+    )
+
+
+def _dbscan(num_points: int) -> Problem:
+    points = movers(num_points).astype(np.float32)
+    columns = np.ascontiguousarray(points.T)
+    radius = _RADIUS_OF_512_PX * math.sqrt(512 / num_points)
+
+    def ours(points: Any, mask: Any, radius: Any, min_points: Any) -> Any:
+        return dbscan(points, mask, radius=radius, min_points=min_points).label
+
+    @cache
+    def prepare() -> tuple[Any, ...]:
+        from sklearn.cluster import DBSCAN  # noqa: PLC0415
+
+        return (DBSCAN(eps=radius, min_samples=_MIN_POINTS),)
+
+    return Problem(
+        ours,
+        (jnp.asarray(points), jnp.ones(num_points, bool), jnp.float32(radius), jnp.int32(_MIN_POINTS)),
+        lambda method: method.fit(columns).labels_,
+        lambda ours, theirs: float(np.mean(_in_order(np.asarray(ours)) != _in_order(theirs))),
+        prepare,
+    )
+
+
+def _in_order(labels: np.ndarray) -> np.ndarray:
+    """The clusters numbered by their first points; noise stays -1."""
+    found, first = np.unique(labels[labels >= 0], return_index=True)
+    number = np.full(len(labels) + 1, -1)  # its last is that of noise
+    number[found[np.argsort(first)]] = np.arange(len(found))
+    return number[labels]
+
+
+POINT_CASES = (
+    Case(
+        name="alignment",
+        axis="poses",
+        sizes=(100, 1000, 10_000, 100_000),
+        reference="scipy Rotation.align_vectors",
+        compared="rigid alignment of two paths and the root of the mean squared distance; SciPy in double precision",
+        difference="relative difference of the error",
+        limit=1e-3,
+        problem=_alignment,
+    ),
+    Case(
+        name="dbscan",
+        axis="points",
+        sizes=(32, 128, 512, 2048),
+        reference="sklearn.cluster.DBSCAN",
+        compared=f"six groups of pixels and a quarter of outliers, {_MIN_POINTS} points within a radius that shrinks as"
+        " points grow in number; ours looks at all pairs",
+        difference="share of points in another cluster",
+        limit=0.01,
+        problem=_dbscan,
+        packages=("scikit-learn",),
+    ),
+)

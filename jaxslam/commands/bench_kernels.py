@@ -1,0 +1,121 @@
+"""`jaxslam bench kernels`: how long each kernel takes, beside other libraries and over sizes."""
+
+import json
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from rich import box
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from jaxslam.benchmark.kernels.case import Case
+from jaxslam.benchmark.kernels.cases import chosen, versions
+from jaxslam.benchmark.kernels.measure import devices, measure
+from jaxslam.benchmark.kernels.report import COLUMNS, about, cells, markdown_report, picture, slopes
+from jaxslam.commands.console import console, plain_console
+from jaxslam.errors import BenchmarkError
+from jaxslam.files import write_atomically
+from jaxslam.results import machine
+from jaxslam.xla import prefer_one_thread
+
+_ROUNDS, _QUICK_ROUNDS, _QUICK_SIZES = 30, 5, 2
+_JSON, _MARKDOWN, _PICTURE = "kernels.json", "kernels.md", "kernels.png"
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """Measure each kernel beside OpenCV, SciPy, Ceres, gtsam or scikit-learn, over sizes; on a GPU too if there is one.
+
+    Nothing else should run on the machine meanwhile; some minutes.
+    """
+
+    only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
+    """Kernels, instead of all of them."""
+    out: Path = Path("results") / "bench" / "kernels"
+    """Folder for the table, the picture and the figures; those of an earlier time are replaced."""
+    rounds: int | None = None
+    """How often each is called; 30 if not given. Calls of seconds are fewer."""
+    quick: bool = False
+    """The two smallest sizes only, 5 calls each: to see that it works."""
+
+    def main(self) -> None:
+        """Run the command."""
+        if self.rounds is not None and self.rounds < 1:
+            raise BenchmarkError(f"--rounds: expected at least 1, got {self.rounds}")
+        cases = chosen(self.only)
+        _prepare(self.out)
+        prefer_one_thread()  # before the first array
+        rounds = self.rounds or (_QUICK_ROUNDS if self.quick else _ROUNDS)
+        rows = _measured(cases, rounds, _QUICK_SIZES if self.quick else None)
+        for case in cases:
+            of_it = [row for row in rows if row["kernel"] == case.name]
+            console.print(_table(case, of_it))
+            longest = max(row["compile_s"] for row in of_it)
+            plain_console.print(f"{case.name} {about(case, of_it)}; compiled in {longest:.1f} s at most")
+        self._write(cases, rows, rounds)
+        console.print(f"Table and picture: {self.out / _MARKDOWN}, {self.out / _PICTURE}; figures: {self.out / _JSON}")
+
+    def _write(self, cases: Sequence[Case], rows: Sequence[dict[str, Any]], rounds: int) -> None:
+        on = machine()
+        on["versions"] |= versions()
+        content = {**on, "rounds": rounds, "quick": self.quick, "kernels": _described(cases, rows), "rows": rows}
+        files = {
+            _JSON: (json.dumps(content, indent=1) + "\n").encode(),
+            _MARKDOWN: markdown_report(cases, rows, on).encode(),
+            _PICTURE: picture(cases, rows),
+        }
+        for name, data in files.items():
+            write_atomically(self.out / name, data, BenchmarkError)
+
+
+def _prepare(out: Path) -> None:
+    """An error now, not after minutes."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=out):
+            pass
+    except OSError as problem:
+        raise BenchmarkError(f"--out: '{out}' cannot be written to: {problem.strerror}") from None
+
+
+def _measured(cases: Sequence[Case], rounds: int, num_sizes: int | None) -> list[dict[str, Any]]:
+    jobs = [(case, size, device) for case in cases for size in case.sizes[:num_sizes] for device in devices()]
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    rows = []
+    # Drawn between measurements only: a thread that draws would run on the core where they are taken.
+    with Progress(*columns, console=console, auto_refresh=False) as progress:
+        task = progress.add_task("", total=len(jobs))
+        for case, size, device in jobs:
+            progress.update(task, description=f"{case.name}, {case.label(size)}", refresh=True)
+            rows.append(measure(case, size, device, rounds))
+            progress.advance(task)
+        progress.update(task, description="Kernels", refresh=True)
+    return rows
+
+
+def _described(cases: Sequence[Case], rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    return {
+        case.name: {
+            "axis": case.axis,
+            "reference": case.reference,
+            "compared": case.compared,
+            "difference": case.difference,
+            "limit": case.limit,
+            "slopes": slopes([row for row in rows if row["kernel"] == case.name]),
+        }
+        for case in cases
+    }
+
+
+def _table(case: Case, rows: Sequence[dict[str, Any]]) -> Table:
+    """In a terminal, without the name and the time of compiling."""
+    drawn = Table(title=case.name, title_justify="left", box=box.SIMPLE_HEAD, padding=0)
+    for column in COLUMNS[1:-1]:
+        drawn.add_column(column, justify="right", no_wrap=True)
+    for row in rows:
+        drawn.add_row(*cells(row)[1:-1])
+    return drawn
