@@ -1,6 +1,7 @@
 """The detector that the settings ask for."""
 
 import logging
+from pathlib import Path
 
 from jaxslam.config import SemanticsConfig
 from jaxslam.errors import ModelError
@@ -16,13 +17,24 @@ def detector_of(config: SemanticsConfig) -> Detector | None:
     Raises:
         ModelError: If a file is named that is not there, or that cannot be used.
     """
+    path = model_file(config)
+    if path is None:
+        return None
+    return load_detector(path, labels=config.labels, min_score=config.min_score, num_threads=config.threads)
+
+
+def model_file(config: SemanticsConfig) -> Path | None:
+    """The file of the network of the settings; `None`, and a warning, if it is known but not on this machine.
+
+    Raises:
+        ModelError: If a file is named that is not there.
+    """
     if config.model is None:
         return None
     try:
-        path = find_model(config.model)
+        return find_model(config.model)
     except ModelError as error:
         if not is_known(config.model):
             raise
         _log.warning("no network finds what moves, geometry alone decides: %s", error)
         return None
-    return load_detector(path, labels=config.labels, min_score=config.min_score, num_threads=config.threads)

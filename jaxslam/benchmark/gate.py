@@ -2,13 +2,18 @@
 
 Runs are deterministic and have the same seeds, so that on one machine their errors are equal to the last digit as long
 as nothing has changed. Times are not, even as ratios to OpenCV's flow: the best run of each row is compared.
+
+Another processor rounds otherwise, and so do other releases of the compiler: that changes errors as another seed does.
+There, what counts as worse is more than the seeds' own spread explains, and times of other processors are left alone.
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from jaxslam.benchmark.rows import rows_of
 from jaxslam.errors import BenchmarkError
@@ -16,6 +21,10 @@ from jaxslam.files import write_atomically
 
 _WORSE_ATE, _WORSE_TIME = 0.02, 0.2
 """Shares by which the median error, and the time of the median frame, may be greater."""
+_NOISE = 4.0
+"""Where rounding differs: so many standard deviations of the errors. Medians of three runs differ by one."""
+_VERSIONS = ("jaxlib", "opencv-python-headless", "numpy")
+"""What rounds."""
 _LEAST_ATE_M = 1e-5
 """Smaller differences are of no interest to anybody."""
 _LEAST_PERCENT = 1e-6
@@ -34,6 +43,8 @@ class Baseline:
         runs: How often each.
         reason: Why these figures are the ones to keep to.
         machine: On which they were measured.
+        versions: Of the libraries that computed them.
+        noise: By label, the standard deviation of errors over seeds, as a share of them; none where there was one run.
         rows: Figures by sequence and label.
     """
 
@@ -42,6 +53,8 @@ class Baseline:
     runs: int
     reason: str
     machine: str
+    versions: str
+    noise: Mapping[str, float]
     rows: Mapping[str, Mapping[str, float]]
 
 
@@ -81,27 +94,39 @@ def make_baseline(
     failed = [result for result in results if result["status"] != "done"]
     if failed or not results:
         raise BenchmarkError(f"baseline: expected runs that all ended well, got {len(failed)} of {len(results)} failed")
-    machines = sorted({f"{result['cpu']}, {result['cores']} cores" for result in results})
-    return Baseline(suite, tuple(presets), runs, reason, "; ".join(machines), _figures_of(results))
+    machine, versions = _machine(results), _versions(results)
+    return Baseline(suite, tuple(presets), runs, reason, machine, versions, _noise_of(results), _figures_of(results))
+
+
+def differences(baseline: Baseline, results: Sequence[Mapping[str, Any]]) -> str:
+    """In what the machine of these runs differs from that of the baseline, in words; empty if in nothing."""
+    ours = _machine(results), _versions(results)
+    theirs = baseline.machine, baseline.versions
+    return "; ".join(f"{now}, not {before}" for now, before in zip(ours, theirs, strict=True) if now != before)
 
 
 def complaints(baseline: Baseline, results: Sequence[Mapping[str, Any]]) -> list[Complaint]:
-    """What has become worse: errors by over 2 %, tracked frames at all, time by over 20 %; and what is missing."""
+    """What has become worse: errors by over 2 %, tracked frames at all, time by over 20 %; and what is missing.
+
+    On another machine or with other libraries, errors are worse if more so than seeds explain; times of another machine
+    are not compared.
+    """
     found = [
         Complaint(f"{result['sequence']}, {result['label']}, seed {result['seed']}", result["problem"], None, None)
         for result in results
         if result["status"] != "done"
     ]
     now = _figures_of(results)
+    limits = _limits(baseline, results)
     for row, before in baseline.rows.items():
         if row not in now:
             found.append(Complaint(row, "is missing", None, None))
             continue
         for figure, was in before.items():
-            value = now[row].get(figure)
+            value, limit = now[row].get(figure), limits(row, figure, was)
             if value is None:
                 found.append(Complaint(row, f"{figure} is missing", None, None))
-            elif _is_worse(figure, was, value):
+            elif value < limit if figure == _TRACKED else value > limit:
                 found.append(Complaint(row, figure, was, value))
     return found
 
@@ -117,7 +142,8 @@ def load_baseline(path: Path) -> Baseline:
         presets = tuple(str(preset) for preset in content["presets"])
         rows = {str(row): {str(k): float(v) for k, v in figures.items()} for row, figures in content["rows"].items()}
         suite, reason, machine = (str(content[key]) for key in ("suite", "reason", "machine"))
-        return Baseline(suite, presets, int(content["runs"]), reason, machine, rows)
+        noise = {str(label): float(share) for label, share in content["noise"].items()}
+        return Baseline(suite, presets, int(content["runs"]), reason, machine, str(content["versions"]), noise, rows)
     except OSError as problem:
         raise BenchmarkError(f"{path}: expected a baseline, cannot be read: {problem.strerror}") from None
     except (ValueError, KeyError, TypeError, AttributeError) as problem:
@@ -132,7 +158,7 @@ def save_baseline(path: Path, baseline: Baseline) -> None:
     Raises:
         BenchmarkError: If it cannot be written.
     """
-    text = json.dumps({**vars(baseline), "rows": dict(baseline.rows)}, indent=1)
+    text = json.dumps({**vars(baseline), "noise": dict(baseline.noise), "rows": dict(baseline.rows)}, indent=1)
     write_atomically(path, (text + "\n").encode(), BenchmarkError)
 
 
@@ -146,9 +172,38 @@ def _figures_of(results: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, flo
     }
 
 
-def _is_worse(figure: str, before: float, now: float) -> bool:
-    if figure == _TRACKED:
-        return now < before - _LEAST_PERCENT
-    if figure == _TIME:
-        return now > before * (1 + _WORSE_TIME)
-    return now > before * (1 + _WORSE_ATE) + _LEAST_ATE_M
+def _limits(baseline: Baseline, results: Sequence[Mapping[str, Any]]) -> Callable[[str, str, float], float]:
+    """A function of row, figure and what it was, that gives the last value which is not worse."""
+    same_machine = _machine(results) == baseline.machine
+    same_rounding = same_machine and _versions(results) == baseline.versions
+
+    def limit(row: str, figure: str, before: float) -> float:
+        if figure == _TRACKED:
+            return before - _LEAST_PERCENT
+        if figure == _TIME:
+            return before * (1 + _WORSE_TIME) if same_machine else np.inf
+        noise = 0.0 if same_rounding else _NOISE * baseline.noise.get(row.rpartition(", ")[2], 0.0)
+        return before * (1 + max(_WORSE_ATE, noise)) + _LEAST_ATE_M
+
+    return limit
+
+
+def _noise_of(results: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Of every label, over all sequences that were run more than once."""
+    shares: dict[str, list[float]] = {}
+    for row in rows_of(results):
+        runs = [run for run in results if (run["sequence"], run["label"]) == (row["sequence"], row["label"])]
+        ates = [run[_ATE] for run in runs if run.get(_ATE) is not None]
+        if len(ates) > 1:
+            shares.setdefault(row["label"], []).append(float(np.std(ates, ddof=1) / np.mean(ates)))
+    return {label: round(float(np.sqrt(np.mean(np.square(of_it)))), 4) for label, of_it in shares.items()}
+
+
+def _machine(results: Sequence[Mapping[str, Any]]) -> str:
+    done = (result for result in results if result["status"] == "done")
+    return "; ".join(sorted({f"{run['cpu']} ({run['vectors']}), {run['cores']} cores" for run in done}))
+
+
+def _versions(results: Sequence[Mapping[str, Any]]) -> str:
+    done = (result for result in results if result["status"] == "done")
+    return "; ".join(sorted({", ".join(f"{name} {run['versions'][name]}" for name in _VERSIONS) for run in done}))

@@ -24,6 +24,8 @@ from jaxslam.config import Config, load_config, to_yaml
 from jaxslam.datasets import Dataset, Subset, open_dataset
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.datasets.synthetic.sensor import SensorConfig
+from jaxslam.detector_choice import model_file
+from jaxslam.download import sha256_of
 from jaxslam.errors import BenchmarkError, JaxSlamError
 from jaxslam.files import write_atomically
 from jaxslam.frame import to_grey
@@ -36,7 +38,7 @@ from jaxslam.xla import prefer_one_thread
 RESULT = "result.json"
 """The last file of a run to be written: where it is, the run is done."""
 _JOB = "job.json"
-_FLOW_PAIRS = 20
+_FLOW_PAIRS, _FLOW_CALLS = 8, 3
 _FLOW_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.03)
 _MOST_HASHED_BYTES = 5_000_000
 _LAST_WORDS = 400
@@ -141,7 +143,13 @@ def run_in_process(job: Job, out: Path, root: Path | None) -> dict[str, Any]:
     result = finished(job, out)
     if result is not None and done.returncode == 0:
         return result
-    return _figures(job) | {"status": "failed", "problem": _problem(done)}
+    (folder / RESULT).unlink(missing_ok=True)
+    return failed(job, _problem(done))
+
+
+def failed(job: Job, problem: str) -> dict[str, Any]:
+    """What is said of a run that did not come to its end."""
+    return _figures(job) | {"status": "failed", "problem": problem}
 
 
 def run_here(folder: Path, root: Path | None) -> None:
@@ -168,9 +176,13 @@ def run_here(folder: Path, root: Path | None) -> None:
         "status": "done",
         "problem": None,
         **summary,
+        "rate_hz": _rate_hz(dataset),
         "flow_ms": round(flow_ms, 4),
         **ratios,
         "data_sha256": _fingerprint(job.clip, root),
+        "model": job.config.semantics.model,
+        "model_sha256": None if (model := model_file(job.config.semantics)) is None else sha256_of(model),
+        "config": dataclasses.asdict(job.config),
     }
     write_atomically(folder / RESULT, (json.dumps(result, indent=2) + "\n").encode(), BenchmarkError)
 
@@ -194,9 +206,18 @@ def _flow_of_pair_ms(dataset: Dataset, index: int) -> float:
     corners = cv2.goodFeaturesToTrack(a, 1000, 0.001, 7)
     if corners is None:
         corners = np.random.default_rng(index).uniform(0, min(a.shape), (1000, 1, 2)).astype(np.float32)
-    began = time.perf_counter()
-    cv2.calcOpticalFlowPyrLK(a, b, corners, corners.copy(), winSize=(21, 21), maxLevel=3, criteria=_FLOW_CRITERIA)
-    return 1e3 * (time.perf_counter() - began)
+    taken: list[float] = []
+    for _ in range(_FLOW_CALLS):
+        began = time.perf_counter()
+        cv2.calcOpticalFlowPyrLK(a, b, corners, corners.copy(), winSize=(21, 21), maxLevel=3, criteria=_FLOW_CRITERIA)
+        taken.append(1e3 * (time.perf_counter() - began))
+    return float(np.median(taken))
+
+
+def _rate_hz(dataset: Dataset) -> float:
+    """Frames a second; that of the camera if there is one frame only."""
+    steps_ns = np.diff(dataset.timestamps_ns)
+    return round(1e9 / float(np.median(steps_ns)), 3) if len(steps_ns) else dataset.camera.fps
 
 
 def _figures(job: Job) -> dict[str, Any]:

@@ -7,26 +7,45 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from PIL import Image
 
-from jaxslam.benchmark.report import COLUMNS, cells, how, published_table
-from jaxslam.benchmark.rows import rows_of
+from jaxslam.benchmark.plots import folder_of, plot_errors, plot_paths, plot_rates, plot_spread, plot_times, png
+from jaxslam.benchmark.report import (
+    VERDICTS,
+    failures,
+    figure_table,
+    how,
+    overview_table,
+    published_table,
+    summary_lines,
+    without_network,
+)
+from jaxslam.benchmark.rows import ACCURACY, RUNNING, by_sequence, median_run, rows_of
 from jaxslam.benchmark.suite import Suite
 
-_PICTURE_PX = 720
+_PICTURE_PX = 1000
+_PICTURES = {
+    "failures.png": "where it was lost, and the largest error",
+    "masks.png": "what was left out as moving",
+}
 _STYLE = """
-body { font: 16px/1.5 system-ui, sans-serif; margin: 0 auto; max-width: 60rem; padding: 0 1rem 3rem; color: #222; }
+body { font: 16px/1.5 system-ui, sans-serif; margin: 0 auto; max-width: 60rem; padding: 0 1rem 3rem; color: #222;
+  overflow-wrap: anywhere; }
 h1, h2 { line-height: 1.2; } h2 { border-top: 1px solid #ddd; padding-top: 1rem; }
-.wide { overflow-x: auto; }
-table { border-collapse: collapse; white-space: nowrap; font-variant-numeric: tabular-nums; }
+.wide { overflow-x: auto; margin: 1rem 0; }
+table { border-collapse: collapse; white-space: nowrap; font-variant-numeric: tabular-nums; font-size: 0.9rem; }
 th, td { padding: .3rem .7rem; border-bottom: 1px solid #ddd; text-align: right; }
-th:first-child, td:first-child { text-align: left; } th { cursor: pointer; background: #f4f4f4; }
-img { max-width: 100%; height: auto; } .failed { color: #b00; } figure { margin: 1rem 0; } figcaption { color: #555; }
-@media (prefers-color-scheme: dark) { body { background: #181818; color: #ddd; } th { background: #2a2a2a; }
-  th, td, h2 { border-color: #444; } .failed { color: #f77; } figcaption { color: #aaa; } }
+th:first-child, td:first-child { text-align: left; position: sticky; left: 0; background: #fff; }
+th, th:first-child { cursor: pointer; background: #f4f4f4; }
+.better { color: #060; font-weight: 600; } .worse { color: #b00; } .failed { color: #b00; }
+img { width: 40rem; max-width: 100%; height: auto; } figure { margin: 1rem 0; } figcaption { color: #555; }
+summary { cursor: pointer; padding: .3rem 0; }
+@media (max-width: 40rem) { th, td { padding: .3rem .4rem; }
+  td:first-child { white-space: normal; overflow-wrap: anywhere; min-width: 6rem; } }
+@media (prefers-color-scheme: dark) { body { background: #181818; color: #ddd; }
+  th:first-child, td:first-child { background: #181818; } th, th:first-child { background: #2a2a2a; }
+  th, td, h2 { border-color: #444; } .better { color: #7d7; } .worse, .failed { color: #f77; }
+  figcaption { color: #aaa; } img { background: #fff; } }
 """
 _SCRIPT = """
 document.querySelectorAll("th").forEach(head => head.addEventListener("click", () => {
@@ -41,37 +60,31 @@ document.querySelectorAll("th").forEach(head => head.addEventListener("click", (
 """
 
 
-def html_report(suite: Suite, results: Sequence[Mapping[str, Any]], missing: Sequence[str], out: Path) -> str:
+def html_report(suite: Suite, results: Sequence[Mapping[str, Any]], missing: Mapping[str, str], out: Path) -> str:
     """The report of a suite.
 
     Args:
         suite: What was run.
         results: Of every run, as `run_jobs` gives them.
-        missing: Names of recordings that are not there.
-        out: The folder of the results, whose pictures are shown.
+        missing: Names of what was not run, with the reason.
+        out: The folder of the results, whose files are shown.
     """
-    rows = rows_of(results)
-    parts = [f"<h1>{_text(suite.name)}</h1>", f"<p>{_text(suite.about)}</p>"]
-    for sequence in dict.fromkeys(row["sequence"] for row in rows):
-        of_it = [row for row in rows if row["sequence"] == sequence]
-        runs = [result for result in results if result["sequence"] == sequence]
+    rows, runs = rows_of(results), by_sequence(results)
+    parts = [f"<h1>{_text(suite.name)}</h1>", f"<p>{_text(suite.about)}</p>", _table(overview_table(suite, rows))]
+    parts += [f"<p>{_text(line)}</p>" for line in summary_lines(suite, rows)]
+    parts += [f'<p class="failed">{_text(line)}</p>' for line in without_network(results)]
+    rates = _by_rate(suite, results)
+    if rates:
+        parts.append(_figure(png(plot_rates(rates)), "Error over the rate of frames: median and range of the runs."))
+    for sequence, of_it in by_sequence(rows).items():
         parts.append(f"<h2>{_text(sequence)}</h2>")
-        parts.append(_table(COLUMNS, [cells(row) for row in of_it]))
-        published = published_table(suite, sequence, of_it)
-        if published:
-            parts.append(_table(published[0], published[1:]))
-        parts += [
-            f'<p class="failed">{_text(run["label"])}, seed {run["seed"]}: {_text(run["problem"])}</p>'
-            for run in runs
-            if run["status"] != "done"
-        ]
-        done = [run for run in runs if run["status"] == "done"]
-        if done:
-            parts.append(_figure(_png(_overview(done)), f"{sequence}: errors of the runs, and time of the frames"))
-        parts += [_median_run(label, done, out) for label in dict.fromkeys(run["label"] for run in done)]
+        parts += [_table(figure_table(of_it, columns)) for columns in (ACCURACY, RUNNING)]
+        parts += [f'<p class="failed">{_text(line)}</p>' for line in failures(of_it)]
+        parts.append(_table(published_table(suite, sequence, of_it)))
+        parts += _plots(sequence, [run for run in runs[sequence] if run["status"] == "done"], out)
     if missing:
-        parts.append("<h2>Not run: recordings that are not on this machine</h2><ul>")
-        parts += [f"<li>{_text(name)}: <code>jaxslam data get {_text(name)}</code></li>" for name in missing]
+        parts.append("<h2>Not run</h2><ul>")
+        parts += [f"<li>{_text(name)}: {_text(why)}</li>" for name, why in missing.items()]
         parts.append("</ul>")
     parts.append(f"<p>{_text(how(results))}</p>")
     head = (
@@ -86,66 +99,65 @@ def _text(value: object) -> str:
     return html.escape(str(value))
 
 
-def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    head = "".join(f"<th>{_text(column)}</th>" for column in columns)
-    body = "".join("<tr>" + "".join(f"<td>{_text(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+def _table(lines: Sequence[Sequence[str]]) -> str:
+    if not lines:
+        return ""
+    head = "".join(f"<th>{_text(column)}</th>" for column in lines[0])
+    body = "".join("<tr>" + "".join(map(_cell, line)) + "</tr>" for line in lines[1:])
     return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
-def _figure(picture: bytes, caption: str) -> str:
+def _cell(text: str) -> str:
+    look = f' class="{text}"' if text in VERDICTS else ""
+    return f"<td{look}>{_text(text)}</td>"
+
+
+def _figure(picture: bytes, caption: str, kind: str = "png") -> str:
     data = base64.b64encode(picture).decode()
     return (
-        f'<figure><img alt="{_text(caption)}" src="data:image/png;base64,{data}">'
+        f'<figure><img alt="{_text(caption)}" src="data:image/{kind};base64,{data}">'
         f"<figcaption>{_text(caption)}</figcaption></figure>"
     )
 
 
-def _overview(done: Sequence[Mapping[str, Any]]) -> Figure:
-    """ATE of the runs as boxes, and median and 95th percentile of the frames' times."""
-    labels = list(dict.fromkeys(run["label"] for run in done))
-    figure = Figure(figsize=(9, 0.6 * len(labels) + 1.8), layout="constrained")
-    errors, times = figure.subplots(1, 2)
-    of = lambda label, name: [run[name] for run in done if run["label"] == label and run.get(name) is not None]
-    positions = np.arange(len(labels), 0, -1)
-    found = [of(label, "ate_rmse_m") for label in labels]
-    known = [index for index, values in enumerate(found) if values]
-    if known:
-        errors.boxplot(
-            [found[index] for index in known], positions=positions[known], orientation="horizontal", widths=0.6
-        )
-    for index in known:
-        errors.plot(found[index], np.full(len(found[index]), positions[index]), ".", color="tab:blue", alpha=0.6)
-    errors.set(xlabel="ATE [m]", yticks=positions, ylim=(0.4, len(labels) + 0.6))
-    errors.set_yticklabels(labels)
-    for name, marker in (("flow_ratio_median", "o"), ("flow_ratio_p95", "|")):
-        middle = [np.median(of(label, name)) if of(label, name) else np.nan for label in labels]
-        times.plot(middle, positions, marker, markersize=9, label=name.removeprefix("flow_ratio_"))
-    times.axvline(1, color="0.6", linewidth=0.8)
-    times.set(xlabel="time of a frame / OpenCV's flow of 1000 points", yticks=positions, ylim=(0.4, len(labels) + 0.6))
-    times.set_yticklabels([])
-    times.legend(fontsize=8)
-    for axes in (errors, times):
-        axes.set_xlim(left=0)
-        axes.grid(alpha=0.3)
-    return figure
+def _plots(sequence: str, done: Sequence[Mapping[str, Any]], out: Path) -> list[str]:
+    """Everything there is to look at of a sequence."""
+    if not done:
+        return []
+    drawn = (
+        (plot_spread(done), "errors of the runs, and times of their frames beside OpenCV's optical flow (LK)"),
+        (plot_paths(done, out), "runs of median error against the truth"),
+        (plot_errors(done, out), "error over time of those runs"),
+        (plot_times(done, out), "times of the frames of all runs, and of their stages"),
+    )
+    parts = [_figure(png(figure), f"{sequence}: {caption}") for figure, caption in drawn if figure is not None]
+    for label in dict.fromkeys(run["label"] for run in done):
+        run = median_run([run for run in done if run["label"] == label])
+        for name, caption in _PICTURES.items():
+            parts.append(_picture(folder_of(run, out) / name, f"{label}, seed {run['seed']}: {caption}"))
+    return parts
 
 
-def _png(figure: Figure) -> bytes:
-    file = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(file)
-    return file.getvalue()
-
-
-def _median_run(label: str, done: Sequence[Mapping[str, Any]], out: Path) -> str:
-    """The picture that the run of median error has left, path and error over time."""
-    runs = [run for run in done if run["label"] == label]
-    ates = [np.inf if run["ate_rmse_m"] is None else run["ate_rmse_m"] for run in runs]
-    run = runs[int(np.argsort(ates, kind="stable")[(len(runs) - 1) // 2])]
-    path = out / run["sequence"] / label / str(run["seed"]) / "plot.png"
+def _picture(path: Path, caption: str) -> str:
+    """A picture that a run has left, if it has, folded."""
     if not path.is_file():
-        return f'<p class="failed">{_text(label)}: no pose in its median run</p>'
+        return ""
     with Image.open(path) as picture:
-        picture.thumbnail((_PICTURE_PX, 10 * _PICTURE_PX))
-        file = io.BytesIO()
-        picture.convert("RGB").quantize(128).save(file, "PNG")
-    return _figure(file.getvalue(), f"{label}, its run of median error (seed {run['seed']})")
+        small = picture.convert("RGB")
+    small.thumbnail((_PICTURE_PX, 10 * _PICTURE_PX))
+    file = io.BytesIO()
+    small.save(file, "JPEG", quality=80)
+    shown = _figure(file.getvalue(), caption, "jpeg")
+    return f"<details><summary>{_text(caption)}</summary>{shown}</details>"
+
+
+def _by_rate(suite: Suite, results: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
+    """Results that are done of what is there at more than one rate, by the name of the recording, or of the first."""
+    sources: dict[object, str] = {}
+    groups: dict[str, list[Mapping[str, Any]]] = {}
+    for clip in suite.sequences:
+        name = sources.setdefault((clip.recording, clip.room, clip.start, clip.stop), clip.recording or clip.name)
+        groups.setdefault(name, []).extend(
+            result for result in results if result["sequence"] == clip.name and result["status"] == "done"
+        )
+    return {name: group for name, group in groups.items() if len({round(run["rate_hz"]) for run in group}) > 1}

@@ -1,24 +1,89 @@
-"""What a suite has shown, as Markdown: a table a sequence, published figures beside ours."""
+"""What a suite has shown, as Markdown; and the tables of which the HTML page is made too."""
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from jaxslam.benchmark.published import published_for, verdict
-from jaxslam.benchmark.rows import rows_of
+from jaxslam.benchmark.published import Figure, Verdict, published_for, verdict
+from jaxslam.benchmark.rows import ACCURACY, RUNNING, Column, by_sequence, cell, columns_of, rows_of
 from jaxslam.benchmark.suite import Suite
 
-COLUMNS = (
-    "preset",
-    "runs",
-    "tracked, %",
-    "ATE, m",
-    "from - to",
-    "ATE Sim(3), m",
-    "RPE, m/s",
-    "RPE, deg/s",
-    "time / LK",
-    "p95 / LK",
+_INLINE = (
+    " In deterministic runs mapping and the detector are done within the frame, which takes so much longer; with"
+    " `--set run.deterministic=false` they have threads of their own."
 )
+VERDICTS: tuple[Verdict, ...] = ("better", "equal", "worse")
+
+
+def markdown_report(suite: Suite, results: Sequence[Mapping[str, Any]], missing: Mapping[str, str]) -> str:
+    """The report of a suite.
+
+    Args:
+        suite: What was run.
+        results: Of every run, as `run_jobs` gives them.
+        missing: Names of what was not run, with the reason.
+    """
+    rows = rows_of(results)
+    parts = [f"# {suite.name}\n", f"{suite.about}\n" if suite.about else ""]
+    parts.append(_markdown(overview_table(suite, rows)))
+    parts += [f"- {line}\n" for line in (*summary_lines(suite, rows), *without_network(results))]
+    for sequence, of_it in by_sequence(rows).items():
+        parts.append(f"## {sequence}\n")
+        tables = (figure_table(of_it, ACCURACY), figure_table(of_it, RUNNING), published_table(suite, sequence, of_it))
+        parts += [_markdown(found) for found in tables]
+        parts += [f"- {line}\n" for line in failures(of_it)]
+    if missing:
+        parts.append("## Not run\n")
+        parts += [f"- {name}: {why}\n" for name, why in missing.items()]
+    parts.append(how(results))
+    return "\n".join(part for part in parts if part)
+
+
+def overview_table(suite: Suite, rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """Median ATE of every label on every sequence beside the best published one; headings first."""
+    labels = list(dict.fromkeys(row["label"] for row in rows))
+    lines = [["ATE, m", *labels, "best published", "of"]]
+    for sequence, of_it in by_sequence(rows).items():
+        medians = {row["label"]: row["ate_rmse_m"] for row in of_it}
+        ours = ["-" if (spread := medians.get(label)) is None else f"{spread['median']:.4f}" for label in labels]
+        best = published_of(suite, sequence)[:1]
+        lines.append([sequence, *ours, *((f"{best[0].value:g}", best[0].system) if best else ("-", "-"))])
+    return lines if rows else []
+
+
+def summary_lines(suite: Suite, rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """How each label stands against what has been published, wins and losses."""
+    lines = []
+    for label in dict.fromkeys(row["label"] for row in rows):
+        of_it = [row for row in rows if row["label"] == label and row["ate_rmse_m"] is not None]
+        against = [(row, published_of(suite, row["sequence"])) for row in of_it]
+        best = Counter(_verdict(row, figures[0]) for row, figures in against if figures)
+        every = Counter(_verdict(row, figure) for row, figures in against for figure in figures)
+        if every:
+            lines.append(f"{label}: against the best published figures {_counts(best)}; against all {_counts(every)}")
+    return lines
+
+
+def without_network(results: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Runs that had to do without the network of their settings, a line a network."""
+    lacking: dict[str, list[str]] = {}
+    for result in results:
+        if result["status"] == "done" and result["model"] is not None and result["model_sha256"] is None:
+            lacking.setdefault(result["model"], []).append(result["label"])
+    return [
+        f"{', '.join(dict.fromkeys(labels))}: without a network, because {model} was not on the machine; depth alone"
+        f" decided. To get it: jaxslam models get {model}"
+        for model, labels in lacking.items()
+    ]
+
+
+def figure_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]) -> list[list[str]]:
+    """Figures of the rows of one sequence, those that there are; headings first."""
+    shown = columns_of(rows, columns)
+    lines = [["preset", "runs", *(column.heading for column in shown)]]
+    return lines + [
+        [row["label"], f"{row['done']} of {row['runs']}", *(cell(row, column) for column in shown)] for row in rows
+    ]
 
 
 def published_table(suite: Suite, sequence: str, rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
@@ -32,71 +97,33 @@ def published_table(suite: Suite, sequence: str, rows: Sequence[Mapping[str, Any
     Returns:
         Lines of as many texts; none if nothing has been published.
     """
-    clip = next(clip for clip in suite.sequences if clip.name == sequence)
-    figures = published_for(clip.recording) if clip.recording and clip.whole else []
-    ours = [row for row in rows if row["ate_rmse_m"] is not None]
-    lines = [["published ATE", "m", "aligned", *(f"{row['label']} is" for row in ours), "source", "note"]]
+    figures, ours = published_of(suite, sequence), [row for row in rows if row["ate_rmse_m"] is not None]
+    lines = [["published ATE", "m", *(f"{row['label']} is" for row in ours), "aligned", "source", "note"]]
     for figure in figures:
-        verdicts = [verdict(row["ate_rmse_m"]["least"], row["ate_rmse_m"]["most"], figure.value) for row in ours]
+        name = figure.system if figure.variant is None else f"{figure.system}, {figure.variant}"
         stated = figure.alignment if figure.alignment_stated else f"{figure.alignment}, not stated"
         whose = figure.source if figure.reported_by is None else f"{figure.source} of {figure.reported_by}"
-        lines.append([figure.system, f"{figure.value:g}", stated, *verdicts, whose, figure.note])
+        verdicts = (_verdict(row, figure) for row in ours)
+        lines.append([name, f"{figure.value:g}", *verdicts, stated, whose, figure.note])
     return lines if figures else []
 
 
-def markdown_report(suite: Suite, results: Sequence[Mapping[str, Any]], missing: Sequence[str]) -> str:
-    """The report of a suite.
+def published_of(suite: Suite, sequence: str) -> list[Figure]:
+    """Published ATE of a sequence of a suite, best first; of a part of a recording there is none."""
+    clip = next(clip for clip in suite.sequences if clip.name == sequence)
+    return published_for(clip.recording, variants=suite.ablation) if clip.recording and clip.whole else []
 
-    Args:
-        suite: What was run.
-        results: Of every run, as `run_jobs` gives them.
-        missing: Names of recordings that are not there.
-    """
-    rows = rows_of(results)
-    parts = [f"# {suite.name}\n", f"{suite.about}\n" if suite.about else ""]
-    for sequence in dict.fromkeys(row["sequence"] for row in rows):
-        of_it = [row for row in rows if row["sequence"] == sequence]
-        parts += [f"## {sequence}\n", table(COLUMNS, [cells(row) for row in of_it])]
-        published = published_table(suite, sequence, of_it)
-        if published:
-            parts.append(table(published[0], published[1:]))
-        parts += [
-            f"- {row['label']}: {row['runs'] - row['done']} runs failed: {'; '.join(row['problems'])}\n"
-            for row in of_it
-            if row["done"] < row["runs"]
-        ]
-    if missing:
-        parts.append("## Not run: recordings that are not on this machine\n")
-        parts += [f"- {name}: `jaxslam data get {name}`\n" for name in missing]
-    parts.append(how(results))
-    return "\n".join(part for part in parts if part)
+
+def failures(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Runs that failed, a line a row."""
+    for row in rows:
+        if row["done"] < row["runs"]:
+            yield f"{row['label']}: {row['runs'] - row['done']} runs failed: {'; '.join(row['problems'])}"
 
 
 def table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table in Markdown."""
     return "".join(f"| {' | '.join(line)} |\n" for line in (columns, ["---"] * len(columns), *rows))
-
-
-def figure(spread: Mapping[str, float] | None, digits: int) -> str:
-    """The median of a figure, `-` if no run has it."""
-    return "-" if spread is None else f"{spread['median']:.{digits}f}"
-
-
-def cells(row: Mapping[str, Any]) -> list[str]:
-    """A row of `rows_of` as texts below `COLUMNS`."""
-    ate = row["ate_rmse_m"]
-    return [
-        row["label"],
-        f"{row['done']} of {row['runs']}",
-        figure(row["tracked_percent"], 1),
-        figure(ate, 4),
-        "-" if ate is None else f"{ate['least']:.4f} - {ate['most']:.4f}",
-        figure(row["ate_sim3_rmse_m"], 4),
-        figure(row["rpe_trans_m_per_s"], 4),
-        figure(row["rpe_rot_deg_per_s"], 3),
-        figure(row["flow_ratio_median"], 2),
-        figure(row["flow_ratio_p95"], 2),
-    ]
 
 
 def how(results: Sequence[Mapping[str, Any]]) -> str:
@@ -108,11 +135,24 @@ def how(results: Sequence[Mapping[str, Any]]) -> str:
     commits = sorted({result["commit"] or result["versions"]["jaxslam"] for result in done})
     modes = sorted({_mode(result) for result in done})
     return (
-        f"ATE: RMSE after SE(3) alignment of all frames, median and range of the runs; `better` than a published figure"
-        f" if all of them are, `equal` if it lies within their range. RPE: over 1 s. LK: OpenCV's"
-        f" optical flow of 1000 points in one thread, on the same machine. Runs: {'; '.join(modes)}."
-        f" Machine: {'; '.join(machines)}. jaxslam: {', '.join(commits)}.\n"
+        f"Figures are medians of the runs. ATE: RMSE after SE(3) alignment of all frames; `better` than a published"
+        f" figure if all runs are, `equal` if it lies within their range. RPE: over 1 s. First loss: the earliest of"
+        f" the runs. LK: OpenCV's optical flow of 1000 points in one thread, on the same machine; memory: the most."
+        f"{_INLINE if any(result['deterministic'] for result in done) else ''}"
+        f" Runs: {'; '.join(modes)}. Machine: {'; '.join(machines)}. jaxslam: {', '.join(commits)}.\n"
     )
+
+
+def _markdown(lines: Sequence[Sequence[str]]) -> str:
+    return table(lines[0], lines[1:]) if lines else ""
+
+
+def _verdict(row: Mapping[str, Any], figure: Figure) -> Verdict:
+    return verdict(row["ate_rmse_m"]["least"], row["ate_rmse_m"]["most"], figure.value)
+
+
+def _counts(verdicts: Mapping[str, int]) -> str:
+    return ", ".join(f"{verdicts.get(name, 0)} {name}" for name in VERDICTS)
 
 
 def _mode(result: Mapping[str, Any]) -> str:

@@ -1,47 +1,116 @@
 """What the runs of a sequence have in common: a row of a table."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-SUMMED_UP = (
-    "ate_rmse_m",
-    "ate_sim3_rmse_m",
-    "rpe_trans_m_per_s",
-    "rpe_rot_deg_per_s",
-    "tracked_percent",
-    "dropped_percent",
-    "first_loss_s",
-    "relocalised",
-    "flow_ratio_median",
-    "flow_ratio_p95",
-    "flow_ratio_max",
+
+class Column(NamedTuple):
+    """A column of figures.
+
+    Attributes:
+        heading: What stands above it.
+        figure: Name of the figure in `figures_of`.
+        digits: Decimals.
+        which: `median`, `least` or `most` of the runs, or `range` for the last two.
+    """
+
+    heading: str
+    figure: str
+    digits: int
+    which: str = "median"
+
+
+ACCURACY = (
+    Column("tracked, %", "tracked_percent", 1),
+    Column("ATE, m", "ate_rmse_m", 4),
+    Column("from - to", "ate_rmse_m", 4, "range"),
+    Column("ATE Sim(3), m", "ate_sim3_rmse_m", 4),
+    Column("RPE, m/s", "rpe_trans_m_per_s", 4),
+    Column("RPE, deg/s", "rpe_rot_deg_per_s", 3),
+    Column("RPE, m/frame", "rpe_trans_m_per_frame", 5),
+    Column("RPE, deg/frame", "rpe_rot_deg_per_frame", 4),
+    Column("t_rel, %", "kitti_trans_percent", 3),
+    Column("r_rel, deg/100 m", "kitti_rot_deg_per_100m", 3),
 )
-"""Figures of a run of which a row has the median and the range."""
+"""How good trajectories are; those of KITTI only where a path is long enough."""
+RUNNING = (
+    Column("dropped, %", "dropped_percent", 1),
+    Column("first loss, s", "first_loss_s", 2, "least"),
+    Column("found again", "relocalised", 0),
+    Column("mask age, frames", "mask_age_median", 0),
+    Column("ms", "track_ms_median", 1),
+    Column("p95, ms", "track_ms_p95", 1),
+    Column("max, ms", "track_ms_max", 1),
+    Column("time / LK", "flow_ratio_median", 2),
+    Column("p95 / LK", "flow_ratio_p95", 2),
+    Column("max / LK", "flow_ratio_max", 2),
+    Column("memory, MB", "peak_rss_mb", 0, "most"),
+)
+"""How they came about."""
 
 
 def rows_of(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Results by sequence and label: how many runs, and the figures of those that are done."""
+    """Results by sequence and label: how many runs, and the figures of those that are done.
+
+    A row has `sequence`, `label`, `runs`, `done`, `problems`, and by the name of each figure its `median`, `least` and
+    `most`, or `None`.
+    """
     groups: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
     for result in results:
         groups.setdefault((result["sequence"], result["label"]), []).append(result)
     return [_row(sequence, label, group) for (sequence, label), group in groups.items()]
 
 
+def by_sequence(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
+    """Rows or results, by the name of the sequence they are of, in their order."""
+    groups: dict[str, list[Mapping[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault(row["sequence"], []).append(row)
+    return groups
+
+
+def median_run(results: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
+    """Of results of one row that are done, at least one: the run of median error, the better of two."""
+    ates = [np.inf if result["ate_rmse_m"] is None else result["ate_rmse_m"] for result in results]
+    return results[int(np.argsort(ates, kind="stable")[(len(results) - 1) // 2])]
+
+
+def figures_of(result: Mapping[str, Any]) -> dict[str, float | None]:
+    """Every figure of a run that a table may show, by name."""
+    flat = {**(result["evaluation"] or {}), **result}
+    for name in ("track_ms", "mask_age_frames"):
+        short = name.removesuffix("_frames")
+        flat |= {f"{short}_{measure}": value for measure, value in (result[name] or {}).items()}
+    return {column.figure: flat.get(column.figure) for column in (*ACCURACY, *RUNNING)}
+
+
+def columns_of(rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]) -> list[Column]:
+    """The columns in which a row has a figure."""
+    return [column for column in columns if any(row[column.figure] is not None for row in rows)]
+
+
+def cell(row: Mapping[str, Any], column: Column) -> str:
+    """The text of a row in a column, `-` if no run has the figure."""
+    spread = row[column.figure]
+    if spread is None:
+        return "-"
+    which = ("least", "most") if column.which == "range" else (column.which,)
+    return " - ".join(f"{spread[name]:.{column.digits}f}" for name in which)
+
+
 def _row(sequence: str, label: str, group: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    done = [result for result in group if result["status"] == "done"]
-    row: dict[str, Any] = {
+    done = [figures_of(result) for result in group if result["status"] == "done"]
+    columns = {column.figure: [figures[column.figure] for figures in done] for column in (*ACCURACY, *RUNNING)}
+    return {
         "sequence": sequence,
         "label": label,
         "runs": len(group),
         "done": len(done),
         "problems": sorted({result["problem"] for result in group if result["problem"]}),
+        **{name: _spread([value for value in values if value is not None]) for name, values in columns.items()},
     }
-    for name in SUMMED_UP:
-        values = [value for result in done if (value := result.get(name)) is not None]
-        row[name] = _spread(values)
-    return row
 
 
 def _spread(values: Sequence[float]) -> dict[str, float] | None:

@@ -1,10 +1,10 @@
 """Runs of a suite: planned, spread over processes, and gone on with where they were broken off."""
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -18,10 +18,15 @@ RESULTS = "results.json"
 
 
 class Executor(Protocol):
-    """Calls functions elsewhere: `concurrent.futures` has it, and so do clients of Dask."""
+    """Where runs are made: on this machine, `local`, or on others, `cluster`."""
 
-    def submit(self, function: Callable[..., Any], /, *arguments: Any) -> "Future[Any]":
-        """Call a function, later."""
+    @property
+    def recordings(self) -> Collection[str]:
+        """Names of the recordings that are there."""
+        ...
+
+    def run(self, jobs: Sequence[Job], out: Path) -> Iterator[tuple[Job, dict[str, Any]]]:
+        """Run jobs, each in a process of its own, and give their figures as they end; files go below `out`, here."""
         ...
 
 
@@ -43,11 +48,21 @@ def plan(suite: Suite, *, presets: Sequence[str] = (), runs: int | None = None) 
     ]
 
 
-def missing(suite: Suite, root: Path | None) -> list[str]:
-    """Names of recordings that are not on this machine."""
-    wanted = dict.fromkeys(clip.recording for clip in suite.sequences if clip.recording)
-    found = found_recordings(root)
-    return [name for name in wanted if name not in found]
+def missing(suite: Suite, found: Collection[str]) -> dict[str, str]:
+    """Recordings that cannot be run, by name, and why: what nothing tracks yet, and what is not there.
+
+    Args:
+        suite: What is run.
+        found: Names of the recordings that are there.
+    """
+    why: dict[str, str] = {}
+    for clip in suite.sequences:
+        name = clip.recording
+        if clip.sensor == "stereo":
+            why[name] = "stereo input is not supported yet"
+        elif name and name not in found:
+            why[name] = f"not there; to get it: jaxslam data get {name}"
+    return why
 
 
 def swept(suite: Suite, sweeps: Iterable[str]) -> Suite:
@@ -77,7 +92,6 @@ def swept(suite: Suite, sweeps: Iterable[str]) -> Suite:
 def run_jobs(
     jobs: Sequence[Job],
     out: Path,
-    root: Path | None,
     *,
     executor: Executor,
     on_result: Callable[[dict[str, Any]], None],
@@ -87,35 +101,51 @@ def run_jobs(
     Args:
         jobs: From `plan`.
         out: Folder of the results, each job's in one of its own.
-        root: Folder in which recordings are looked for first.
         executor: Where they are run.
         on_result: Called with each result, those of earlier runs first.
 
     Raises:
-        BenchmarkError: If a result of an earlier run is unreadable.
+        BenchmarkError: If a result of an earlier run is unreadable, or there is nobody any more to run the others.
     """
-    results: dict[int, dict[str, Any]] = {}
-    for index, job in enumerate(jobs):
+    results: dict[Job, dict[str, Any]] = {}
+    for job in jobs:
         earlier = finished(job, out)
         if earlier is not None:
-            results[index] = earlier
+            results[job] = earlier
             on_result(earlier)
-    waiting = {
-        executor.submit(run_in_process, job, out, root): index for index, job in enumerate(jobs) if index not in results
-    }
-    for future in as_completed(waiting):
-        results[waiting[future]] = result = future.result()
+    for job, result in executor.run([job for job in jobs if job not in results], out):
+        results[job] = result
         on_result(result)
-    ordered = [results[index] for index in range(len(jobs))]
+    ordered = [results[job] for job in jobs]
     write_atomically(out / RESULTS, (json.dumps(ordered, indent=1) + "\n").encode(), BenchmarkError)
     return ordered
 
 
 @contextmanager
-def local(workers: int) -> Iterator[Executor]:
-    """So many processes on this machine at a time; what has not begun when it is left is not begun any more."""
+def local(workers: int, root: Path | None) -> Iterator[Executor]:
+    """Processes on this machine; what has not begun when it is left is not begun any more.
+
+    Args:
+        workers: How many at a time.
+        root: Folder in which recordings are looked for first.
+
+    Raises:
+        DatasetError: If a folder to look for recordings in is none.
+    """
     pool = ThreadPoolExecutor(workers)  # threads that wait for processes
     try:
-        yield pool
+        yield _Local(pool, root, found_recordings(root).keys())
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
+
+
+@dataclass(frozen=True)
+class _Local:
+    pool: ThreadPoolExecutor
+    root: Path | None
+    recordings: Collection[str]
+
+    def run(self, jobs: Sequence[Job], out: Path) -> Iterator[tuple[Job, dict[str, Any]]]:
+        waiting = {self.pool.submit(run_in_process, job, out, self.root): job for job in jobs}
+        for future in as_completed(waiting):
+            yield waiting[future], future.result()

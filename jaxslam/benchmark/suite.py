@@ -7,8 +7,12 @@ set: [semantics.model=null]          # settings of all runs
 sequences:
   - recording: rgbd_bonn_crowd       # a folder of that name
     stop: 220                        # frames from `start` to before `stop`
+    camera: my_camera.yaml           # if the recording's folder does not tell; beside the suite's file, or a known one
   - name: room                       # what it is called in tables; a recording's own name if not given
     room: {frames: 90, people: 2}    # rendered, see `SyntheticConfig`
+  - recording: kitti_00
+    sensor: stereo                   # rgbd if not given; stereo is listed, not run: nothing tracks it yet
+ablation: false                      # true shows published figures of parts of systems too
 variants:                            # every preset with each of these settings too
   few-points: [track.num_points=256]
 """
@@ -16,7 +20,7 @@ variants:                            # every preset with each of these settings 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 from jaxslam.checked import Checked, Range
 from jaxslam.config import configs_dir, load_config, presets, updated
@@ -38,7 +42,8 @@ class Sequence(Checked):
         start: First frame.
         stop: The frame after the last; `None` for all.
         every: All frames, or every nth, as if the camera were slower.
-        camera: Known camera or camera file of the recording; `None` if its folder tells.
+        camera: Known camera of the recording, or a camera file, seen from the suite's; `None` if its folder tells.
+        sensor: What it was taken with. Nothing tracks stereo yet, see `runner.missing`.
     """
 
     _error: ClassVar[type[JaxSlamError]] = BenchmarkError
@@ -50,11 +55,14 @@ class Sequence(Checked):
     stop: Annotated[int, _Positive] | None = None
     every: Annotated[int, _Positive] = 1
     camera: str | None = None
+    sensor: Literal["rgbd", "stereo"] = "rgbd"
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if bool(self.recording) == (self.room is not None):
             raise BenchmarkError(f"sequence {self.name}: expected either `recording` or `room`, got both or neither")
+        if self.room is not None and self.sensor != "rgbd":
+            raise BenchmarkError(f"sequence {self.name}: expected a `room` with sensor rgbd, got {self.sensor}")
         if not self.name or "/" in self.name or self.name.startswith("."):
             raise BenchmarkError(f"sequence: expected a name that can be a folder's, got '{self.name}'")
 
@@ -76,6 +84,7 @@ class Suite:
         runs: How often each, with the seeds 0, 1, 2, ...
         settings: `key=value` of all runs.
         variants: More settings by name; every preset is run with each, and not without.
+        ablation: Whether published figures of parts of systems are shown too.
     """
 
     name: str
@@ -85,6 +94,7 @@ class Suite:
     runs: int = 1
     settings: tuple[str, ...] = ()
     variants: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    ablation: bool = False
 
 
 def suites() -> dict[str, Path]:
@@ -112,7 +122,7 @@ def load_suite(name_or_path: str) -> Suite:
         raise BenchmarkError(f"suite: expected a known one, a YAML file or a folder, got '{name_or_path}'{hint}")
     content = read_mapping(path, BenchmarkError)
     try:
-        return _suite(path.stem, content)
+        return _suite(path.stem, content, path.parent)
     except JaxSlamError as error:
         raise BenchmarkError(f"{path}: {error}") from None
 
@@ -143,8 +153,8 @@ def _suite_of_folder(folder: Path) -> Suite:
     )
 
 
-def _suite(name: str, content: Mapping[str, Any]) -> Suite:
-    known = ("about", "presets", "runs", "set", "sequences", "variants")
+def _suite(name: str, content: Mapping[str, Any], folder: Path) -> Suite:
+    known = ("about", "presets", "runs", "set", "sequences", "variants", "ablation")
     for key in content:
         if key not in known:
             raise BenchmarkError(f"{key}: unknown key{nearest(key, known)}")
@@ -154,7 +164,7 @@ def _suite(name: str, content: Mapping[str, Any]) -> Suite:
     sequences = content.get("sequences")
     if not isinstance(sequences, list) or not sequences:
         raise BenchmarkError("sequences: expected a list of at least one")
-    made = tuple(_sequence(f"sequences[{index}]", entry) for index, entry in enumerate(sequences))
+    made = tuple(_sequence(f"sequences[{index}]", entry, folder) for index, entry in enumerate(sequences))
     names = [sequence.name for sequence in made]
     for name_of_one in names:
         if names.count(name_of_one) > 1:
@@ -162,6 +172,9 @@ def _suite(name: str, content: Mapping[str, Any]) -> Suite:
     variants = content.get("variants", {})
     if not isinstance(variants, Mapping):
         raise BenchmarkError(f"variants: expected names with lists of settings, got {variants!r}")
+    ablation = content.get("ablation", False)
+    if not isinstance(ablation, bool):
+        raise BenchmarkError(f"ablation: expected true or false, got {ablation!r}")
     suite = Suite(
         name,
         str(content.get("about", "")),
@@ -170,6 +183,7 @@ def _suite(name: str, content: Mapping[str, Any]) -> Suite:
         runs,
         _texts("set", content.get("set", [])),
         {str(key): _texts(f"variants.{key}", value) for key, value in variants.items()},
+        ablation,
     )
     for variant in suite.variants.values() or [()]:
         for preset in suite.presets:
@@ -177,8 +191,8 @@ def _suite(name: str, content: Mapping[str, Any]) -> Suite:
     return suite
 
 
-def _sequence(place: str, entry: object) -> Sequence:
-    known = ("name", "recording", "room", "start", "stop", "every", "camera")
+def _sequence(place: str, entry: object, folder: Path) -> Sequence:
+    known = ("name", "recording", "room", "start", "stop", "every", "camera", "sensor")
     if not isinstance(entry, Mapping):
         raise BenchmarkError(f"{place}: expected `recording: NAME` or `room: ...`, got {entry!r}")
     fields = dict(entry)
@@ -192,6 +206,8 @@ def _sequence(place: str, entry: object) -> Sequence:
     if "name" not in fields and "recording" not in fields:
         raise BenchmarkError(f"{place}: expected a name, got none")
     fields.setdefault("name", fields.get("recording"))
+    if isinstance(camera := fields.get("camera"), str) and (folder / camera).is_file():
+        fields["camera"] = str((folder / camera).absolute())  # not where the run happens to be
     return Sequence(**fields)
 
 

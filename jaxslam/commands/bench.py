@@ -1,5 +1,7 @@
 """`jaxslam bench`: run a suite of recordings with presets, and write a report."""
 
+import re
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,7 +13,7 @@ from rich.table import Table
 from jaxslam.benchmark.job import Job
 from jaxslam.benchmark.page import html_report
 from jaxslam.benchmark.report import markdown_report
-from jaxslam.benchmark.runner import RESULTS, local, missing, plan, run_jobs, swept
+from jaxslam.benchmark.runner import RESULTS, Executor, local, missing, plan, run_jobs, swept
 from jaxslam.benchmark.suite import checked_presets, load_suite, suites
 from jaxslam.commands.console import console
 from jaxslam.config import load_config
@@ -19,6 +21,8 @@ from jaxslam.errors import BenchmarkError
 from jaxslam.files import write_atomically
 
 _REPORT, _PAGE = "report.md", "report.html"
+_LOCAL = "local"
+_DASK = re.compile(r"dask://((?:\[[0-9A-Fa-f:.]+\]|[^\s/:@\[\]]+):[0-9]+)")
 
 
 @dataclass(frozen=True)
@@ -32,7 +36,10 @@ class RunsOfSuite:
     runs: int | None = None
     """How often to run each, instead of as often as the suite says."""
     workers: int = 1
-    """Runs at the same time; times are only worth something with 1."""
+    """Runs at the same time on this machine; times are only worth something with 1."""
+    executor: str = _LOCAL
+    """Where to run: local, or dask://HOST:PORT, the scheduler of a Dask cluster. Its workers have recordings and --root
+    on their own machines, and run as many at a time as they have threads: `dask worker --nthreads 1` for times."""
     resume: bool = False
     """Go on with results that are there."""
     out: Path | None = None
@@ -48,22 +55,22 @@ class RunsOfSuite:
             if value is not None and value < 1:
                 raise BenchmarkError(f"{option}: expected at least 1, got {value}")
         suite = swept(load_suite(name), self.sweep)
-        root = self._root(name)
         chosen = checked_presets(self.presets) if self.presets else ()
         jobs = plan(replace(suite, settings=(*self.set, *suite.settings)), presets=chosen, runs=self.runs)
         for preset, settings in {(job.preset, job.settings) for job in jobs}:
             load_config(preset, overrides=settings)  # an error now, not after hours
-        absent = missing(suite, root)
-        there = [job for job in jobs if job.clip.recording not in absent]
         out = self.out or Path("results") / "bench" / suite.name
-        self._prepare(out)
-        for recording in absent:
-            console.print(f"Not on this machine: {recording}; to get it: jaxslam data get {recording}", highlight=False)
-        results = self._run(there, out, root)
+        with self._executor(self._root(name)) as executor:
+            absent = missing(suite, executor.recordings)
+            self._prepare(out)
+            for why in dict.fromkeys(absent.values()):
+                names = ", ".join(name for name in absent if absent[name] == why)
+                console.print(f"Not run: {names}: {why}", highlight=False)
+            results = self._run([job for job in jobs if job.clip.recording not in absent], out, executor)
         write_atomically(out / _REPORT, markdown_report(suite, results, absent).encode(), BenchmarkError)
         write_atomically(out / _PAGE, html_report(suite, results, absent, out).encode(), BenchmarkError)
         failed = sum(result["status"] != "done" for result in results)
-        console.print(f"{len(results) - failed} runs, {failed} failed, {len(absent)} recordings missing.")
+        console.print(f"{len(results) - failed} runs, {failed} failed, {len(absent)} recordings not run.")
         console.print(
             f"Report: {out / _PAGE}, {out / _REPORT}; figures: {out / RESULTS}; each run in {out}/SEQUENCE/PRESET/SEED"
         )
@@ -74,9 +81,25 @@ class RunsOfSuite:
         root = self.root
         if root is None and suite not in suites() and Path(suite).is_dir():
             root = Path(suite)
+        if root is not None and self.executor != _LOCAL:
+            return root.absolute()  # on other machines, which are asked
         if root is not None and not root.is_dir():
             raise BenchmarkError(f"--root: expected a folder, got '{root}'")
         return root
+
+    def _executor(self, root: Path | None) -> AbstractContextManager[Executor]:
+        if self.executor == _LOCAL:
+            return local(self.workers, root)
+        match = _DASK.fullmatch(self.executor)
+        if match is None:
+            raise BenchmarkError(f"--executor: expected local or dask://HOST:PORT, got '{self.executor}'")
+        if self.workers != 1:
+            raise BenchmarkError(
+                "--workers: is for this machine; a Dask cluster runs as many as its workers have threads"
+            )
+        from jaxslam.benchmark.cluster import cluster  # noqa: PLC0415 - Dask is an extra
+
+        return cluster(match[1], root)
 
     def _prepare(self, out: Path) -> None:
         if not self.resume and out.is_dir() and any(out.iterdir()):
@@ -88,7 +111,7 @@ class RunsOfSuite:
         except OSError as problem:
             raise BenchmarkError(f"{out}: cannot be made: {problem.strerror}") from None
 
-    def _run(self, jobs: list[Job], out: Path, root: Path | None) -> list[dict[str, Any]]:
+    def _run(self, jobs: list[Job], out: Path, executor: Executor) -> list[dict[str, Any]]:
         columns = (
             TextColumn("Runs"),
             BarColumn(),
@@ -96,14 +119,14 @@ class RunsOfSuite:
             TimeElapsedColumn(),
             TimeRemainingColumn(),
         )
-        with Progress(*columns, console=console) as progress, local(self.workers) as executor:
+        with Progress(*columns, console=console) as progress:
             task = progress.add_task("runs", total=len(jobs))
 
             def told(result: dict[str, Any]) -> None:
                 progress.console.print(_line(result), highlight=False)
                 progress.advance(task)
 
-            return run_jobs(jobs, out, root, executor=executor, on_result=told)
+            return run_jobs(jobs, out, executor=executor, on_result=told)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from jaxslam.benchmark.gate import complaints, load_baseline, make_baseline, save_baseline
+from jaxslam.benchmark.gate import complaints, differences, load_baseline, make_baseline, save_baseline
 from jaxslam.commands.bench import RunsOfSuite
 from jaxslam.commands.console import console
 from jaxslam.errors import BenchmarkError
@@ -43,6 +43,11 @@ class Gate(RunsOfSuite):
             console.print(f"Baseline: {self.baseline}")
             return
         assert before is not None
+        other = differences(before, results)
+        if other:
+            console.print(
+                f"Here: {other}. Errors may differ as those of seeds do; times of other machines are left out."
+            )
         worse = complaints(before, results)
         for complaint in worse:
             console.print(f"worse: {complaint}", highlight=False)

@@ -1,15 +1,21 @@
 """`jaxslam bench`: runs in processes of their own, reports, and going on where it was broken off."""
 
+import html
 import json
 import re
+import shutil
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from jaxslam.benchmark.report import published_table
+from jaxslam.benchmark.page import html_report
+from jaxslam.benchmark.plots import plot_rates
+from jaxslam.benchmark.published import published_for
+from jaxslam.benchmark.report import overview_table, published_table, summary_lines, without_network
 from jaxslam.benchmark.suite import Sequence, Suite
 from jaxslam.cli import main
 from jaxslam.datasets.synthetic import SyntheticConfig
@@ -24,6 +30,36 @@ sequences:
     room: {frames: 8, people: 1, width: 160, height: 120}
 """
 COLUMNS = ("preset", "runs", "tracked, %", "ATE, m", "from - to")
+
+
+BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
+LOOK = """
+const table = document.querySelectorAll("table")[1];
+const head = [...table.rows[0].cells].find(cell => cell.textContent == "ATE, m");
+const order = () => { head.click(); return [...table.tBodies[0].rows].map(row => row.cells[0].textContent); };
+const pictures = [...document.images];
+document.querySelectorAll("details").forEach(part => part.open = true);
+parent.postMessage(JSON.stringify({
+  pictures: pictures.length, drawn: pictures.filter(picture => picture.naturalWidth > 100).length,
+  wide: document.documentElement.scrollWidth, window: innerWidth, sorted: [order(), order()]}), "*");
+"""
+"""Looks at a page, and tells the one around it."""
+AROUND = """<script>onmessage = message => document.title = message.data;</script>
+<iframe src="page.html" width="{width}" height="900" style="border: 0"></iframe>
+"""
+"""A window as narrow as wanted, which a browser's own is not; its title is what is told."""
+
+
+def tables(markdown: str) -> list[list[list[str]]]:
+    """Cells of every table, headings first."""
+    groups = re.findall(r"(?:^\|.*\n)+", markdown, flags=re.MULTILINE)
+    split = [[line.strip("| ").split(" | ") for line in group.splitlines()] for group in groups]
+    return [[lines[0], *lines[2:]] for lines in split]
+
+
+def column(table: list[list[str]], index: int) -> list[str]:
+    """Of the rows below the headings."""
+    return [row[index] for row in table[1:]]
 
 
 def suite_file(folder: Path, text: str = SUITE) -> str:
@@ -67,13 +103,19 @@ class TestResults:
 
     def test_report(self, out: Path) -> None:
         text = (out / "report.md").read_text()
-        head, _, *rows = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("|")]
-        assert tuple(head[: len(COLUMNS)]) == COLUMNS
-        assert [row[:2] for row in rows] == [["static", "2 of 2"], ["default", "2 of 2"]]
+        overview, accuracy, running = tables(text)
+        assert tuple(accuracy[0][: len(COLUMNS)]) == COLUMNS
+        assert [row[:2] for row in accuracy[1:]] == [["static", "2 of 2"], ["default", "2 of 2"]]
         results = json.loads((out / "results.json").read_text())
-        for row in rows:
+        for row in accuracy[1:]:
             ates = sorted(run["ate_rmse_m"] for run in results if run["label"] == row[0])
             assert row[3:5] == [f"{sum(ates) / 2:.4f}", f"{ates[0]:.4f} - {ates[1]:.4f}"]
+        assert overview == [
+            ["ATE, m", "static", "default", "best published", "of"],
+            ["room", *column(accuracy, 3), "-", "-"],
+        ]
+        times = sorted(run["track_ms"]["p95"] for run in results if run["label"] == "static")
+        assert float(running[1][running[0].index("p95, ms")]) == pytest.approx(sum(times) / 2, abs=0.06)
         assert "deterministic, all frames" in text
 
     def test_page(self, out: Path) -> None:
@@ -81,8 +123,54 @@ class TestResults:
         page = (out / "report.html").read_text()
         assert page.startswith("<!doctype html>")
         assert not re.findall(r'(?:src|href)="(?!data:)', page)
-        assert page.count("<img") == 3
+        pictures = re.findall(r'<img alt="([^"]*)" src="data:image/(?:png|jpeg);base64,[A-Za-z0-9+/=]{1000,}"', page)
+        shown = ("errors of the runs", "against the truth", "error over time", "times of the frames", "largest error")
+        assert all(any(what in picture for picture in pictures) for what in shown)
         assert "2 of 2" in page
+
+    @pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")
+    @pytest.mark.parametrize("width", [390, 1200])
+    def test_page_in_a_browser(self, out: Path, tmp_path: Path, width: int) -> None:
+        """It is no wider than the window, its pictures are there, and a click on a heading sorts."""
+        page, around = tmp_path / "page.html", tmp_path / "around.html"
+        page.write_text((out / "report.html").read_text().replace("</body>", f"<script>{LOOK}</script></body>"))
+        around.write_text(AROUND.format(width=width))
+        browser = [str(BROWSER), "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'user'}"]
+        shown = subprocess.run(
+            [*browser, "--virtual-time-budget=5000", "--dump-dom", around.as_uri()],
+            capture_output=True, text=True, check=True, timeout=60,
+        )  # fmt: skip
+        found = re.search(r"<title>(.*?)</title>", shown.stdout)
+        assert found is not None
+        seen = json.loads(html.unescape(found[1]))
+        assert seen["pictures"] == seen["drawn"] >= 5
+        assert seen["wide"] <= seen["window"] == width
+        results = json.loads((out / "results.json").read_text())
+        ate = {
+            label: [run["ate_rmse_m"] for run in results if run["label"] == label] for label in ("static", "default")
+        }
+        up = sorted(ate, key=lambda label: float(f"{sum(ate[label]) / 2:.4f}"))
+        assert seen["sorted"] == [up, up[::-1]]
+
+
+class TestRates:
+    def test_errors_over_the_rate(self, out: Path, tmp_path: Path) -> None:
+        """Of a room that is there at two rates, one line a preset, through the medians of its runs."""
+        shutil.copytree(out, tmp_path / "out")
+        shutil.copytree(out / "room", tmp_path / "out" / "room_15_hz")
+        results = json.loads((out / "results.json").read_text())
+        slow = [{**run, "sequence": "room_15_hz", "rate_hz": 15.0, "ate_rmse_m": 0.05} for run in results]
+        figure = plot_rates({"room": [*results, *slow]})
+        lines = {str(line.get_label()): np.asarray(line.get_xydata()) for line in figure.axes[0].lines}
+        assert set(lines) == {"static", "default"}
+        for label, points in lines.items():
+            ates = [run["ate_rmse_m"] for run in results if run["label"] == label]
+            np.testing.assert_allclose(points, [[15.0, 0.05], [30.0, np.median(ates)]], rtol=1e-3)
+        room = SyntheticConfig(frames=8, people=1, width=160, height=120)
+        suite = Suite("rates", "", (Sequence("room", room=room), Sequence("room_15_hz", room=room, every=2)))
+        page = html_report(suite, [*results, *slow], {}, tmp_path / "out")
+        assert "Error over the rate of frames" in page
+        assert "Error over the rate of frames" not in (out / "report.html").read_text()
 
 
 class TestGoingOn:
@@ -141,13 +229,26 @@ class TestTrouble:
         assert results[-1]["problem"].startswith("ended with 1: error: ")
         report = (folder / "report.md").read_text()
         assert "1 runs failed: ended with 1" in report
-        assert "| static | 0 of 1 | - |" in report
+        assert "| static | 0 of 1 |" in report
 
     def test_recording_that_is_not_there(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         text = SUITE.replace("runs: 2", "runs: 1") + "  - recording: rgbd_bonn_nowhere\n"
         main(["bench", suite_file(tmp_path, text), "--out", str(tmp_path / "out"), "--presets", "default"])
         assert "jaxslam data get rgbd_bonn_nowhere" in (tmp_path / "out" / "report.md").read_text()
         assert "rgbd_bonn_nowhere" in (tmp_path / "out" / "report.html").read_text()
+
+    def test_stereo(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        """One line says that nothing tracks it; the reports say so too."""
+        with pytest.raises(SystemExit) as ended:
+            main(["bench", "kitti_stereo", "--out", str(tmp_path / "out")])
+        out, error = capsys.readouterr()
+        assert ended.value.code == 1
+        assert error.strip() == "error: nothing could be run"
+        assert out.count("stereo input is not supported yet") == 1
+        assert "Not run: kitti_00, kitti_01, " in out
+        assert "11 recordings not run." in out
+        for report in ("report.md", "report.html"):
+            assert (tmp_path / "out" / report).read_text().count("kitti_10: stereo input is not supported yet") == 1
 
     def test_wrong_options(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         suite, file = suite_file(tmp_path), tmp_path / "file"
@@ -215,11 +316,38 @@ class TestPublished:
 
     def test_beside_ours(self) -> None:
         head, *lines = self.lines(Sequence("crowd", "rgbd_bonn_crowd"), (0.020, 0.025))
-        assert head[:4] == ["published ATE", "m", "aligned", "ours is"]
-        found = {line[0]: (float(line[1]), line[3]) for line in lines}
+        assert head[:4] == ["published ATE", "m", "ours is", "aligned"]
+        found = {line[0]: (float(line[1]), line[2]) for line in lines}
         assert found["NGD-SLAM"] == (0.024, "equal")
         assert {verdict for value, verdict in found.values() if value < 0.020} == {"worse"}
         assert {verdict for value, verdict in found.values() if value > 0.025} == {"better"}
+
+    def test_parts_of_systems_in_an_ablation(self) -> None:
+        clip = Sequence("w", "rgbd_dataset_freiburg3_walking_xyz")
+        whole, parts = (published_table(Suite("any", "", (clip,), ablation=a), "w", []) for a in (False, True))
+        assert ["NGD-SLAM, yolo", "0.014"] in [line[:2] for line in parts]
+        assert not any("," in line[0] for line in whole)
+
+    def test_wins_and_losses(self) -> None:
+        clips = Sequence("crowd", "rgbd_bonn_crowd"), Sequence("mine", "my_own_recording")
+        spread = {"median": 0.02, "least": 0.02, "most": 0.02}
+        rows = [{"sequence": clip.name, "label": "ours", "ate_rmse_m": spread} for clip in clips]
+        suite = Suite("any", "", clips)
+        known = [figure.value for figure in published_for("rgbd_bonn_crowd")]
+        better, worse = sum(value > 0.02 for value in known), sum(value < 0.02 for value in known)
+        best = published_for("rgbd_bonn_crowd")[0]
+        lines = [["crowd", "0.0200", f"{best.value:g}", best.system], ["mine", "0.0200", "-", "-"]]
+        assert overview_table(suite, rows)[1:] == lines
+        assert summary_lines(suite, rows) == [
+            f"ours: against the best published figures 0 better, 0 equal, 1 worse; against all {better} better,"
+            f" {len(known) - better - worse} equal, {worse} worse"
+        ]
+
+    def test_without_a_network(self) -> None:
+        run = {"status": "done", "model": "yolox-nano", "model_sha256": None, "label": "ngd"}
+        (line,) = without_network([run, run, {**run, "label": "default"}, {**run, "model_sha256": "0" * 64}])
+        assert line.startswith("ngd, default: without a network, because yolox-nano was not")
+        assert not without_network([{**run, "model": None}, {"status": "failed"}])
 
     def test_nothing_about_parts_and_rooms(self) -> None:
         assert not self.lines(Sequence("crowd", "rgbd_bonn_crowd", stop=220), (0.02, 0.03))

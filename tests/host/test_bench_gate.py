@@ -8,14 +8,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jaxslam.benchmark.gate import Baseline, complaints, load_baseline, make_baseline, save_baseline
+from jaxslam.benchmark.gate import Baseline, complaints, differences, load_baseline, make_baseline, save_baseline
 from jaxslam.errors import BenchmarkError
 
 LABELS = ("static", "default")
 
 
 def results(
-    *, ate: float = 1.0, time: float = 1.0, tracked: float = 100.0, jitter: float = 0.0
+    *,
+    ate: float = 1.0,
+    time: float = 1.0,
+    tracked: float = 100.0,
+    jitter: float = 0.0,
+    cpu: str = "any",
+    jaxlib: str = "1",
 ) -> list[dict[str, Any]]:
     """Two runs of each of two presets, their figures multiplied by so much."""
     random = np.random.default_rng(0 if not jitter else None)
@@ -26,8 +32,13 @@ def results(
             "seed": seed,
             "status": "done",
             "problem": None,
-            "cpu": "any",
+            "cpu": cpu,
+            "vectors": "avx2",
             "cores": 2,
+            "versions": {"jaxlib": jaxlib, "opencv-python-headless": "2", "numpy": "3"},
+            "evaluation": None,
+            "track_ms": None,
+            "mask_age_frames": None,
             "ate_rmse_m": ate * (0.01 + 0.002 * seed),
             "tracked_percent": tracked,
             "flow_ratio_median": time * (1 + 0.05 * seed + jitter * random.uniform()),
@@ -47,7 +58,7 @@ class TestComplaints:
         [{}, {"ate": 0.5}, {"ate": 1.015}, {"time": 0.3}, {"time": 1.15}],
         ids=["nothing", "better", "a little worse", "faster", "a little slower"],
     )
-    def test_none(self, changes: Mapping[str, float]) -> None:
+    def test_none(self, changes: Mapping[str, Any]) -> None:
         assert not complaints(baseline(), results(**changes))
 
     @pytest.mark.parametrize("run", range(20))
@@ -58,12 +69,30 @@ class TestComplaints:
         ("changes", "figure"),
         [({"ate": 1.05}, "ate_rmse_m"), ({"time": 1.5}, "flow_ratio_median"), ({"tracked": 99.9}, "tracked_percent")],
     )
-    def test_what_is_worse(self, changes: Mapping[str, float], figure: str) -> None:
+    def test_what_is_worse(self, changes: Mapping[str, Any], figure: str) -> None:
         found = complaints(baseline(), results(**changes))
         assert [(complaint.row, complaint.figure) for complaint in found] == [
             (f"room, {label}", figure) for label in LABELS
         ]
         assert all(f"{figure} " in str(complaint) and "was" in str(complaint) for complaint in found)
+
+    @pytest.mark.parametrize("other", [{"cpu": "another"}, {"jaxlib": "2"}])
+    def test_where_rounding_differs(self, other: dict[str, Any]) -> None:
+        """Seeds differ by 12.9 % here, so that 50 % may be chance and 60 % are not."""
+        assert baseline().noise == {label: pytest.approx(np.sqrt(2) * 0.001 / 0.011, abs=1e-4) for label in LABELS}
+        assert not complaints(baseline(), results(ate=1.5, **other))
+        assert {complaint.figure for complaint in complaints(baseline(), results(ate=1.6, **other))} == {"ate_rmse_m"}
+        assert {complaint.figure for complaint in complaints(baseline(), results(tracked=99.0, **other))} == {
+            "tracked_percent"
+        }
+
+    def test_times_are_those_of_a_machine(self) -> None:
+        assert not complaints(baseline(), results(time=2.0, cpu="another"))
+        assert complaints(baseline(), results(time=2.0, jaxlib="2"))
+
+    def test_differences_are_told(self) -> None:
+        assert differences(baseline(), results()) == ""
+        assert differences(baseline(), results(cpu="b")) == "b (avx2), 2 cores, not any (avx2), 2 cores"
 
     def test_failed_and_missing_runs(self) -> None:
         failed = [{**run, "status": "failed", "problem": "killed by signal 9"} for run in results()]

@@ -5,10 +5,11 @@ from pathlib import Path
 import pytest
 
 from jaxslam.benchmark.job import Job
-from jaxslam.benchmark.runner import plan, swept
+from jaxslam.benchmark.runner import missing, plan, swept
 from jaxslam.benchmark.suite import Sequence, load_suite, suites
 from jaxslam.datasets.synthetic import SyntheticConfig
 from jaxslam.errors import BenchmarkError
+from jaxslam.recordings import known_recordings
 
 SUITE = """
 about: two rooms
@@ -44,6 +45,13 @@ class TestSuite:
         assert suite.sequences[1] == Sequence("start", "rgbd_bonn_crowd", stop=20)
         assert [clip.whole for clip in suite.sequences] == [True, False]
 
+    def test_camera_file_beside_it(self, tmp_path: Path) -> None:
+        """It is found from wherever the suite is run; a known camera is left as it is."""
+        (tmp_path / "mine_camera.yaml").touch()
+        text = SUITE + "    camera: mine_camera.yaml\n  - recording: other\n    camera: tum_fr1\n"
+        _, first, second = load_suite(suite_file(tmp_path, text)).sequences
+        assert (first.camera, second.camera) == (str(tmp_path / "mine_camera.yaml"), "tum_fr1")
+
     def test_of_a_folder(self, tmp_path: Path) -> None:
         for name in ("b", "a"):
             (tmp_path / "some" / name).mkdir(parents=True)
@@ -56,6 +64,7 @@ class TestSuite:
         [
             ("sequences: []", "sequences: expected a list of at least one"),
             (SUITE + "seqences: []", "seqences: unknown key .did you mean 'sequences'"),
+            (SUITE + "ablation: 3", "ablation: expected true or false, got 3"),
             (SUITE.replace("runs: 3", "runs: 0"), "runs: expected an integer >= 1, got 0"),
             (SUITE.replace("static, default", "statik"), "unknown preset 'statik' .did you mean 'static'"),
             (SUITE.replace("static, default", ""), "presets: expected at least one"),
@@ -64,6 +73,8 @@ class TestSuite:
             (SUITE.replace("name: start", "name: room"), "'room' stands twice"),
             (SUITE.replace("name: start", "name: a/b"), "expected a name that can be a folder's"),
             (SUITE.replace("recording: rgbd_bonn_crowd\n", "name: x\n").replace("    name: start\n", ""), "either"),
+            (SUITE.replace("    stop: 20", "    sensor: lidar"), "sensor: expected one of 'rgbd', 'stereo'"),
+            (SUITE.replace("- name: room", "- name: room\n    sensor: stereo"), "expected a `room` with sensor rgbd"),
             (SUITE.replace("semantics.model", "semantic.model"), "semantic: unknown key"),
             (SUITE.replace("[semantics.model=null]", "semantics"), "set: expected a list of texts"),
             (SUITE + "variants: [a]", "variants: expected names with lists"),
@@ -81,6 +92,24 @@ class TestSuite:
             load_suite("smok")
         with pytest.raises(BenchmarkError, match="expected a folder with recordings"):
             load_suite(str(tmp_path))
+
+
+class TestMissing:
+    def test_nothing(self, tmp_path: Path) -> None:
+        assert missing(load_suite(suite_file(tmp_path, SUITE)), ["rgbd_bonn_crowd"]) == {}
+
+    def test_recording(self, tmp_path: Path) -> None:
+        why = missing(load_suite(suite_file(tmp_path, SUITE)), [])
+        assert why == {"rgbd_bonn_crowd": "not there; to get it: jaxslam data get rgbd_bonn_crowd"}
+
+    def test_stereo(self) -> None:
+        """Known recordings that nothing tracks, also where they are there."""
+        suite = load_suite("kitti_stereo")
+        names = [clip.recording for clip in suite.sequences]
+        assert names == [recording.name for recording in known_recordings().values() if recording.kind == "kitti"]
+        assert len(names) == 11
+        for found in ([], names):
+            assert missing(suite, found) == dict.fromkeys(names, "stereo input is not supported yet")
 
 
 class TestPlan:
