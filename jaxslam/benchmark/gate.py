@@ -21,8 +21,9 @@ from jaxslam.files import write_atomically
 
 _WORSE_ATE, _WORSE_TIME = 0.02, 0.2
 """Shares by which the median error, and the time of the median frame, may be greater."""
-_NOISE = 4.0
-"""Where rounding differs: so many standard deviations of the errors. Medians of three runs differ by one."""
+_NOISE, _ROUNDING = 4.0, 0.05
+"""Where rounding differs: so many standard deviations of the errors over seeds, or this share of them. With XLA held to
+AVX2, AVX and SSE4.2 on one processor, errors of `smoke` differ by 0.02, 0.8 and 2.2 % at most."""
 _VERSIONS = ("jaxlib", "opencv-python-headless", "numpy")
 """What rounds."""
 _LEAST_ATE_M = 1e-5
@@ -182,8 +183,9 @@ def _limits(baseline: Baseline, results: Sequence[Mapping[str, Any]]) -> Callabl
             return before - _LEAST_PERCENT
         if figure == _TIME:
             return before * (1 + _WORSE_TIME) if same_machine else np.inf
-        noise = 0.0 if same_rounding else _NOISE * baseline.noise.get(row.rpartition(", ")[2], 0.0)
-        return before * (1 + max(_WORSE_ATE, noise)) + _LEAST_ATE_M
+        noise = _NOISE * baseline.noise.get(row.rpartition(", ")[2], 0.0)
+        share = _WORSE_ATE if same_rounding else max(_ROUNDING, noise)
+        return before * (1 + share) + _LEAST_ATE_M
 
     return limit
 
