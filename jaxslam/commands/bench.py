@@ -133,7 +133,8 @@ class RunsOfSuite:
 class Bench(RunsOfSuite):
     """Run a suite: recordings or rendered rooms, presets, several seeds. Without a suite, list those there are.
 
-    `jaxslam bench gate` runs the suite of a baseline, and fails if it has become worse; it has a --help of its own.
+    Three more have a --help of their own: `jaxslam bench gate` fails if a suite has become worse than its baseline,
+    `jaxslam bench kernels` measures the kernels, `jaxslam bench batch` the tracker on many clips at once.
     """
 
     suite: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="SUITE")] = None
