@@ -1,0 +1,85 @@
+"""What a cue is given and what it says, the same for all of them, and how several become one weight a point.
+
+A cue measures something that points at rest do not show, in units in which 1 is the limit. Published systems compare
+with the limit and drop what is beyond; with a temperature the same comparison is smooth, and has a derivative.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxlie import SE3
+from jaxslam_kernels.camera import Intrinsics
+from jaxslam_kernels.types import Mask, Pixels, Points, Scalar, Weights
+
+
+class Scene(NamedTuple):
+    """What is known of `n` points between two frames, before the pose of the second is refined.
+
+    Attributes:
+        uv_before: `(2, n)` where they are in the frame before, pixels of the distorted image.
+        uv: `(2, n)` where flow has them now.
+        followed: `(n,)` which are there in both; nothing is said of the others.
+        depth_before: `(n,)` metres in the frame before, 0 where not measured.
+        depth: `(n,)` metres now, 0 where not measured.
+        X_world: `(3, n)` where the map has them, metres.
+        masked: `(n,)` which lie on what a network takes for something that may move.
+        T_world_before: Pose of the camera in the frame before.
+        T_world_cam: Its pose now, as most points have it.
+        intrinsics: The camera.
+    """
+
+    uv_before: Pixels
+    uv: Pixels
+    followed: Mask
+    depth_before: Weights
+    depth: Weights
+    X_world: Points
+    masked: Mask
+    T_world_before: SE3
+    T_world_cam: SE3
+    intrinsics: Intrinsics
+
+
+class Verdict(NamedTuple):
+    """What a cue says of each point.
+
+    Attributes:
+        weight: `(n,)` 0 for what moves to 1 for what is at rest; 1 where nothing is known.
+        evidence: `(n,)` what was measured, in units of its limit; 0 where nothing is known.
+        known: `(n,)` where something is.
+    """
+
+    weight: Weights
+    evidence: Weights
+    known: Mask
+
+
+def judge(evidence: Weights, known: Mask, temperature: Scalar) -> Verdict:
+    """A verdict by the limit, which is 1.
+
+    Args:
+        evidence: `(n,)` not negative; beyond 1 a point moves.
+        known: `(n,)` where it is worth anything. Where it is not finite it is not.
+        temperature: 0 compares, as published. Above, the weight is `1 / (1 + exp((evidence - 1) / temperature))`:
+            one half at the limit, and what comparing gives as the temperature goes to 0.
+    """
+    known = known & jnp.isfinite(evidence)
+    measured = jnp.where(known, evidence, 0)
+    smooth = temperature > 0
+    soft = jax.nn.sigmoid((1 - measured) / jnp.where(smooth, temperature, 1))
+    weight = jnp.where(smooth, soft, (measured <= 1).astype(measured.dtype))
+    return Verdict(jnp.where(known, weight, 1), measured, known)
+
+
+def combined(verdicts: Sequence[Verdict]) -> Weights:
+    """`(n,)` the product of the weights: every cue has a veto, as one layer after the other has in RTS-SLAM.
+
+    Args:
+        verdicts: One at least, of the same points.
+    """
+    weight = verdicts[0].weight
+    for verdict in verdicts[1:]:
+        weight = weight * verdict.weight
+    return weight
