@@ -15,6 +15,7 @@ from jaxslam_kernels.camera import make_intrinsics, project
 from jaxslam_kernels.transform import moved, to_camera, to_world
 
 from jaxslam.dynamics.cue import Scene, Verdict, combined, judge
+from jaxslam.dynamics.occlusion import PointState, next_states, occluded_share, occlusion_weights
 from jaxslam.dynamics.trajectory import TrajectoryParams, trajectory_cue
 
 N = 60
@@ -154,6 +155,45 @@ class TestTrajectory:
         check_finite(jax.grad(total, argnums=(0, 1, 2)), *arguments)
         if motion == "all":  # at rest the length of a way has a corner
             check_grads(total, arguments, order=1, modes=("fwd", "rev"), rtol=1e-4, atol=1e-4, eps=1e-6)
+
+
+class TestOcclusion:
+    """A point that a person passes before, in the order of the frames."""
+
+    @staticmethod
+    def after(*frames: tuple[bool, bool, bool]) -> PointState:
+        """Of a point for which each frame says: inside the picture, under the mask, displaced."""
+        states = jnp.array([PointState.STATIC])
+        for frame in frames:
+            states = next_states(states, *(jnp.array([flag]) for flag in frame))
+        return PointState(int(states[0]))
+
+    SEEN, UNDER = (True, False, False), (True, True, False)
+    OUTSIDE, ELSEWHERE = (False, False, False), (True, False, True)
+
+    def test_states(self) -> None:
+        assert self.after(self.SEEN, self.SEEN) == PointState.STATIC
+        assert self.after(self.SEEN, self.UNDER) == PointState.BLOCKED
+        assert self.after(self.SEEN, self.UNDER, self.UNDER, self.SEEN) == PointState.OCCLUDED
+        assert self.after(self.UNDER, self.OUTSIDE) == PointState.BLOCKED
+        assert self.after(self.UNDER, self.OUTSIDE, self.SEEN) == PointState.OCCLUDED
+        assert self.after(self.UNDER, self.SEEN, self.UNDER, self.OUTSIDE) == PointState.OCCLUDED
+        assert self.after((False, True, False)) == PointState.STATIC
+
+    def test_guard(self) -> None:
+        """What is carried away later is as any other point again, and may be passed again."""
+        assert self.after(self.UNDER, self.SEEN, self.ELSEWHERE) == PointState.STATIC
+        assert self.after(self.UNDER, self.ELSEWHERE) == PointState.STATIC
+        assert self.after(self.UNDER, self.SEEN, (False, False, True)) == PointState.OCCLUDED
+        assert self.after(self.UNDER, self.SEEN, self.ELSEWHERE, self.UNDER, self.SEEN) == PointState.OCCLUDED
+
+    def test_weights(self) -> None:
+        states = jnp.array([0, 1, 2, 2])
+        assert occlusion_weights(states, jnp.array(3.0)).tolist() == [1, 1, 3, 3]
+        total = lambda weight: jnp.sum(occlusion_weights(states, weight))
+        assert float(jax.grad(total)(jnp.array(3.0))) == 2
+        assert float(occluded_share(states, jnp.array([True, True, True, False]))) == pytest.approx(1 / 3)
+        assert float(occluded_share(states, jnp.zeros(4, bool))) == 0
 
 
 def check_finite(function: Callable[..., Any], *arguments: Any) -> None:
