@@ -16,6 +16,7 @@ from jaxslam.benchmark.report import (
     figure_table,
     how,
     overview_table,
+    protocols,
     published_table,
     summary_lines,
     without_network,
@@ -86,6 +87,10 @@ def html_report(suite: Suite, results: Sequence[Mapping[str, Any]], missing: Map
         parts.append("<h2>Not run</h2><ul>")
         parts += [f"<li>{_text(name)}: {_text(why)}</li>" for name, why in missing.items()]
         parts.append("</ul>")
+    known = protocols(suite, rows)
+    if known:
+        parts.append("<h2>How published figures came about</h2>")
+        parts += [f"<p>{_text(line)}</p>" for line in known]
     parts.append(f"<p>{_text(how(results))}</p>")
     head = (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'

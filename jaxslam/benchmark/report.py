@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from jaxslam.benchmark.published import Figure, Verdict, published_for, verdict
+from jaxslam.benchmark.published import Figure, Verdict, load_published, published_for, verdict
 from jaxslam.benchmark.rows import ACCURACY, RUNNING, Column, by_sequence, cell, columns_of, rows_of
 from jaxslam.benchmark.suite import Suite
 
@@ -35,6 +35,9 @@ def markdown_report(suite: Suite, results: Sequence[Mapping[str, Any]], missing:
     if missing:
         parts.append("## Not run\n")
         parts += [f"- {name}: {why}\n" for name, why in missing.items()]
+    known = protocols(suite, rows)
+    if known:
+        parts += ["## How published figures came about\n", *(f"- {line}\n" for line in known)]
     parts.append(how(results))
     return "\n".join(part for part in parts if part)
 
@@ -112,6 +115,18 @@ def published_of(suite: Suite, sequence: str) -> list[Figure]:
     """Published ATE of a sequence of a suite, best first; of a part of a recording there is none."""
     clip = next(clip for clip in suite.sequences if clip.name == sequence)
     return published_for(clip.recording, variants=suite.ablation) if clip.recording and clip.whole else []
+
+
+def protocols(suite: Suite, rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Of every paper whose figures stand beside ours: which frames, and what was taken of how many runs."""
+    figures = [figure for sequence in by_sequence(rows) for figure in published_of(suite, sequence)]
+    names = {name for figure in figures for name in (figure.reported_by or figure.system).split(", ")}
+    return [
+        f"{paper.name} ({paper.authors}; {paper.venue}{'' if paper.year is None else f', {paper.year}'}):"
+        f" {paper.protocol} {paper.link or ''}".rstrip()
+        for paper in load_published()
+        if paper.name in names
+    ]
 
 
 def failures(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:

@@ -15,7 +15,7 @@ import pytest
 from jaxslam.benchmark.page import html_report
 from jaxslam.benchmark.plots import plot_rates
 from jaxslam.benchmark.published import published_for
-from jaxslam.benchmark.report import overview_table, published_table, summary_lines, without_network
+from jaxslam.benchmark.report import overview_table, protocols, published_table, summary_lines, without_network
 from jaxslam.benchmark.suite import Sequence, Suite
 from jaxslam.cli import main
 from jaxslam.datasets.synthetic import SyntheticConfig
@@ -342,6 +342,13 @@ class TestPublished:
             f"ours: against the best published figures 0 better, 0 equal, 1 worse; against all {better} better,"
             f" {len(known) - better - worse} equal, {worse} worse"
         ]
+
+    def test_protocols(self) -> None:
+        suite = Suite("any", "", (Sequence("crowd", "rgbd_bonn_crowd"), Sequence("mine", "my_own_recording")))
+        lines = protocols(suite, [{"sequence": clip.name} for clip in suite.sequences])
+        assert any(line.startswith("RTS-SLAM (") and "Mean of 20 runs" in line for line in lines)
+        assert len(lines) == len({line.partition(" (")[0] for line in lines})
+        assert not protocols(suite, [{"sequence": "mine"}])
 
     def test_without_a_network(self) -> None:
         run = {"status": "done", "model": "yolox-nano", "model_sha256": None, "label": "ngd"}
