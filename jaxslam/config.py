@@ -144,11 +144,28 @@ class SemanticsConfig(Checked):
 
 
 @dataclass(frozen=True)
+class TrajectoryCueConfig(Checked):
+    """Whether points go from frame to frame as they would at rest (RTS-SLAM)."""
+
+    tolerance_m: Annotated[float, Positive] = 0.02
+    """Distance from there that says nothing, metres,"""
+    tolerance_per_m: Annotated[float, Range(at_least=0)] = 0.02
+    """and its growth with depth."""
+    as_published: bool = False
+    """Compare lengths of ways, as the paper does: wrong where the camera turns."""
+
+
+@dataclass(frozen=True)
 class DynamicsConfig(Checked):
     """Finding what moves without a network."""
 
     newcomers: bool = True
     """Leave out what has come before surfaces that were seen earlier: people, doors, things that are carried."""
+    cues: tuple[Literal["trajectory"], ...] = ()
+    """What else tells points that move, each with a veto."""
+    temperature: Annotated[float, Range(at_least=0)] = 0.0
+    """Of the limits of cues: 0 compares and drops; above, points count less the further they are beyond."""
+    trajectory: TrajectoryCueConfig = field(default_factory=TrajectoryCueConfig)
 
 
 @dataclass(frozen=True)

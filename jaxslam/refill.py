@@ -61,6 +61,8 @@ def refill(
     put = lambda old, fresh: jnp.where(new, jnp.take(fresh, candidate, axis=-1), old)
     return TrackedPoints(
         uv=put(points.uv, uv),
+        xy=put(points.xy, seen.xy),
+        depth=put(points.depth, seen.depth),
         X_world=put(points.X_world, X_world),
         information=put(points.information, 1 / jnp.square(sigma)),
         weight=jnp.where(new, 1, points.weight),

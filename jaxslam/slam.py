@@ -20,6 +20,7 @@ from jaxslam.datasets import Dataset, prefetch
 from jaxslam.datasets.realtime import in_real_time
 from jaxslam.detector_choice import detector_of
 from jaxslam.dynamic_masks import DynamicMasks, FrameMask, MaskSource
+from jaxslam.dynamics.known import cue_params_of, cues_of
 from jaxslam.errors import DatasetError, FrameError, JaxSlamError, MapFileError
 from jaxslam.frame import Frame, check_frame
 from jaxslam.frame_arrays import FrameArrays, FrameMemory
@@ -109,11 +110,13 @@ class Slam:
                 f" got {map.camera.width}x{map.camera.height}"
             )
         self._start_map, self._localize_only = map, localize_only
-        self._params = track_params(camera, self.config.track)._replace(restart_after=jnp.float32(_NEVER))
+        self._params = track_params(camera, self.config.track)._replace(
+            restart_after=jnp.float32(_NEVER), cues=cue_params_of(self.config.dynamics)
+        )
         # ORB-SLAM's local mapping does not accept keyframes either while it is busy.
         patient = max(_PATIENT_S, self.config.track.keyframe_weak_after_s)
         self._patient_params = self._params._replace(keyframe_weak_after_s=jnp.float32(patient))
-        self._plan = track_plan(self.config.track)
+        self._plan = track_plan(self.config.track)._replace(cues=cues_of(self.config.dynamics))
         self._detector = detector or detector_of(self.config.semantics)
         self._memory = FrameMemory(camera.height, camera.width)
         self._ready = False
@@ -434,8 +437,8 @@ def track_plan(config: TrackConfig) -> TrackPlan:
 
 def track_params(camera: Camera, config: TrackConfig, dtype: type[np.floating] = np.float32) -> TrackParams:
     """The traced part of the tracker's settings, with the camera; `track_step` takes it."""
-    traced = (name for name in TrackParams._fields if name not in ("intrinsics", "readout_s"))
-    settings = {name: jnp.asarray(getattr(config, name), dtype) for name in traced}
+    traced = (name for name in TrackParams._fields if name not in ("intrinsics", "readout_s", "cues"))
+    settings: dict[str, Any] = {name: jnp.asarray(getattr(config, name), dtype) for name in traced}
     return TrackParams(intrinsics=camera.intrinsics(dtype), readout_s=jnp.asarray(camera.readout_s, dtype), **settings)
 
 

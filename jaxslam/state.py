@@ -1,7 +1,7 @@
 """Everything the tracker carries from frame to frame, as pytrees of fixed capacity, and what it says of a frame."""
 
 import enum
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from jaxlie import SE3
 from jaxslam_kernels.camera import Intrinsics
@@ -9,6 +9,8 @@ from jaxslam_kernels.image import Pyramid
 from jaxslam_kernels.lk_flow import FlowPlan, LevelPlan
 from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Points, Scalar, Weights
 from jaxtyping import Array, Float, Int, Key, Num
+
+from jaxslam.dynamics.cue import Cue, Verdict
 
 
 class TrackStatus(enum.IntEnum):
@@ -90,6 +92,7 @@ class TrackPlan(NamedTuple):
         cell_px: Side of the cells that each get at most one new corner, even.
         new_points: In which frames new points are sought: `always`, where there are few, or in `keyframes` only.
         flow: How points are followed from frame to frame.
+        cues: What tells points that move, see `dynamics.cue.Cue`; functions, in the order of `TrackParams.cues`.
         look_up: How points of keyframes are searched. A window of 21 takes 1 ms a frame more and is no more accurate;
             17, 15 and 13 are alike too: TUM `fr1_rpy` 10.2, 10.2, 10.2 mm, Bonn `crowd` (start) 9.7, 9.6, 9.5.
     """
@@ -105,6 +108,7 @@ class TrackPlan(NamedTuple):
     new_points: Literal["always", "keyframes"] = "always"
     flow: FlowPlan = FlowPlan()
     look_up: LevelPlan = LevelPlan(15, 8, 0.05)
+    cues: tuple[Cue, ...] = ()
 
     def exact(self) -> "TrackPlan":
         """The same with searches that go on until nothing moves, for derivatives that must be exact; in float64.
@@ -154,6 +158,7 @@ class TrackParams(NamedTuple):
         restart_after: Frames of loss after which tracking starts anew at the held pose.
         max_speed_m_per_s: Highest believed speed of the camera.
         max_turn_rad_per_s: Highest believed angular speed of the camera.
+        cues: Parameters of each of `TrackPlan.cues`.
     """
 
     intrinsics: Intrinsics
@@ -181,6 +186,7 @@ class TrackParams(NamedTuple):
     restart_after: Scalar
     max_speed_m_per_s: Scalar
     max_turn_rad_per_s: Scalar
+    cues: tuple[Any, ...] = ()
 
 
 class TrackedPoints(NamedTuple):
@@ -188,6 +194,8 @@ class TrackedPoints(NamedTuple):
 
     Attributes:
         uv: `(2, n)` where they are in the last good frame, pixels.
+        xy: `(2, n)` the same as an ideal camera sees it, normalised coordinates.
+        depth: `(n,)` measured there, metres, 0 where nothing was.
         X_world: `(3, n)` where they are in the world, metres.
         information: `(n,)` inverse variance of their depth, 1 / m^2.
         weight: `(n,)` how much each counts, 0 to 1; the caller may change it between steps.
@@ -197,6 +205,8 @@ class TrackedPoints(NamedTuple):
     """
 
     uv: Pixels
+    xy: Pixels
+    depth: Weights
     X_world: Points
     information: Weights
     weight: Weights
@@ -297,6 +307,7 @@ class TrackOutput(NamedTuple):
         looked_up: Points of keyframes found in the frame.
         twist: Velocity of the camera in its own axes, metres a second then radians a second.
         keyframe: A `KeyframeReason`.
+        verdicts: What each of `TrackPlan.cues` says of the points that were followed.
     """
 
     T_world_cam: SE3
@@ -315,6 +326,7 @@ class TrackOutput(NamedTuple):
     looked_up: LookedUp
     twist: Float[Array, "6"]
     keyframe: Code
+    verdicts: tuple[Verdict, ...] = ()
 
     @property
     def is_keyframe(self) -> Flag:

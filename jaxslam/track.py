@@ -24,6 +24,7 @@ from jaxslam_kernels.transform import displacement, moved, to_camera, to_world
 from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Points, Scalar, Weights
 from jaxtyping import Array, Float
 
+from jaxslam.dynamics.cue import Scene, Verdict, combined
 from jaxslam.frame_arrays import FrameArrays
 from jaxslam.keyframes import empty_keyframes, look_up, with_keyframe
 from jaxslam.observe import Observed, View, depth_sigma, observe, predict_pixels
@@ -63,7 +64,7 @@ class Followed(NamedTuple):
     ok: Mask
 
 
-class _Verdict(NamedTuple):
+class _Outcome(NamedTuple):
     """Whether the frame was tracked, and why not."""
 
     lost: Flag
@@ -100,6 +101,8 @@ def init_state(
         pyramid=blank,
         points=TrackedPoints(
             uv=jnp.zeros((2, n), dtype),
+            xy=jnp.zeros((2, n), dtype),
+            depth=jnp.zeros(n, dtype),
             X_world=jnp.zeros((3, n), dtype),
             information=jnp.zeros(n, dtype),
             weight=jnp.ones(n, dtype),
@@ -176,11 +179,15 @@ def track_followed(
     params = _widened(params, state.points.uv, uv, followed)
     coarse, agreeing = _coarse_pose(state, view, uv, followed, predicted, params, plan)
     twist = _twist(state.T_world_cam, coarse, view.elapsed_s)
+    verdicts = _verdicts(state, view, uv, agreeing, coarse, twist, params, plan)
+    trust = combined(verdicts, _trust(state.points, params))
+    agreeing &= trust > 0
     looked_up = look_up(state.keyframes, coarse, twist, view, params, plan)
-    refined, inliers = _refine(state, view, uv, agreeing, looked_up, coarse, twist, params)
+    refined, inliers = _refine(state, view, uv, jnp.where(agreeing, trust, 0), looked_up, coarse, twist, params)
     verdict = _judge(state, view, refined, followed, inliers, params)
     kept = _update_points(state, view, uv, inliers, refined.T_world_cam, params)
-    return _conclude(state, view, kept, refined, looked_up, verdict, params, plan)
+    new_state, output = _conclude(state, view, kept, refined, looked_up, verdict, params, plan)
+    return new_state, output._replace(verdicts=verdicts)
 
 
 def _widened(params: TrackParams, before: Pixels, after: Pixels, followed: Mask) -> TrackParams:
@@ -236,7 +243,7 @@ def _refine(
     state: TrackState,
     view: View,
     uv: Pixels,
-    agreeing: Mask,
+    trust: Weights,
     looked_up: LookedUp,
     coarse: SE3,
     twist: Float[Array, "6"],
@@ -245,7 +252,7 @@ def _refine(
     """The pose that fits followed points and points of keyframes together, and which followed points it fits."""
     X_world = jnp.concatenate([state.points.X_world, looked_up.X_world], axis=1)
     seen = _see(X_world, jnp.concatenate([uv, looked_up.uv], axis=1), coarse, twist, view, params)
-    weights = jnp.concatenate([jnp.where(agreeing, _trust(state.points, params), 0), looked_up.weight])
+    weights = jnp.concatenate([trust, looked_up.weight])
     refined = refine_pose(
         coarse,
         X_world,
@@ -259,7 +266,36 @@ def _refine(
         scale=params.loss_scale,
     )
     close = _close(refined.T_world_cam, X_world, seen.xy, params)
-    return refined, agreeing & close[: agreeing.shape[0]]
+    return refined, (trust > 0) & close[: trust.shape[0]]
+
+
+def _verdicts(
+    state: TrackState,
+    view: View,
+    uv: Pixels,
+    agreeing: Mask,
+    coarse: SE3,
+    twist: Float[Array, "6"],
+    params: TrackParams,
+    plan: TrackPlan,
+) -> tuple[Verdict, ...]:
+    """What cues say of the points that agree with the coarse pose, which most of those at rest have made."""
+    if not plan.cues:
+        return ()
+    points, ideal = state.points, without_distortion(params.intrinsics)
+    seen = _see(points.X_world, uv, coarse, twist, view, params)
+    scene = Scene(
+        uv_before=to_pixels(ideal, points.xy),
+        uv=to_pixels(ideal, seen.xy),
+        followed=agreeing,
+        depth_before=points.depth,
+        depth=seen.depth,
+        X_world=points.X_world,
+        T_world_before=state.T_world_cam,
+        T_world_cam=coarse,
+        intrinsics=ideal,
+    )
+    return tuple(cue(scene, chosen) for cue, chosen in zip(plan.cues, params.cues, strict=True))
 
 
 def _close(T_world_cam: SE3, X_world: Points, xy: Pixels, params: TrackParams) -> Mask:
@@ -273,7 +309,7 @@ def _close(T_world_cam: SE3, X_world: Points, xy: Pixels, params: TrackParams) -
 
 def _judge(
     state: TrackState, view: View, refined: PoseRefinement, followed: Mask, inliers: Mask, params: TrackParams
-) -> _Verdict:
+) -> _Outcome:
     """Lost, weak or fine, and why."""
     num_followed, num_inliers = (jnp.sum(mask, dtype=state.twist.dtype) for mask in (followed, inliers))
     ratio = num_inliers / jnp.maximum(num_followed, 1)
@@ -291,7 +327,7 @@ def _judge(
     weak = num_inliers < params.weak_inliers
     mild = jnp.where(weak, _code(TrackReason.FEW_INLIERS), _code(TrackReason.NONE))
     codes = [_code(reason) for _, reason in causes]
-    return _Verdict(lost, weak & ~lost, jnp.select(conditions, codes, mild), ratio)
+    return _Outcome(lost, weak & ~lost, jnp.select(conditions, codes, mild), ratio)
 
 
 def _code(value: enum.IntEnum) -> Code:
@@ -318,6 +354,8 @@ def _update_points(
     cap = _MAX_FUSED * information
     return TrackedPoints(
         uv=jnp.where(inliers[None, :], uv, points.uv),
+        xy=jnp.where(inliers[None, :], seen.xy, points.xy),
+        depth=jnp.where(inliers, seen.depth, points.depth),
         X_world=jnp.where(agrees[None, :], X_world, points.X_world),
         information=jnp.where(agrees, jnp.minimum(points.information + information, cap), points.information),
         weight=points.weight,
@@ -333,7 +371,7 @@ def _conclude(
     kept: TrackedPoints,
     refined: PoseRefinement,
     looked_up: LookedUp,
-    verdict: _Verdict,
+    verdict: _Outcome,
     params: TrackParams,
     plan: TrackPlan,
 ) -> tuple[TrackState, TrackOutput]:
@@ -410,7 +448,7 @@ def _keyframe_reason(
     state: TrackState,
     kept: TrackedPoints,
     looked_up: LookedUp,
-    verdict: _Verdict,
+    verdict: _Outcome,
     started: Flag,
     since_keyframe_s: Scalar,
     params: TrackParams,

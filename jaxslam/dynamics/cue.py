@@ -4,8 +4,8 @@ A cue measures something that points at rest do not show, in units in which 1 is
 with the limit and drop what is beyond; with a temperature the same comparison is smooth, and has a derivative.
 """
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -18,16 +18,15 @@ class Scene(NamedTuple):
     """What is known of `n` points between two frames, before the pose of the second is refined.
 
     Attributes:
-        uv_before: `(2, n)` where they are in the frame before, pixels of the distorted image.
-        uv: `(2, n)` where flow has them now.
+        uv_before: `(2, n)` where they are in the frame before, pixels of the camera of `intrinsics`.
+        uv: `(2, n)` where they are now.
         followed: `(n,)` which are there in both; nothing is said of the others.
         depth_before: `(n,)` metres in the frame before, 0 where not measured.
         depth: `(n,)` metres now, 0 where not measured.
         X_world: `(3, n)` where the map has them, metres.
-        masked: `(n,)` which lie on what a network takes for something that may move.
         T_world_before: Pose of the camera in the frame before.
         T_world_cam: Its pose now, as most points have it.
-        intrinsics: The camera.
+        intrinsics: The camera. The tracker's is one without lens distortion and with a global shutter.
     """
 
     uv_before: Pixels
@@ -36,7 +35,6 @@ class Scene(NamedTuple):
     depth_before: Weights
     depth: Weights
     X_world: Points
-    masked: Mask
     T_world_before: SE3
     T_world_cam: SE3
     intrinsics: Intrinsics
@@ -56,6 +54,10 @@ class Verdict(NamedTuple):
     known: Mask
 
 
+Cue: TypeAlias = Callable[[Scene, Any], Verdict]
+"""A pure function of what is known and of its own parameters, a pytree. `TrackPlan.cues` takes any of them."""
+
+
 def judge(evidence: Weights, known: Mask, temperature: Scalar) -> Verdict:
     """A verdict by the limit, which is 1.
 
@@ -73,13 +75,13 @@ def judge(evidence: Weights, known: Mask, temperature: Scalar) -> Verdict:
     return Verdict(jnp.where(known, weight, 1), measured, known)
 
 
-def combined(verdicts: Sequence[Verdict]) -> Weights:
-    """`(n,)` the product of the weights: every cue has a veto, as one layer after the other has in RTS-SLAM.
+def combined(verdicts: Sequence[Verdict], weight: Weights) -> Weights:
+    """`(n,)` the weights times those of all verdicts: every cue has a veto, as every layer has in RTS-SLAM.
 
     Args:
-        verdicts: One at least, of the same points.
+        verdicts: Of the same points, any number.
+        weight: `(n,)` how much each counts without them.
     """
-    weight = verdicts[0].weight
-    for verdict in verdicts[1:]:
+    for verdict in verdicts:
         weight = weight * verdict.weight
     return weight

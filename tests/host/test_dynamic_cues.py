@@ -54,7 +54,6 @@ def scene(motion: Any, moved_m: Any = (0, 0, 0), seed: int = 0) -> Scene:
         depth_before=jnp.asarray(X_cam[2]),
         depth=seen[2],
         X_world=jnp.asarray(X_world),
-        masked=jnp.zeros(N, bool),
         T_world_before=before,
         T_world_cam=now,
         intrinsics=intrinsics,
@@ -92,7 +91,8 @@ class TestJudge:
 
     def test_every_cue_has_a_veto(self) -> None:
         made = [Verdict(jnp.array(w), jnp.zeros(3), jnp.ones(3, bool)) for w in ([1.0, 0.0, 0.5], [1.0, 1.0, 0.5])]
-        assert combined(made).tolist() == [1.0, 0.0, 0.25]
+        assert combined(made, jnp.array([1.0, 1.0, 0.8])).tolist() == pytest.approx([1.0, 0.0, 0.2])
+        assert combined([], jnp.array([0.5])).tolist() == [0.5]
 
 
 class TestTrajectory:
