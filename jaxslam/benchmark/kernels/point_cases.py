@@ -1,18 +1,22 @@
-"""Kernels on sets of points beside SciPy and scikit-learn: alignment of paths, clusters by density."""
+"""Kernels on sets of points beside SciPy, scikit-learn and OpenCV: alignment of paths, clusters of two kinds."""
 
 import math
 from functools import cache
 from typing import Any
 
+import cv2
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxslam_kernels.alignment import ate
 from jaxslam_kernels.dbscan import dbscan
+from jaxslam_kernels.kmeans import kmeans
 from scipy.spatial.transform import Rotation
 
 from jaxslam.benchmark.kernels.case import Case, Problem
 
 _MIN_POINTS, _RADIUS_OF_512_PX = 5, 20.0
+_CENTERS, _STEPS = 24, 10
 
 
 def scipy_ate(estimate: np.ndarray, reference: np.ndarray) -> float:
@@ -36,6 +40,15 @@ def movers(n: int) -> np.ndarray:
     centres = random.uniform([[50], [50]], [[590], [430]], (2, 6))
     points = centres[:, random.integers(0, 6, n)] + 20 * random.normal(size=(2, n))
     return np.where(random.uniform(size=n) < 0.25, random.uniform([[0], [0]], [[640], [480]], (2, n)), points)
+
+
+def opencv_kmeans(
+    rows: np.ndarray, num: int, steps: int, labels: np.ndarray | None = None
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Cost, labels and centers of `(n, d)` points; from labels, or from centers drawn by k-means++ in a first step."""
+    flags = cv2.KMEANS_PP_CENTERS if labels is None else cv2.KMEANS_USE_INITIAL_LABELS
+    first = np.zeros((len(rows), 1), np.int32) if labels is None else labels.reshape(-1, 1).copy()
+    return cv2.kmeans(rows, num, first, (cv2.TERM_CRITERIA_COUNT, steps, 0), 1, flags)
 
 
 def _alignment(num_poses: int) -> Problem:
@@ -72,6 +85,24 @@ def _dbscan(num_points: int) -> Problem:
     )
 
 
+def _kmeans(num_points: int) -> Problem:
+    points = paths(num_points)[0].astype(np.float32)
+    rows, arguments = np.ascontiguousarray(points.T), (jax.random.key(0), jnp.asarray(points))
+    mask = jnp.ones(num_points, bool)
+    first = kmeans(*arguments, mask, num_clusters=_CENTERS, num_steps=0)
+    label = np.asarray(first.label)
+
+    def ours(key: Any, points: Any, mask: Any, initial: Any) -> Any:
+        return kmeans(key, points, mask, num_clusters=_CENTERS, num_steps=_STEPS, initial=initial).cost
+
+    return Problem(
+        ours,
+        (*arguments, mask, first.centers),
+        lambda: opencv_kmeans(rows, _CENTERS, _STEPS, label)[0],
+        lambda ours, theirs: abs(float(ours) / theirs - 1),
+    )
+
+
 def _in_order(labels: np.ndarray) -> np.ndarray:
     """The clusters numbered by their first points; noise stays -1."""
     found, first = np.unique(labels[labels >= 0], return_index=True)
@@ -102,5 +133,16 @@ POINT_CASES = (
         limit=0.01,
         problem=_dbscan,
         packages=("scikit-learn",),
+    ),
+    Case(
+        name="kmeans",
+        axis="points",
+        sizes=(300, 1200, 4800, 19_200),
+        reference="cv2.kmeans",
+        compared=f"{_CENTERS} clusters of the positions of a walk, {_STEPS} steps from the same centers; OpenCV does"
+        " not label the points after the last of them",
+        difference="relative difference of the sum of squared distances",
+        limit=0.01,
+        problem=_kmeans,
     ),
 )

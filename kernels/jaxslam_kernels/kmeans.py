@@ -1,0 +1,241 @@
+"""K-means clusters with fixed shapes: every point belongs to the nearest of a fixed number of centers.
+
+Lloyd's iterations from centers drawn by greedy k-means++, or from given ones such as those of the last frame. Sources:
+Lloyd, "Least squares quantization in PCM", 1982; Arthur and Vassilvitskii, "k-means++: the advantages of careful
+seeding", SODA 2007, where section 7 proposes the greedy form: several draws for each center, the best of them kept.
+
+Layout: distances are taken by differences, a center at a time, into a running minimum. XLA makes one pass over the
+points of that, several times as fast as a matrix product of centers and points with its minimum, which writes `k n`
+numbers, and nothing cancels. Sums are added up point by point, faster than by a product with one-hot labels.
+"""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from jaxslam_kernels.types import Mask, Scalar
+
+_DRAWS = 3  # so many for each center, as in OpenCV
+
+
+class KMeans(NamedTuple):
+    """Points and the centers they belong to.
+
+    Attributes:
+        label: `(n,)` the nearest center of each point, the first of equally near ones; -1 for points that do not count.
+        centers: `(d, k)` the centers, in the unit of the points.
+        cost: Sum of the squared distances of points to their centers.
+        counts: `(k,)` how many points belong to each center. A center with none is not worth anything: with
+            `usable=counts > 0` it is drawn anew in the next call.
+    """
+
+    label: Int[Array, " n"]
+    centers: Float[Array, "d k"]
+    cost: Scalar
+    counts: Int[Array, " k"]
+
+
+def kmeans(
+    key: Key[Array, ""],
+    points: Float[Array, "d n"],
+    mask: Mask,
+    *,
+    num_clusters: int,
+    num_steps: int,
+    initial: Float[Array, "d k"] | None = None,
+    usable: Bool[Array, " k"] | None = None,
+) -> KMeans:
+    """Clusters of points around centers.
+
+    A step gives each point to its nearest center and moves each center to the mean of its points; one without points
+    stays where it is. Labels and cost belong to the centers after the last step.
+
+    Labels are choices, constant for a derivative, and so is where the search begins. Centers are the means of the
+    points that had their labels before the last step and carry a gradient as such, and so does the cost. A center
+    without points then, or after no step at all, has none.
+
+    Args:
+        key: Random key; the same key gives the same answer for the same points in the same order.
+        points: `(d, n)` coordinates in any unit; d of 1 or more.
+        mask: `(n,)` which of them count. One that is not finite does not count either, nor one with a coordinate
+            beyond the fourth root of the largest number (4e9 in single precision), whose squares might overflow.
+        num_clusters: How many centers, static. All of them are written out in the program: dozens, not thousands.
+        num_steps: How many steps, static.
+        initial: `(d, k)` where to begin; `None` to draw all centers from the points.
+        usable: `(k,)` which of the initial centers to begin with; the others are drawn. One that is not finite is
+            drawn in any case. `None`: all.
+
+    Returns:
+        `KMeans`; everything in it is finite. With fewer different points than centers, some centers coincide, and all
+        but the first of those have no points. With no points, centers that had to be drawn are zero.
+    """
+    _check(points, num_clusters, num_steps, initial)
+    counts = mask & _in_range(points)
+    origin = lax.stop_gradient(_mean(points, counts))  # far from zero, sums would be rounded more
+    points = jnp.where(counts[None, :], points - origin[:, None], 0)
+    fixed = lax.stop_gradient(points)
+    begin, usable = _given(initial, usable, origin, num_clusters)
+    centers = lax.cond(usable.all(), lambda: begin, lambda: _seed(key, fixed, counts, begin, usable))
+    before, (label, _) = _lloyd(fixed, counts, centers, num_steps)
+    centers = _means(points, before.label, before.centers)  # what the last step ends with, once more for the gradient
+    cost = jnp.square(points - centers[:, jnp.maximum(label, 0)]).sum(axis=0, where=counts).sum()
+    num = jnp.zeros(num_clusters, jnp.int32).at[_or_dropped(label, num_clusters)].add(1, mode="drop")
+    placed = usable | counts.any()
+    return KMeans(label, jnp.where(placed[None, :], centers + origin[:, None], 0), cost, num)
+
+
+def _check(points: Array, num_clusters: int, num_steps: int, initial: Array | None) -> None:
+    if num_clusters < 1 or num_steps < 0:
+        raise ValueError(
+            f"num_clusters of 1 or more and num_steps of 0 or more expected, got {num_clusters, num_steps}"
+        )
+    expected = (points.shape[0], num_clusters)
+    if initial is not None and initial.shape != expected:
+        raise ValueError(f"initial: {expected} expected, a column a center, got {initial.shape}")
+
+
+def _in_range(points: Float[Array, "d n"]) -> Bool[Array, " n"]:
+    """False for NaN too."""
+    limit = float(jnp.finfo(points.dtype).max) ** 0.25
+    return (jnp.abs(lax.stop_gradient(points)) < limit).all(axis=0)
+
+
+def _mean(points: Float[Array, "d n"], counts: Mask) -> Float[Array, " d"]:
+    total = jnp.where(counts[None, :], points, 0).sum(axis=1)
+    return total / jnp.maximum(counts.sum(dtype=jnp.int32), 1).astype(points.dtype)
+
+
+def _given(
+    initial: Float[Array, "d k"] | None, usable: Bool[Array, " k"] | None, origin: Float[Array, " d"], num: int
+) -> tuple[Float[Array, "d k"], Bool[Array, " k"]]:
+    """Centers to begin with, from the origin, zero where there is none; and where there is one."""
+    if initial is None:
+        return jnp.zeros((origin.shape[0], num), origin.dtype), jnp.zeros(num, bool)
+    initial = lax.stop_gradient(initial)
+    usable = _in_range(initial) if usable is None else usable & _in_range(initial)
+    return jnp.where(usable[None, :], initial - origin[:, None], 0), usable
+
+
+class _Labelled(NamedTuple):
+    """Labels of points, -1 for none, and the centers they stand for."""
+
+    label: Int[Array, " n"]
+    centers: Float[Array, "d k"]
+
+
+def _lloyd(
+    points: Float[Array, "d n"], counts: Mask, centers: Float[Array, "d k"], num_steps: int
+) -> tuple[_Labelled, _Labelled]:
+    """What the last step begins with, and what it ends with.
+
+    One time more is gone round, at first without any labels, which leaves all centers where they are. So labels are
+    computed in one place of the program, and in a loop, out of which XLA does not move them: else it computes them anew
+    for everything they are used for, which takes longer than ten steps.
+    """
+
+    def step(_: Array, state: tuple[_Labelled, _Labelled]) -> tuple[_Labelled, _Labelled]:
+        before = state[1]
+        moved = _means(points, before.label, before.centers)
+        return before, _Labelled(jnp.where(counts, _nearest(points, moved)[0], -1), moved)
+
+    nothing = _Labelled(jnp.full(counts.shape, -1, jnp.int32), centers)
+    return lax.fori_loop(0, num_steps + 1, step, (nothing, nothing))
+
+
+def _means(points: Float[Array, "d n"], label: Int[Array, " n"], centers: Float[Array, "d k"]) -> Float[Array, "d k"]:
+    """Each center at the mean of its points, or where it was if it has none."""
+    dim, num = centers.shape
+    rows = jnp.concatenate([points, jnp.ones_like(points[:1])]).T  # XLA adds whole rows faster than columns
+    sums = jnp.zeros((num, dim + 1), points.dtype).at[_or_dropped(label, num)].add(rows, mode="drop").T
+    return jnp.where(sums[dim:] > 0, sums[:dim] / jnp.maximum(sums[dim:], 1), centers)
+
+
+def _nearest(
+    points: Float[Array, "d ..."], centers: Float[Array, "d k"]
+) -> tuple[Int[Array, "..."], Float[Array, "..."]]:
+    """Index of and squared distance to the nearest center, the first of equally near ones; infinite ones are none."""
+    squared = jnp.full(points.shape[1:], jnp.inf, points.dtype)
+    label = jnp.zeros(points.shape[1:], jnp.int32)
+    for k in range(centers.shape[1]):
+        distance = _squared_distances(points, centers[:, k])
+        nearer = distance < squared
+        label, squared = jnp.where(nearer, k, label), jnp.where(nearer, distance, squared)
+    return label, squared
+
+
+def _squared_distances(points: Float[Array, "d ..."], center: Float[Array, " d"]) -> Float[Array, "..."]:
+    squares = [jnp.square(x - c) for x, c in zip(points, center, strict=True)]
+    return sum(squares[1:], start=squares[0])
+
+
+def _seed(
+    key: Key[Array, ""],
+    points: Float[Array, "d n"],
+    counts: Mask,
+    begin: Float[Array, "d k"],
+    usable: Bool[Array, " k"],
+) -> Float[Array, "d k"]:
+    """Centers that are not usable drawn one after the other, each a point by its squared distance to the nearest one.
+
+    Of `_DRAWS` points that one is taken which brings the points nearest to their centers. Points lie in a square, so
+    that a draw chooses one of its rows and then one in the row: sums along the way, of all points in turn, would take
+    longer than the distances.
+    """
+    tiles, inside = _square(points, counts)
+    _, squared = _nearest(tiles, jnp.where(usable[None, :], begin, jnp.inf))
+
+    def draw(squared: Array, one: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+        uniform, given, keep = one
+        row, column = jax.vmap(_draw, (0, None, None))(uniform, squared, inside)
+        drawn = tiles[:, row, column]
+        left = [jnp.minimum(squared, _squared_distances(tiles, drawn[:, i])).sum(axis=0).sum() for i in range(_DRAWS)]
+        best = jnp.argmin(jnp.stack(left))
+        center = jnp.where(keep, given, drawn[:, best])
+        return jnp.minimum(squared, _squared_distances(tiles, center)), center
+
+    uniform = jax.random.uniform(key, (usable.size, _DRAWS), points.dtype)
+    return lax.scan(draw, jnp.where(inside, squared, 0), (uniform, begin.T, usable))[1].T
+
+
+def _square(points: Float[Array, "d n"], counts: Mask) -> tuple[Float[Array, "d r c"], Bool[Array, "r c"]]:
+    """Points in about as many rows as columns, filled up with some that do not count; one of them at least."""
+    dim, n = points.shape
+    columns = max(math.isqrt(n), 1)
+    rows = max(-(-n // columns), 1)
+    more = rows * columns - n
+    tiles = jnp.pad(points, ((0, 0), (0, more))).reshape(dim, rows, columns)
+    return tiles, jnp.pad(counts, (0, more)).reshape(rows, columns)
+
+
+def _draw(
+    uniform: Scalar, squared: Float[Array, "r c"], inside: Bool[Array, "r c"]
+) -> tuple[Int[Array, ""], Int[Array, ""]]:
+    """Row and column of a point in proportion to its squared distance; each is as likely as any if all are 0 or inf."""
+    weights = jnp.where(jnp.isfinite(squared), squared, 0)
+    in_rows = weights.sum(axis=1)
+    all_alike = in_rows.sum() <= 0
+    ones = inside.astype(squared.dtype)
+    in_rows = jnp.where(all_alike, ones.sum(axis=1), in_rows)
+    row, left = _pick(uniform * in_rows.sum(), in_rows)
+    column, _ = _pick(left, jnp.where(all_alike, ones[row], weights[row]))
+    return row, column
+
+
+def _pick(target: Scalar, weights: Float[Array, " n"]) -> tuple[Int[Array, ""], Scalar]:
+    """Where a target falls on the line of stacked weights, and how far beyond the beginning of that one.
+
+    Never on a weight of zero as long as another is positive, however the sums are rounded.
+    """
+    ends = jnp.cumsum(weights)
+    hit = (weights > 0) & (ends > target)
+    index = jnp.where(hit.any(), jnp.argmax(hit), jnp.argmax(weights))
+    return index, target - (ends[index] - weights[index])
+
+
+def _or_dropped(label: Int[Array, " n"], num: int) -> Int[Array, " n"]:
+    """Labels with an index past the end, instead of -1, which would be the last one's."""
+    return jnp.where(label < 0, num, label)
