@@ -117,17 +117,19 @@ def ransac_pnp(
     return _result(refined.T_world_cam, refined.status, fixed, fallback, scores.max() >= 0, min_inliers)
 
 
-def draw_samples(key: Key[Array, ""], weights: Weights, num_samples: int) -> Int[Array, "4 h"]:
-    """Draws samples of `SAMPLE_SIZE` different points, each in proportion to its weight among those left.
+def draw_samples(
+    key: Key[Array, ""], weights: Weights, num_samples: int, size: int = SAMPLE_SIZE
+) -> Int[Array, "size h"]:
+    """Draws samples of `size` different points, each in proportion to its weight among those left.
 
     Exact sequential sampling without replacement: a draw lands on the line of stacked weights from which the ones
     drawn before have been cut out. With fewer points of positive weight than the sample has, some come twice.
     """
     ends = jnp.cumsum(weights)
     starts, total = ends - weights, ends[-1]
-    uniform = jax.random.uniform(key, (SAMPLE_SIZE, num_samples), weights.dtype)
+    uniform = jax.random.uniform(key, (size, num_samples), weights.dtype)
     drawn: list[Array] = []
-    for position in range(SAMPLE_SIZE):
+    for position in range(size):
         taken = jnp.sort(jnp.stack(drawn), axis=0) if drawn else jnp.zeros((0, num_samples), jnp.int32)
         left = total - weights[taken].sum(axis=0)
         target = uniform[position] * left
