@@ -3,6 +3,7 @@
 The public index. `Slam` is for robots and recordings, `track_step` for gradients and batches.
 """
 
+from jaxslam.batch import track_clips as track_clips
 from jaxslam.camera import Camera as Camera
 from jaxslam.camera import known_cameras as known_cameras
 from jaxslam.config import Config as Config

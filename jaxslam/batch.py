@@ -138,8 +138,10 @@ def _check_clips(clips: Sequence[FrameArrays]) -> None:
     for index, kind in enumerate(kinds):
         for name, one, other in zip(FrameArrays._fields, kinds[0], kind, strict=True):
             if one != other:
-                raise FrameError(f"clips: {name}: expected {one[1]} {one[0]} as in the first clip, got {other[1]}"
-                                 f" {other[0]} in clip {index}")
+                raise FrameError(
+                    f"clips: {name}: expected {one[1]} {one[0]} as in the first clip, got {other[1]}"
+                    f" {other[0]} in clip {index}"
+                )
 
 
 def _check_settings(batch: _Batch, at_once: int, threads: int) -> None:

@@ -166,7 +166,7 @@ def _summary(
         "track_ms": _distribution([record.track_ms for record in records if record.track_ms is not None]),
         "compile_s": round(slam.compile_s, 3),
         "wall_s": round(info.wall_s, 3),
-        "peak_rss_mb": round(_peak_rss_mb(), 1),
+        "peak_rss_mb": round(peak_rss_mb(), 1),
         **machine(),
     }
 
@@ -196,7 +196,8 @@ def _distribution(figures: Sequence[float]) -> dict[str, float] | None:
     return {name: round(float(value), 3) for name, value in measures.items()}
 
 
-def _peak_rss_mb() -> float:
+def peak_rss_mb() -> float:
+    """The most memory this process has had, megabytes."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (1e6 if sys.platform == "darwin" else 1e3)  # bytes there, kilobytes elsewhere
 

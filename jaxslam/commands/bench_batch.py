@@ -1,0 +1,130 @@
+"""`jaxslam bench batch`: the whole tracker on many clips at once, beside clip by clip."""
+
+import json
+import re
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+from rich import box
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from jaxslam.benchmark.batch import DIFFERENT, make_task, measure
+from jaxslam.benchmark.batch_report import COLUMNS, cells, how, markdown_report, picture
+from jaxslam.commands.console import console, plain_console
+from jaxslam.errors import BenchmarkError
+from jaxslam.files import write_atomically
+from jaxslam.results import machine
+
+_JSON, _MARKDOWN, _PICTURE = "batch.json", "batch.md", "batch.png"
+_LEFT_OUT = ("loop", "worst, m")
+"""Columns for which there is no room in a terminal."""
+_FEWEST_FRAMES, _LEAST_PX, _MOST_PX = 3, 64, 8192
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Track 1 to 64 clips at once with `vmap`: frames a second, beside a loop, on the GPU where JAX has one.
+
+    Nothing else should run on the machine meanwhile; some minutes. `NPROC=1` before the command holds XLA to one
+    thread.
+    """
+
+    clips: tuple[int, ...] = (1, 4, 16, 64)
+    """Numbers of clips."""
+    frames: int = 30
+    """Frames of each."""
+    size: str = "320x240"
+    """Width and height of the images."""
+    rounds: int = 3
+    """How often each is timed."""
+    out: Path = Path("results") / "bench" / "batch"
+    """Folder for the table, the picture and the figures; those of an earlier time are replaced."""
+
+    def main(self) -> None:
+        """Run the command."""
+        width, height = self._checked()
+        _prepare(self.out)
+        counts = sorted(set(self.clips))  # the peak of memory is that of the largest so far
+        different = min(DIFFERENT, counts[-1])
+        rows = self._measured(counts, different, width, height)
+        content = {
+            **machine(),
+            "backend": jax.default_backend(),
+            "device": jax.local_devices()[0].device_kind,
+            "size": [width, height],
+            "frames": self.frames,
+            "rounds": self.rounds,
+            "different": different,
+            "rows": rows,
+        }
+        console.print(_table(rows))
+        plain_console.print(how(content))
+        files = {
+            _JSON: (json.dumps(content, indent=1) + "\n").encode(),
+            _MARKDOWN: markdown_report(content).encode(),
+            _PICTURE: picture(content),
+        }
+        for name, data in files.items():
+            write_atomically(self.out / name, data, BenchmarkError)
+        console.print(f"Table and picture: {self.out / _MARKDOWN}, {self.out / _PICTURE}; figures: {self.out / _JSON}")
+
+    def _checked(self) -> tuple[int, int]:
+        """The size of the images, if all options are fit."""
+        if not self.clips or min(self.clips) < 1:
+            raise BenchmarkError(f"--clips: expected numbers of at least 1, got {' '.join(map(str, self.clips))}")
+        if self.frames < _FEWEST_FRAMES:
+            raise BenchmarkError(
+                f"--frames: expected at least {_FEWEST_FRAMES}, to be aligned with the truth, got {self.frames}"
+            )
+        if self.rounds < 1:
+            raise BenchmarkError(f"--rounds: expected at least 1, got {self.rounds}")
+        found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", self.size)
+        sides = tuple(map(int, found.groups())) if found else ()
+        if not sides or not all(_LEAST_PX <= side <= _MOST_PX for side in sides):
+            raise BenchmarkError(
+                f"--size: expected WIDTHxHEIGHT of {_LEAST_PX} to {_MOST_PX} pixels each, got '{self.size}'"
+            )
+        return sides[0], sides[1]
+
+    def _measured(self, counts: Sequence[int], different: int, width: int, height: int) -> list[dict[str, Any]]:
+        columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+        rows: list[dict[str, Any]] = []
+        # Drawn between measurements only: a thread that draws would run on a core where they are taken.
+        with Progress(*columns, console=console, auto_refresh=False) as progress:
+            bar = progress.add_task(f"rendering {different} clips", total=1 + len(counts))
+            progress.refresh()
+            task = make_task(different, self.frames, width, height)
+            for count in counts:
+                progress.advance(bar)
+                progress.update(bar, description=f"clips: {count}", refresh=True)
+                rows += measure(task, count, self.rounds)
+            progress.advance(bar)
+            progress.update(bar, description="clips", refresh=True)
+        return rows
+
+
+def _prepare(out: Path) -> None:
+    """An error now, not after minutes."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=out):
+            pass
+    except OSError as problem:
+        raise BenchmarkError(f"--out: '{out}' cannot be written to: {problem.strerror}") from None
+
+
+def _table(rows: Sequence[dict[str, Any]]) -> Table:
+    drawn = Table(title="Clips at once", title_justify="left", box=box.SIMPLE_HEAD, padding=0)
+    shown = [index for index, column in enumerate(COLUMNS) if column not in _LEFT_OUT]
+    for index in shown:
+        is_text = COLUMNS[index] == "how"
+        drawn.add_column(COLUMNS[index], justify="left" if is_text else "right", no_wrap=is_text)
+    for row in rows:
+        texts = cells(row)
+        drawn.add_row(*(texts[index] for index in shown))
+    return drawn
