@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -37,3 +38,17 @@ def write_atomically(path: str | os.PathLike[str], data: bytes, error: type[JaxS
     """
     with replacing(path, error) as temporary:
         temporary.write_bytes(data)
+
+
+def make_folder(path: Path, error: type[JaxSlamError] = JaxSlamError) -> None:
+    """Make a folder for results, if it is not there, and see whether files can be written in it: now, not after hours.
+
+    Raises:
+        JaxSlamError: Of class `error`, if not.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except OSError as problem:
+        raise error(f"--out: '{path}' cannot be written to: {problem.strerror}") from None

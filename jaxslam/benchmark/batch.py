@@ -20,7 +20,7 @@ from jaxslam.slam import track_params, track_plan
 from jaxslam.state import TrackParams, TrackPlan, TrackStatus
 from jaxslam.track import init_state, track_step
 from jaxslam.trajectory import Trajectory
-from jaxslam.xla import usable_cores
+from jaxslam.xla import threads
 
 DIFFERENT = 8
 """Rooms that are rendered; of more clips some are the same."""
@@ -108,8 +108,8 @@ def make_task(count: int, frames: int, width: int, height: int) -> Task:
 
 
 def ways(count: int) -> list[Way]:
-    """How so many clips are tracked: all in one program, and shared by the cores of a processor."""
-    found, cores = [Way(count, 1)], usable_cores()
+    """How so many clips are tracked: all in one program, and shared by the threads that XLA has on a processor."""
+    found, cores = [Way(count, 1)], threads()
     if jax.default_backend() == "cpu" and cores > 1 and count >= 2 * cores:
         found.append(Way(min(_AT_ONCE, count // cores), cores))
     return found

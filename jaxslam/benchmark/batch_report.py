@@ -17,7 +17,7 @@ COLUMNS = (
     "a core",
     "loop",
     "/ loop",
-    "compile, s",
+    "compile",
     "MB",
     "ATE, m",
     "worst, m",
@@ -65,12 +65,12 @@ def how(content: Mapping[str, Any]) -> str:
         f"{content['different']} rendered rooms, different in motion, textures and people"
         + ("; of more clips some are the same. " if repeated else ". ")
         + "Frames/s of all clips together, median of rounds in turn with the loop: the compiled step clip by clip,"
-        " frame by frame. Cores: processor time over wall time. Compile: the first call, of one frame; a program made"
-        f" before is only called. MB: the most memory {memory} so far, compiling included. ATE: RMSE after SE(3)"
-        " alignment, median of the rooms, and the worst. Off: farthest position from that of the same clip tracked"
-        f" alone. Rounds: {content['rounds']}."
-        f" Device: {content['device']}. Processor: {content['cpu']}, {content['cores']} cores, XLA with"
-        f" {content['threads']} threads. jaxslam: {content['commit'] or content['versions']['jaxslam']}."
+        " frame by frame. Cores: processor time over wall time. Compile: seconds of the first call, of one frame; a"
+        f" program made before is only called. MB: the most memory {memory} so far, compiling included. ATE: RMSE after"
+        " SE(3) alignment, median of the rooms, and the worst. Off: farthest position from that of the clip tracked"
+        f" alone. Rounds: {content['rounds']}. Device: {content['device']}."
+        f" Processor: {content['cpu']}, {content['cores']} cores, XLA with {content['threads']} threads."
+        f" jaxslam: {content['commit'] or content['versions']['jaxslam']}."
     )
 
 

@@ -11,7 +11,6 @@ from PIL import Image
 
 from jaxslam.benchmark.plots import folder_of, plot_errors, plot_paths, plot_rates, plot_spread, plot_times, png
 from jaxslam.benchmark.report import (
-    VERDICTS,
     failures,
     figure_table,
     how,
@@ -25,6 +24,7 @@ from jaxslam.benchmark.rows import ACCURACY, RUNNING, by_sequence, median_run, r
 from jaxslam.benchmark.suite import Suite
 
 _PICTURE_PX = 1000
+_COLOURED = ("better", "worse")
 _PICTURES = {
     "failures.png": "where it was lost, and the largest error",
     "masks.png": "what was left out as moving",
@@ -113,7 +113,7 @@ def _table(lines: Sequence[Sequence[str]]) -> str:
 
 
 def _cell(text: str) -> str:
-    look = f' class="{text}"' if text in VERDICTS else ""
+    look = f' class="{text}"' if text in _COLOURED else ""
     return f"<td{look}>{_text(text)}</td>"
 
 

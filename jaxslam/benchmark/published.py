@@ -24,7 +24,7 @@ Metric: TypeAlias = Literal[
 """Of one sequence; smaller is better. The names are those of `Evaluation`, and the mean time of a frame."""
 Sensor: TypeAlias = Literal["rgbd", "stereo", "mono"]
 Alignment: TypeAlias = Literal["se3", "sim3"]
-Verdict: TypeAlias = Literal["better", "equal", "worse"]
+Verdict: TypeAlias = Literal["better", "in range", "worse"]
 
 _COLLECTION = "Collection of best figures"
 _POSITIVE = Annotated[float, Range(above=0)]
@@ -190,7 +190,7 @@ def verdict(ours_best: float, ours_worst: float, published: float) -> Verdict:
         published: The other's.
 
     Returns:
-        `equal` if the published figure lies within our runs, `better` if all of ours are smaller, `worse` if all are
+        `in range` if the published figure lies within our runs, `better` if all of ours are smaller, `worse` if all are
         larger.
 
     Raises:
@@ -202,7 +202,7 @@ def verdict(ours_best: float, ours_worst: float, published: float) -> Verdict:
             f" against {published}"
         )
     if ours_best <= published <= ours_worst:
-        return "equal"
+        return "in range"
     return "better" if ours_worst < published else "worse"
 
 

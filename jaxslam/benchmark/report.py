@@ -12,7 +12,7 @@ _INLINE = (
     " In deterministic runs mapping and the detector are done within the frame, which takes so much longer; with"
     " `--set run.deterministic=false` they have threads of their own."
 )
-VERDICTS: tuple[Verdict, ...] = ("better", "equal", "worse")
+VERDICTS: tuple[Verdict, ...] = ("better", "in range", "worse")
 
 
 def markdown_report(suite: Suite, results: Sequence[Mapping[str, Any]], missing: Mapping[str, str]) -> str:
@@ -151,8 +151,9 @@ def how(results: Sequence[Mapping[str, Any]]) -> str:
     modes = sorted({_mode(result) for result in done})
     return (
         f"Figures are medians of the runs. ATE: RMSE after SE(3) alignment of all frames; `better` than a published"
-        f" figure if all runs are, `equal` if it lies within their range. RPE: over 1 s. First loss: the earliest of"
-        f" the runs. LK: OpenCV's optical flow of 1000 points in one thread, on the same machine; memory: the most."
+        f" figure if all runs are, `in range` if it lies between them, however far apart they are. RPE: over 1 s."
+        f" First loss: the earliest of the runs; memory: the most. LK: OpenCV's optical flow of 1000 points in one"
+        f" thread, on the same machine."
         f"{_INLINE if any(result['deterministic'] for result in done) else ''}"
         f" Runs: {'; '.join(modes)}. Machine: {'; '.join(machines)}. jaxslam: {', '.join(commits)}.\n"
     )

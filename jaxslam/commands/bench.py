@@ -18,7 +18,7 @@ from jaxslam.benchmark.suite import checked_presets, load_suite, suites
 from jaxslam.commands.console import console
 from jaxslam.config import load_config
 from jaxslam.errors import BenchmarkError
-from jaxslam.files import write_atomically
+from jaxslam.files import make_folder, write_atomically
 
 _REPORT, _PAGE = "report.md", "report.html"
 _LOCAL = "local"
@@ -106,10 +106,7 @@ class RunsOfSuite:
             raise BenchmarkError(
                 f"{out}: expected no results there; --resume goes on with them, --out names another folder"
             )
-        try:
-            out.mkdir(parents=True, exist_ok=True)
-        except OSError as problem:
-            raise BenchmarkError(f"{out}: cannot be made: {problem.strerror}") from None
+        make_folder(out, BenchmarkError)
 
     def _run(self, jobs: list[Job], out: Path, executor: Executor) -> list[dict[str, Any]]:
         columns = (

@@ -2,7 +2,6 @@
 
 import json
 import re
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from jaxslam.benchmark.batch import DIFFERENT, make_task, measure
 from jaxslam.benchmark.batch_report import COLUMNS, cells, how, markdown_report, picture
 from jaxslam.commands.console import console, plain_console
 from jaxslam.errors import BenchmarkError
-from jaxslam.files import write_atomically
+from jaxslam.files import make_folder, write_atomically
 from jaxslam.results import machine
 
 _JSON, _MARKDOWN, _PICTURE = "batch.json", "batch.md", "batch.png"
@@ -48,7 +47,7 @@ class Batch:
     def main(self) -> None:
         """Run the command."""
         width, height = self._checked()
-        _prepare(self.out)
+        make_folder(self.out, BenchmarkError)
         counts = sorted(set(self.clips))  # the peak of memory is that of the largest so far
         different = min(DIFFERENT, counts[-1])
         rows = self._measured(counts, different, width, height)
@@ -106,16 +105,6 @@ class Batch:
             progress.advance(bar)
             progress.update(bar, description="clips", refresh=True)
         return rows
-
-
-def _prepare(out: Path) -> None:
-    """An error now, not after minutes."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=out):
-            pass
-    except OSError as problem:
-        raise BenchmarkError(f"--out: '{out}' cannot be written to: {problem.strerror}") from None
 
 
 def _table(rows: Sequence[dict[str, Any]]) -> Table:

@@ -1,7 +1,6 @@
 """`jaxslam bench kernels`: how long each kernel takes, beside other libraries and over sizes."""
 
 import json
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ from jaxslam.benchmark.kernels.measure import devices, measure
 from jaxslam.benchmark.kernels.report import COLUMNS, about, cells, markdown_report, picture, slopes
 from jaxslam.commands.console import console, plain_console
 from jaxslam.errors import BenchmarkError
-from jaxslam.files import write_atomically
+from jaxslam.files import make_folder, write_atomically
 from jaxslam.results import machine
 from jaxslam.xla import prefer_one_thread
 
@@ -47,7 +46,7 @@ class Kernels:
         if self.rounds is not None and self.rounds < 1:
             raise BenchmarkError(f"--rounds: expected at least 1, got {self.rounds}")
         cases = chosen(self.only)
-        _prepare(self.out)
+        make_folder(self.out, BenchmarkError)
         prefer_one_thread()  # before the first array
         rounds = self.rounds or (_QUICK_ROUNDS if self.quick else _ROUNDS)
         rows = _measured(cases, rounds, _QUICK_SIZES if self.quick else None)
@@ -70,16 +69,6 @@ class Kernels:
         }
         for name, data in files.items():
             write_atomically(self.out / name, data, BenchmarkError)
-
-
-def _prepare(out: Path) -> None:
-    """An error now, not after minutes."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=out):
-            pass
-    except OSError as problem:
-        raise BenchmarkError(f"--out: '{out}' cannot be written to: {problem.strerror}") from None
 
 
 def _measured(cases: Sequence[Case], rounds: int, num_sizes: int | None) -> list[dict[str, Any]]:

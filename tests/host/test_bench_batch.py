@@ -198,13 +198,13 @@ class TestCommand:
 class TestMeasure:
     def test_ways(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Programs share the cores of a processor where there are clips enough for two on each."""
-        monkeypatch.setattr(batch, "usable_cores", lambda: 2)
+        monkeypatch.setattr(batch, "threads", lambda: 2)
         assert [ways(count) for count in (1, 3, 4, 16)] == [
             [Way(1, 1)], [Way(3, 1)], [Way(4, 1), Way(2, 2)], [Way(16, 1), Way(4, 2)]
         ]  # fmt: skip
-        monkeypatch.setattr(batch, "usable_cores", lambda: 1)
+        monkeypatch.setattr(batch, "threads", lambda: 1)
         assert ways(16) == [Way(16, 1)]
-        monkeypatch.setattr(batch, "usable_cores", lambda: 2)
+        monkeypatch.setattr(batch, "threads", lambda: 2)
         monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
         assert ways(16) == [Way(16, 1)]
 

@@ -222,13 +222,13 @@ class TestPublishedFor:
 class TestVerdict:
     @pytest.mark.parametrize(
         ("published", "expected"),
-        [(0.021, "better"), (0.020, "equal"), (0.015, "equal"), (0.010, "equal"), (0.009, "worse")],
+        [(0.021, "better"), (0.020, "in range"), (0.015, "in range"), (0.010, "in range"), (0.009, "worse")],
     )
-    def test_equal_is_within_our_runs(self, published: float, expected: str) -> None:
+    def test_in_range_is_within_our_runs(self, published: float, expected: str) -> None:
         assert verdict(0.010, 0.020, published) == expected
 
     def test_a_single_run(self) -> None:
-        assert verdict(0.01, 0.01, 0.01) == "equal"
+        assert verdict(0.01, 0.01, 0.01) == "in range"
         assert verdict(0.01, 0.01, 0.02) == "better"
 
     @pytest.mark.parametrize("ours", [(0.02, 0.01), (math.nan, 0.02), (0.01, math.inf)])
