@@ -12,10 +12,11 @@ import platformdirs
 
 from jaxslam.checked import Checked, Range, field_hints
 from jaxslam.config import configs_dir
-from jaxslam.errors import DatasetError, JaxSlamError, nearest
-from jaxslam.yaml_file import parse_yaml
+from jaxslam.errors import DatasetError, JaxSlamError
+from jaxslam.yaml_file import check_keys, parse_yaml
 
 _DEPTH = 3
+_NEEDED = ("dataset", "kind", "licence", "page", "about")
 _MARKS = ("rgb.txt", "times.txt")  # the first is in every recording of TUM's layout, the second in every one of KITTI's
 _SHORTENED = ((re.compile(r"\Argbd_dataset_freiburg"), "fr"), (re.compile(r"\Argbd_bonn_"), "bonn_"))
 _NAME = re.compile(r"[a-z0-9_]+\Z")
@@ -148,7 +149,7 @@ def _of_group(group: object, where: str) -> Iterator[Recording]:
     entries = _mapping(shared.pop("recordings", None), f"{where}: recordings")
     for name, entry in entries.items():
         fields: dict[str, Any] = shared | _mapping(entry, f"{where}: {name}") | {"name": name}
-        _check_keys(fields, f"{where}: {name}")
+        check_keys(fields, field_hints(Recording), _NEEDED, f"{where}: {name}", DatasetError)
         if isinstance(fields.get("url"), str):
             fields["url"] = fields["url"].replace("{name}", name)
         try:
@@ -161,16 +162,6 @@ def _mapping(value: object, where: str) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise DatasetError(f"{where}: expected `key: value` lines, got {type(value).__name__}")
     return {str(key): content for key, content in value.items()}
-
-
-def _check_keys(fields: dict[str, Any], where: str) -> None:
-    valid = field_hints(Recording)
-    for key in fields:
-        if key not in valid:
-            raise DatasetError(f"{where}: unknown key '{key}'{nearest(key, valid)}")
-    missing = [key for key in ("dataset", "kind", "licence", "page", "about") if key not in fields]
-    if missing:
-        raise DatasetError(f"{where}: missing {', '.join(repr(key) for key in missing)}")
 
 
 def _meant(name: str, known: list[str]) -> str:

@@ -143,10 +143,20 @@ def plot_snapshots(snapshots: Sequence[Snapshot], path: str | os.PathLike[str]) 
     _write_png(figure, path)
 
 
-def _write_png(figure: Figure, path: str | os.PathLike[str]) -> None:
+def png(figure: Figure) -> bytes:
+    """A figure as a picture."""
     picture = io.BytesIO()
     FigureCanvasAgg(figure).print_png(picture)
-    write_atomically(path, picture.getvalue(), TrajectoryError)
+    return picture.getvalue()
+
+
+def with_breaks(timestamps_ns: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Rows of a path, `(n,)` or `(n, k)`, with NaN between those so far apart in time that no line should join them."""
+    return np.insert(rows, np.flatnonzero(_breaks(timestamps_ns)) + 1, np.nan, axis=0)
+
+
+def _write_png(figure: Figure, path: str | os.PathLike[str]) -> None:
+    write_atomically(path, png(figure), TrajectoryError)
 
 
 def _draw_links(axes: Axes, map: Map, plane: list[int]) -> None:
@@ -204,10 +214,8 @@ def _draw_evaluated_paths(axes: Axes, reference: Trajectory | None, evaluation: 
 def _draw_errors(axes: Axes, evaluation: Evaluation) -> None:
     begin = min(evaluation.timestamps_ns[0], evaluation.lost_spans_ns.min(initial=evaluation.timestamps_ns[0]))
     seconds = (evaluation.timestamps_ns - begin) / 1e9
-    after_break = np.flatnonzero(_breaks(evaluation.timestamps_ns)) + 1
-    axes.plot(
-        np.insert(seconds, after_break, np.nan), np.insert(evaluation.errors_m, after_break, np.nan), color=_PATH_COLOR
-    )
+    over_time = with_breaks(evaluation.timestamps_ns, np.column_stack([seconds, evaluation.errors_m]))
+    axes.plot(*over_time.T, color=_PATH_COLOR)
     rmse = f"rmse {evaluation.ate_rmse_m:.4f} m"
     axes.axhline(evaluation.ate_rmse_m, color="0.3", linestyle="--", linewidth=0.8, label=rmse)
     for k, (lost, found) in enumerate((evaluation.lost_spans_ns - begin) / 1e9):
@@ -235,8 +243,7 @@ def _draw_truth(axes: Axes, reference: Trajectory, plane: list[int]) -> None:
 
 
 def _draw_path(axes: Axes, trajectory: Trajectory, plane: list[int], color: str, label: str) -> None:
-    after_break = np.flatnonzero(_breaks(trajectory.timestamps_ns)) + 1
-    u, v = np.insert(trajectory.positions[:, plane], after_break, np.nan, axis=0).T
+    u, v = with_breaks(trajectory.timestamps_ns, trajectory.positions[:, plane]).T
     axes.plot(u, v, color=color, linewidth=1.2, label=label)
 
 

@@ -1,12 +1,13 @@
 """Reading YAML: plain safe YAML, strict about duplicate keys, tolerant of OpenCV's dialect."""
 
 import re
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from jaxslam.errors import JaxSlamError
+from jaxslam.errors import JaxSlamError, nearest
 
 _OPENCV_HEADER = re.compile(r"\A%YAML:[^\n]*")
 _FLOAT_TAG, _BOOL_TAG = "tag:yaml.org,2002:float", "tag:yaml.org,2002:bool"
@@ -75,3 +76,19 @@ def read_mapping(path: Path, error: type[JaxSlamError]) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise error(f"{path}: expected `key: value` lines, got {type(content).__name__}")
     return {str(key): value for key, value in content.items()}
+
+
+def check_keys(
+    content: Mapping[str, Any], known: Collection[str], needed: Collection[str], place: str, error: type[JaxSlamError]
+) -> None:
+    """Refuse a mapping with a key that is not known, or without one that is needed.
+
+    Raises:
+        JaxSlamError: Of class `error`, naming `place` and the keys.
+    """
+    for key in content:
+        if key not in known:
+            raise error(f"{place}: unknown key '{key}'{nearest(key, known)}")
+    missing = [key for key in needed if key not in content]
+    if missing:
+        raise error(f"{place}: missing {', '.join(map(repr, missing))}")

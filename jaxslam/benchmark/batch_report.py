@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxslam.benchmark.plots import png
 from jaxslam.benchmark.report import table
+from jaxslam.visualize import png
 
 COLUMNS = (
     "clips",
@@ -23,7 +23,7 @@ COLUMNS = (
     "worst, m",
     "off, m",
 )
-_SIZE_IN = (6.4, 4.8)
+_SIZE_IN, _DPI = (6.4, 4.8), 160
 _LOOP_COLOR, _IDEAL_COLOR = "#d55e00", "0.6"
 _COLORS = ("#0072b2", "#009e73")
 
@@ -77,7 +77,7 @@ def how(content: Mapping[str, Any]) -> str:
 def picture(content: Mapping[str, Any]) -> bytes:
     """A PNG: frames a second over clips, both axes logarithmic, with the loop and what would be ideal."""
     rows = content["rows"]
-    figure = Figure(figsize=_SIZE_IN, layout="constrained")
+    figure = Figure(dpi=_DPI, figsize=_SIZE_IN, layout="constrained")
     axes = figure.subplots()
     for threads, color in zip(sorted({row["threads"] for row in rows}), _COLORS, strict=False):
         of_it = [row for row in rows if row["threads"] == threads]

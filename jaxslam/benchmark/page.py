@@ -9,7 +9,7 @@ from typing import Any
 
 from PIL import Image
 
-from jaxslam.benchmark.plots import folder_of, plot_errors, plot_paths, plot_rates, plot_spread, plot_times, png
+from jaxslam.benchmark.plots import folder_of, plot_errors, plot_paths, plot_rates, plot_spread, plot_times
 from jaxslam.benchmark.report import (
     failures,
     figure_table,
@@ -22,6 +22,7 @@ from jaxslam.benchmark.report import (
 )
 from jaxslam.benchmark.rows import ACCURACY, RUNNING, by_sequence, median_run, rows_of
 from jaxslam.benchmark.suite import Suite
+from jaxslam.visualize import png
 
 _PICTURE_PX = 1000
 _COLOURED = ("better", "worse")

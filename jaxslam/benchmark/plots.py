@@ -1,17 +1,16 @@
 """Plots of a suite's runs: errors, paths against the truth, errors and times of frames, stages, frame rates."""
 
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from jaxslam.benchmark.rows import median_run
 from jaxslam.frame_log import Errors, read_errors, read_track_ms
+from jaxslam.visualize import with_breaks
 
 _WIDTH_IN, _DPI = 4.8, 160
 """So that the letters can be read on a telephone, across its whole width."""
@@ -19,21 +18,12 @@ _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#0
 """Told apart by the colour-blind too (Okabe and Ito)."""
 _STAGES = ("take over", "flow", "wait for mask", "pose", "match with map", "hand over")
 _ROOM = 0.15
-_BREAK_INTERVALS = 3.0
-
-
-def png(figure: Figure) -> bytes:
-    """A figure as a picture."""
-    file = io.BytesIO()
-    figure.set_dpi(_DPI)
-    FigureCanvasAgg(figure).print_png(file)
-    return file.getvalue()
 
 
 def plot_spread(done: Sequence[Mapping[str, Any]]) -> Figure:
     """ATE of the runs of one sequence as boxes, and times of their frames, a line a label."""
     labels = _labels(done)
-    figure = Figure(figsize=(_WIDTH_IN, 0.8 * len(labels) + 1.8), layout="constrained")
+    figure = Figure(dpi=_DPI, figsize=(_WIDTH_IN, 0.8 * len(labels) + 1.8), layout="constrained")
     errors, times = figure.subplots(2, 1)
     positions = np.arange(len(labels), 0, -1)
     found = [_figures(done, label, "ate_rmse_m") for label in labels]
@@ -70,13 +60,17 @@ def plot_paths(done: Sequence[Mapping[str, Any]], out: Path) -> Figure | None:
     plane = sorted(np.argsort(-np.ptp(truth, axis=0), kind="stable")[:2].tolist())
     low, high = truth[:, plane].min(axis=0), truth[:, plane].max(axis=0)
     room = _ROOM * max(*(high - low).tolist(), 1e-3)
-    figure = Figure(figsize=(_WIDTH_IN, 2.4 * lines + 0.3), layout="constrained")
+    figure = Figure(dpi=_DPI, figsize=(_WIDTH_IN, 2.4 * lines + 0.3), layout="constrained")
     every = figure.subplots(lines, columns, squeeze=False, sharex=True, sharey=True).ravel()
     for axes in every[len(runs) :]:
         axes.set_axis_off()
     for axes, (label, errors) in zip(every, runs.items(), strict=False):
         axes.plot(*errors.reference_m[:, plane].T, color="0.6", linewidth=2.5, label="truth")
-        axes.plot(*_broken(errors, errors.positions_m[:, plane]).T, color=_color(list(runs).index(label)), linewidth=1)
+        axes.plot(
+            *with_breaks(errors.timestamps_ns, errors.positions_m[:, plane]).T,
+            color=_color(list(runs).index(label)),
+            linewidth=1,
+        )
         axes.set_title(f"{label}, {_rmse(errors):.4f} m", fontsize=9)
         axes.set(xlim=(low[0] - room, high[0] + room), ylim=(low[1] - room, high[1] + room), aspect="equal")
         axes.grid(alpha=0.3)
@@ -88,7 +82,7 @@ def plot_paths(done: Sequence[Mapping[str, Any]], out: Path) -> Figure | None:
 
 def plot_errors(done: Sequence[Mapping[str, Any]], out: Path) -> Figure | None:
     """Error over time of the run of median error of every label; `None` if none was evaluated."""
-    figure = Figure(figsize=(_WIDTH_IN, 2.8), layout="constrained")
+    figure = Figure(dpi=_DPI, figsize=(_WIDTH_IN, 2.8), layout="constrained")
     axes = figure.subplots()
     start = None
     for index, label in enumerate(_labels(done)):
@@ -97,7 +91,7 @@ def plot_errors(done: Sequence[Mapping[str, Any]], out: Path) -> Figure | None:
             continue
         start = errors.timestamps_ns[0] if start is None else start
         seconds = (errors.timestamps_ns - start) * 1e-9
-        lines = _broken(errors, np.column_stack([seconds, errors.errors_m]))
+        lines = with_breaks(errors.timestamps_ns, np.column_stack([seconds, errors.errors_m]))
         axes.plot(*lines.T, color=_color(index), linewidth=1, label=label)
     if start is None:
         return None
@@ -111,7 +105,7 @@ def plot_errors(done: Sequence[Mapping[str, Any]], out: Path) -> Figure | None:
 def plot_times(done: Sequence[Mapping[str, Any]], out: Path) -> Figure:
     """Times of the frames of all runs as histograms, and the mean time of each stage, for every label."""
     labels = _labels(done)
-    figure = Figure(figsize=(_WIDTH_IN, 0.3 * len(labels) + 4.2), layout="constrained")
+    figure = Figure(dpi=_DPI, figsize=(_WIDTH_IN, 0.3 * len(labels) + 4.2), layout="constrained")
     frames, stages = figure.subplots(2, height_ratios=(2.4, 0.3 * len(labels) + 1))
     taken = {label: np.concatenate([_track_ms(run, out) for run in _of(done, label)]) for label in labels}
     shown = {label: times for label, times in taken.items() if len(times)}
@@ -137,7 +131,7 @@ def plot_rates(groups: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
     """
     columns = min(len(groups), 2)
     lines = (len(groups) + columns - 1) // columns
-    figure = Figure(figsize=(_WIDTH_IN, 3.0 * lines), layout="constrained")
+    figure = Figure(dpi=_DPI, figsize=(_WIDTH_IN, 3.0 * lines), layout="constrained")
     every = figure.subplots(lines, columns, squeeze=False).ravel()
     for axes in every[len(groups) :]:
         axes.set_axis_off()
@@ -213,10 +207,3 @@ def _track_ms(run: Mapping[str, Any], out: Path) -> np.ndarray:
 
 def _rmse(errors: Errors) -> float:
     return float(np.sqrt(np.mean(np.square(errors.errors_m))))
-
-
-def _broken(errors: Errors, rows: np.ndarray) -> np.ndarray:
-    """Rows with a line of NaN wherever poses are missing, so that no line is drawn across."""
-    steps = np.diff(errors.timestamps_ns)
-    after = np.flatnonzero(steps > _BREAK_INTERVALS * np.median(steps)) + 1 if len(steps) else np.zeros(0, int)
-    return np.insert(rows, after, np.nan, axis=0)

@@ -8,7 +8,7 @@ import dataclasses
 import functools
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias, get_args
@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal, TypeAlias, get_args
 from jaxslam.checked import Checked, Range, checked_value, field_hints
 from jaxslam.config import configs_dir
 from jaxslam.errors import ConfigError, nearest
-from jaxslam.yaml_file import read_mapping
+from jaxslam.yaml_file import check_keys, read_mapping
 
 Metric: TypeAlias = Literal[
     "ate_rmse_m", "ate_mean_m", "ate_median_m", "ate_std_m", "rpe_trans_m_per_s", "rpe_rot_deg_per_s", "frame_ms"
@@ -138,7 +138,7 @@ def read_published(path: Path) -> PublishedSystem:
     raw = read_mapping(path, ConfigError)
     hints = field_hints(PublishedSystem)
     heads = [key for key in hints if key not in ("figures", "overall")]
-    _check_keys(raw, (*heads, "overall", "tables"), (*heads, "tables"), str(path))
+    check_keys(raw, (*heads, "overall", "tables"), (*heads, "tables"), str(path), ConfigError)
     head = {key: checked_value(hints[key], raw[key], f"{path}: {key}") for key in heads}
     if not isinstance(raw["tables"], list):
         raise ConfigError(f"{path}: tables: expected a list, got {raw['tables']!r}")
@@ -207,7 +207,7 @@ def verdict(ours_best: float, ours_worst: float, published: float) -> Verdict:
 
 
 def _figures(table: Mapping[str, Any], head: Mapping[str, Any], place: str) -> list[Figure]:
-    _check_keys(table, _TABLE_KEYS, ("source", "figures"), place)
+    check_keys(table, _TABLE_KEYS, ("source", "figures"), place, ConfigError)
     hints = field_hints(Figure)
     given = {
         key: checked_value(hints[key], table[key], f"{place}: {key}")
@@ -231,7 +231,7 @@ def _checked_row(sequence: str, row: object, metric: str | None, place: str) -> 
     if not _SEQUENCE.fullmatch(sequence):
         raise ConfigError(f"{place}: expected the folder of a recording of TUM or Bonn, or kitti_NN, got '{sequence}'")
     numbers = {metric: row} if metric else _mapping(row, place)
-    _check_keys(numbers, get_args(Metric), (), place)
+    check_keys(numbers, get_args(Metric), (), place, ConfigError)
     return {name: checked_value(_POSITIVE, value, f"{place}: {name}") for name, value in numbers.items()}
 
 
@@ -258,15 +258,6 @@ def _mapping(value: object, place: str) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise ConfigError(f"{place}: expected `key: value` lines, got {value!r}")
     return {str(key): item for key, item in value.items()}
-
-
-def _check_keys(raw: Mapping[str, Any], known: Sequence[str], needed: Sequence[str], place: str) -> None:
-    for key in raw:
-        if key not in known:
-            raise ConfigError(f"{place}: unknown key '{key}'{nearest(key, known)}")
-    missing = [key for key in needed if key not in raw]
-    if missing:
-        raise ConfigError(f"{place}: missing {', '.join(map(repr, missing))}")
 
 
 def _check_unique(figures: Iterable[Figure], path: Path) -> None:

@@ -12,31 +12,29 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from command_line import failing
 from PIL import Image
 
 from jaxslam.benchmark.kernels import case as case_module
 from jaxslam.benchmark.kernels.cases import CASES, chosen
 from jaxslam.benchmark.kernels.measure import devices, measure
 from jaxslam.benchmark.kernels.report import cells, markdown_report, picture, slopes
+from jaxslam.benchmark.kernels.two_views import make_two_views
 from jaxslam.benchmark.timing import call_times, compare, pinned_to_one_core
 from jaxslam.cli import main
 from jaxslam.results import machine
 
+fails = failing("bench", "kernels")
+
 MEASURED, ROUNDS = ("image_pyramid", "lk_flow", "dbscan"), 6
-SMALL = ("corners", "pose_refine", "bundle_adjust", "pose_graph", "alignment")
+SMALL = (
+    "corners", "pose_refine", "bundle_adjust", "pose_graph", "alignment", "cue_clusters", "cue_epipolar_trajectory",
+    "cue_occlusion",
+)  # fmt: skip
 """What else is compared here, once and at its smallest size."""
 
 # Compiling is what these tests cost; the code LLVM leaves as it is runs as correctly.
 _compile = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
-
-
-def fails(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    with pytest.raises(SystemExit) as ended:
-        main(["bench", "kernels", *arguments])
-    assert ended.value.code == 1
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1
-    return lines[0]
 
 
 @pytest.fixture(scope="module")
@@ -98,10 +96,29 @@ def test_results_agree(name: str) -> None:
     if (absent := case.missing()) is not None:
         pytest.skip(f"{absent} is not installed")
     problem = case.problem(case.sizes[0])
-    ours, theirs = _compile(problem.ours)(*problem.arguments), problem.theirs(*problem.prepare())
+    program = _compile(problem.ours) if problem.compile is None else problem.ours
+    ours, theirs = program(*problem.arguments), problem.theirs(*problem.prepare())
     assert problem.difference(ours, theirs) <= case.limit
     other = jax.tree.map(lambda x: 1.1 * x + 1 if np.issubdtype(x.dtype, np.floating) else x, ours)
     assert problem.difference(other, theirs) > case.limit
+
+
+def test_fundamental_matrices_are_told_apart() -> None:
+    """The true one has as many right matches as OpenCV's, another one has not; ours is compiled for a cue above."""
+    case = CASES["ransac_fundamental"]
+    problem = case.problem(case.sizes[0])
+    theirs, truth = problem.theirs(), make_two_views(0, case.sizes[0]).F
+    assert problem.difference(truth, theirs) <= case.limit
+    assert problem.difference(1.1 * truth + 1, theirs) > case.limit
+    assert problem.difference(theirs[0], theirs) == 0
+    assert problem.difference(truth, (None, None)) == np.inf
+
+
+def test_what_works_on_the_host_is_called_as_it_is() -> None:
+    row = measure(CASES["cue_occlusion"], CASES["cue_occlusion"].sizes[0], devices()[0], ROUNDS)
+    assert row["agrees"]
+    assert min(row["compile_s"], *row["ours_times_ms"]) > 0
+    assert len(row["ours_times_ms"]) == ROUNDS
 
 
 class TestWithoutReference:
@@ -187,13 +204,13 @@ class TestTiming:
 class TestBadInput:
     def test_unknown_kernel(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         error = fails(capsys, "--only", "lkflow", "--out", str(tmp_path / "out"))
-        assert error == "error: --only: unknown kernel 'lkflow' (did you mean 'lk_flow'?)"
+        assert error == "--only: unknown kernel 'lkflow' (did you mean 'lk_flow'?)"
         assert not (tmp_path / "out").exists()
 
     def test_no_rounds(self, capsys: pytest.CaptureFixture[str]) -> None:
-        assert fails(capsys, "--rounds", "0") == "error: --rounds: expected at least 1, got 0"
+        assert fails(capsys, "--rounds", "0") == "--rounds: expected at least 1, got 0"
 
     def test_no_folder(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         (tmp_path / "file").write_text("")
         for out in (tmp_path / "file", tmp_path / "file" / "out"):
-            assert fails(capsys, "--out", str(out)).startswith(f"error: --out: '{out}' cannot be written to: ")
+            assert fails(capsys, "--out", str(out)).startswith(f"--out: '{out}' cannot be written to: ")

@@ -5,21 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import failing
 from tiny_recording import CAMERA, write_recording
 
 from jaxslam.cli import main
 from jaxslam.trajectory import Trajectory, write_tum
 
-
-def fails(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """The message of a command that must end with code 1 and say one line."""
-    with pytest.raises(SystemExit) as stop:
-        main(arguments)
-    assert stop.value.code == 1
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1
-    assert lines[0].startswith("error: ")
-    return lines[0].removeprefix("error: ")
+fails = failing()
 
 
 @pytest.fixture

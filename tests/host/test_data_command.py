@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command_line import failing
 from tiny_recording import write_recording
 
 from jaxslam import recordings
@@ -23,6 +24,8 @@ from jaxslam.commands import data as data_command
 from jaxslam.datasets import open_dataset
 from jaxslam.download import download
 from jaxslam.recordings import Recording, find_recording
+
+fails = failing("data")
 
 TUM, BONN = "rgbd_dataset_freiburg3_walking_xyz", "rgbd_bonn_crowd"
 CUT = 1000
@@ -117,16 +120,6 @@ def serve(monkeypatch: pytest.MonkeyPatch, site: Site) -> Serve:
         return known[name]
 
     return change
-
-
-def fails(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """The message of a command that must end with code 1 and say one line."""
-    with pytest.raises(SystemExit) as stop:
-        main(["data", *arguments])
-    assert stop.value.code == 1
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1
-    return lines[0].removeprefix("error: ")
 
 
 def names_in(folder: Path) -> list[str]:

@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from command_line import failing
 
 from jaxslam import known_models
 from jaxslam.cli import main
@@ -20,20 +21,12 @@ from jaxslam.known_models import KNOWN_MODELS, known_model
 from jaxslam.semantics import Detections, no_detections
 from jaxslam.semantics.adapters import ADAPTERS
 
+fails = failing("models")
+
 MODELS = os.environ.get("JAXSLAM_MODELS")
 HEIGHT, WIDTH = 120, 160
 CONTENT = b"a network"
 HASH = hashlib.sha256(CONTENT).hexdigest()
-
-
-def fails(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """The message of a command that must end with code 1 and say one line."""
-    with pytest.raises(SystemExit) as stop:
-        main(["models", *arguments])
-    assert stop.value.code == 1
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1
-    return lines[0].removeprefix("error: ")
 
 
 def two_people() -> Detections:

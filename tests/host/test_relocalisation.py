@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import failing
 from room_round import FPS, FRAMES, TRACK, room
 from small_map import same
 
@@ -27,6 +28,8 @@ from jaxslam.state import TrackStatus
 from jaxslam.tracked import Tracked
 from jaxslam.trajectory import Trajectory
 from jaxslam.trajectory import read as read_trajectory
+
+fails = failing()
 
 CONFIG = Config(track=TRACK)
 HOLD, PREDICT, SUBMAP = (replace(CONFIG, run=RunConfig(on_loss=policy)) for policy in ("hold", "predict", "submap"))
@@ -333,13 +336,3 @@ class TestCommandLine:
         assert "damaged.npz" in fails(capsys, "export", str(damaged), "--ply", str(tmp_path / "x.ply"))
         save_map(damaged, start)
         assert "expected at least one of --ply" in fails(capsys, "export", str(damaged))
-
-
-def fails(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """The message of a command that must end with code 1 and say one line."""
-    with pytest.raises(SystemExit) as stop:
-        main(arguments)
-    assert stop.value.code == 1
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1
-    return lines[0]

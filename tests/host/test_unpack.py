@@ -106,11 +106,20 @@ class TestWhole:
 class TestOutside:
     @pytest.mark.parametrize("make", MAKERS)
     @pytest.mark.parametrize(
-        "name", ["../evil", "walk/../../evil", "/tmp/jaxslam_evil", "..\\evil", "C:\\evil", "C:evil", "walk/..\\evil"]
+        "name",
+        [
+            "../evil",
+            "walk/../../evil",
+            "/jaxslam_evil/file",
+            "..\\evil",
+            "C:\\evil",
+            "C:evil",
+            "walk/..\\evil",
+        ],
     )
     def test_names(self, tmp_path: Path, target: Path, make: Maker, name: str) -> None:
         refused(make(tmp_path / "a", FILES | {name: b"evil"}), target, "expected files inside one folder, got")
-        assert not Path("/tmp/jaxslam_evil").exists()
+        assert not Path("/jaxslam_evil").exists()
 
     @pytest.mark.parametrize("kind", [tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.FIFOTYPE, tarfile.CHRTYPE])
     @pytest.mark.parametrize("goal", ["/etc", "../../..", "rgb.txt"])

@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from command_line import failing
 from PIL import Image
 from rerun.chunk import RrdReader
 from small_scene import CONFIG, HEIGHT, WIDTH, clip
 from tiny_recording import CAMERA, write_recording
 
 import jaxslam.viewer
-from jaxslam.cli import main
 from jaxslam.dynamic_masks import MaskSource
 from jaxslam.errors import JaxSlamError
 from jaxslam.frame import Frame
@@ -23,6 +23,8 @@ from jaxslam.slam import Slam
 from jaxslam.tracked import Rejected, Tracked
 from jaxslam.trajectory import Trajectory
 from jaxslam.viewer import Viewer
+
+fails = failing("run", "walk")
 
 FRAMES = 12
 MASKED = range(4, 7)
@@ -196,29 +198,22 @@ class TestErrors:
         yield
         assert not (recording.parent / "results").exists()
 
-    def fails(self, capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-        with pytest.raises(SystemExit) as stop:
-            main(["run", "walk", *arguments])
-        assert stop.value.code == 1
-        (line,) = capsys.readouterr().err.splitlines()
-        return line
-
     def test_file_that_cannot_be_written(self, capsys: pytest.CaptureFixture[str]) -> None:
-        expected = "error: nowhere/run.rrd: cannot be written: "
-        assert self.fails(capsys, "--rrd", "nowhere/run.rrd").startswith(expected)
+        expected = "nowhere/run.rrd: cannot be written: "
+        assert fails(capsys, "--rrd", "nowhere/run.rrd").startswith(expected)
 
     def test_rerun_is_not_installed(self, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(sys.modules, "rerun", None)
         monkeypatch.delitem(sys.modules, "jaxslam.viewer")
-        line = self.fails(capsys, "--rrd", "run.rrd")
-        assert line.startswith("error: rerun cannot be imported")
+        line = fails(capsys, "--rrd", "run.rrd")
+        assert line.startswith("rerun cannot be imported")
         assert "pip install 'jaxslam[viz]'" in line
 
     @pytest.mark.skipif(sys.platform != "linux", reason="only there the environment says whether there is a screen")
     def test_no_screen(self, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
         for name in ("DISPLAY", "WAYLAND_DISPLAY"):
             monkeypatch.delenv(name, raising=False)
-        assert "needs a screen" in self.fails(capsys, "--viz")
+        assert "needs a screen" in fails(capsys, "--viz")
 
     def test_no_viewer(self, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
         def spawn(**_: object) -> None:
@@ -226,8 +221,8 @@ class TestErrors:
 
         monkeypatch.setenv("DISPLAY", ":0")
         monkeypatch.setattr(jaxslam.viewer.rr, "spawn", spawn)
-        expected = "error: the viewer cannot be started: Failed to find Rerun Viewer executable in PATH."
-        assert self.fails(capsys, "--viz") == expected
+        expected = "the viewer cannot be started: Failed to find Rerun Viewer executable in PATH."
+        assert fails(capsys, "--viz") == expected
 
     def test_neither_file_nor_viewer(self) -> None:
         with pytest.raises(JaxSlamError, match="expected a file to write or a live viewer, got neither"):
