@@ -22,7 +22,7 @@ import numpy as np
 from jaxslam.benchmark.suite import Sequence as Clip
 from jaxslam.config import Config, load_config, to_yaml
 from jaxslam.datasets import Dataset, Subset, open_dataset
-from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
+from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset, with_true_masks
 from jaxslam.datasets.synthetic.sensor import SensorConfig
 from jaxslam.detector_choice import model_file
 from jaxslam.download import sha256_of
@@ -92,12 +92,13 @@ class Job:
         return cls(Clip(room=room, **clip), **fields | {"settings": tuple(fields["settings"])})
 
 
-def opened(clip: Clip, root: Path | None) -> Dataset:
-    """What a job tracks.
+def opened(clip: Clip, root: Path | None) -> tuple[Dataset, Path | None]:
+    """What a job tracks, and the folder it is in, if it is a recording.
 
     Raises:
         BenchmarkError: If its recording is not on this machine.
     """
+    folder = None
     if clip.room is not None:
         dataset: Dataset = SyntheticDataset(clip.room)
     else:
@@ -105,7 +106,7 @@ def opened(clip: Clip, root: Path | None) -> Dataset:
         if folder is None:
             raise BenchmarkError(f"{clip.recording}: not on this machine; to get it: jaxslam data get {clip.recording}")
         dataset = open_dataset(folder, camera=clip.camera)
-    return dataset if clip.whole else Subset(dataset, clip.start, clip.stop, clip.every)
+    return (dataset if clip.whole else Subset(dataset, clip.start, clip.stop, clip.every)), folder
 
 
 def finished(job: Job, out: Path) -> dict[str, Any] | None:
@@ -160,10 +161,11 @@ def run_here(folder: Path, root: Path | None) -> None:
     """
     prefer_one_thread()
     job = Job.of_json((folder / _JOB).read_text())
-    dataset = opened(job.clip, root)
+    whole, recording = opened(job.clip, root)
+    dataset, truth = with_true_masks(whole, job.config.semantics)
     flow_ms = flow_time_ms(dataset)
     pictures = RunPictures(len(dataset))
-    slam = Slam(dataset.camera, job.config)
+    slam = Slam(dataset.camera, job.config, detector=truth)
     slam.warm_up()
     began = time.perf_counter()
     with slam:
@@ -179,7 +181,7 @@ def run_here(folder: Path, root: Path | None) -> None:
         "rate_hz": _rate_hz(dataset),
         "flow_ms": round(flow_ms, 4),
         **ratios,
-        "data_sha256": _fingerprint(job.clip, root),
+        "data_sha256": None if recording is None else _fingerprint(recording),
         "model": job.config.semantics.model,
         "model_sha256": None if (model := model_file(job.config.semantics)) is None else sha256_of(model),
         "config": dataclasses.asdict(job.config),
@@ -231,11 +233,8 @@ def _figures(job: Job) -> dict[str, Any]:
     }
 
 
-def _fingerprint(clip: Clip, root: Path | None) -> str | None:
-    """A hash of the text files of a recording, and of names and sizes of the others; `None` for a rendered room."""
-    folder = find_recording(clip.recording, root) if clip.recording else None
-    if folder is None:
-        return None
+def _fingerprint(folder: Path) -> str:
+    """A hash of the text files of a recording, and of names and sizes of the others."""
     digest = hashlib.sha256()
     for path in sorted(path for path in folder.rglob("*") if path.is_file()):
         digest.update(f"{path.relative_to(folder)} {path.stat().st_size}\n".encode())

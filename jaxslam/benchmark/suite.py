@@ -23,8 +23,9 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 from jaxslam.checked import Checked, Range
-from jaxslam.config import configs_dir, load_config, presets, updated
+from jaxslam.config import Config, configs_dir, load_config, presets, updated
 from jaxslam.datasets.synthetic import SyntheticConfig
+from jaxslam.detector_choice import SCENE
 from jaxslam.errors import BenchmarkError, JaxSlamError, nearest
 from jaxslam.yaml_file import read_mapping
 
@@ -187,8 +188,15 @@ def _suite(name: str, content: Mapping[str, Any], folder: Path) -> Suite:
     )
     for variant in suite.variants.values() or [()]:
         for preset in suite.presets:
-            load_config(preset, overrides=(*suite.settings, *variant))  # an error now, not after hours
+            _check_masks(made, load_config(preset, overrides=(*suite.settings, *variant)))  # now, not after hours
     return suite
+
+
+def _check_masks(sequences: tuple[Sequence, ...], config: Config) -> None:
+    """Nobody knows the truth of a recording."""
+    recordings = [sequence.name for sequence in sequences if sequence.room is None]
+    if config.semantics.model == SCENE and recordings:
+        raise BenchmarkError(f"semantics.model: '{SCENE}' expected rendered rooms, got the recording {recordings[0]}")
 
 
 def _sequence(place: str, entry: object, folder: Path) -> Sequence:

@@ -15,7 +15,7 @@ from rich.table import Table
 from jaxslam.commands.console import console
 from jaxslam.config import Config, load_config
 from jaxslam.datasets import Dataset, Subset, dataset_kinds, open_dataset
-from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
+from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset, with_true_masks
 from jaxslam.datasets.synthetic.camera_path import CameraPathKind
 from jaxslam.errors import ConfigError, nearest
 from jaxslam.evaluation import Evaluation
@@ -49,21 +49,39 @@ class Demo:
     """How the camera moves."""
     people: int = 2
     """People walking through the room."""
+    boxes: int = 0
+    """Boxes carried about in it, which no network knows."""
+    seated: int = 0
+    """People sitting at the desk, who hardly move."""
     seed: int = 0
     """Seed of room, people, path and noise."""
     viz: bool = False
     """Watch it in the viewer of rerun."""
     rrd: Path | None = None
     """File to write a recording for that viewer to."""
+    set: _Settings = ()
+    """Settings, as in `--set semantics.model=scene`, which tracks with the true masks of who moves."""
 
     def main(self) -> None:
         """Run the command."""
-        scene = SyntheticConfig(frames=self.frames, path=self.path, people=self.people, seed=self.seed)
-        console.print(f"Rendering a room with {self.people} people, the camera moving as in '{self.path}'.")
-        dataset = SyntheticDataset(scene)
-        slam = Slam(dataset.camera, load_config())
+        config = load_config(overrides=tuple(itertools.chain(*self.set)))
+        scene = SyntheticConfig(
+            frames=self.frames,
+            path=self.path,
+            people=self.people,
+            boxes=self.boxes,
+            seated=self.seated,
+            seed=self.seed,
+        )
+        console.print(f"Rendering a room with {self._who()}, the camera moving as in '{self.path}'.")
+        dataset, truth = with_true_masks(SyntheticDataset(scene), config.semantics)
+        slam = Slam(dataset.camera, config, detector=truth)
         viewer = _viewer(slam, dataset, live=self.viz, path=self.rrd)
         track(dataset, slam, "default", self.out, viewer)
+
+    def _who(self) -> str:
+        boxes = f", {self.boxes} boxes carried about" if self.boxes else ""
+        return f"{self.people} people{boxes}" + (f", {self.seated} people at the desk" if self.seated else "")
 
 
 @dataclass(frozen=True)

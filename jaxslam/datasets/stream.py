@@ -18,7 +18,12 @@ _Item_co = TypeVar("_Item_co", covariant=True)
 
 
 class Subset:
-    """Frames `start` to `stop - 1` of another recording, all or every nth, with its camera and whole ground truth."""
+    """Frames `start` to `stop - 1` of another recording, all or every nth, with its camera and whole ground truth.
+
+    Attributes:
+        whole: The other recording.
+        indices: Of the frames in it.
+    """
 
     def __init__(self, dataset: Dataset, start: int = 0, stop: int | None = None, step: int = 1) -> None:
         """Choose the frames as a slice does: negative numbers of frames count from the end.
@@ -26,33 +31,33 @@ class Subset:
         Raises:
             DatasetError: If no frame is left.
         """
-        self._dataset = dataset
-        self._indices = range(len(dataset))[start:stop:step]
-        if not self._indices:
+        self.whole = dataset
+        self.indices = range(len(dataset))[start:stop:step]
+        if not self.indices:
             raise DatasetError(f"{dataset.name}: expected a part of {len(dataset)} frames, got {start}:{stop}")
         every = f":{step}" if step > 1 else ""
-        self.name = f"{dataset.name}[{self._indices.start}:{self._indices.stop}{every}]"
+        self.name = f"{dataset.name}[{self.indices.start}:{self.indices.stop}{every}]"
 
     @property
     def camera(self) -> Camera:
         """The camera of the whole recording."""
-        return self._dataset.camera
+        return self.whole.camera
 
     @property
     def timestamps_ns(self) -> np.ndarray:
         """`(n,)` int64 nanoseconds of the chosen frames."""
-        return self._dataset.timestamps_ns[self._indices.start : self._indices.stop : self._indices.step]
+        return self.whole.timestamps_ns[self.indices.start : self.indices.stop : self.indices.step]
 
     @property
     def ground_truth(self) -> Trajectory | None:
         """The ground truth of the whole recording."""
-        return self._dataset.ground_truth
+        return self.whole.ground_truth
 
     def __len__(self) -> int:
-        return len(self._indices)
+        return len(self.indices)
 
     def __getitem__(self, index: int) -> Frame:
-        return self._dataset[self._indices[index]]
+        return self.whole[self.indices[index]]
 
 
 class Indexed(Protocol[_Item_co]):

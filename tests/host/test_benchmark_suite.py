@@ -38,6 +38,24 @@ class TestSuite:
         assert suite.about
         assert plan(suite)
 
+    @pytest.mark.parametrize(("name", "rooms", "runs"), [("unknown_movers", 16, 64), ("seated", 4, 16)])
+    def test_of_rooms_with_true_masks(self, name: str, rooms: int, runs: int) -> None:
+        """All four paths, the same rooms for both kinds of masks, and few runs."""
+        suite = load_suite(name)
+        assert len(suite.sequences) == rooms
+        assert len(plan(suite)) == runs
+        assert all(clip.room is not None and clip.room.frames == 120 for clip in suite.sequences)
+        paths = [clip.room.path for clip in suite.sequences if clip.room is not None]
+        assert {path: paths.count(path) for path in paths} == dict.fromkeys(
+            ("xyz", "rpy", "halfsphere", "static"), rooms // 4
+        )
+        labels = {
+            (job.variant, job.config.semantics.model, job.config.semantics.labels) for job in plan(suite) if job.variant
+        }
+        known = ("true-masks", "scene", ("person", "box") if name == "unknown_movers" else ("person",))
+        assert known in labels
+        assert len(labels) == 2
+
     def test_of_a_file(self, tmp_path: Path) -> None:
         suite = load_suite(suite_file(tmp_path, SUITE))
         assert (suite.name, suite.about, suite.presets, suite.runs) == ("mine", "two rooms", ("static", "default"), 3)
@@ -76,6 +94,7 @@ class TestSuite:
             (SUITE.replace("    stop: 20", "    sensor: lidar"), "sensor: expected one of 'rgbd', 'stereo'"),
             (SUITE.replace("- name: room", "- name: room\n    sensor: stereo"), "expected a `room` with sensor rgbd"),
             (SUITE.replace("semantics.model", "semantic.model"), "semantic: unknown key"),
+            (SUITE.replace("model=null", "model=scene"), "'scene' expected rendered rooms, got the recording start"),
             (SUITE.replace("[semantics.model=null]", "semantics"), "set: expected a list of texts"),
             (SUITE + "variants: [a]", "variants: expected names with lists"),
             (SUITE + "variants: {a: [track.num_points=x]}", "num_points"),

@@ -16,6 +16,8 @@ from jaxslam.benchmark.published import (
     read_published,
     verdict,
 )
+from jaxslam.benchmark.report import published_of
+from jaxslam.benchmark.suite import load_suite, suites
 from jaxslam.config import configs_dir
 from jaxslam.datasets import bonn, tum
 from jaxslam.datasets.protocol import Fit
@@ -88,6 +90,74 @@ TYPED = [
     (COLLECTION, "ORB-SLAM2", None, S + "rpy", ATE, 0.0195),
     (COLLECTION, "DynaMoN", None, B + "person_tracking2", ATE, 0.022),
 ]
+# Suite: paper; preset of each column, and its system and variant in the data files; the table of the paper, ATE in m.
+ABLATIONS = {
+    "ngd_ablation": (
+        "NGD-SLAM",
+        {
+            "static": ("ORB-SLAM3", None),
+            "ngd-detector": ("NGD-SLAM", "yolo"),
+            "ngd-propagation": ("NGD-SLAM", "mask-propagation"),
+            "ngd": ("NGD-SLAM", None),
+        },
+        {
+            W + "xyz": (0.390, 0.014, 0.014, 0.015),
+            W + "rpy": (0.639, 0.041, 0.037, 0.034),
+            W + "halfsphere": (0.431, 0.023, 0.028, 0.024),
+            W + "static": (0.096, 0.007, 0.007, 0.007),
+        },
+    ),
+    "trs_ablation": (
+        "TRS-SLAM",
+        {
+            "static": ("ORB-SLAM2", None),
+            "trs-geometry": ("TRS-SLAM", "geometry"),
+            "trs-semantics": ("TRS-SLAM", "semantic"),
+            "trs": ("TRS-SLAM", None),
+        },
+        {
+            S + "xyz": (0.0094, 0.0100, 0.0116, 0.0117),
+            S + "halfsphere": (0.0242, 0.0187, 0.0174, 0.0172),
+            W + "static": (0.1908, 0.0111, 0.0177, 0.0111),
+            W + "rpy": (0.8467, 0.2143, 0.0373, 0.0371),
+            W + "xyz": (0.4662, 0.0290, 0.0217, 0.0194),
+            W + "halfsphere": (0.4430, 0.0362, 0.0295, 0.0290),
+        },
+    ),
+    "rts_ablation": (  # Table 7; the world as static is in Table 1
+        "RTS-SLAM",
+        {
+            "static": ("ORB-SLAM2", None),
+            "rts-semantics": ("RTS-SLAM", "semantic"),
+            "rts-epipolar": ("RTS-SLAM", "geometric"),
+            "rts-semantics-epipolar": ("RTS-SLAM", "semantic-geometric"),
+            "rts": ("RTS-SLAM", None),
+        },
+        {
+            W + "xyz": (0.8882, 0.0181, 0.0216, 0.0170, 0.0161),
+            W + "static": (0.3455, 0.0094, 0.0102, 0.0077, 0.0069),
+            W + "rpy": (0.6435, 0.0359, 0.2350, 0.0310, 0.0254),
+            W + "halfsphere": (0.3531, 0.0763, 0.0400, 0.0306, 0.0245),
+            S + "static": (0.0101, 0.0083, 0.0099, 0.0079, 0.0068),
+        },
+    ),
+    "occlusion_ablation": (  # Table 2; the world as static is in Table 1
+        "Occlusion SLAM",
+        {
+            "static": ("ORB-SLAM2", None),
+            "occlusion-masks": ("Occlusion SLAM", "segmentation"),
+            "occlusion": ("Occlusion SLAM", None),
+        },
+        {
+            W + "xyz": (0.8665, 0.0153, 0.0152),
+            W + "static": (0.4702, 0.0067, 0.0065),
+            W + "halfsphere": (0.4310, 0.0276, 0.0286),
+            B + "crowd": (0.8780, 0.0213, 0.0177),
+            B + "crowd2": (1.4830, 0.1243, 0.0459),
+            B + "crowd3": (1.1830, 0.0405, 0.0332),
+        },
+    ),
+}
 FIGURES = [figure for paper in load_published() for figure in paper.figures]
 SEQUENCES = sorted({figure.sequence for figure in FIGURES})
 
@@ -111,6 +181,33 @@ class TestDataFiles:
         wanted = (system, variant, sequence, metric)
         found = [f.value for f in paper(of).figures if (f.system, f.variant, f.sequence, f.metric) == wanted]
         assert found == [value]
+
+    @pytest.mark.parametrize("suite", ABLATIONS)
+    def test_ablation_is_that_of_the_paper(self, suite: str) -> None:
+        of, columns, table = ABLATIONS[suite]
+        found = {(f.system, f.variant, f.sequence): f.value for f in paper(of).figures if f.metric == ATE}
+        for sequence, row in table.items():
+            assert tuple(found[*column, sequence] for column in columns.values()) == row, sequence
+        variants = {figure.variant for figure in paper(of).variants}
+        assert variants == {variant for _, variant in columns.values() if variant}
+
+    @pytest.mark.parametrize("suite", ABLATIONS)
+    def test_suite_runs_what_the_paper_ran(self, suite: str) -> None:
+        """A preset for every column, every sequence whole, and the published figures of parts beside ours."""
+        _, columns, table = ABLATIONS[suite]
+        ours = load_suite(suite)
+        assert ours.presets == tuple(columns)
+        assert [clip.recording for clip in ours.sequences] == list(table)
+        assert ours.ablation
+        assert not ours.settings
+        assert not ours.variants
+        for clip in ours.sequences:
+            shown = {(figure.system, figure.variant) for figure in published_of(ours, clip.name)}
+            assert shown >= {column for column in columns.values() if column[0] != "ORB-SLAM2"}
+
+    def test_every_ablation_suite_is_of_a_table(self) -> None:
+        texts = {name: path.read_text(encoding="utf-8") for name, path in suites().items()}
+        assert {name for name, text in texts.items() if "ablation: true" in text} == set(ABLATIONS)
 
     def test_figures_are_finite_and_positive(self) -> None:
         numbers = [figure.value for figure in FIGURES]

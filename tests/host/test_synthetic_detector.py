@@ -69,6 +69,16 @@ def test_some_labels(label: str) -> None:
         np.testing.assert_array_equal(mask, np.isin(frame.instance_mask, numbers))
 
 
+def test_people_who_sit_are_people() -> None:
+    room = SyntheticDataset(dataclasses.replace(SMALL, people=1, boxes=1, seated=2))
+    frame = room.render(0)
+    found = SceneDetector(room)(frame.rgb)
+    assert found.masks is not None
+    named = {int(frame.instance_mask[mask][0]): label for mask, label in zip(found.masks, found.labels, strict=True)}
+    assert named == {number: "box" if number == 2 else "person" for number in np.unique(frame.instance_mask)[1:]}
+    assert {3, 4} <= named.keys()
+
+
 def test_nobody_there() -> None:
     room = SyntheticDataset(dataclasses.replace(SMALL, people=0, boxes=0))
     found = SceneDetector(room)(room[0].image)

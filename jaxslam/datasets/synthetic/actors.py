@@ -1,4 +1,4 @@
-"""Who moves through the room: walking people of capsules, and boxes that are carried.
+"""Who moves in the room: walking people of capsules, boxes that are carried, and people who sit.
 
 Each actor has a frame of its own: origin on the floor under it (a person) or in its centre (a box), x forward, z up.
 Motions are closed forms of time in float64, so that ground truth is exact and any frame can be asked for.
@@ -9,15 +9,18 @@ from typing import Protocol
 
 import numpy as np
 
+from jaxslam.datasets.synthetic.body import TRUNK, below, body, bone
 from jaxslam.datasets.synthetic.rigid import transform
-from jaxslam.datasets.synthetic.solids import Solid, box, capsule, pill
+from jaxslam.datasets.synthetic.seated import SeatedPerson
+from jaxslam.datasets.synthetic.solids import Solid, box
 from jaxslam.datasets.synthetic.texture import Material
-from jaxslam.rotation import axis_rotation, matrices
+from jaxslam.rotation import axis_rotation
 
 
 class Actor(Protocol):
-    """Something that moves on its own."""
+    """Something that moves on its own: a `person` or a `box`."""
 
+    label: str
     solids: list[Solid]
 
     def root(self, time_s: np.ndarray) -> np.ndarray:
@@ -52,7 +55,7 @@ _ACROSS_VIEW = (
 _ROUND_DESK = (Lane((0.4, 0.0), (0.85, 1.10), 0.45),)
 
 
-def cast(path: str, people: int, boxes: int, seed: int) -> list[Actor]:
+def cast(path: str, people: int, boxes: int, seated: int, seed: int) -> list[Actor]:
     """The actors of a scene.
 
     The first two cross the view of the camera close in front of it and in front of the desk, the others go round
@@ -63,6 +66,7 @@ def cast(path: str, people: int, boxes: int, seed: int) -> list[Actor]:
         path: The camera's path.
         people: How many people walk; they are actors 1 to `people`.
         boxes: How many boxes are carried; the actors after them.
+        seated: How many people sit, see `seated`; the last actors.
         seed: Chooses where they start, their sizes and clothes.
     """
     lanes = _ROUND_DESK if path == "loop" else _ACROSS_VIEW
@@ -74,7 +78,7 @@ def cast(path: str, people: int, boxes: int, seed: int) -> list[Actor]:
         start += 2.0 * np.pi * (index - lane) / sharing
         kind = Person if index < people else CarriedBox
         actors.append(kind(lanes[lane], start, np.random.default_rng([seed, 200, index])))
-    return actors
+    return actors + [SeatedPerson(place, seed) for place in range(seated)]
 
 
 def _walk(lane: Lane, start: float, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -91,9 +95,6 @@ def _walk(lane: Lane, start: float, time_s: np.ndarray) -> tuple[np.ndarray, np.
     return position, heading, speed
 
 
-_SKIN = Material((0.72, 0.50, 0.38), (0.85, 0.64, 0.52), noise_per_m=9.0, noise=0.35)
-_HAIR = Material((0.10, 0.07, 0.05), (0.26, 0.18, 0.12), noise_per_m=20.0, stretch=4.0, noise=0.8)
-_SHOE = Material((0.10, 0.10, 0.11), (0.25, 0.24, 0.23), noise_per_m=12.0, noise=0.5)
 _STRIDES_PER_S = 0.85
 _LEG_M = 0.88
 
@@ -101,11 +102,13 @@ _LEG_M = 0.88
 class Person:
     """A walking person of fifteen capsules and ellipsoids; the swing of arms and legs follows the speed."""
 
+    label = "person"
+
     def __init__(self, lane: Lane, start: float, rng: np.random.Generator) -> None:
         self._lane = lane
         self._start = start
         self._scale = rng.uniform(0.94, 1.05)
-        self.solids = _body(self._scale, rng)
+        self.solids = body(self._scale, rng)
 
     def root(self, time_s: np.ndarray) -> np.ndarray:
         """Poses of the point on the floor under the hips, x forward: `(t, 7)`, wxyz_xyz."""
@@ -118,7 +121,7 @@ class Person:
         _, _, speed = _walk(self._lane, self._start, time_s)
         phase = 2.0 * np.pi * _STRIDES_PER_S * time_s + self._start
         swing = np.arcsin(np.minimum(speed / (4.0 * _STRIDES_PER_S * _LEG_M), 0.6))
-        trunk = [_still(time_s, place) for place in _TRUNK]
+        trunk = [_still(time_s, place) for place in TRUNK]
         limbs = [_limbs(side, phase, swing) for side in (-1.0, 1.0)]
         parts = np.stack([*trunk, *limbs[0], *limbs[1]], axis=1)
         # The hips sink when the legs are apart.
@@ -127,84 +130,25 @@ class Person:
         return parts
 
 
-_TRUNK = ((0.0, 0.0, 1.19), (0.0, 0.0, 0.96), (0.01, 0.0, 1.50), (0.02, 0.0, 1.63), (-0.01, 0.0, 1.655))
-"""Where torso, hips, neck, head and hair are on a person of average size, in metres."""
-
-
-def _body(scale: float, rng: np.random.Generator) -> list[Solid]:
-    shirt, trousers = _clothes(rng, patches=0.6), _clothes(rng, patches=0.15)
-    sleeve = shirt if rng.uniform() < 0.6 else _SKIN
-
-    def limb(radius: float, length: float, look: Material) -> Solid:
-        return capsule(scale * radius, scale * length, look, rng)
-
-    def oval(radii: tuple[float, float, float], length: float, look: Material) -> Solid:
-        x, y, z = (scale * radius for radius in radii)
-        return pill((x, y, z), scale * length, look, rng)
-
-    trunk = [
-        oval((0.115, 0.185, 0.10), 0.32, shirt),
-        oval((0.115, 0.165, 0.10), 0.10, trousers),
-        limb(0.055, 0.08, _SKIN),
-        oval((0.095, 0.078, 0.12), 0.0, _SKIN),
-        oval((0.098, 0.086, 0.115), 0.0, _HAIR),
-    ]
-    limbs = [
-        limb(0.085, 0.42, trousers),
-        limb(0.058, 0.40, trousers),
-        limb(0.045, 0.15, _SHOE),
-        limb(0.052, 0.27, shirt),
-        limb(0.042, 0.30, sleeve),
-    ]
-    return [*trunk, *limbs, *limbs]
-
-
-def _clothes(rng: np.random.Generator, patches: float) -> Material:
-    dark = rng.uniform(0.08, 0.55, 3)
-    light = np.clip(dark + rng.uniform(0.1, 0.35, 3), 0.0, 1.0)
-    size = rng.uniform(0.10, 0.22)
-    bright = np.clip(light + rng.uniform(0.1, 0.4, 3), 0.0, 1.0)
-    return Material(
-        tuple(dark),
-        tuple(light),
-        tuple(0.4 * dark),
-        tuple(bright),
-        noise_per_m=8.0,
-        noise=0.6,
-        patch_m=size,
-        patch_density=patches,
-    )
-
-
 def _limbs(side: float, phase: np.ndarray, swing: np.ndarray) -> list[np.ndarray]:
     """Thigh, shin, foot, upper arm and forearm of one side, each `(t, 4, 4)`; the arm swings against the leg."""
     step = side * np.sin(phase)
     bend = swing * (0.8 + 0.7 * side * np.cos(phase))
     hip, thigh = np.array([0.0, 0.09 * side, 0.92]), -swing * step
-    knee = hip + _below(thigh, 0.42)
-    ankle = knee + _below(thigh + bend, 0.40)
-    toe = ankle + _below(thigh + bend - np.pi / 2.0, 0.15)
+    knee = hip + below(thigh, 0.42)
+    ankle = knee + below(thigh + bend, 0.40)
+    toe = ankle + below(thigh + bend - np.pi / 2.0, 0.15)
     shoulder, arm = np.array([0.0, 0.225 * side, 1.40]), 0.9 * swing * step
-    elbow = shoulder + _below(arm, 0.27)
-    wrist = elbow + _below(arm - 0.35, 0.30)
+    elbow = shoulder + below(arm, 0.27)
+    wrist = elbow + below(arm - 0.35, 0.30)
     hips, shoulders = np.broadcast_to(hip, knee.shape), np.broadcast_to(shoulder, elbow.shape)
     return [
-        _bone(hips, knee, thigh),
-        _bone(knee, ankle, thigh + bend),
-        _bone(ankle, toe, thigh + bend - np.pi / 2.0),
-        _bone(shoulders, elbow, arm),
-        _bone(elbow, wrist, arm - 0.35),
+        bone(hips, knee, thigh),
+        bone(knee, ankle, thigh + bend),
+        bone(ankle, toe, thigh + bend - np.pi / 2.0),
+        bone(shoulders, elbow, arm),
+        bone(elbow, wrist, arm - 0.35),
     ]
-
-
-def _below(angle: np.ndarray, length: float) -> np.ndarray:
-    """`(t, 3)` vectors that hang down, turned about y; a negative angle swings forward."""
-    return -length * np.stack([np.sin(angle), np.zeros_like(angle), np.cos(angle)], axis=-1)
-
-
-def _bone(first: np.ndarray, second: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    rotation = matrices(axis_rotation(1, angle))
-    return transform(rotation, 0.5 * (first + second))
 
 
 def _still(time_s: np.ndarray, place: tuple[float, float, float]) -> np.ndarray:
@@ -213,6 +157,8 @@ def _still(time_s: np.ndarray, place: tuple[float, float, float]) -> np.ndarray:
 
 class CarriedBox:
     """A textured box carried about at the height of a chest, turning as it goes: a mover no detector knows."""
+
+    label = "box"
 
     def __init__(self, lane: Lane, start: float, rng: np.random.Generator) -> None:
         self._lane = lane

@@ -15,6 +15,7 @@ from jaxslam.datasets.synthetic.actors import cast
 from jaxslam.datasets.synthetic.camera_path import CameraPathKind, camera_path
 from jaxslam.datasets.synthetic.render import Rendering, View, pack_scene, render
 from jaxslam.datasets.synthetic.scene import furnish
+from jaxslam.datasets.synthetic.seated import MOST_SEATED, chairs
 from jaxslam.datasets.synthetic.sensor import SensorConfig, measure, sensor_params
 from jaxslam.errors import ConfigError
 from jaxslam.frame import Frame
@@ -35,6 +36,8 @@ class SyntheticConfig(Checked):
         path: How the camera moves; see `camera_path.CameraPathKind`. `loop` comes back after 32 s.
         people: Number of walking people: actors 1 to `people`. Two or three at times fill half of the picture.
         boxes: Number of carried boxes: the actors after the people.
+        seated: Number of people who sit at the ends of the desk and move a little, as in the `sitting` recordings of
+            TUM RGB-D: the last actors. Their chairs are static.
         width: Pixels of a row.
         height: Pixels of a column.
         fps: Frames a second.
@@ -53,6 +56,7 @@ class SyntheticConfig(Checked):
     path: CameraPathKind = "xyz"
     people: Annotated[int, Range(at_least=0, at_most=24)] = 2
     boxes: Annotated[int, Range(at_least=0, at_most=24)] = 0
+    seated: Annotated[int, Range(at_least=0, at_most=MOST_SEATED)] = 0
     width: Annotated[int, Range(at_least=8, at_most=8192)] = 640
     height: Annotated[int, Range(at_least=8, at_most=8192)] = 480
     fps: Annotated[float, Range(above=0, at_most=1000)] = 30.0
@@ -93,6 +97,11 @@ class SyntheticFrame:
     T_world_cam: np.ndarray
     T_world_actor: np.ndarray
 
+    @property
+    def measured(self) -> Frame:
+        """What a camera would deliver of it: no mask of what moves."""
+        return Frame(self.timestamp_ns, self.rgb, self.depth_m)
+
 
 class SyntheticDataset:
     """A recording of a furnished room with walking people, rendered when a frame is asked for.
@@ -105,7 +114,8 @@ class SyntheticDataset:
 
     def __init__(self, config: SyntheticConfig | None = None) -> None:
         self.config = config = config or SyntheticConfig()
-        self.name = f"synthetic_{config.path}_{config.people}people_{config.boxes}boxes_seed{config.seed}"
+        seated = f"_{config.seated}seated" if config.seated else ""
+        self.name = f"synthetic_{config.path}_{config.people}people_{config.boxes}boxes{seated}_seed{config.seed}"
         self.width, self.height, self.fps = config.width, config.height, config.fps
         self.fx = 525.0 * config.width / 640.0 if config.fx is None else config.fx
         self.fy = self.fx if config.fy is None else config.fy
@@ -128,8 +138,8 @@ class SyntheticDataset:
             depth_scale_per_m=DEPTH_COUNTS_PER_M,
             fps=self.fps,
         )
-        self.actors = cast(config.path, config.people, config.boxes, config.seed)
-        static = furnish(config.seed)
+        self.actors = cast(config.path, config.people, config.boxes, config.seated, config.seed)
+        static = furnish(config.seed) + chairs(config.seated, config.seed)
         owned = [(solid, number) for number, actor in enumerate(self.actors, 1) for solid in actor.solids]
         solids = [(placed.solid, 0) for placed in static] + owned
         self._scene, self._slots = pack_scene([solid for solid, _ in solids], [number for _, number in solids])
@@ -141,8 +151,7 @@ class SyntheticDataset:
 
     def __getitem__(self, index: int) -> Frame:
         """Frame `index` as a camera would deliver it: without a mask of what moves."""
-        frame = self.render(index)
-        return Frame(frame.timestamp_ns, frame.rgb, frame.depth_m)
+        return self.render(index).measured
 
     def render(self, index: int) -> SyntheticFrame:
         """Frame `index` with its ground truth.

@@ -74,13 +74,18 @@ class SceneDetector:
                 self._keep(self._dataset.render(index))
             return self._actors.get(key)
 
+    def note(self, frame: SyntheticFrame) -> None:
+        """Remember where everybody is in a frame of the recording, so that it need not be rendered once more."""
+        with self._lock:
+            self._keep(frame)
+
     def _keep(self, frame: SyntheticFrame) -> int:
         """Remember where everybody is in a frame; gives its time."""
         self._actors[_digest(frame.rgb)] = zlib.compress(frame.instance_mask.astype(np.uint8).tobytes(), 1)
         return frame.timestamp_ns
 
     def _detections(self, numbers: np.ndarray) -> Detections:
-        label = {k: _LABELS[k > self._dataset.config.people] for k in np.unique(numbers[numbers > 0]).tolist()}
+        label = {k: self._dataset.actors[k - 1].label for k in np.unique(numbers[numbers > 0]).tolist()}
         found = [k for k in label if label[k] in self._labels]
         if not found:
             return no_detections()
