@@ -27,6 +27,8 @@ SAMPLE_SIZE = 4
 """Three points for P3P and one to choose its root."""
 
 _GATE_SIGMAS = 3.0  # a threshold is taken as so many standard deviations in the refinement
+_NARROW = 0.5
+"""Scale of the redescending loss, in thresholds: with 1 it is drawn from the right pose to one half way to a mover."""
 _CONSENSUS_STEPS = 10
 
 _Transforms = Float[Array, "3 4 h"]
@@ -40,7 +42,7 @@ class PnpResult(NamedTuple):
         T_world_cam: The pose; the initial one (or the identity) if `status` says that none was found.
         inliers: Which points agree with it. All false if none was found.
         num_inliers: How many.
-        score: `Σ w (1 - min(e², 1))` with e the error in thresholds: the weight of the inliers, less for larger errors.
+        score: `Σ w (1 - min(e, 1))²` with e the error in thresholds: the weight of the inliers, less for larger errors.
         status: A `PoseStatus`.
     """
 
@@ -109,7 +111,7 @@ def ransac_pnp(
     hypotheses = jnp.concatenate([hypotheses, _as_transform(fallback)], axis=2)
     scores = jnp.where(jnp.append(real, has_initial), score_poses(hypotheses, fixed), -1.0)
     best, _ = usable_pose(_as_pose(hypotheses[:, :, jnp.argmax(scores)]))
-    consensus, _ = solve_pose(best, fixed, "geman_mcclure", _CONSENSUS_STEPS)
+    consensus = _improved(best, fixed)
     inliers, _ = _consensus(consensus, fixed)
     weights_of_inliers = jnp.where(inliers, problem.weights, 0.0)
     on_inliers = problem._replace(weights=weights_of_inliers, scale=0.5 * problem.scale)
@@ -143,11 +145,16 @@ def draw_samples(
 def score_poses(T_cam_world: _Transforms, problem: PoseProblem) -> Float[Array, " h"]:
     """The score of each pose (see `PnpResult.score`), thresholds being `problem.scale` deviations.
 
+    `(1 - e)²` is the truncated squared error `1 - min(e² / s², 1)` averaged over all thresholds s up to 1: nobody knows
+    the noise, and a pose that fits some points well is rather right than one that fits more of them badly (the idea of
+    Barath, Matas and Noskova, "MAGSAC: marginalizing sample consensus", CVPR 2019). Without the average, a pose half
+    way between a room and a box that is carried before it beats both.
+
     One fused pass over hypotheses x points: 40 us for 128 x 500 on one core. As a matrix product followed by the
     errors it takes 50 us, with an exponential map in the loop 9 ms.
     """
     error = _squared_errors(T_cam_world[..., None], *(o[..., None, :] for o in _observed(problem)))
-    return (1.0 - jnp.minimum(error, 1.0)) @ problem.weights
+    return jnp.square(1.0 - jnp.sqrt(jnp.minimum(error, 1.0))) @ problem.weights
 
 
 def _observed(problem: PoseProblem) -> tuple[Array, Array, Array, Array]:
@@ -182,6 +189,13 @@ def _hypotheses(problem: PoseProblem, samples: Int[Array, "4 h"]) -> tuple[_Tran
     chosen = jnp.argmin(disagreement, axis=0)
     T = jnp.take_along_axis(T, chosen[None, None, None, :], axis=2)[:, :, 0, :]
     return T, (real & spans).any(axis=0)
+
+
+def _improved(best: SE3, problem: PoseProblem) -> SE3:
+    """A pose after a redescending refinement, or as it was if that has led away to where fewer agree."""
+    solved, _ = solve_pose(best, problem._replace(scale=_NARROW * problem.scale), "geman_mcclure", _CONSENSUS_STEPS)
+    better = _consensus(solved, problem)[1] > _consensus(best, problem)[1]
+    return SE3(jnp.where(better, solved.wxyz_xyz, best.wxyz_xyz))
 
 
 def _consensus(T_world_cam: SE3, problem: PoseProblem) -> tuple[Mask, Scalar]:
