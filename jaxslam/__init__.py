@@ -9,6 +9,11 @@ from jaxslam.camera import known_cameras as known_cameras
 from jaxslam.config import Config as Config
 from jaxslam.config import load_config as load_config
 from jaxslam.datasets import open_dataset as open_dataset
+from jaxslam.dynamics.cue import Scene as Scene
+from jaxslam.dynamics.cue import Verdict as Verdict
+from jaxslam.dynamics.cue import judge as judge
+from jaxslam.dynamics.known import with_cue_params as with_cue_params
+from jaxslam.dynamics.known import with_cues as with_cues
 from jaxslam.errors import JaxSlamError as JaxSlamError
 from jaxslam.evaluation import Evaluation as Evaluation
 from jaxslam.evaluation import evaluate as evaluate
@@ -24,7 +29,9 @@ from jaxslam.state import TrackParams as TrackParams
 from jaxslam.state import TrackPlan as TrackPlan
 from jaxslam.state import TrackState as TrackState
 from jaxslam.state import TrackStatus as TrackStatus
+from jaxslam.track import follow_points as follow_points
 from jaxslam.track import init_state as init_state
+from jaxslam.track import track_followed as track_followed
 from jaxslam.track import track_step as track_step
 from jaxslam.tracked import Tracked as Tracked
 from jaxslam.trajectory import Trajectory as Trajectory

@@ -1,7 +1,8 @@
-"""All that goes on beside tracking: mapping, loop closing and recall, in threads or on a fixed schedule.
+"""All that goes on beside tracking: mapping, loop closing, recall, and a detector that looks at keyframes alone.
 
-The tracker hands over keyframes and takes what is there; it never waits. Every exchange happens in the tracker's
-thread, in `update`: jobs and results are immutable, so threads share nothing but the index of places, which has a lock.
+It runs in threads or on a fixed schedule. The tracker hands over keyframes and takes what is there; it never waits.
+Every exchange happens in the tracker's thread, in `update`: jobs and results are immutable, so threads share nothing
+but their queues and the index of places, which has a lock.
 """
 
 import threading
@@ -19,15 +20,19 @@ from jaxslam.essential_graph import compile_graph
 from jaxslam.feature_pose import MIN_INLIERS
 from jaxslam.features import Features, features_of, no_features
 from jaxslam.frame_arrays import FrameArrays
+from jaxslam.keyframe_semantics import KeyframeSemantics
 from jaxslam.local_map import keyframes_in_view, match_local_map
-from jaxslam.local_mapping import LocalMapping, NewKeyframe, mapping_plan, with_new_keyframe
+from jaxslam.local_mapping import LocalMapping, NewKeyframe, mapping_plan, point_ids, with_new_keyframe
 from jaxslam.loop_closing import LoopClosing, LoopClosure
-from jaxslam.map import NONE, Map, empty_map
-from jaxslam.map_link import Hung, MapLink, pose_of
+from jaxslam.map import NONE, Map, empty_map, has
+from jaxslam.map_link import Hung, MapLink, pose_of, tracks_of
+from jaxslam.map_movers import Movers
 from jaxslam.place_index import PlaceIndex
 from jaxslam.place_recognition import compile_recognition, recognise
+from jaxslam.point_states import PointStates, StateChanges
 from jaxslam.pose import IDENTITY, compose, inverse, transform
 from jaxslam.recall import Recalled, recall
+from jaxslam.semantics import Detector
 from jaxslam.stage_times import StageTimes
 from jaxslam.state import TrackOutput, TrackParams, TrackPlan, TrackReason, TrackState, TrackStatus
 from jaxslam.state_edit import relocated
@@ -74,15 +79,37 @@ class _Recall(NamedTuple):
     known: frozenset[int]
 
 
-class _MapUpdate(NamedTuple):
-    """A new map, the keyframe it is of or `NONE`, and the loops closed in it."""
+class _Replace(NamedTuple):
+    """A job: take in that a keyframe has lost features."""
 
     map: Map
     keyframe: int
-    loops: int
 
 
-_PlaceJob: TypeAlias = _Look | _Recall
+class _MapUpdate(NamedTuple):
+    """A new map, and what is new in it.
+
+    Attributes:
+        map: The map.
+        keyframe: The new keyframe, or `NONE`.
+        loops: Loops closed.
+        cleaned: The keyframe that what may move has left, or `NONE`.
+        removed: Points that have left the map with it,
+        gone: and the tracker's numbers of them.
+        states: Number of the changes of states that it has, and all before; 0 if no more than the map before.
+    """
+
+    map: Map
+    keyframe: int = NONE
+    loops: int = 0
+    cleaned: int = NONE
+    removed: int = 0
+    gone: np.ndarray | None = None
+    states: int = 0
+
+
+_MapJob: TypeAlias = NewKeyframe | LoopClosure | Movers | StateChanges
+_PlaceJob: TypeAlias = _Look | _Recall | _Replace
 _PlaceResult: TypeAlias = LoopClosure | tuple[Recalled, ...] | None
 
 
@@ -98,6 +125,7 @@ class BackEnd:
         map: Map | None = None,
         *,
         localize_only: bool = False,
+        detector: Detector | None = None,
         times: StageTimes | None = None,
     ) -> None:
         """Start with a map, empty by default.
@@ -109,24 +137,33 @@ class BackEnd:
             config: Settings.
             map: To start with.
             localize_only: Leave the map as it is.
+            detector: Finds in keyframes what may move, which leaves them and the map.
             times: Where to keep how long the jobs of the threads take.
         """
         self._times = times or StageTimes()
-        self._params, self._track_plan, self._plan = params, plan, mapping_plan(config.mapping, config.track)
+        occlusion = config.dynamics.occlusion
+        self._params, self._track_plan = params, plan
+        self._plan = mapping_plan(config.mapping, config.track, occlusion)
         self._camera, self._config, self._localize_only = camera, config, localize_only
         start = empty_map(camera) if map is None else map
         self._mapping = LocalMapping(camera, params, self._plan, start)
         self._index, self._lock = PlaceIndex.from_map(start), threading.Lock()
         self._loops = LoopClosing(self._index, params, self._plan.features, self._lock)
-        self._to_mapping: Worker[NewKeyframe | LoopClosure, _MapUpdate] = self._worker(self._map_job, "mapping", 1)
+        self._to_mapping: Worker[_MapJob, _MapUpdate] = self._worker(self._map_job, "mapping", 1)
         self._to_places: Worker[_PlaceJob, _PlaceResult] = self._worker(self._place_job, "places", 2)
+        self._semantics = None if detector is None else self._semantics_of(detector)
         self._link = MapLink(plan, start)
+        most = config.mapping.num_features + self._num_tracks
+        self._states = PointStates(occlusion, params, start, most) if occlusion.enabled else None
+        self._states_in_map = 0  # number of the changes that the newest map has
         self._arrived: Map | None = None
         self._waiting: list[Recalled] = []
         self._wanted: set[int] = set()
         self._correction = IDENTITY
         self._features: Features | None = None  # of the present frame, once they have been sought
-        self._loops_closed = 0
+        self._gone: list[np.ndarray] = []  # numbers of points that the tracker is to forget
+        self._detector_error = ""
+        self._loops_closed = self._removed = 0
         self._closed = False
 
     @property
@@ -140,14 +177,31 @@ class BackEnd:
         return self._loops_closed
 
     @property
+    def removed_by_semantics(self) -> int:
+        """Points that have left the map because a keyframe saw them where something may move."""
+        return self._removed
+
+    @property
+    def keyframes_passed_over(self) -> int:
+        """Keyframes that the detector has never looked at, because too many waited."""
+        return 0 if self._semantics is None else self._semantics.num_passed_over
+
+    @property
+    def _num_tracks(self) -> int:
+        """Points that the tracker sees in a frame at most."""
+        plan = self._track_plan
+        return plan.num_points + plan.num_sources * plan.points_per_source
+
+    @property
     def is_behind(self) -> bool:
         """Whether keyframes wait that mapping has not begun with; never on the schedule of a deterministic run."""
         return not self._config.run.in_turn and self._link.num_on_the_way > _MOST_ON_THE_WAY
 
     def compile(self, frame: FrameArrays) -> None:
         """Compile all that is needed while frames of this kind come."""
-        num_looked_up = self._track_plan.num_sources * self._track_plan.points_per_source
-        self._mapping.compile(frame, self._track_plan.num_points + num_looked_up)
+        self._mapping.compile(frame, self._num_tracks)
+        if self._states is not None:
+            self._states.compile(frame)
         compile_recognition(self._params, self._plan.features)
         self._compile_edits(*frame.image.shape)
         if not self._config.run.in_turn:
@@ -166,6 +220,8 @@ class BackEnd:
         if self._closed:
             raise RuntimeError("the back end is closed")
         self._features = None
+        if self._semantics is not None:
+            self._take_movers(*self._semantics.take(frame), frame)
         self._take_places(self._to_places.take(frame), frame)
         more = self._take_maps(self._to_mapping.take(frame), frame)
         state = self._carried(state)
@@ -174,21 +230,38 @@ class BackEnd:
         correction, self._correction = self._correction, IDENTITY
         return self._with_recalled(state), correction
 
+    def told_error(self) -> str:
+        """What went wrong in the detector that looks at keyframes; told once, empty if nothing did."""
+        error, self._detector_error = self._detector_error, ""
+        return error
+
     def keyframe_made(
-        self, timestamp_ns: int, arrays: FrameArrays, output: TrackOutput, frame: int, recognised: Hung | None
+        self,
+        timestamp_ns: int,
+        image: np.ndarray,
+        arrays: FrameArrays,
+        output: TrackOutput,
+        frame: int,
+        recognised: Hung | None,
     ) -> None:
         """Hand over a keyframe of the tracker.
 
         Args:
             timestamp_ns: Its time.
+            image: `(h, w, 3)` RGB or `(h, w)`; copied if it is needed.
             arrays: The frame; it is copied.
             output: What the tracker said of it.
             frame: Its number.
             recognised: Where it is, if tracking began at a place that was recognised.
         """
+        keyframe = NONE
         if not self._localize_only:
             new = self._link.keyframe_made(timestamp_ns, _copied(arrays), output, recognised)
-            self._to_mapping.offer(new._replace(features=self._features), frame)
+            keyframe = new.id
+            states = None if self._states is None else self._states.handed_over()
+            self._to_mapping.offer(new._replace(features=self._features, states=states), frame)
+        if self._semantics is not None:
+            self._semantics.offer(keyframe, image, np.asarray(arrays.depth), tracks_of(output), frame)
 
     def held_to_map(
         self, state: TrackState, arrays: FrameArrays, output: TrackOutput
@@ -217,6 +290,16 @@ class BackEnd:
             reason=TrackReason.NONE if fine else output.reason,
         )
         return state, output, placed.num_matched
+
+    def look_at_points(self, arrays: FrameArrays, output: TrackOutput) -> float | None:
+        """Take in which points of the reference keyframe a frame that was tracked shows, and which are blocked in it.
+
+        Returns:
+            The share of them that are OCCLUDED; `None` if the settings do not ask for it, or the map has no keyframe.
+        """
+        if self._states is None or (hung := self._link.in_map(pose_of(output))) is None:
+            return None
+        return self._states.see(self.map, hung.keyframe, hung.T_keyframe_cam, np.asarray(output.twist), arrays)
 
     def regain(self, arrays: FrameArrays, predicted: np.ndarray | None) -> tuple[Placed | None, bool]:
         """Where a frame was taken that flow has lost, if the map shows that place.
@@ -280,6 +363,10 @@ class BackEnd:
         Raises:
             Exception: What went wrong in a thread. The state is as it was, and nothing else is lost: finish again.
         """
+        if self._semantics is not None:
+            self._take_movers(*self._semantics.drain(), 0)
+        if self._states is not None and not (self._localize_only or self._closed):
+            self._offer_states(self._states)
         self._take_places(self._to_places.drain(), 0)
         while self._take_maps(self._to_mapping.drain(), 0):
             self._take_places(self._to_places.drain(), 0)
@@ -288,7 +375,8 @@ class BackEnd:
     def close(self) -> None:
         """End the threads, with the jobs they have not begun, in less than two seconds."""
         self._closed = True
-        close_all((self._to_mapping, self._to_places))
+        looking = () if self._semantics is None else (self._semantics.worker,)
+        close_all((self._to_mapping, self._to_places, *looking))
 
     def _in_local_map(self, features: Features, T_world_cam: np.ndarray) -> Placed | None:
         """Where a frame was taken that is about at a pose, if the map around shows it."""
@@ -296,7 +384,7 @@ class BackEnd:
         if about is None:
             return None
         found = match_local_map(
-            self.map, about.keyframe, about.T_keyframe_cam, features, self._params, self._plan.features
+            self.map, about.keyframe, about.T_keyframe_cam, features, self._params, self._plan.features, self._states
         )
         if found is None:
             return None
@@ -307,7 +395,21 @@ class BackEnd:
         shapes: Any = jax.eval_shape(partial(init_state, height, width, self._track_plan))
         nothing = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes._replace(key=None))
         state = _relocated(nothing._replace(key=jax.random.key(0)), np.asarray(IDENTITY, np.float32))
-        jax.block_until_ready(self._link.compile(state))
+        state = self._link.compile(state)
+        if self._semantics is not None:
+            state = self._link.forgotten(state, np.zeros(1, np.int64))
+        jax.block_until_ready(state)
+
+    def _semantics_of(self, detector: Detector) -> KeyframeSemantics:
+        settings = self._config.semantics
+        return KeyframeSemantics(
+            self._camera,
+            detector,
+            deterministic=self._config.run.in_turn,
+            latency_frames=settings.latency_frames,
+            dilate_px=settings.dilate_px,
+            times=self._times,
+        )
 
     def _worker(self, work: Callable[[Any], Any], name: str, turn: int) -> Worker[Any, Any]:
         latency_frames = turn * self._config.mapping.latency_frames
@@ -318,22 +420,30 @@ class BackEnd:
             latency_frames=latency_frames,
         )
 
-    def _map_job(self, job: NewKeyframe | LoopClosure) -> _MapUpdate:
+    def _map_job(self, job: _MapJob) -> _MapUpdate:
         before = self._mapping.map
         try:
             if isinstance(job, LoopClosure):
                 map = self._mapping.close_loop(job)
-                return _MapUpdate(map, NONE, int(map is not before))
-            return _MapUpdate(self._mapping.add(job), job.id, 0)
+                return _MapUpdate(map, loops=int(map is not before))
+            if isinstance(job, Movers):
+                map, gone = self._mapping.remove(job)
+                removed = len(before.points.ids) - len(map.points.ids)
+                return _MapUpdate(map, cleaned=job.keyframe, removed=removed, gone=gone)
+            if isinstance(job, StateChanges):
+                return _MapUpdate(self._mapping.take_states(job), states=job.number)
+            return _MapUpdate(self._mapping.add(job), job.id, states=0 if job.states is None else job.states.number)
         except BaseException:
             # What was begun is forgotten; those after a keyframe hang on it, and so it is there, without points.
-            map = before if isinstance(job, LoopClosure) else with_new_keyframe(before, job, no_features())
+            map = with_new_keyframe(before, job, no_features()) if isinstance(job, NewKeyframe) else before
             self._mapping = LocalMapping(self._camera, self._params, self._plan, map)
             raise
 
     def _place_job(self, job: _PlaceJob) -> _PlaceResult:
         if isinstance(job, _Look):
             return self._loops.look(job.map, job.keyframe)
+        if isinstance(job, _Replace):
+            return self._loops.replace(job.map, job.keyframe)
         return self._recalls(job)
 
     def _recalls(self, job: _Recall) -> tuple[Recalled, ...]:
@@ -345,6 +455,12 @@ class BackEnd:
         for update in updates:
             self._arrived = update.map
             self._loops_closed += update.loops
+            self._removed += update.removed
+            self._states_in_map = max(self._states_in_map, update.states)
+            if update.gone is not None:
+                self._gone.append(update.gone)
+            if update.cleaned != NONE and not self._closed:
+                self._to_places.offer(_Replace(update.map, update.cleaned), frame)
             if update.keyframe != NONE and not self._closed:
                 self._to_places.offer(_Look(update.map, update.keyframe), frame)
         return bool(updates)
@@ -354,7 +470,26 @@ class BackEnd:
             state, change = self._link.corrected(state, self._arrived)
             self._arrived = None
             self._correction = compose(change, self._correction)
+            if self._states is not None:
+                self._states.arrived(self.map, self._states_in_map)
+        for gone in self._gone:
+            state = self._link.forgotten(state, gone)
+        self._gone.clear()
         return state
+
+    def _take_movers(self, found: list[Movers], error: str, frame: int) -> None:
+        """Have what may move leave the keyframes it was found in, the map, and the tracker's state."""
+        self._detector_error = error or self._detector_error
+        for movers in found:
+            self._gone.append(movers.tracks)
+            if movers.keyframe != NONE and movers.mask.any() and not self._closed:
+                self._to_mapping.offer(movers, frame)
+
+    def _offer_states(self, states: PointStates) -> None:
+        """Hand over what has changed since the last keyframe."""
+        changes = states.handed_over()
+        if len(changes.ids):
+            self._to_mapping.offer(changes, 0)
 
     def _take_places(self, results: list[_PlaceResult], frame: int) -> None:
         for result in results:
@@ -378,10 +513,18 @@ class BackEnd:
         """The state with one more of the keyframes that wait; one a frame, so that none takes long."""
         while self._waiting:
             keyframe = self._waiting.pop(0)
+            if self._semantics is not None:
+                keyframe = _without_removed(keyframe, self.map)
             slot = self._link.slot_for(keyframe.keyframe, self._wanted)
             if slot is not None:
                 return self._link.recalled(state, slot, keyframe)
         return state
+
+
+def _without_removed(keyframe: Recalled, map: Map) -> Recalled:
+    """A keyframe that was prepared from an earlier map, without the points that have left it since."""
+    there = has(map.points.ids, point_ids(keyframe.id))
+    return keyframe._replace(weight=np.where(there, keyframe.weight, np.float32(0)))
 
 
 def _copied(arrays: FrameArrays) -> FrameArrays:

@@ -88,6 +88,8 @@ class TrackConfig(Checked):
     """or so many while tracking is weak or has few points."""
     probation_frames: Annotated[float, Range(at_least=1)] = 8
     """Frames after which a point counts in full: what moves on its own is an outlier before that."""
+    anchor_frames: Annotated[float, Range(at_least=1)] = 15
+    """Frames after which the place of a point is taken anew as the one that cues to slow motion compare with."""
     restart_after: Annotated[float, Range(at_least=0)] = 15
     """Frames of loss after which tracking starts anew at the pose held."""
     max_speed_m_per_s: Annotated[float, Positive] = 5.0
@@ -128,15 +130,19 @@ class SemanticsConfig(Checked):
 
     model: str | None = "yolox-nano"
     """Network: a name of `jaxslam models list`, or an ONNX file. With `null`, or where a known one is not on this
-    machine, which is said, geometry alone decides."""
+    machine, which is said, geometry alone decides. `scene` is the truth of a rendered room: there only."""
     labels: tuple[str, ...] = ("person",)
-    """What may move, as the network names it."""
+    """What may move, as the network names it; in a rendered room `person` and `box`."""
     min_score: Annotated[float, Share] = 0.3
     """Detections below this score are dropped."""
     threads: Annotated[int, Range(at_least=1, at_most=64)] = 1
     """Threads the network may use."""
+    frames: Literal["every", "keyframes"] = "every"
+    """What the network looks at: every frame it has time for, to make masks of all, or `keyframes` alone: what may move
+    then leaves keyframe and map when it is found, and frames have no mask of it (TRS-SLAM)."""
     latency_frames: Annotated[int, Range(at_least=0, at_most=100)] = 2
-    """Frames after which a deterministic run has what the network found; 0 has every frame wait, live too."""
+    """Frames after which a deterministic run has what the network found; 0 has every frame wait, live too, unless the
+    network looks at keyframes alone: nobody waits for those."""
     propagate: bool = True
     """Carry masks on from frame to frame, by flow and depth; without it, one stays where it was until the next."""
     dilate_px: Annotated[int, Range(at_least=0, at_most=100)] = 3
@@ -156,16 +162,80 @@ class TrajectoryCueConfig(Checked):
 
 
 @dataclass(frozen=True)
+class EpipolarCueConfig(Checked):
+    """Whether points are on the lines on which they would be at rest (RTS-SLAM)."""
+
+    limit_px: Annotated[float, Positive] = 1.0
+    """Distance from the line beyond which a point moves."""
+    fewest_outside: Annotated[int, Range(at_least=0)] = 30
+    """With no more points outside masks, those under masks help to find the lines."""
+    border_px: Annotated[float, Range(at_least=0)] = 10.0
+    """Points closer to the border of the picture are not judged."""
+    ransac_px: Annotated[float, Positive] = 0.5
+    """Distance up to which a point supports a fundamental matrix."""
+    num_hypotheses: Annotated[int, Range(at_least=8, at_most=4096)] = 128
+    """Fundamental matrices tried a frame."""
+
+
+@dataclass(frozen=True)
+class ClusterCueConfig(Checked):
+    """Whether the points of a surface are on average where the map has them (TRS-SLAM)."""
+
+    num_regions: Annotated[int, Range(at_least=2, at_most=128)] = 24
+    """Surfaces into which the depth image is divided by K-means,"""
+    step_px: Annotated[int, Range(at_least=1, at_most=32)] = 4
+    """of which one pixel in so many is looked at, in rows and in columns,"""
+    num_steps: Annotated[int, Range(at_least=1, at_most=50)] = 2
+    """in so many steps a frame."""
+    recover_frames: Annotated[int, Range(at_least=1, at_most=1000)] = 15
+    """Frames without motion after which a surface that moved counts again."""
+    times_mean: Annotated[float, Positive] = 1.5
+    """A surface moves if its mean error is beyond so many times that of all points."""
+    least_px: Annotated[float, Range(at_least=0)] = 1.4
+    """A surface with a root mean squared error below is at rest."""
+    robust_px: Annotated[float, Positive] = 2.45
+    """Errors beyond count hardly more; 95 % of those with a standard deviation of a pixel are below."""
+    fewest: Annotated[int, Range(at_least=1)] = 3
+    """Least number of points of which a mean is taken."""
+    as_published: bool = False
+    """Take the mean over all points, not over those that agree with the pose."""
+
+
+@dataclass(frozen=True)
+class OcclusionConfig(Checked):
+    """Points of the map that something passed before and that are there again count more (Occlusion SLAM)."""
+
+    enabled: bool = False
+    """Follow what passes before the points of the map."""
+    weight: Annotated[float, Positive] = 3.0
+    """How much such a point counts, where others count 1."""
+    guard: bool = True
+    """A point that is not where it should be by depth is as any other again: a thing that stood still and is carried
+    away. The paper has no such guard."""
+
+
+_CueName = Literal["trajectory", "epipolar", "clusters"]
+
+
+@dataclass(frozen=True)
 class DynamicsConfig(Checked):
     """Finding what moves without a network."""
 
     newcomers: bool = True
     """Leave out what has come before surfaces that were seen earlier: people, doors, things that are carried."""
-    cues: tuple[Literal["trajectory"], ...] = ()
+    cues: tuple[_CueName, ...] = ()
     """What else tells points that move, each with a veto."""
+    reach_px: Annotated[int, Range(at_least=0, at_most=100)] = 12
+    """How far around a point that moves by its cues the map gets nothing, on surfaces as far away as it is."""
+    even_votes: bool = True
+    """Give no surface more of a say in the pose than an even share: whoever carries a large box has most of the points,
+    and the room behind it most of the surfaces. They are those of `clusters`."""
     temperature: Annotated[float, Range(at_least=0)] = 0.0
     """Of the limits of cues: 0 compares and drops; above, points count less the further they are beyond."""
     trajectory: TrajectoryCueConfig = field(default_factory=TrajectoryCueConfig)
+    epipolar: EpipolarCueConfig = field(default_factory=EpipolarCueConfig)
+    clusters: ClusterCueConfig = field(default_factory=ClusterCueConfig)
+    occlusion: OcclusionConfig = field(default_factory=OcclusionConfig)
 
 
 @dataclass(frozen=True)

@@ -49,6 +49,8 @@ class MaskSource(enum.IntEnum):
     """The caller's alone."""
     DEPTH = 4
     """What came before surfaces seen earlier, carried on from frame to frame; no detector has seen it."""
+    CUES = 5
+    """Surfaces of this frame that move by what dynamic cues say of their points, and nothing else."""
 
 
 class FrameMask(NamedTuple):

@@ -42,7 +42,7 @@ class Matches(NamedTuple):
         uv: `(2, n)` the features, pixels of the ideal camera.
         depth: `(n,)` measured there, 0 for none.
         sigma_px: `(n,)` standard deviation of the features, each coordinate.
-        weight: `(n,)` how much each counts, 0 to 1.
+        weight: `(n,)` how much each counts, 0 for not at all.
     """
 
     X: Points

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 from jaxslam.map import NONE, Map, Sightings, covisible, has, rows, sightings_at
 from jaxslam.map_edit import moved, without_sightings
 from jaxslam.padding import padded
+from jaxslam.point_states import state_weights
 from jaxslam.pose import between, compose, inverse, rotate, to_local, transform
 
 _NUM_FIXED = 4
@@ -36,6 +37,7 @@ class AdjustPlan(NamedTuple):
         loss_scale: Scale of the Cauchy loss, in standard deviations.
         depth_sigma_m: Standard deviation of measured depth close to the camera, metres.
         depth_sigma_per_m2: Its growth with the square of depth, a metre.
+        occluded_weight: How much OCCLUDED points count, where others count 1.
     """
 
     window: int = 8
@@ -43,6 +45,7 @@ class AdjustPlan(NamedTuple):
     loss_scale: float = 1.0
     depth_sigma_m: float = 0.005
     depth_sigma_per_m2: float = 0.007
+    occluded_weight: float = 1.0
 
 
 class _Window(NamedTuple):
@@ -167,7 +170,10 @@ def _observations(map: Map, window: _Window, size: int, plan: AdjustPlan) -> Obs
     focal = np.array([[camera.fx], [camera.fy]])
     centre = np.array([[camera.cx], [camera.cy]])
     point_row = np.searchsorted(window.points, seen.point)
-    weight = seen.weight * map.points.weight[rows(map.points.ids, seen.point)]
+    at = rows(map.points.ids, seen.point)
+    weight = seen.weight * map.points.weight[at]
+    if plan.occluded_weight != 1:
+        weight = weight * state_weights(map.points.state[at], plan.occluded_weight)
     precision = np.concatenate([focal / seen.sigma_px, np.where(seen.depth > 0, 1 / sigma_depth, 0)[None, :]])
     fit: Any = lambda array, dtype: padded(array.astype(dtype), room, axis=-1, fill=0)
     valid: Any = np.arange(room) < len(row)

@@ -9,6 +9,7 @@ from jaxslam.feature_pose import FeaturePose, fit_pose, matches_of
 from jaxslam.features import FeaturePlan, Features
 from jaxslam.map import Map, covisible, rows
 from jaxslam.map_matching import find_points, recognisable_in
+from jaxslam.point_states import PointStates
 from jaxslam.pose import angle, between, compose, to_local
 from jaxslam.state import TrackParams
 
@@ -69,7 +70,13 @@ def keyframes_in_view(map: Map, T_world_cam: np.ndarray, submap: int, exclude: s
 
 
 def match_local_map(
-    map: Map, keyframe_id: int, T_keyframe_cam: np.ndarray, features: Features, params: TrackParams, plan: FeaturePlan
+    map: Map,
+    keyframe_id: int,
+    T_keyframe_cam: np.ndarray,
+    features: Features,
+    params: TrackParams,
+    plan: FeaturePlan,
+    states: PointStates | None = None,
 ) -> FeaturePose | None:
     """Where a frame was taken, from the points of the local map that are found in it; `None` if that is not certain.
 
@@ -80,6 +87,7 @@ def match_local_map(
         features: Of the frame.
         params: Camera, and the errors of its depth.
         plan: How features were found.
+        states: By which points that are OCCLUDED count more.
 
     Returns:
         The pose in the axes of the keyframe.
@@ -94,7 +102,10 @@ def match_local_map(
         expected = compose(origin, T_keyframe_cam)
         index, feature = find_points(map, points, features, expected, plan, radius_px=radius_px)
         X, better_known = to_local(origin, points.X_world[:, index]), np.zeros(len(index))
-        matches = matches_of(X, better_known, features, feature, plan, weight=weight[index])
+        counts = weight[index]
+        if states is not None:
+            counts = counts * states.weights(map, points.ids[index])
+        matches = matches_of(X, better_known, features, feature, plan, weight=counts)
         found = fit_pose(T_keyframe_cam, matches, params, min_inliers=_MIN_INLIERS, min_cells=_MIN_CELLS)
         if found is None or not _near(found.T_origin_cam, T_first):
             return None

@@ -17,7 +17,7 @@ from jaxslam_kernels.types import Pixels, Weights
 from jaxtyping import Array, Float
 
 from jaxslam.camera import Camera
-from jaxslam.config import MappingConfig, TrackConfig
+from jaxslam.config import MappingConfig, OcclusionConfig, TrackConfig
 from jaxslam.culling import CONFIRM_WITHIN, without_redundant, without_unconfirmed
 from jaxslam.features import FeaturePlan, Features, features_of
 from jaxslam.frame_arrays import FrameArrays
@@ -28,9 +28,11 @@ from jaxslam.loop_correction import with_loop_closed
 from jaxslam.map import NONE, Keyframe, Map, Sightings, covisible, empty_map, has, point_submaps, rows, standing
 from jaxslam.map_edit import with_keyframe, with_points, with_sightings
 from jaxslam.map_matching import feature_sightings, find_points, fuse_duplicates, recognisable_in
+from jaxslam.map_movers import Movers, without_known, without_movers
 from jaxslam.map_part import Part, most_shared, part_around, put_back
 from jaxslam.new_points import new_points, with_triangulated
 from jaxslam.observe import observe
+from jaxslam.point_states import StateChanges, with_changes
 from jaxslam.pose import compose, transform
 from jaxslam.state import TrackParams
 
@@ -41,6 +43,8 @@ _LOOP_KEYFRAMES = 96
 """Keyframes around a loop that are adjusted when it is closed: where those that see the same do not yet agree."""
 _SPAN = 64
 """Keyframes after which the number the tracker gave a point is forgotten."""
+_GONE = -2
+"""In place of a point of the map: none, and none is to be made."""
 
 
 class Tracks(NamedTuple):
@@ -72,6 +76,7 @@ class NewKeyframe(NamedTuple):
         twist: `(6,)` velocity of the camera in its own axes.
         tracks: Points seen.
         features: Found in it, if that has been done.
+        states: Of points, changed since the keyframe before.
     """
 
     id: int
@@ -83,6 +88,7 @@ class NewKeyframe(NamedTuple):
     twist: np.ndarray
     tracks: Tracks
     features: Features | None = None
+    states: StateChanges | None = None
 
 
 class MappingPlan(NamedTuple):
@@ -101,12 +107,18 @@ class MappingPlan(NamedTuple):
     search_px: float = 3.0
 
 
-def mapping_plan(config: MappingConfig, track: TrackConfig) -> MappingPlan:
+def mapping_plan(config: MappingConfig, track: TrackConfig, occlusion: OcclusionConfig | None = None) -> MappingPlan:
     """The settings of local mapping; depth is measured as well as in tracking."""
+    occluded_weight = occlusion.weight if occlusion is not None and occlusion.enabled else 1.0
     return MappingPlan(
         features=FeaturePlan(**{name: getattr(config, name) for name in FeaturePlan._fields}),
         adjust=AdjustPlan(
-            config.window, config.max_steps, track.loss_scale, track.depth_sigma_m, track.depth_sigma_per_m2
+            window=config.window,
+            max_steps=config.max_steps,
+            loss_scale=track.loss_scale,
+            depth_sigma_m=track.depth_sigma_m,
+            depth_sigma_per_m2=track.depth_sigma_per_m2,
+            occluded_weight=occluded_weight,
         ),
         track_sigma_px=config.track_sigma_px,
         search_px=config.search_px,
@@ -116,6 +128,11 @@ def mapping_plan(config: MappingConfig, track: TrackConfig) -> MappingPlan:
 def recalled_id(point_ids: np.ndarray) -> np.ndarray:
     """The tracker's numbers for points of the map: negative, so that none is one of its own."""
     return -1 - point_ids
+
+
+def point_ids(recalled: np.ndarray) -> np.ndarray:
+    """The points of the map by the tracker's numbers of recalled ones."""
+    return -1 - recalled
 
 
 class LocalMapping:
@@ -142,7 +159,7 @@ class LocalMapping:
         if features is None:
             features = features_of(new.frame, new.twist, self._params, self._plan.features)
         whole = with_new_keyframe(self.map, new, features)
-        known = self._known(new.tracks)
+        known = self._points(new.tracks.id)
         part = _part(whole, new.id, known[has(whole.points.ids, known)])
         map = self._with_tracks(part.map, new, known)
         map, taken = self._with_found_points(map, new.id, features)
@@ -158,6 +175,11 @@ class LocalMapping:
         self.map = put_back(whole, part, map)
         return self.map
 
+    def take_states(self, changes: StateChanges) -> Map:
+        """Take in states of points that changed after the last keyframe; gives the new map."""
+        self.map = with_changes(self.map, changes)
+        return self.map
+
     def close_loop(self, loop: LoopClosure) -> Map:
         """Close a loop, or make one submap of two; gives the new map."""
         if not has(self.map.ids, np.array([loop.source, loop.target])).all():
@@ -170,6 +192,28 @@ class LocalMapping:
         map = adjust_around(map, loop.target, self._plan.adjust, part.keyframes)
         self.map = put_back(whole, part, adjust_all(map, self._plan.adjust, part.keyframes))
         return self.map
+
+    def remove(self, movers: Movers) -> tuple[Map, np.ndarray]:
+        """Take what may move out of a keyframe and the map.
+
+        Of a keyframe that has been culled since, only the points that the tracker saw are known. The others were seen
+        by those that made it redundant, and leave with what may move in them.
+
+        Returns:
+            The map, and the tracker's numbers of the points that have left it.
+        """
+        before = map = self.map
+        if has(map.ids, np.array([movers.keyframe]))[0]:
+            map = without_movers(map, movers.keyframe, movers.mask)
+        map = without_known(map, self._points(movers.tracks))
+        self.map = map
+        gone = before.points.ids[~has(map.points.ids, before.points.ids)]
+        points = set(gone.tolist())
+        tracks = [track for track, point in self._point_of.items() if point in points]
+        for track in movers.tracks[movers.tracks >= 0].tolist():
+            self._point_of.setdefault(track, _GONE)
+            self._last_seen.setdefault(track, movers.keyframe)
+        return map, np.append(recalled_id(gone), np.array(tracks, np.int64))
 
     def _with_tracks(self, map: Map, new: NewKeyframe, known: np.ndarray) -> Map:
         """The points the tracker saw: those the map has get a sighting, the others become points."""
@@ -204,10 +248,10 @@ class LocalMapping:
             ),
         )
 
-    def _known(self, tracks: Tracks) -> np.ndarray:
-        """The points of the map that the tracker has; `NONE` where one has not come up yet."""
-        points = (-1 - track if track < 0 else self._point_of.get(track, NONE) for track in tracks.id.tolist())
-        return np.fromiter(points, np.int64, len(tracks.id))
+    def _points(self, tracks: np.ndarray) -> np.ndarray:
+        """The points of the map by the tracker's numbers of them; `NONE` where one has not come up yet."""
+        points = (-1 - track if track < 0 else self._point_of.get(track, NONE) for track in tracks.tolist())
+        return np.fromiter(points, np.int64, len(tracks))
 
     def _with_found_points(self, map: Map, keyframe_id: int, features: Features) -> tuple[Map, np.ndarray]:
         """Points of the map that its neighbours see, found in it by their descriptor; and the features they are."""
@@ -248,7 +292,9 @@ class LocalMapping:
 
 
 def with_new_keyframe(map: Map, new: NewKeyframe, features: Features) -> Map:
-    """The map with a keyframe where its parent has it, and no point seen in it yet."""
+    """The map with a keyframe where its parent has it, and no point seen in it yet; and what came with it of others."""
+    if new.states is not None:
+        map = with_changes(map, new.states)
     pose, parent, submap = new.T_parent_keyframe, new.parent, new.submap
     if parent != NONE:
         pose = compose(map.pose(parent), pose)

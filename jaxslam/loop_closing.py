@@ -100,6 +100,12 @@ class LoopClosing:
             self._closed = len(map.loops.source), keyframe_id
         return closure
 
+    def replace(self, map: Map, keyframe_id: int) -> None:
+        """Take in that a keyframe of the map has lost features."""
+        with self._lock:
+            if keyframe_id in self._index and has(map.ids, np.array([keyframe_id]))[0]:
+                self._index.replace(keyframe_id, map.keyframe(keyframe_id).features)
+
     def _recognised(self, map: Map, keyframe_id: int) -> Recognition | None:
         """The place a keyframe shows, if it was seen long ago; the keyframe is in the index then."""
         features = map.keyframe(keyframe_id).features

@@ -9,7 +9,7 @@ Arrays are NumPy's and as long as needed; what the kernels get is cut out and pa
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt8
+from jaxtyping import Bool, Float32, Float64, Int8, Int32, Int64, UInt8
 from scipy.sparse import csr_array
 
 from jaxslam.camera import Camera
@@ -21,7 +21,7 @@ NONE = -1
 
 
 class Keyframe(NamedTuple):
-    """What was seen from one place; it never changes.
+    """What was seen from one place; nothing of it changes, but features may leave it.
 
     Attributes:
         id: Its number.
@@ -46,6 +46,7 @@ class MapPoints(NamedTuple):
         descriptor: ORB descriptor of the points that can be recognised, zeros for the others.
         recognisable: Which have a descriptor; the others are only followed and looked up by their picture.
         made_by: Id of the keyframe that made each.
+        state: A `PointState` of each: whether something that moves has passed before it.
     """
 
     ids: Int64[np.ndarray, " p"]
@@ -54,6 +55,7 @@ class MapPoints(NamedTuple):
     descriptor: UInt8[np.ndarray, "p 32"]
     recognisable: Bool[np.ndarray, " p"]
     made_by: Int64[np.ndarray, " p"]
+    state: Int8[np.ndarray, " p"]
 
 
 class Sightings(NamedTuple):
@@ -189,6 +191,7 @@ def empty_points() -> MapPoints:
         descriptor=np.zeros((0, DESCRIPTOR_BYTES), np.uint8),
         recognisable=np.zeros(0, bool),
         made_by=np.zeros(0, np.int64),
+        state=np.zeros(0, np.int8),
     )
 
 

@@ -6,6 +6,7 @@ from typing import NamedTuple, TypeAlias, get_type_hints
 import numpy as np
 from jaxtyping import AbstractArray
 
+from jaxslam.dynamics.occlusion import PointState
 from jaxslam.features import Features
 from jaxslam.map import NONE, Culled, Loops, Map, MapPoints, Sightings, has, point_submaps, rows
 
@@ -110,6 +111,8 @@ def number_problems(record: Record, prefix: str = "") -> list[str]:
     ]
     if isinstance(record, MapPoints | Sightings) and ((record.weight < 0) | (record.weight > 1)).any():
         wrong.append(f"{prefix}weight: expected 0 to 1")
+    if isinstance(record, MapPoints) and not np.isin(record.state, list(PointState)).all():
+        wrong.append(f"{prefix}state: expected {min(PointState)} to {max(PointState)}")
     if isinstance(record, Sightings | Features) and (record.depth < 0).any():
         wrong.append(f"{prefix}depth: expected 0 or more")
     if isinstance(record, Sightings) and (record.sigma_px <= 0).any():

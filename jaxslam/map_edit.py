@@ -8,6 +8,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from jaxslam.dynamics.occlusion import PointState
 from jaxslam.map import (
     NONE,
     Culled,
@@ -154,7 +155,8 @@ def fused(map: Map, keep: np.ndarray, drop: np.ndarray) -> Map:
     """Make one point of two: sightings of `drop[i]` become those of `keep[i]`, and `drop[i]` goes.
 
     Points linked by several pairs become one, the lowest of those not dropped. It takes over the place and weight of
-    the one seen most often, and a descriptor if it has none. Of two sightings in one keyframe the first stays.
+    the one seen most often, a descriptor if it has none, and the highest state: what passed before one of them passed
+    before the thing that all of them are. Of two sightings in one keyframe the first stays.
 
     Args:
         map: The map.
@@ -178,7 +180,24 @@ def fused(map: Map, keep: np.ndarray, drop: np.ndarray) -> Map:
     stays = ~changed
     stays[changed] = _first_of_rivals(sightings_at(seen, changed))
     points = _with_best_known(_with_descriptors(map.points, into), into, map.sightings.point)
+    points = _with_highest_state(points, into)
     return map._replace(points=points_at(points, into == np.arange(len(into))), sightings=sightings_at(seen, stays))
+
+
+def with_states(map: Map, point_ids: np.ndarray, states: np.ndarray) -> Map:
+    """Give points new states, a `PointState` each.
+
+    Raises:
+        ValueError: If one is no state.
+        KeyError: If a point is not in the map.
+    """
+    if not len(point_ids):
+        return map
+    if not np.isin(states, list(PointState)).all():
+        raise ValueError(f"states: expected {min(PointState)} to {max(PointState)}")
+    state = map.points.state.copy()
+    state[rows(map.points.ids, point_ids)] = states
+    return map._replace(points=map.points._replace(state=state))
 
 
 def without_points(map: Map, point_ids: np.ndarray) -> Map:
@@ -347,6 +366,16 @@ def _with_best_known(points: MapPoints, into: np.ndarray, seen: np.ndarray) -> M
     X_world, weight = points.X_world.copy(), points.weight.copy()
     X_world[:, takers], weight[takers] = points.X_world[:, order[first]], points.weight[order[first]]
     return points._replace(X_world=X_world, weight=weight)
+
+
+def _with_highest_state(points: MapPoints, into: np.ndarray) -> MapPoints:
+    """Points take over the highest state of those that become them."""
+    givers = np.flatnonzero(points.state[into] < points.state)
+    if not len(givers):
+        return points
+    state = points.state.copy()
+    np.maximum.at(state, into[givers], points.state[givers])
+    return points._replace(state=state)
 
 
 def _loops_without(loops: Loops, keyframe_id: int, anchor: int, T_anchor_keyframe: np.ndarray) -> Loops:

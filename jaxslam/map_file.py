@@ -3,7 +3,7 @@
 Its first member, `header.json`, holds
 
     format           "jaxslam map"
-    version          1
+    version          2
     camera           the fields of `jaxslam.Camera`, by name
     counts           how many keyframes k, points p, sightings s, loops l, culled keyframes c, features n of all
                      keyframes together, and bytes b of all images together
@@ -32,6 +32,7 @@ The others are arrays, each `NAME.npy`, little-endian, in C order:
     points.descriptor              uint8    (p, 32)    ORB; zeros for none
     points.recognisable            bool     (p)        whether there is a descriptor
     points.made_by                 int64    (p)        id of a keyframe
+    points.state                   int8     (p)        0 static, 1 blocked, 2 occluded; not in version 1: 0 there
     sightings.keyframe             int64    (s)        id
     sightings.point                int64    (s)        id
     sightings.feature              int32    (s)        index in the keyframe; -1 for none
@@ -70,9 +71,12 @@ from jaxslam.map import Culled, Keyframe, Loops, Map, MapPoints, Sightings
 from jaxslam.map_check import ArrayField, array_fields, problems
 
 FORMAT = "jaxslam map"
-VERSION = 1
-READABLE = (1,)
+VERSION = 2
+READABLE = (1, 2)
 """Versions that `load_map` reads."""
+
+_SINCE = {"points.state": 2}
+"""The version that an array came with, if not the first; where it is not in a file it is all zeros."""
 
 _COUNTS = {
     "k": "keyframes",
@@ -91,6 +95,7 @@ _DAMAGE = (zipfile.BadZipFile, EOFError, ValueError, KeyError, RuntimeError, str
 
 
 class _Header(NamedTuple):
+    version: int
     camera: Camera
     lengths: dict[str, int]
     next_keyframe: int
@@ -124,7 +129,7 @@ def load_map(path: str | os.PathLike[str]) -> Map:
     try:
         with zipfile.ZipFile(path) as archive:
             header = _read_header(archive)
-            arrays = _read_arrays(archive, header.lengths, Path(path).stat().st_size)
+            arrays = _read_arrays(archive, header, Path(path).stat().st_size)
         return _assembled(header, arrays)
     except MapFileError as error:
         raise MapFileError(f"{path}: {error}") from None
@@ -215,6 +220,7 @@ def _read_header(archive: zipfile.ZipFile) -> _Header:
         raise MapFileError(f"expected a map file of version {readable}, got version {version!r}")
     counts = _field(header, "counts", dict)
     return _Header(
+        version=version,
         camera=_camera(_field(header, "camera", dict)),
         lengths={letter: _count(counts, name) for letter, name in _COUNTS.items()},
         next_keyframe=_count(header, "next_keyframe"),
@@ -247,18 +253,21 @@ def _camera(fields: dict[str, Any]) -> Camera:
         raise MapFileError(f"header: {error}") from None
 
 
-def _read_arrays(archive: zipfile.ZipFile, lengths: dict[str, int], size: int) -> dict[str, np.ndarray]:
-    layout = _layout()
+def _read_arrays(archive: zipfile.ZipFile, header: _Header, size: int) -> dict[str, np.ndarray]:
+    whole = _layout()
+    layout = {name: field for name, field in whole.items() if _SINCE.get(name, 1) <= header.version}
     expected = {_HEADER, *(f"{name}.npy" for name in layout)}
     if sorted(archive.namelist()) != sorted(expected):
         odd = ", ".join(sorted(expected ^ set(archive.namelist()))) or "one twice"
         raise MapFileError(f"unknown or missing members: {odd}")
-    lengths = lengths | {"k+1": lengths["k"] + 1}
+    lengths = header.lengths | {"k+1": header.lengths["k"] + 1}
     shapes = {name: field.shape(lengths) for name, field in layout.items()}
     announced = sum(layout[name].dtype.itemsize * math.prod(shape) for name, shape in shapes.items())
     if announced > size:
         raise MapFileError(f"announces {announced} bytes of arrays in a file of {size}")
-    return {name: _read_array(archive, name, layout[name].dtype, shape) for name, shape in shapes.items()}
+    arrays = {name: _read_array(archive, name, layout[name].dtype, shape) for name, shape in shapes.items()}
+    missing = {name: whole[name] for name in whole.keys() - layout.keys()}
+    return arrays | {name: np.zeros(field.shape(lengths), field.dtype) for name, field in missing.items()}
 
 
 def _read_array(archive: zipfile.ZipFile, name: str, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarray:

@@ -12,16 +12,20 @@ import numpy as np
 from jaxslam.frame_arrays import FrameArrays
 from jaxslam.local_mapping import NewKeyframe, Tracks
 from jaxslam.map import NONE, Map, has, standing
+from jaxslam.padding import padded
 from jaxslam.pose import IDENTITY, angle, between, compose, inverse, to_local, transform
 from jaxslam.recall import Recalled
 from jaxslam.state import TrackOutput, TrackPlan, TrackState, TrackStatus
-from jaxslam.state_edit import carried, recalled
+from jaxslam.state_edit import carried, forgotten, recalled
 
 _LEAST_MOVE_M, _LEAST_TURN = 1e-6, 1e-6
 """A correction below both is none."""
 
 _carried = jax.jit(carried, donate_argnums=0)
 _recalled = jax.jit(recalled, donate_argnums=0)
+_forgotten = jax.jit(forgotten, donate_argnums=0)
+_AT_ONCE = 1024
+"""Points forgotten in one call."""
 
 
 class Hung(NamedTuple):
@@ -129,7 +133,7 @@ class MapLink:
         self._slots[self._made % self._plan.num_keyframes] = id
         self._made += 1
         self.reference = id
-        tracks = _tracks(pose, output)
+        tracks = tracks_of(output)
         return NewKeyframe(id, timestamp_ns, frame, parent, seen_from, self._submap, np.asarray(output.twist), tracks)
 
     def corrected(self, state: TrackState, map: Map) -> tuple[TrackState, np.ndarray]:
@@ -165,6 +169,13 @@ class MapLink:
         if is_keyframe:
             corrections[self._made % self._plan.num_keyframes] = change
         return _carried(state, change, corrections)
+
+    def forgotten(self, state: TrackState, ids: np.ndarray) -> TrackState:
+        """The tracker's state without some points, given its numbers of them, however many."""
+        for start in range(0, len(ids), _AT_ONCE):
+            some = ids[start : start + _AT_ONCE]
+            state = _forgotten(state, np.sort(padded(some, _AT_ONCE, fill=some[0])).astype(np.int32))
+        return state
 
     def latest(self) -> list[int]:
         """The keyframes in the tracker's ring."""
@@ -203,9 +214,9 @@ def knows(map: Map, keyframe_id: int) -> bool:
     return bool(has(map.ids, np.array([keyframe_id]))[0])
 
 
-def _tracks(pose: np.ndarray, output: TrackOutput) -> Tracks:
+def tracks_of(output: TrackOutput) -> Tracks:
     """Points followed and looked up, in the axes of the camera."""
-    found = output.looked_up
+    pose, found = pose_of(output), output.looked_up
     join = lambda followed, looked_up: np.concatenate([np.asarray(followed), np.asarray(looked_up)], axis=-1)
     X_world = join(output.X_world, found.X_world).astype(np.float64)
     return Tracks(

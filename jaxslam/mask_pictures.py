@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw, ImageFont
 from jaxslam.dynamic_masks import MaskSource
 from jaxslam.files import write_atomically
 from jaxslam.frame import Frame
-from jaxslam.tint import GREEN, ORANGE, PURPLE, SKY_BLUE, Rgb, tint
+from jaxslam.tint import GREEN, ORANGE, PURPLE, SKY_BLUE, VERMILION, Rgb, tint
 from jaxslam.tracked import Rejected, Tracked
 
 MASK_RGB: dict[MaskSource, Rgb] = {
@@ -20,6 +20,7 @@ MASK_RGB: dict[MaskSource, Rgb] = {
     MaskSource.PROPAGATED: SKY_BLUE,
     MaskSource.CALLER: PURPLE,
     MaskSource.DEPTH: GREEN,
+    MaskSource.CUES: VERMILION,
 }
 """The colour of a mask, by where it comes from."""
 

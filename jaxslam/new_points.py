@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from jaxslam.dynamics.occlusion import PointState
 from jaxslam.features import DESCRIPTOR_BYTES, FeaturePlan, Features
 from jaxslam.map import NONE, Map, MapPoints
 from jaxslam.map_edit import with_points, with_sightings
@@ -24,6 +25,7 @@ def new_points(map: Map, keyframe_id: int, X_world: np.ndarray, descriptor: np.n
         descriptor=np.zeros((num, DESCRIPTOR_BYTES), np.uint8) if descriptor is None else descriptor,
         recognisable=recognisable,
         made_by=np.full(num, keyframe_id, np.int64),
+        state=np.full(num, PointState.STATIC, np.int8),
     )
 
 

@@ -76,6 +76,23 @@ class PlaceIndex:
             raise ValueError(f"keyframe {keyframe_id} was added before")
         self._added.add(keyframe_id)
         self._alive.add(keyframe_id)
+        self._index(keyframe_id, features)
+
+    def replace(self, keyframe_id: int, features: Features) -> None:
+        """Hold other features of a keyframe than before.
+
+        Raises:
+            KeyError: If it is not there.
+        """
+        if keyframe_id not in self._alive:
+            raise KeyError(keyframe_id)
+        others, nothing = self._alive - {keyframe_id}, _block(keyframe_id, features.descriptor[:0])
+        self._blocks = [
+            _merged(block, nothing, others) if keyframe_id in block.keyframe else block for block in self._blocks
+        ]
+        self._index(keyframe_id, features)
+
+    def _index(self, keyframe_id: int, features: Features) -> None:
         self._blocks.append(_block(keyframe_id, features.descriptor[::_INDEXED_STEP]))
         # Sizes at least halve from block to block, so there are few of them and each entry is seldom merged.
         while len(self._blocks) > 1 and 2 * len(self._blocks[-1].keyframe) > len(self._blocks[-2].keyframe):

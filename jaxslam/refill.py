@@ -64,9 +64,11 @@ def refill(
         xy=put(points.xy, seen.xy),
         depth=put(points.depth, seen.depth),
         X_world=put(points.X_world, X_world),
+        X_anchor=put(points.X_anchor, X_world),
         information=put(points.information, 1 / jnp.square(sigma)),
         weight=jnp.where(new, 1, points.weight),
         age=jnp.where(new, 0, points.age),
+        anchor_age=jnp.where(new, 0, points.anchor_age),
         id=jnp.where(new, next_id + rank, points.id),
         valid=points.valid | new,
     )

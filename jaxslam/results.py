@@ -22,6 +22,7 @@ from jaxslam.files import write_atomically
 from jaxslam.frame_log import write_errors, write_frames
 from jaxslam.map_export import write_keyframe_trajectory
 from jaxslam.mask_pictures import write_mask_pictures
+from jaxslam.point_states import occluded_shares
 from jaxslam.run_pictures import RunPictures
 from jaxslam.slam import Slam
 from jaxslam.state import TrackStatus
@@ -159,8 +160,11 @@ def _summary(
         "submaps": len(set(slam.map.submap.tolist())),
         **{name: figures.get(name) for name in wanted},
         "evaluation": figures or None,
+        "occluded_share": _distribution(_occluded_shares(slam)),
         "mask_sources": dict(sorted(Counter(record.mask_source.name for record in records).items())),
         "mask_age_frames": _distribution([record.mask_age for record in records if record.mask_age >= 0]),
+        "removed_by_semantics": slam.removed_by_semantics,
+        "keyframes_passed_over": slam.keyframes_passed_over,
         "detector_errors": sum(bool(record.detector_error) for record in records),
         "stage_ms": {stage: _distribution(times.tolist()) for stage, times in slam.times.ms.items()},
         "track_ms": _distribution([record.track_ms for record in records if record.track_ms is not None]),
@@ -169,6 +173,11 @@ def _summary(
         "peak_rss_mb": round(peak_rss_mb(), 1),
         **machine(),
     }
+
+
+def _occluded_shares(slam: Slam) -> list[float]:
+    """Share of the points of each keyframe that are OCCLUDED; nothing if the settings do not ask for it."""
+    return occluded_shares(slam.map).tolist() if slam.config.dynamics.occlusion.enabled else []
 
 
 def machine() -> dict[str, Any]:

@@ -9,6 +9,7 @@ import time
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float, UInt8
 
 from jaxslam.masks.box_mask import mask_of_detections, reduced_detections
 from jaxslam.masks.propagation import Origin, make_origin
@@ -51,6 +52,33 @@ class Found(NamedTuple):
     origin: Origin
 
 
+class Failures:
+    """What goes wrong in a detector: told every time, in the log only when it changes."""
+
+    def __init__(self) -> None:
+        """Begin with nothing wrong."""
+        self._said = ""
+
+    def told(self, error: str) -> str:
+        """What went wrong, as it is told."""
+        if error != self._said:
+            _log.warning("detector failed: %s", error)
+        self._said = error
+        return error
+
+
+def rgb_copy(image: np.ndarray) -> np.ndarray:
+    """`(h, w, 3)` of `(h, w, 3)` or of grey `(h, w)`, as a detector takes it; a copy."""
+    return image.copy() if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
+
+
+def mask_found(
+    detector: Detector, reduced: Reduced, rgb: UInt8[np.ndarray, "h w 3"], depth: Float[np.ndarray, "_h _w"]
+) -> Bool[np.ndarray, "_h _w"]:
+    """What a detector finds in an image, as a mask of the size of masks, no wider than it was found."""
+    return mask_of_detections(reduced_detections(detector(rgb), reduced), depth, dilate_px=0)
+
+
 class SemanticThread:
     """Looks at one frame after the other.
 
@@ -81,7 +109,7 @@ class SemanticThread:
         self.looking_at: int | None = None
         self._offered: int | None = None
         self._detector, self._reduced, self._seed = detector, reduced, seed
-        self._all_wait, self._begun, self._said = latency_frames == 0, False, ""
+        self._all_wait, self._begun, self._failures = latency_frames == 0, False, Failures()
         self._worker: Worker[Seen, Found] = make_worker(
             (times or StageTimes()).timed("detector", self._look),
             "jaxslam-semantics",
@@ -105,8 +133,7 @@ class SemanticThread:
     def offer(self, seen: Seen) -> None:
         """Have it look at a frame, if it is idle and has not yet; image and depth are copied."""
         if self.looking_at is None and seen.frame != self._offered:
-            rgb = seen.image.copy() if seen.image.ndim == 3 else np.repeat(seen.image[..., None], 3, axis=2)
-            self._worker.offer(seen._replace(image=rgb, depth=seen.depth.copy()), seen.frame)
+            self._worker.offer(seen._replace(image=rgb_copy(seen.image), depth=seen.depth.copy()), seen.frame)
             self.looking_at = self._offered = seen.frame
 
     def close(self) -> None:
@@ -114,8 +141,7 @@ class SemanticThread:
         self._worker.close()
 
     def _look(self, job: Seen) -> Found:
-        detections = reduced_detections(self._detector(job.image), self._reduced)
-        mask = mask_of_detections(detections, job.depth, dilate_px=0)
+        mask = mask_found(self._detector, self._reduced, job.image, job.depth)
         return Found(job.frame, make_origin(mask, job.grey, self._seed + job.frame))
 
     def _newest(self, frame: int) -> tuple[Found | None, str]:
@@ -123,18 +149,11 @@ class SemanticThread:
             done = self._worker.take(frame)
         except Exception as error:
             self.looking_at = None
-            return None, self._told(f"{type(error).__name__}: {error}")
+            return None, self._failures.told(f"{type(error).__name__}: {error}")
         if not done:
             return None, ""
         self.looking_at = None
         return done[-1], ""
-
-    def _told(self, error: str) -> str:
-        """What went wrong; in the log only if it is not what went wrong before."""
-        if error != self._said:
-            _log.warning("detector failed: %s", error)
-        self._said = error
-        return error
 
     def _awaited(self, frame: int) -> tuple[Found | None, str]:
         """The mask of this very frame, if it comes in time."""

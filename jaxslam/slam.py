@@ -20,7 +20,8 @@ from jaxslam.datasets import Dataset, prefetch
 from jaxslam.datasets.realtime import in_real_time
 from jaxslam.detector_choice import detector_of
 from jaxslam.dynamic_masks import DynamicMasks, FrameMask, MaskSource
-from jaxslam.dynamics.known import cue_params_of, cues_of
+from jaxslam.dynamics.known import with_cue_params, with_cues
+from jaxslam.dynamics.point_mask import mask_around, moving_points
 from jaxslam.errors import DatasetError, FrameError, JaxSlamError, MapFileError
 from jaxslam.frame import Frame, check_frame
 from jaxslam.frame_arrays import FrameArrays, FrameMemory
@@ -110,13 +111,12 @@ class Slam:
                 f" got {map.camera.width}x{map.camera.height}"
             )
         self._start_map, self._localize_only = map, localize_only
-        self._params = track_params(camera, self.config.track)._replace(
-            restart_after=jnp.float32(_NEVER), cues=cue_params_of(self.config.dynamics)
-        )
+        params = track_params(camera, self.config.track)._replace(restart_after=jnp.float32(_NEVER))
+        self._params = with_cue_params(params, self.config.dynamics)
         # ORB-SLAM's local mapping does not accept keyframes either while it is busy.
         patient = max(_PATIENT_S, self.config.track.keyframe_weak_after_s)
         self._patient_params = self._params._replace(keyframe_weak_after_s=jnp.float32(patient))
-        self._plan = track_plan(self.config.track)._replace(cues=cues_of(self.config.dynamics))
+        self._plan = with_cues(track_plan(self.config.track), self.config.dynamics)
         self._detector = detector or detector_of(self.config.semantics)
         self._memory = FrameMemory(camera.height, camera.width)
         self._ready = False
@@ -199,20 +199,25 @@ class Slam:
         followed = _follow_points(self._state, arrays, self._params, self._plan)
         watch.ends("flow")
         mask: FrameMask = self._beside.drain()[-1]
+        mask = mask._replace(error=mask.error or self._back.told_error())
         arrays = self._memory.ignoring(arrays, mask.mask)
         watch.ends("wait for mask")
         output, placed, num_matched = self._advance(arrays, followed), None, 0
+        arrays, mask = self._without_movers(arrays, mask, followed, output)
         watch.ends("pose")
         if int(output.status) == TrackStatus.LOST:
             output, placed = self._regain(arrays, output, dt_s)
             num_matched = 0 if placed is None else placed.num_matched
         elif self._to_be_matched(output):
             self._state, output, num_matched = self._back.held_to_map(self._state, arrays, output)
+        share = None if int(output.status) == TrackStatus.LOST else self._back.look_at_points(arrays, output)
         watch.ends("match with map")
         if output.keyframe:
             hung = None if placed is None else placed.hung
-            self._back.keyframe_made(frame.timestamp_ns, arrays, output, self._frame, hung)
-        tracked = tracked_of(frame.timestamp_ns, output, correction, num_matched, mask, relocalised=placed is not None)
+            self._back.keyframe_made(frame.timestamp_ns, frame.image, arrays, output, self._frame, hung)
+        tracked = tracked_of(
+            frame.timestamp_ns, output, correction, num_matched, mask, share, relocalised=placed is not None
+        )
         self._last_ns = frame.timestamp_ns
         tracked = self._recorded(tracked, dt_s, float(arrays.depth_delay_s))
         if self._masks is not None:
@@ -245,7 +250,10 @@ class Slam:
         return records
 
     def finish(self) -> None:
-        """Wait until mapping has caught up, so that `map` and `trajectory` hold all that was seen."""
+        """Wait until mapping has caught up, so that `map` and `trajectory` hold all that was seen.
+
+        So has a detector that looks at keyframes alone, then.
+        """
         self._state = self._back.finish(self._state)
 
     def close(self) -> None:
@@ -272,6 +280,19 @@ class Slam:
         return self._back.loops_closed
 
     @property
+    def removed_by_semantics(self) -> int:
+        """Points removed from the map so far because a keyframe saw them where something may move.
+
+        With `semantics.frames: keyframes`, as the next one.
+        """
+        return self._back.removed_by_semantics
+
+    @property
+    def keyframes_passed_over(self) -> int:
+        """Keyframes so far that the detector had no time for: too many waited."""
+        return self._back.keyframes_passed_over
+
+    @property
     def online_trajectory(self) -> Trajectory:
         """Every pose as it was given out; frames that were lost have none."""
         poses = np.array(self._poses).reshape(-1, 7)
@@ -286,6 +307,8 @@ class Slam:
 
     def _begin(self) -> None:
         self.times = StageTimes()
+        run, semantics, dynamics = self.config.run, self.config.semantics, self.config.dynamics
+        every = self._detector if semantics.frames == "every" else None
         self._back = BackEnd(
             self.camera,
             self._params,
@@ -293,15 +316,15 @@ class Slam:
             self.config,
             self._start_map,
             localize_only=self._localize_only,
+            detector=self._detector if every is None else None,
             times=self.times,
         )
-        run, semantics, dynamics = self.config.run, self.config.semantics, self.config.dynamics
         self._masks = (
             None
-            if self._detector is None and not dynamics.newcomers
+            if every is None and not dynamics.newcomers
             else DynamicMasks(
                 self.camera,
-                self._detector,
+                every,
                 deterministic=run.in_turn,
                 latency_frames=semantics.latency_frames,
                 propagate=semantics.propagate,
@@ -315,7 +338,7 @@ class Slam:
         self._beside: Worker[Callable[[], Any], Any] = make_worker(
             self.times.timed("masks", lambda job: job()),
             "jaxslam-masks",
-            deterministic=run.in_turn,
+            deterministic=run.in_turn or self._masks is None,  # nothing to do beside flow then
             latency_frames=0,
             urgent=True,
         )
@@ -363,6 +386,20 @@ class Slam:
         params = self._patient_params if self._back.is_behind else self._params
         self._state, output = _track_followed(self._state, arrays, followed, params, self._plan)
         return jax.tree.map(np.asarray, output)  # as `device_get`, in a tenth of its time
+
+    def _without_movers(
+        self, arrays: FrameArrays, mask: FrameMask, followed: Followed, output: TrackOutput
+    ) -> tuple[FrameArrays, FrameMask]:
+        """The frame and its mask with what cues say moves, regions and points: the map gets nothing of it."""
+        moving = None if output.moving is None else np.asarray(output.moving)
+        points, reach_px = moving_points(output.verdicts), self.config.dynamics.reach_px
+        if reach_px and points.any():
+            around = mask_around(np.asarray(followed.uv)[:, points], np.asarray(arrays.depth), reach_px)
+            moving = around if moving is None else moving | around
+        if moving is None or not moving.any():
+            return arrays, mask
+        mask = mask._replace(mask=mask.mask | moving, source=mask.source or MaskSource.CUES)
+        return self._memory.ignoring(arrays, mask.mask), mask
 
     def _to_be_matched(self, output: TrackOutput) -> bool:
         """Whether a frame that was tracked is matched with the map too."""

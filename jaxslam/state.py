@@ -8,9 +8,10 @@ from jaxslam_kernels.camera import Intrinsics
 from jaxslam_kernels.image import Pyramid
 from jaxslam_kernels.lk_flow import FlowPlan, LevelPlan
 from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Points, Scalar, Weights
-from jaxtyping import Array, Float, Int, Key, Num
+from jaxtyping import Array, Bool, Float, Int, Key, Num
 
 from jaxslam.dynamics.cue import Cue, Verdict
+from jaxslam.dynamics.regions import RegionMemory, RegionPlan, Regions
 
 
 class TrackStatus(enum.IntEnum):
@@ -93,6 +94,8 @@ class TrackPlan(NamedTuple):
         new_points: In which frames new points are sought: `always`, where there are few, or in `keyframes` only.
         flow: How points are followed from frame to frame.
         cues: What tells points that move, see `dynamics.cue.Cue`; functions, in the order of `TrackParams.cues`.
+        regions: How the depth image is divided for cues that judge whole surfaces; `None` if none does.
+        even_votes: Whether no region has more of a say in the pose than an even share.
         look_up: How points of keyframes are searched. A window of 21 takes 1 ms a frame more and is no more accurate;
             17, 15 and 13 are alike too: TUM `fr1_rpy` 10.2, 10.2, 10.2 mm, Bonn `crowd` (start) 9.7, 9.6, 9.5.
     """
@@ -109,6 +112,8 @@ class TrackPlan(NamedTuple):
     flow: FlowPlan = FlowPlan()
     look_up: LevelPlan = LevelPlan(15, 8, 0.05)
     cues: tuple[Cue, ...] = ()
+    regions: RegionPlan | None = None
+    even_votes: bool = False
 
     def exact(self) -> "TrackPlan":
         """The same with searches that go on until nothing moves, for derivatives that must be exact; in float64.
@@ -155,6 +160,7 @@ class TrackParams(NamedTuple):
         keyframe_weak_after_s: or this many while tracking is weak (`WEAK`) or has few points.
         probation_frames: Frames after which a point counts in full. What moves on its own is an outlier within a few
             frames, so that it never counts for much.
+        anchor_frames: Frames after which the place of a point counts as where it was, for cues to slow motion.
         restart_after: Frames of loss after which tracking starts anew at the held pose.
         max_speed_m_per_s: Highest believed speed of the camera.
         max_turn_rad_per_s: Highest believed angular speed of the camera.
@@ -183,6 +189,7 @@ class TrackParams(NamedTuple):
     keyframe_after_s: Scalar
     keyframe_weak_after_s: Scalar
     probation_frames: Scalar
+    anchor_frames: Scalar
     restart_after: Scalar
     max_speed_m_per_s: Scalar
     max_turn_rad_per_s: Scalar
@@ -196,10 +203,12 @@ class TrackedPoints(NamedTuple):
         uv: `(2, n)` where they are in the last good frame, pixels.
         xy: `(2, n)` the same as an ideal camera sees it, normalised coordinates.
         depth: `(n,)` measured there, metres, 0 where nothing was.
-        X_world: `(3, n)` where they are in the world, metres.
+        X_world: `(3, n)` where they are in the world, metres, as measured over the last few frames.
+        X_anchor: `(3, n)` the same as measured `anchor_age` frames ago: what moves slowly leaves it.
         information: `(n,)` inverse variance of their depth, 1 / m^2.
         weight: `(n,)` how much each counts, 0 to 1; the caller may change it between steps.
         age: `(n,)` frames each has survived.
+        anchor_age: `(n,)` frames since `X_anchor` was measured.
         id: `(n,)` number of each point, given once and never again.
         valid: `(n,)` which slots hold a point.
     """
@@ -208,9 +217,11 @@ class TrackedPoints(NamedTuple):
     xy: Pixels
     depth: Weights
     X_world: Points
+    X_anchor: Points
     information: Weights
     weight: Weights
     age: Int[Array, " n"]
+    anchor_age: Int[Array, " n"]
     id: Int[Array, " n"]
     valid: Mask
 
@@ -271,6 +282,7 @@ class TrackState(NamedTuple):
         frame: Frames seen.
         next_id: Number of the next new point.
         key: Source of every random choice.
+        regions: What is kept of the regions of the last frame, see `TrackPlan.regions`.
     """
 
     pyramid: Pyramid
@@ -285,6 +297,7 @@ class TrackState(NamedTuple):
     frame: Code
     next_id: Code
     key: Key[Array, ""]
+    regions: RegionMemory
 
 
 class TrackOutput(NamedTuple):
@@ -307,7 +320,9 @@ class TrackOutput(NamedTuple):
         looked_up: Points of keyframes found in the frame.
         twist: Velocity of the camera in its own axes, metres a second then radians a second.
         keyframe: A `KeyframeReason`.
-        verdicts: What each of `TrackPlan.cues` says of the points that were followed.
+        verdicts: What each of `TrackPlan.cues` says of the points that were followed,
+        regions: and the regions they speak of.
+        moving: `(h, w)` true in regions that move; `None` without regions.
     """
 
     T_world_cam: SE3
@@ -327,6 +342,8 @@ class TrackOutput(NamedTuple):
     twist: Float[Array, "6"]
     keyframe: Code
     verdicts: tuple[Verdict, ...] = ()
+    regions: Regions | None = None
+    moving: Bool[Array, "h w"] | None = None
 
     @property
     def is_keyframe(self) -> Flag:

@@ -6,7 +6,7 @@ from jax import lax
 from jaxlie import SE3
 from jaxslam_kernels.transform import composed, to_world
 from jaxslam_kernels.types import Code, Pixels, Points, Weights
-from jaxtyping import Array, Float, Int, Num
+from jaxtyping import Array, Bool, Float, Int, Num
 
 from jaxslam.state import TrackState
 
@@ -26,7 +26,9 @@ def carried(state: TrackState, T_new_old: Float[Array, "7"], T_new_old_keyframes
     X_world = jax.vmap(lambda correction, X: to_world(SE3(correction), X))(T_new_old_keyframes, keyframes.X_world)
     return state._replace(
         T_world_cam=composed(now, state.T_world_cam),
-        points=state.points._replace(X_world=to_world(now, state.points.X_world)),
+        points=state.points._replace(
+            X_world=to_world(now, state.points.X_world), X_anchor=to_world(now, state.points.X_anchor)
+        ),
         keyframes=keyframes._replace(T_world_cam=poses, X_world=X_world),
     )
 
@@ -64,6 +66,25 @@ def recalled(
             weight=put(keyframes.weight, weight),
             id=put(keyframes.id, id),
         )
+    )
+
+
+def forgotten(state: TrackState, ids: Int[Array, " m"]) -> TrackState:
+    """The state without some points: they are followed no longer, and not looked up in keyframes.
+
+    Args:
+        state: The state.
+        ids: Their numbers, ascending; a number may come more than once.
+    """
+
+    def among(numbers: Int[Array, "*shape"]) -> Bool[Array, "*shape"]:
+        at = jnp.minimum(jnp.searchsorted(ids, numbers), ids.shape[0] - 1)
+        return ids[at] == numbers
+
+    points, keyframes = state.points, state.keyframes
+    return state._replace(
+        points=points._replace(valid=points.valid & ~among(points.id)),
+        keyframes=keyframes._replace(weight=jnp.where(among(keyframes.id), 0, keyframes.weight)),
     )
 
 

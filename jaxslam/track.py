@@ -22,9 +22,21 @@ from jaxslam_kernels.pose_refine import PoseRefinement, refine_pose
 from jaxslam_kernels.robust import weighted_median
 from jaxslam_kernels.transform import displacement, moved, to_camera, to_world
 from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Points, Scalar, Weights
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxslam.dynamics.cue import Scene, Verdict, combined
+from jaxslam.dynamics.regions import (
+    RegionMemory,
+    RegionPlan,
+    Regions,
+    RegionVerdict,
+    even_votes,
+    find_regions,
+    moving_pixels,
+    no_regions,
+    of_points,
+    region_weights,
+)
 from jaxslam.frame_arrays import FrameArrays
 from jaxslam.keyframes import empty_keyframes, look_up, with_keyframe
 from jaxslam.observe import Observed, View, depth_sigma, observe, predict_pixels
@@ -46,6 +58,7 @@ _MAX_PREDICTION_S = 0.1
 """A constant velocity says nothing about longer gaps."""
 _MAX_FUSED = 4
 _UNKNOWN_VARIANCE = 1e2
+_DEPTH_SIGMAS = 3.0
 
 
 class Followed(NamedTuple):
@@ -62,6 +75,51 @@ class Followed(NamedTuple):
     predicted: SE3
     uv: Pixels
     ok: Mask
+
+
+class _Seen(NamedTuple):
+    """Points of a state in a frame: followed under no mask, under one, and in agreement with a pose; `(n,)` each."""
+
+    uv: Pixels
+    followed: Mask
+    masked: Mask
+    agreeing: Mask
+
+
+class _Judged(NamedTuple):
+    """What cues say, and the pixels that are left out for it."""
+
+    verdicts: tuple[Verdict, ...] = ()
+    regions: Regions | None = None
+    memory: RegionMemory | None = None
+    remembered: Weights | None = None
+    moving: Bool[Array, "h w"] | None = None
+
+    def weights(self, weight: Weights) -> Weights:
+        """Weights of the points, times those of the cues, and 0 in regions that moved a moment ago."""
+        weight = combined(self.verdicts, weight)
+        return weight if self.remembered is None else weight * self.remembered
+
+    def counts(self) -> Mask | Flag:
+        """`(n,)` which points no cue says anything against."""
+        return self.weights(jnp.ones(())) > 0
+
+    def without_movers(self, view: View) -> View:
+        """The frame with nothing trusted where regions move."""
+        if self.moving is None:
+            return view
+        return view._replace(frame=view.frame._replace(ignore=view.frame.ignore | self.moving))
+
+    def at_rest(self, uv: Pixels) -> Mask:
+        """`(n,)` which pixels are in no region that moves.
+
+        New points are taken there all the same, and are witnesses in the next frame: without them nothing is known of
+        the region then, and what moves passes for a room in every other frame.
+        """
+        if self.moving is None:
+            return jnp.ones(uv.shape[1], bool)
+        column, row = jnp.round(lax.stop_gradient(uv)).astype(jnp.int32)
+        return ~self.moving.at[row, column].get(mode="fill", fill_value=False)
 
 
 class _Outcome(NamedTuple):
@@ -104,9 +162,11 @@ def init_state(
             xy=jnp.zeros((2, n), dtype),
             depth=jnp.zeros(n, dtype),
             X_world=jnp.zeros((3, n), dtype),
+            X_anchor=jnp.zeros((3, n), dtype),
             information=jnp.zeros(n, dtype),
             weight=jnp.ones(n, dtype),
             age=jnp.zeros(n, jnp.int32),
+            anchor_age=jnp.zeros(n, jnp.int32),
             id=jnp.zeros(n, jnp.int32),
             valid=jnp.zeros(n, bool),
         ),
@@ -120,6 +180,7 @@ def init_state(
         frame=jnp.zeros((), jnp.int32),
         next_id=jnp.zeros((), jnp.int32),
         key=jax.random.key(seed),
+        regions=no_regions(plan.regions, dtype),
     )
 
 
@@ -171,23 +232,30 @@ def track_followed(
     plan: TrackPlan = DEFAULT_PLAN,
 ) -> tuple[TrackState, TrackOutput]:
     """The second part of `track_step`: pose, points, keyframe, from where `follow_points` has them."""
-    pyramid, predicted, uv, followed = followed_points
+    pyramid, predicted, uv, found = followed_points
     depth = believable(frame.depth, params.min_depth_m, params.max_depth_m)
     view = View(frame, pyramid, depth, state.elapsed_s + frame.dt_s)
     column, row = jnp.round(lax.stop_gradient(uv)).astype(jnp.int32)
-    followed &= ~frame.ignore.at[row, column].get(mode="fill", fill_value=True)
+    masked = frame.ignore.at[row, column].get(mode="fill", fill_value=True)
+    followed = found & ~masked
     params = _widened(params, state.points.uv, uv, followed)
-    coarse, agreeing = _coarse_pose(state, view, uv, followed, predicted, params, plan)
+    regions = _regions(state, view, uv, predicted, params, plan)
+    votes = _trust(state.points, params)
+    if regions is not None and plan.even_votes:
+        votes = even_votes(jnp.where(followed, votes, 0), regions)
+    coarse, agreeing = _coarse_pose(state, view, uv, jnp.where(followed, votes, 0), predicted, params, plan)
+    agreeing &= followed
     twist = _twist(state.T_world_cam, coarse, view.elapsed_s)
-    verdicts = _verdicts(state, view, uv, agreeing, coarse, twist, params, plan)
-    trust = combined(verdicts, _trust(state.points, params))
+    points = _Seen(uv, followed, found & masked, agreeing)
+    judged = _judge_points(state, view, points, regions, coarse, twist, params, plan)
+    trust = judged.weights(votes)
     agreeing &= trust > 0
-    looked_up = look_up(state.keyframes, coarse, twist, view, params, plan)
+    looked_up = look_up(state.keyframes, coarse, twist, judged.without_movers(view), params, plan)
     refined, inliers = _refine(state, view, uv, jnp.where(agreeing, trust, 0), looked_up, coarse, twist, params)
-    verdict = _judge(state, view, refined, followed, inliers, params)
+    verdict = _judge(state, view, refined, followed & judged.counts(), inliers, params)
     kept = _update_points(state, view, uv, inliers, refined.T_world_cam, params)
-    new_state, output = _conclude(state, view, kept, refined, looked_up, verdict, params, plan)
-    return new_state, output._replace(verdicts=verdicts)
+    new_state, output = _conclude(state, view, kept, refined, looked_up, verdict, judged, params, plan)
+    return new_state, output._replace(verdicts=judged.verdicts, regions=judged.regions, moving=judged.moving)
 
 
 def _widened(params: TrackParams, before: Pixels, after: Pixels, followed: Mask) -> TrackParams:
@@ -213,24 +281,35 @@ def _trust(points: TrackedPoints, params: TrackParams) -> Weights:
     return jnp.where(points.valid, points.weight * jnp.minimum(served, 1), 0)
 
 
-def _coarse_pose(
-    state: TrackState, view: View, uv: Pixels, followed: Mask, predicted: SE3, params: TrackParams, plan: TrackPlan
-) -> tuple[SE3, Mask]:
-    """The pose most points agree with, and which do."""
+def _regions(
+    state: TrackState, view: View, uv: Pixels, predicted: SE3, params: TrackParams, plan: TrackPlan
+) -> Regions | None:
+    """The surfaces of the frame, if something asks for them."""
+    if plan.regions is None:
+        return None
     seen = _see(state.points.X_world, uv, predicted, state.twist, view, params)
-    usable = jnp.where(followed, _trust(state.points, params), 0)
+    key, ideal = jax.random.fold_in(state.key, -1 - state.frame), without_distortion(params.intrinsics)
+    return find_regions(key, view.depth, state.regions.centers, seen.in_camera(), ideal, plan.regions)
+
+
+def _coarse_pose(
+    state: TrackState, view: View, uv: Pixels, votes: Weights, predicted: SE3, params: TrackParams, plan: TrackPlan
+) -> tuple[SE3, Mask]:
+    """The pose that gets most votes of points, and which agree with it."""
+    seen = _see(state.points.X_world, uv, predicted, state.twist, view, params)
     result = ransac_pnp(
         jax.random.fold_in(state.key, state.frame),
         state.points.X_world,
         to_pixels(params.intrinsics, seen.xy),
         without_distortion(params.intrinsics),
-        weights=usable,
+        weights=votes,
         depth=seen.depth,
         threshold_px=params.ransac_px,
+        threshold_depth=_DEPTH_SIGMAS * depth_sigma(seen.depth, params),
         num_hypotheses=plan.num_hypotheses,
         initial=predicted,
     )
-    return result.T_world_cam, result.inliers & followed
+    return result.T_world_cam, result.inliers
 
 
 def _twist(before: SE3, after: SE3, elapsed_s: Scalar) -> Float[Array, "6"]:
@@ -269,33 +348,63 @@ def _refine(
     return refined, (trust > 0) & close[: trust.shape[0]]
 
 
-def _verdicts(
+def _judge_points(
     state: TrackState,
     view: View,
-    uv: Pixels,
-    agreeing: Mask,
+    seen: _Seen,
+    regions: Regions | None,
     coarse: SE3,
     twist: Float[Array, "6"],
     params: TrackParams,
     plan: TrackPlan,
-) -> tuple[Verdict, ...]:
-    """What cues say of the points that agree with the coarse pose, which most of those at rest have made."""
+) -> _Judged:
+    """What cues say of the points, given the coarse pose, which most of those at rest have made."""
     if not plan.cues:
-        return ()
+        return _Judged(regions=regions)
     points, ideal = state.points, without_distortion(params.intrinsics)
-    seen = _see(points.X_world, uv, coarse, twist, view, params)
+    observed = _see(points.X_world, seen.uv, coarse, twist, view, params)
+    height, width = view.frame.image.shape
     scene = Scene(
         uv_before=to_pixels(ideal, points.xy),
-        uv=to_pixels(ideal, seen.xy),
-        followed=agreeing,
+        uv=to_pixels(ideal, observed.xy),
+        followed=seen.followed,
+        masked=seen.masked,
+        agrees=seen.agreeing,
+        weight=_trust(points, params),
         depth_before=points.depth,
-        depth=seen.depth,
+        depth=observed.depth,
         X_world=points.X_world,
+        X_anchor=points.X_anchor,
         T_world_before=state.T_world_cam,
         T_world_cam=coarse,
         intrinsics=ideal,
+        size=jnp.array([width, height], seen.uv.dtype),
+        key=jax.random.fold_in(jax.random.fold_in(state.key, -1 - state.frame), 1),
+        regions=regions,
     )
-    return tuple(cue(scene, chosen) for cue, chosen in zip(plan.cues, params.cues, strict=True))
+    verdicts = tuple(cue(scene, chosen) for cue, chosen in zip(plan.cues, params.cues, strict=True))
+    if regions is None or plan.regions is None:
+        return _Judged(verdicts)
+    of_regions = [verdict.regions for verdict in verdicts if verdict.regions is not None]
+    weight = _region_weights(state, seen.agreeing, regions, of_regions, plan.regions)
+    remembered = of_points((weight >= 0.5).astype(weight.dtype), regions, jnp.ones_like(weight[0]))
+    moving = moving_pixels(regions, weight, height, width, plan.regions)
+    return _Judged(verdicts, regions, RegionMemory(regions.centers, weight), remembered, moving)
+
+
+def _region_weights(
+    state: TrackState, agreeing: Mask, regions: Regions, verdicts: list[RegionVerdict], plan: RegionPlan
+) -> Weights:
+    """What becomes of verdicts on regions, `(k,)`.
+
+    What was said before counts unless it speaks against most of what agrees now: then it was wrong, as where somebody
+    has carried the pose with him for a moment, and the room would be left out until nothing is left to track by.
+    """
+    before = state.regions.weight
+    fresh, lasting = (region_weights(regions, verdicts, old, plan) for old in (jnp.ones_like(before), before))
+    one = jnp.ones_like(before[0])
+    left = [jnp.sum(agreeing & (of_points(weight, regions, one) >= 0.5)) for weight in (fresh, lasting)]
+    return jnp.where(2 * left[1] >= left[0], lasting, fresh)
 
 
 def _close(T_world_cam: SE3, X_world: Points, xy: Pixels, params: TrackParams) -> Mask:
@@ -352,14 +461,18 @@ def _update_points(
     fused = X_cam + (information / total)[None, :] * (seen.in_camera() - X_cam)
     X_world = to_world(T_world_cam, fused)
     cap = _MAX_FUSED * information
+    X_world = jnp.where(agrees[None, :], X_world, points.X_world)
+    anchored = points.anchor_age.astype(X_world.dtype) < params.anchor_frames
     return TrackedPoints(
         uv=jnp.where(inliers[None, :], uv, points.uv),
         xy=jnp.where(inliers[None, :], seen.xy, points.xy),
         depth=jnp.where(inliers, seen.depth, points.depth),
-        X_world=jnp.where(agrees[None, :], X_world, points.X_world),
+        X_world=X_world,
+        X_anchor=jnp.where(anchored[None, :], points.X_anchor, X_world),
         information=jnp.where(agrees, jnp.minimum(points.information + information, cap), points.information),
         weight=points.weight,
         age=points.age + inliers.astype(jnp.int32),
+        anchor_age=jnp.where(anchored, points.anchor_age + 1, 0),
         id=points.id,
         valid=points.valid & inliers,
     )
@@ -372,6 +485,7 @@ def _conclude(
     refined: PoseRefinement,
     looked_up: LookedUp,
     verdict: _Outcome,
+    judged: _Judged,
     params: TrackParams,
     plan: TrackPlan,
 ) -> tuple[TrackState, TrackOutput]:
@@ -401,7 +515,9 @@ def _conclude(
     started, stale = start & ~failed, held | failed
     keyframe = reason_to_keep(started)
     make = keyframe > 0
-    keyframes = with_keyframe(state.keyframes, make, view.frame.image, pose, points, _trust(points, params), plan)
+    at_rest = judged.at_rest(points.uv)
+    trust = jnp.where(at_rest, _trust(points, params), 0)
+    keyframes = with_keyframe(state.keyframes, make, view.frame.image, pose, points, trust, plan)
     new_state = TrackState(
         pyramid=jax.tree.map(lambda old, new: jnp.where(stale, old, new), state.pyramid, view.pyramid),
         points=points,
@@ -415,6 +531,7 @@ def _conclude(
         frame=state.frame + 1,
         next_id=jnp.maximum(state.next_id, jnp.max(jnp.where(points.valid, points.id + 1, 0))),
         key=state.key,
+        regions=judged.memory or state.regions,
     )
     status = jnp.select(
         [started, verdict.lost, verdict.weak],
@@ -433,7 +550,7 @@ def _conclude(
         num_looked_up=jnp.sum(found.weight > 0),
         residual_px=refined.residual_scale * params.pixel_sigma,
         uv=points.uv,
-        weights=jnp.where(points.valid & ~held, points.weight, 0),
+        weights=jnp.where(points.valid & at_rest & ~held, points.weight, 0),
         tracked=kept.valid & ~verdict.lost,
         X_world=points.X_world,
         id=points.id,

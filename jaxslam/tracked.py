@@ -37,6 +37,8 @@ class Tracked:
         mask_age: Frames since the one it was detected in; -1 if it was not.
         detector_error: What went wrong in the detector, told once; empty if nothing did.
         track_ms: Time it took, in milliseconds.
+        occluded_share: Share of the points of the keyframe it hangs on that something passed before and that were seen
+            again; `None` if the settings do not ask for it, it was lost, or the map had no keyframe yet.
     """
 
     timestamp_ns: int
@@ -60,6 +62,7 @@ class Tracked:
     mask_age: int
     detector_error: str
     track_ms: float
+    occluded_share: float | None = None
 
     @property
     def dynamic_ratio(self) -> float:
@@ -113,6 +116,7 @@ class FrameRecord:
     mask_age: int = -1
     detector_error: str = ""
     track_ms: float | None = None
+    occluded_share: float | None = None
 
     @classmethod
     def of(cls, result: "Tracked | Rejected") -> "FrameRecord":
@@ -126,6 +130,7 @@ def tracked_of(
     correction: np.ndarray,
     num_matched: int,
     mask: FrameMask,
+    occluded_share: float | None = None,
     *,
     relocalised: bool,
 ) -> Tracked:
@@ -152,4 +157,5 @@ def tracked_of(
         mask_age=mask.age,
         detector_error=mask.error,
         track_ms=0.0,
+        occluded_share=occluded_share,
     )

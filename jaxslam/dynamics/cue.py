@@ -12,6 +12,9 @@ import jax.numpy as jnp
 from jaxlie import SE3
 from jaxslam_kernels.camera import Intrinsics
 from jaxslam_kernels.types import Mask, Pixels, Points, Scalar, Weights
+from jaxtyping import Array, Float, Key
+
+from jaxslam.dynamics.regions import Regions, RegionVerdict
 
 
 class Scene(NamedTuple):
@@ -20,24 +23,38 @@ class Scene(NamedTuple):
     Attributes:
         uv_before: `(2, n)` where they are in the frame before, pixels of the camera of `intrinsics`.
         uv: `(2, n)` where they are now.
-        followed: `(n,)` which are there in both; nothing is said of the others.
+        followed: `(n,)` which are there in both and under no mask.
+        masked: `(n,)` which are there in both and under a mask: they do not count, whatever is said of them.
+        agrees: `(n,)` which of those that are followed agree with `T_world_cam`.
+        weight: `(n,)` how much each counts before anything is said of it.
         depth_before: `(n,)` metres in the frame before, 0 where not measured.
         depth: `(n,)` metres now, 0 where not measured.
-        X_world: `(3, n)` where the map has them, metres.
+        X_world: `(3, n)` where they are in the world, metres, as measured over the last few frames.
+        X_anchor: `(3, n)` where they were up to half a second ago, metres.
         T_world_before: Pose of the camera in the frame before.
         T_world_cam: Its pose now, as most points have it.
         intrinsics: The camera. The tracker's is one without lens distortion and with a global shutter.
+        size: `(2,)` columns and rows of the picture.
+        key: Of the random choices of this frame.
+        regions: Parts of the depth image; `None` without `TrackPlan.regions`.
     """
 
     uv_before: Pixels
     uv: Pixels
     followed: Mask
+    masked: Mask
+    agrees: Mask
+    weight: Weights
     depth_before: Weights
     depth: Weights
     X_world: Points
+    X_anchor: Points
     T_world_before: SE3
     T_world_cam: SE3
     intrinsics: Intrinsics
+    size: Float[Array, "2"]
+    key: Key[Array, ""]
+    regions: Regions | None = None
 
 
 class Verdict(NamedTuple):
@@ -47,11 +64,13 @@ class Verdict(NamedTuple):
         weight: `(n,)` 0 for what moves to 1 for what is at rest; 1 where nothing is known.
         evidence: `(n,)` what was measured, in units of its limit; 0 where nothing is known.
         known: `(n,)` where something is.
+        regions: The same of each of `Scene.regions`, if it is said of them as a whole.
     """
 
     weight: Weights
     evidence: Weights
     known: Mask
+    regions: RegionVerdict | None = None
 
 
 Cue: TypeAlias = Callable[[Scene, Any], Verdict]

@@ -7,35 +7,59 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.config import DynamicsConfig
+from jaxslam.dynamics.clusters import ClusterParams, cluster_cue
 from jaxslam.dynamics.cue import Cue
+from jaxslam.dynamics.epipolar import EpipolarParams, make_epipolar_cue
+from jaxslam.dynamics.regions import RegionPlan
 from jaxslam.dynamics.trajectory import TrajectoryParams, trajectory_cue
+from jaxslam.state import TrackParams, TrackPlan
 
 
 class _Known(NamedTuple):
-    """A cue, and what makes its parameters of settings, all of one floating-point type."""
+    """A cue of settings, and what has the names of its parameters, each of which is a setting or the temperature.
 
-    cue: Cue
-    params: Callable[[DynamicsConfig, type[np.floating]], Any]
+    Attributes:
+        cue: Makes it of the settings of all cues.
+        params: The class of its parameters.
+        needs_regions: Whether it judges regions.
+    """
+
+    cue: Callable[[DynamicsConfig], Cue]
+    params: Callable[..., Any]
+    needs_regions: bool = False
 
 
-def _trajectory_params(config: DynamicsConfig, dtype: type[np.floating]) -> TrajectoryParams:
-    chosen = config.trajectory
-    return TrajectoryParams(
-        tolerance_m=jnp.asarray(chosen.tolerance_m, dtype),
-        tolerance_per_m=jnp.asarray(chosen.tolerance_per_m, dtype),
-        as_published=jnp.asarray(chosen.as_published),
-        temperature=jnp.asarray(config.temperature, dtype),
+_KNOWN = {
+    "trajectory": _Known(lambda _: trajectory_cue, TrajectoryParams),
+    "epipolar": _Known(lambda config: make_epipolar_cue(config.epipolar.num_hypotheses), EpipolarParams),
+    "clusters": _Known(lambda _: cluster_cue, ClusterParams, needs_regions=True),
+}
+
+
+def with_cues(plan: TrackPlan, config: DynamicsConfig) -> TrackPlan:
+    """The plan with the cues of the settings, and regions if one of them needs those."""
+    chosen, clusters = [_KNOWN[name] for name in config.cues], config.clusters
+    regions = RegionPlan(clusters.num_regions, clusters.step_px, clusters.num_steps, clusters.recover_frames)
+    needed = config.even_votes or any(known.needs_regions for known in chosen)
+    return plan._replace(
+        cues=tuple(known.cue(config) for known in chosen),
+        regions=regions if needed else None,
+        even_votes=config.even_votes,
     )
 
 
-_KNOWN = {"trajectory": _Known(trajectory_cue, _trajectory_params)}
+def with_cue_params(params: TrackParams, config: DynamicsConfig, dtype: type[np.floating] = np.float32) -> TrackParams:
+    """The parameters with those of the cues of the settings, all of one floating-point type but for flags."""
+    return params._replace(cues=tuple(_params_of(name, config, dtype) for name in config.cues))
 
 
-def cues_of(config: DynamicsConfig) -> tuple[Cue, ...]:
-    """The cues of the settings, for `TrackPlan.cues`."""
-    return tuple(_KNOWN[name].cue for name in config.cues)
+def _params_of(name: str, config: DynamicsConfig, dtype: type[np.floating]) -> Any:
+    make, chosen = _KNOWN[name].params, getattr(config, name)
+    fields: Any = make._fields  # type: ignore[attr-defined]
+    values = {field: getattr(chosen, field) for field in fields if field != "temperature"}
+    values["temperature"] = config.temperature
+    return make(**{field: _scalar(value, dtype) for field, value in values.items()})
 
 
-def cue_params_of(config: DynamicsConfig, dtype: type[np.floating] = np.float32) -> tuple[Any, ...]:
-    """Their parameters, for `TrackParams.cues`."""
-    return tuple(_KNOWN[name].params(config, dtype) for name in config.cues)
+def _scalar(value: bool | float, dtype: type[np.floating]) -> Any:
+    return jnp.asarray(value) if isinstance(value, bool) else jnp.asarray(value, dtype)

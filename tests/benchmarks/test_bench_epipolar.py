@@ -8,20 +8,22 @@ from typing import Any
 
 import cv2
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxslam_kernels.fundamental import FundamentalStatus, ransac_fundamental
 
+from jaxslam.benchmark.kernels.two_view_cases import (
+    OPENCV_PX,
+    SAME_BAND_PX,
+    fundamental_arguments,
+    opencv_fundamental,
+)
 from jaxslam.benchmark.kernels.two_views import KINDS, TwoViewScene, make_two_views
 from jaxslam.benchmark.timing import compare, compile_seconds
 
 pytestmark = pytest.mark.benchmark
 
 N, SCENES = 500, 200
-OPENCV_PX, CONFIDENCE = 1.0, 0.99
-SAME_BAND_PX = OPENCV_PX * math.sqrt(0.5)
-"""A Sampson distance so large is a distance of one pixel to both epipolar lines, by which OpenCV decides."""
 
 
 def _run(key: Any, before: Any, after: Any, threshold: Any) -> Any:
@@ -31,13 +33,8 @@ def _run(key: Any, before: Any, after: Any, threshold: Any) -> Any:
 _ours = jax.jit(_run)
 
 
-def _arguments(seed: int, scene: TwoViewScene, threshold: float) -> tuple[Any, ...]:
-    pixels = (jnp.asarray(x, jnp.float32) for x in (scene.uv_before, scene.uv_after))
-    return jax.random.key(seed), *pixels, jnp.asarray(threshold, jnp.float32)
-
-
 def _opencv(scene: TwoViewScene, method: int = cv2.FM_RANSAC) -> tuple[Any, np.ndarray]:
-    F, mask = cv2.findFundamentalMat(scene.uv_before.T, scene.uv_after.T, method, OPENCV_PX, CONFIDENCE)
+    F, mask = opencv_fundamental(scene.uv_before.T, scene.uv_after.T, method)
     return F, np.zeros(N, bool) if mask is None else mask[:, 0] > 0
 
 
@@ -55,10 +52,10 @@ def _quality(F: Any, inliers: np.ndarray, scene: TwoViewScene) -> tuple[float, f
 def test_time():
     scene = make_two_views(0, N)
     before, after = scene.uv_before.T.copy(), scene.uv_after.T.copy()
-    arguments = _arguments(0, scene, SAME_BAND_PX)
+    arguments = fundamental_arguments(0, scene, SAME_BAND_PX)
     comparison = compare(
         lambda: _ours(*arguments),
-        lambda: cv2.findFundamentalMat(before, after, cv2.FM_RANSAC, OPENCV_PX, CONFIDENCE),
+        lambda: opencv_fundamental(before, after),
         rounds=100,
     )
     print(f"\nransac_fundamental, {N} matches, half outliers, against cv2.findFundamentalMat\n{comparison}")
@@ -75,7 +72,7 @@ def test_accuracy():
     for seed in range(SCENES):
         scene = make_two_views(seed, N)
         for name, threshold in (("ours, same band", SAME_BAND_PX), ("ours, 1 px", OPENCV_PX)):
-            result = _ours(*_arguments(seed, scene, threshold))
+            result = _ours(*fundamental_arguments(seed, scene, threshold))
             rows.setdefault(name, []).append(_quality(result.F, np.asarray(result.inliers), scene))
         for name, method in (("OpenCV", cv2.FM_RANSAC), ("OpenCV MAGSAC", cv2.USAC_MAGSAC)):
             rows.setdefault(name, []).append(_quality(*_opencv(scene, method), scene))
@@ -98,9 +95,11 @@ def test_degenerate_motion(outliers):
     """False alarms on ordinary motion, and pure rotation, one plane or no motion that is missed."""
     wrong = {}
     for kind in KINDS:
+        seeds = range(1000, 1000 + SCENES)
+        scenes = [make_two_views(seed, N, kind=kind, outliers=outliers) for seed in seeds]
         statuses = [
-            int(_ours(*_arguments(seed, make_two_views(seed, N, kind=kind, outliers=outliers), OPENCV_PX)).status)
-            for seed in range(1000, 1000 + SCENES)
+            int(_ours(*fundamental_arguments(seed, scene, OPENCV_PX)).status)
+            for seed, scene in zip(seeds, scenes, strict=True)
         ]
         degenerate = np.array(statuses) == FundamentalStatus.DEGENERATE
         wrong[kind] = int(np.sum(degenerate == (kind == "ordinary")))

@@ -53,6 +53,7 @@ def points(map: Map, made_by: np.ndarray, rng: np.random.Generator) -> MapPoints
         descriptor=rng.integers(0, 256, (count, 32)).astype(np.uint8) * recognisable[:, None],
         recognisable=recognisable,
         made_by=np.asarray(made_by, np.int64),
+        state=(np.arange(count) % 3).astype(np.int8),
     )
 
 

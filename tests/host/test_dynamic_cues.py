@@ -1,33 +1,22 @@
 """Cues to what moves: limits, their smooth forms, derivatives; each cue on points at rest and points that move."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cue_scenes import MOTIONS, N, check_finite, moves, scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax.test_util import check_grads
-from jaxlie import SE3
-from jaxslam_kernels.camera import make_intrinsics, project
 from jaxslam_kernels.transform import moved, to_camera, to_world
 
-from jaxslam.dynamics.cue import Scene, Verdict, combined, judge
+from jaxslam.dynamics.cue import Verdict, combined, judge
 from jaxslam.dynamics.occlusion import PointState, next_states, occluded_share, occlusion_weights
 from jaxslam.dynamics.trajectory import TrajectoryParams, trajectory_cue
 
-N = 60
-MOTIONS: dict[str, Any] = {
-    "none": (0, 0, 0, 0, 0, 0),
-    "ahead": (0, 0, 0.05, 0, 0, 0),
-    "sideways": (0.05, 0, 0, 0, 0, 0),
-    "turning": (0, 0, 0, 0.02, 0.05, 0.01),
-    "all": (0.02, -0.01, 0.03, 0.01, 0.03, -0.02),
-}
-"""Tangents of the camera from frame to frame."""
-INTRINSICS = (500.0, 505.0, 320.0, 240.0, (0.05, -0.1, 0.001, -0.001, 0.0))
 EVIDENCE = st.lists(st.floats(0, 100, width=32), min_size=1, max_size=20)
 
 
@@ -35,33 +24,6 @@ EVIDENCE = st.lists(st.floats(0, 100, width=32), min_size=1, max_size=20)
 def x64() -> Iterator[None]:
     with jax.enable_x64(True):
         yield
-
-
-def scene(motion: Any, moved_m: Any = (0, 0, 0), seed: int = 0) -> Scene:
-    """Points before a camera that moves by a tangent in its own axes; every third point moves too, in the world."""
-    rng = np.random.default_rng(seed)
-    X_cam = np.stack([rng.uniform(-1, 1, N), rng.uniform(-0.8, 0.8, N), rng.uniform(1, 4, N)])
-    before = moved(SE3.identity(), jnp.array([0.3, -0.2, 0.1, 0.2, 0.1, -0.3]))
-    now = moved(before, jnp.asarray(motion, float))
-    X_world = np.asarray(to_world(before, jnp.asarray(X_cam)))
-    X_now = X_world + np.where(moves()[None, :], np.asarray(moved_m, float)[:, None], 0)
-    intrinsics = make_intrinsics(*INTRINSICS, dtype=jnp.float64)
-    seen = to_camera(now, jnp.asarray(X_now))
-    return Scene(
-        uv_before=project(intrinsics, jnp.asarray(X_cam)),
-        uv=project(intrinsics, seen),
-        followed=jnp.ones(N, bool),
-        depth_before=jnp.asarray(X_cam[2]),
-        depth=seen[2],
-        X_world=jnp.asarray(X_world),
-        T_world_before=before,
-        T_world_cam=now,
-        intrinsics=intrinsics,
-    )
-
-
-def moves() -> np.ndarray:
-    return np.arange(N) % 3 == 0
 
 
 def params(*, as_published: bool = False, temperature: float = 0.0) -> TrajectoryParams:
@@ -194,7 +156,3 @@ class TestOcclusion:
         assert float(jax.grad(total)(jnp.array(3.0))) == 2
         assert float(occluded_share(states, jnp.array([True, True, True, False]))) == pytest.approx(1 / 3)
         assert float(occluded_share(states, jnp.zeros(4, bool))) == 0
-
-
-def check_finite(function: Callable[..., Any], *arguments: Any) -> None:
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(function(*arguments)))

@@ -169,9 +169,9 @@ class TestHeader:
     @pytest.mark.parametrize(
         ("path", "value", "message"),
         [
-            (["version"], 2, "expected a map file of version 1, got version 2"),
-            (["version"], None, "expected a map file of version 1, got version None"),
-            (["version"], True, "expected a map file of version 1, got version True"),
+            (["version"], 3, "expected a map file of version 1, 2, got version 3"),
+            (["version"], None, "expected a map file of version 1, 2, got version None"),
+            (["version"], True, "expected a map file of version 1, 2, got version True"),
             (["counts"], 3, "header: counts: expected dict, got 3"),
             (["counts", "points"], -1, "header: points: expected a count, got -1"),
             (["counts", "points"], 1.5, "header: points: expected int, got 1.5"),

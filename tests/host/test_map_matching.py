@@ -44,6 +44,7 @@ def made(map: Map, keyframe_id: int, places: np.ndarray, index: np.ndarray) -> M
         descriptor=features.descriptor[index],
         recognisable=np.ones(len(index), bool),
         made_by=np.full(len(index), keyframe_id, np.int64),
+        state=np.zeros(len(index), np.int8),
     )
     found = feature_sightings(keyframe_id, features, points.ids, index, DEFAULT_PLAN)
     return with_sightings(with_points(map, points), found)

@@ -30,7 +30,8 @@ def seen_from(poses: list[np.ndarray], shown: list[int], submaps: list[int] | No
         X = np.concatenate([rng.uniform(-0.5, 0.5, (2, POINTS)), np.full((1, POINTS), 2.0)])
         whole = np.ones(POINTS, np.float32)
         none, no_descriptor = np.zeros(POINTS, bool), np.zeros((POINTS, 32), np.uint8)
-        made = with_points(made, MapPoints(ids, X, whole, no_descriptor, none, np.full(POINTS, maker, np.int64)))
+        made_by, static = np.full(POINTS, maker, np.int64), np.zeros(POINTS, np.int8)
+        made = with_points(made, MapPoints(ids, X, whole, no_descriptor, none, made_by, static))
         for number in np.flatnonzero(np.array(submaps) == submap):
             some = ids[: shown[number]]
             by_feature = np.where(np.arange(len(some)) % 2, NONE, np.arange(len(some)))

@@ -11,11 +11,12 @@ class Problem:
     """One problem of a certain size, and both ways to solve it.
 
     Attributes:
-        ours: A function of arrays, not compiled.
+        ours: A function of arrays, not compiled but for `compile`.
         arguments: What it is called with.
         theirs: The same work by another library.
         difference: How far the two results are apart, given both; infinite if theirs is none.
         prepare: Makes what theirs is called with, anew for each call, not timed.
+        compile: Compiles what ours needs, where that works on the host and is called as it is.
     """
 
     ours: Callable[..., Any]
@@ -23,6 +24,7 @@ class Problem:
     theirs: Callable[..., Any]
     difference: Callable[[Any, Any], float]
     prepare: Callable[[], tuple[Any, ...]] = tuple
+    compile: Callable[[], Any] | None = None
 
 
 @dataclass(frozen=True)

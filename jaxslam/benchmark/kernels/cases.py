@@ -1,15 +1,19 @@
-"""All kernels that are compared with other libraries."""
+"""All kernels that are compared with other libraries, and the cues that are made of them."""
 
 from collections.abc import Sequence
 
 from jaxslam.benchmark.kernels.case import Case, installed
+from jaxslam.benchmark.kernels.cue_cases import CUE_CASES
 from jaxslam.benchmark.kernels.graph_cases import GRAPH_CASES
 from jaxslam.benchmark.kernels.image_cases import IMAGE_CASES
 from jaxslam.benchmark.kernels.point_cases import POINT_CASES
 from jaxslam.benchmark.kernels.pose_cases import POSE_CASES
+from jaxslam.benchmark.kernels.two_view_cases import TWO_VIEW_CASES
 from jaxslam.errors import BenchmarkError, nearest
 
-CASES: dict[str, Case] = {case.name: case for case in (*IMAGE_CASES, *POSE_CASES, *GRAPH_CASES, *POINT_CASES)}
+CASES: dict[str, Case] = {
+    case.name: case for case in (*IMAGE_CASES, *POSE_CASES, *TWO_VIEW_CASES, *GRAPH_CASES, *POINT_CASES, *CUE_CASES)
+}
 
 
 def versions() -> dict[str, str | None]:

@@ -77,7 +77,13 @@ def _flow_of(previous: Any, current: Any, points: Any) -> Any:
     return lk_flow(build_pyramid(previous), build_pyramid(current), points).points
 
 
-def _opencv_flow(previous: np.ndarray, current: np.ndarray, points: np.ndarray) -> np.ndarray:
+def moving_corners(num_points: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Two pictures of 640x480, and corners `(2, num_points)` of the first, which move 10 px to the second."""
+    previous, current, _ = warp(picture(640, 480), _SHIFT_PX, 2)
+    return previous, current, corners(previous, num_points)
+
+
+def opencv_flow(previous: np.ndarray, current: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Positions `(n, 2)` of points `(n, 2)`."""
     return cv2.calcOpticalFlowPyrLK(
         previous, current, points, points.copy(), winSize=(_WINDOW, _WINDOW), maxLevel=_LEVELS - 1, criteria=_CRITERIA
@@ -90,11 +96,10 @@ def _median_distance(ours: Any, theirs: Any) -> float:
 
 
 def _flow(num_points: int) -> Problem:
-    previous, current, _ = warp(picture(640, 480), _SHIFT_PX, 2)
-    points = corners(previous, num_points)
+    previous, current, points = moving_corners(num_points)
     rows = np.ascontiguousarray(points.T)
     return Problem(
-        _flow_of, (previous, current, points), lambda: _opencv_flow(previous, current, rows), _median_distance
+        _flow_of, (previous, current, points), lambda: opencv_flow(previous, current, rows), _median_distance
     )
 
 
@@ -107,7 +112,7 @@ def _flow_batch(num_pairs: int) -> Problem:
     return Problem(
         jax.vmap(_flow_of),
         repeated,
-        lambda: [_opencv_flow(previous, image, rows) for image in current],
+        lambda: [opencv_flow(previous, image, rows) for image in current],
         lambda ours, theirs: float(np.median([_median_distance(a, b) for a, b in zip(ours, theirs, strict=True)])),
     )
 

@@ -1,0 +1,45 @@
+"""From points that move to pixels: only near them, only as far away as they are."""
+
+import numpy as np
+
+from jaxslam.dynamics.cue import Verdict
+from jaxslam.dynamics.point_mask import mask_around, moving_points
+
+
+def verdict(weight: list[float], known: list[bool]) -> Verdict:
+    return Verdict(np.array(weight), np.zeros(len(weight)), np.array(known))  # pyright: ignore[reportArgumentType]
+
+
+class TestMovingPoints:
+    def test_needs_a_cue_that_knows(self) -> None:
+        said = [verdict([0.0, 0.0, 0.6, 1.0], [True, False, True, True]), verdict([1.0, 1, 0.6, 1], [False] * 4)]
+        assert moving_points(said).tolist() == [True, False, True, False]
+
+    def test_no_cue(self) -> None:
+        assert not moving_points(()).any()
+
+
+class TestMaskAround:
+    depth = np.full((40, 60), 3.0)
+    depth[10:30, 20:40] = 1.0
+    depth[18, 25] = 0
+
+    def test_stays_on_the_surface(self) -> None:
+        mask = mask_around(np.array([[21.2], [20.0]]), self.depth, 4)
+        expected = np.zeros_like(mask)
+        expected[16:25, 20:26] = True
+        assert (mask == expected).all()
+
+    def test_without_depth_there_is_no_surface(self) -> None:
+        mask = mask_around(np.array([[25.0], [18.0]]), self.depth, 2)
+        assert mask.sum() == 25
+
+    def test_at_the_border_and_outside(self) -> None:
+        uv = np.array([[0.0, 59.0, -3.0, 70.0, np.nan], [0.0, 39.0, 5.0, 5.0, 5.0]])
+        mask = mask_around(uv, self.depth, 3)
+        assert mask.sum() == 2 * 16
+        assert mask[:4, :4].all()
+        assert mask[36:, 56:].all()
+
+    def test_no_points(self) -> None:
+        assert not mask_around(np.zeros((2, 0)), self.depth, 3).any()
