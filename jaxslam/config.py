@@ -227,7 +227,7 @@ class DynamicsConfig(Checked):
     """What else tells points that move, each with a veto."""
     reach_px: Annotated[int, Range(at_least=0, at_most=100)] = 12
     """How far around a point that moves by its cues the map gets nothing, on surfaces as far away as it is."""
-    even_votes: bool = True
+    even_votes: bool = False
     """Give no surface more of a say in the pose than an even share: whoever carries a large box has most of the points,
     and the room behind it most of the surfaces. They are those of `clusters`."""
     temperature: Annotated[float, Range(at_least=0)] = 0.0

@@ -58,7 +58,7 @@ _MAX_PREDICTION_S = 0.1
 """A constant velocity says nothing about longer gaps."""
 _MAX_FUSED = 4
 _UNKNOWN_VARIANCE = 1e2
-_DEPTH_SIGMAS = 3.0
+_DEPTH_GATE_M, _DEPTH_SIGMAS = 0.1, 3.0
 
 
 class Followed(NamedTuple):
@@ -305,7 +305,8 @@ def _coarse_pose(
         weights=votes,
         depth=seen.depth,
         threshold_px=params.ransac_px,
-        threshold_depth=_DEPTH_SIGMAS * depth_sigma(seen.depth, params),
+        threshold_depth=_DEPTH_SIGMAS * depth_sigma(seen.depth, params) if plan.even_votes else _DEPTH_GATE_M,
+        averaged=plan.even_votes,
         num_hypotheses=plan.num_hypotheses,
         initial=predicted,
     )

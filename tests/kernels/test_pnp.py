@@ -298,7 +298,7 @@ class TestRansac:
             without.append(pose_error(_run(seed, no_depth)[0].T_world_cam.wxyz_xyz, scene.pose)[0])
         assert np.median(with_depth) < 0.9 * np.median(without)
 
-    def test_score_is_the_truncated_residual_averaged_over_thresholds(self):
+    def test_score_is_the_truncated_residual_or_its_average_over_thresholds(self):
         scene = make_scene(2, N)
         X_world, uv, depth, sigma = scene.arrays()
         pose = pose_of(scene.pose)
@@ -309,14 +309,19 @@ class TestRansac:
         @_compile
         def evaluate(X_world, uv, depth, sigma, poses):
             problem = pose_problem(X_world, uv, camera(), None, depth, 1.0, sigma, 3.0, None)
-            return pose_cost(pose, problem, "squared").chi2, score_poses(poses, problem)
+            return (
+                pose_cost(pose, problem, "squared").chi2,
+                score_poses(poses, problem),
+                score_poses(poses, problem, True),
+            )
 
         poses = jnp.asarray(np.stack([T_cam_world, behind], axis=-1), jnp.float32)
-        chi2, scores = map(np.asarray, evaluate(X_world, uv, depth, sigma, poses))
+        chi2, scores, averaged = map(np.asarray, evaluate(X_world, uv, depth, sigma, poses))
         assert 0.7 * N < np.sum(chi2 < 9.0) < N
+        np.testing.assert_allclose(scores, [np.sum(1.0 - np.minimum(chi2 / 9.0, 1.0)), 0.0], rtol=1e-4)
         thresholds = (np.arange(20_000) + 0.5) / 20_000
         truncated = [np.mean(1.0 - np.minimum(squared / thresholds**2, 1.0)) for squared in chi2 / 9.0]
-        np.testing.assert_allclose(scores, [np.sum(truncated), 0.0], rtol=1e-3)
+        np.testing.assert_allclose(averaged, [np.sum(truncated), 0.0], rtol=1e-3)
 
     def test_initial_pose_is_tried(self):
         """Nine of ten points wrong: among 128 samples none is good, but a prediction a pixel or two off is."""
