@@ -36,6 +36,7 @@ def ate_m(preset: str, *overrides: str, true_masks: bool = False) -> float:
     with Slam(clip.camera, config, detector=detector if true_masks else None) as slam:
         records = slam.run(clip)
     assert all(record.status in (TrackStatus.OK, TrackStatus.STARTED) for record in records)
+    assert clip.ground_truth is not None
     return max(evaluate(slam.trajectory, clip.ground_truth).ate_rmse_m, FLOOR_M)
 
 
