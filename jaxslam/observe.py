@@ -3,10 +3,12 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
+from jaxlie import SE3
 from jaxslam_kernels.camera import distort, normalise, to_pixels
 from jaxslam_kernels.depth_image import sample_depth
 from jaxslam_kernels.image import Pyramid
 from jaxslam_kernels.rolling_shutter import as_if_at_once, image_velocity, row_time
+from jaxslam_kernels.transform import to_camera
 from jaxslam_kernels.types import DepthImage, Pixels, Points, Scalar, Weights
 from jaxtyping import Array, Float
 
@@ -73,6 +75,14 @@ def observe(
     at_once = as_if_at_once(xy, velocity, uv[1], depth.shape[0], params.readout_s)
     later = uv + focal * velocity * depth_delay_s
     return Observed(at_once, sample_depth(depth, later, reach=reach))
+
+
+def observe_points(
+    X_world: Points, uv: Pixels, pose: SE3, twist: Float[Array, "6"], view: View, params: TrackParams
+) -> Observed:
+    """What a frame says of map points, `(3, n)` metres, seen at pixels `uv` from about `pose`."""
+    expected = jnp.maximum(to_camera(pose, X_world)[2], params.min_depth_m)
+    return observe(uv, expected, twist, view.depth, view.frame.depth_delay_s, params)
 
 
 def predict_pixels(X_cam: Points, twist: Float[Array, "6"], height: int, params: TrackParams) -> Pixels:

@@ -4,6 +4,7 @@ import gc
 import logging
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -161,12 +162,15 @@ class Slam:
             began = time.perf_counter()
             shape = (self.camera.height, self.camera.width)
             nothing = self._memory.hold(Frame(0, np.zeros(shape, np.uint8), np.zeros(shape, np.float32)), 0.0)
-            state = self._fresh_state()
-            followed = _follow_points(state, nothing, self._params, self._plan)
-            jax.block_until_ready(_track_followed(state, nothing, followed, self._params, self._plan))
-            self._back.compile(nothing)
-            if self._masks is not None:
-                self._masks.compile()
+            # In two threads: 5.9 s instead of 7.4 from the cache, 31 instead of 34 without one.
+            with ThreadPoolExecutor(1, thread_name_prefix="jaxslam-compile") as beside:
+                back_end = beside.submit(self._back.compile, nothing)
+                state = self._fresh_state()
+                followed = _follow_points(state, nothing, self._params, self._plan)
+                jax.block_until_ready(_track_followed(state, nothing, followed, self._params, self._plan))
+                if self._masks is not None:
+                    self._masks.compile()
+                back_end.result()
             self.compile_s = time.perf_counter() - began
             self._ready = True
         return self.compile_s

@@ -22,24 +22,13 @@ from jaxslam_kernels.pose_refine import PoseRefinement, refine_pose
 from jaxslam_kernels.robust import weighted_median
 from jaxslam_kernels.transform import displacement, moved, to_camera, to_world
 from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Points, Scalar, Weights
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from jaxslam.dynamics.cue import Scene, Verdict, combined
-from jaxslam.dynamics.regions import (
-    RegionMemory,
-    RegionPlan,
-    Regions,
-    RegionVerdict,
-    even_votes,
-    find_regions,
-    moving_pixels,
-    no_regions,
-    of_points,
-    region_weights,
-)
+from jaxslam.dynamics.regions import Regions, even_votes, find_regions, no_regions
 from jaxslam.frame_arrays import FrameArrays
+from jaxslam.judging import Judged, PointsSeen, judge_points
 from jaxslam.keyframes import empty_keyframes, look_up, with_keyframe
-from jaxslam.observe import Observed, View, depth_sigma, observe, predict_pixels
+from jaxslam.observe import View, depth_sigma, observe_points, predict_pixels
 from jaxslam.refill import refill
 from jaxslam.state import (
     KeyframeReason,
@@ -75,51 +64,6 @@ class Followed(NamedTuple):
     predicted: SE3
     uv: Pixels
     ok: Mask
-
-
-class _Seen(NamedTuple):
-    """Points of a state in a frame: followed under no mask, under one, and in agreement with a pose; `(n,)` each."""
-
-    uv: Pixels
-    followed: Mask
-    masked: Mask
-    agreeing: Mask
-
-
-class _Judged(NamedTuple):
-    """What cues say, and the pixels that are left out for it."""
-
-    verdicts: tuple[Verdict, ...] = ()
-    regions: Regions | None = None
-    memory: RegionMemory | None = None
-    remembered: Weights | None = None
-    moving: Bool[Array, "h w"] | None = None
-
-    def weights(self, weight: Weights) -> Weights:
-        """Weights of the points, times those of the cues, and 0 in regions that moved a moment ago."""
-        weight = combined(self.verdicts, weight)
-        return weight if self.remembered is None else weight * self.remembered
-
-    def counts(self) -> Mask | Flag:
-        """`(n,)` which points no cue says anything against."""
-        return self.weights(jnp.ones(())) > 0
-
-    def without_movers(self, view: View) -> View:
-        """The frame with nothing trusted where regions move."""
-        if self.moving is None:
-            return view
-        return view._replace(frame=view.frame._replace(ignore=view.frame.ignore | self.moving))
-
-    def at_rest(self, uv: Pixels) -> Mask:
-        """`(n,)` which pixels are in no region that moves.
-
-        New points are taken there all the same, and are witnesses in the next frame: without them nothing is known of
-        the region then, and what moves passes for a room in every other frame.
-        """
-        if self.moving is None:
-            return jnp.ones(uv.shape[1], bool)
-        column, row = jnp.round(lax.stop_gradient(uv)).astype(jnp.int32)
-        return ~self.moving.at[row, column].get(mode="fill", fill_value=False)
 
 
 class _Outcome(NamedTuple):
@@ -240,14 +184,14 @@ def track_followed(
     followed = found & ~masked
     params = _widened(params, state.points.uv, uv, followed)
     regions = _regions(state, view, uv, predicted, params, plan)
-    votes = _trust(state.points, params)
+    trust = _trust(state.points, params)
+    votes = jnp.where(followed, trust, 0)
     if regions is not None and plan.even_votes:
-        votes = even_votes(jnp.where(followed, votes, 0), regions)
-    coarse, agreeing = _coarse_pose(state, view, uv, jnp.where(followed, votes, 0), predicted, params, plan)
-    agreeing &= followed
+        votes = even_votes(votes, regions)
+    coarse, agreeing = _coarse_pose(state, view, uv, votes, predicted, params, plan)
     twist = _twist(state.T_world_cam, coarse, view.elapsed_s)
-    points = _Seen(uv, followed, found & masked, agreeing)
-    judged = _judge_points(state, view, points, regions, coarse, twist, params, plan)
+    points = PointsSeen(uv, followed, found & masked, agreeing, trust)
+    judged = judge_points(state, view, points, regions, coarse, twist, params, plan)
     trust = judged.weights(votes)
     agreeing &= trust > 0
     looked_up = look_up(state.keyframes, coarse, twist, judged.without_movers(view), params, plan)
@@ -269,12 +213,6 @@ def _widened(params: TrackParams, before: Pixels, after: Pixels, followed: Mask)
     return params._replace(ransac_px=params.ransac_px + extra, outlier_px=params.outlier_px + extra)
 
 
-def _see(X_world: Points, uv: Pixels, pose: SE3, twist: Float[Array, "6"], view: View, params: TrackParams) -> Observed:
-    """What the frame says of map points, seen from about `pose`."""
-    expected = jnp.maximum(to_camera(pose, X_world)[2], params.min_depth_m)
-    return observe(uv, expected, twist, view.depth, view.frame.depth_delay_s, params)
-
-
 def _trust(points: TrackedPoints, params: TrackParams) -> Weights:
     """How much each point counts: its weight, less while it is on probation; 0 for a slot without a point."""
     served = (points.age + 1).astype(points.weight.dtype) / params.probation_frames
@@ -287,7 +225,7 @@ def _regions(
     """The surfaces of the frame, if something asks for them."""
     if plan.regions is None:
         return None
-    seen = _see(state.points.X_world, uv, predicted, state.twist, view, params)
+    seen = observe_points(state.points.X_world, uv, predicted, state.twist, view, params)
     key, ideal = jax.random.fold_in(state.key, -1 - state.frame), without_distortion(params.intrinsics)
     return find_regions(key, view.depth, state.regions.centers, seen.in_camera(), ideal, plan.regions)
 
@@ -296,7 +234,7 @@ def _coarse_pose(
     state: TrackState, view: View, uv: Pixels, votes: Weights, predicted: SE3, params: TrackParams, plan: TrackPlan
 ) -> tuple[SE3, Mask]:
     """The pose that gets most votes of points, and which agree with it."""
-    seen = _see(state.points.X_world, uv, predicted, state.twist, view, params)
+    seen = observe_points(state.points.X_world, uv, predicted, state.twist, view, params)
     result = ransac_pnp(
         jax.random.fold_in(state.key, state.frame),
         state.points.X_world,
@@ -331,7 +269,7 @@ def _refine(
 ) -> tuple[PoseRefinement, Mask]:
     """The pose that fits followed points and points of keyframes together, and which followed points it fits."""
     X_world = jnp.concatenate([state.points.X_world, looked_up.X_world], axis=1)
-    seen = _see(X_world, jnp.concatenate([uv, looked_up.uv], axis=1), coarse, twist, view, params)
+    seen = observe_points(X_world, jnp.concatenate([uv, looked_up.uv], axis=1), coarse, twist, view, params)
     weights = jnp.concatenate([trust, looked_up.weight])
     refined = refine_pose(
         coarse,
@@ -347,65 +285,6 @@ def _refine(
     )
     close = _close(refined.T_world_cam, X_world, seen.xy, params)
     return refined, (trust > 0) & close[: trust.shape[0]]
-
-
-def _judge_points(
-    state: TrackState,
-    view: View,
-    seen: _Seen,
-    regions: Regions | None,
-    coarse: SE3,
-    twist: Float[Array, "6"],
-    params: TrackParams,
-    plan: TrackPlan,
-) -> _Judged:
-    """What cues say of the points, given the coarse pose, which most of those at rest have made."""
-    if not plan.cues:
-        return _Judged(regions=regions)
-    points, ideal = state.points, without_distortion(params.intrinsics)
-    observed = _see(points.X_world, seen.uv, coarse, twist, view, params)
-    height, width = view.frame.image.shape
-    scene = Scene(
-        uv_before=to_pixels(ideal, points.xy),
-        uv=to_pixels(ideal, observed.xy),
-        followed=seen.followed,
-        masked=seen.masked,
-        agrees=seen.agreeing,
-        weight=_trust(points, params),
-        depth_before=points.depth,
-        depth=observed.depth,
-        X_world=points.X_world,
-        X_anchor=points.X_anchor,
-        T_world_before=state.T_world_cam,
-        T_world_cam=coarse,
-        intrinsics=ideal,
-        size=jnp.array([width, height], seen.uv.dtype),
-        key=jax.random.fold_in(jax.random.fold_in(state.key, -1 - state.frame), 1),
-        regions=regions,
-    )
-    verdicts = tuple(cue(scene, chosen) for cue, chosen in zip(plan.cues, params.cues, strict=True))
-    if regions is None or plan.regions is None:
-        return _Judged(verdicts)
-    of_regions = [verdict.regions for verdict in verdicts if verdict.regions is not None]
-    weight = _region_weights(state, seen.agreeing, regions, of_regions, plan.regions)
-    remembered = of_points((weight >= 0.5).astype(weight.dtype), regions, jnp.ones_like(weight[0]))
-    moving = moving_pixels(regions, weight, height, width, plan.regions)
-    return _Judged(verdicts, regions, RegionMemory(regions.centers, weight), remembered, moving)
-
-
-def _region_weights(
-    state: TrackState, agreeing: Mask, regions: Regions, verdicts: list[RegionVerdict], plan: RegionPlan
-) -> Weights:
-    """What becomes of verdicts on regions, `(k,)`.
-
-    What was said before counts unless it speaks against most of what agrees now: then it was wrong, as where somebody
-    has carried the pose with him for a moment, and the room would be left out until nothing is left to track by.
-    """
-    before = state.regions.weight
-    fresh, lasting = (region_weights(regions, verdicts, old, plan) for old in (jnp.ones_like(before), before))
-    one = jnp.ones_like(before[0])
-    left = [jnp.sum(agreeing & (of_points(weight, regions, one) >= 0.5)) for weight in (fresh, lasting)]
-    return jnp.where(2 * left[1] >= left[0], lasting, fresh)
 
 
 def _close(T_world_cam: SE3, X_world: Points, xy: Pixels, params: TrackParams) -> Mask:
@@ -453,7 +332,7 @@ def _update_points(
     """
     points = state.points
     twist = _twist(state.T_world_cam, T_world_cam, view.elapsed_s)
-    seen = _see(points.X_world, uv, T_world_cam, twist, view, params)
+    seen = observe_points(points.X_world, uv, T_world_cam, twist, view, params)
     X_cam = to_camera(T_world_cam, points.X_world)
     sigma = depth_sigma(seen.depth, params)
     agrees = inliers & (seen.depth > 0) & (jnp.abs(seen.depth - X_cam[2]) < 3 * sigma)
@@ -486,7 +365,7 @@ def _conclude(
     refined: PoseRefinement,
     looked_up: LookedUp,
     verdict: _Outcome,
-    judged: _Judged,
+    judged: Judged,
     params: TrackParams,
     plan: TrackPlan,
 ) -> tuple[TrackState, TrackOutput]:

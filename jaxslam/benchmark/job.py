@@ -1,8 +1,10 @@
 """One run of a suite, in a process of its own: whatever it does to itself, the others and the report go on.
 
-`python -m jaxslam.benchmark.job FOLDER [ROOT]` runs the one that is written in a folder, as long as its input lasts.
+`python -m jaxslam.benchmark.job FOLDER [--root ROOT] [--rooms ROOMS]` runs the one that is written in a folder, as long
+as its input lasts.
 """
 
+import argparse
 import dataclasses
 import hashlib
 import json
@@ -24,6 +26,7 @@ from jaxslam.config import Config, load_config, to_yaml
 from jaxslam.datasets import Dataset, Subset, open_dataset
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset, with_true_masks
 from jaxslam.datasets.synthetic.sensor import SensorConfig
+from jaxslam.datasets.synthetic.stored import StoredRoom
 from jaxslam.detector_choice import model_file
 from jaxslam.download import sha256_of
 from jaxslam.errors import BenchmarkError, JaxSlamError
@@ -92,15 +95,24 @@ class Job:
         return cls(Clip(room=room, **clip), **fields | {"settings": tuple(fields["settings"])})
 
 
-def opened(clip: Clip, root: Path | None) -> tuple[Dataset, Path | None]:
+def opened(clip: Clip, root: Path | None, rooms: Path | None = None) -> tuple[Dataset, Path | None]:
     """What a job tracks, and the folder it is in, if it is a recording.
+
+    Args:
+        clip: What is asked for.
+        root: Folder in which recordings are looked for first.
+        rooms: Folder in which rendered frames are kept; all are rendered before anything is timed. `None` to render
+            them as they are asked for.
 
     Raises:
         BenchmarkError: If its recording is not on this machine.
     """
     folder = None
-    if clip.room is not None:
-        dataset: Dataset = SyntheticDataset(clip.room)
+    if clip.room is not None and rooms is not None:
+        dataset: Dataset = StoredRoom(clip.room, rooms / clip.name)
+        dataset.render_all()
+    elif clip.room is not None:
+        dataset = SyntheticDataset(clip.room)
     else:
         folder = find_recording(clip.recording, root)
         if folder is None:
@@ -122,8 +134,14 @@ def finished(job: Job, out: Path) -> dict[str, Any] | None:
         raise BenchmarkError(f"{folder}: expected the results of a run, got something unreadable: {problem}") from None
 
 
-def run_in_process(job: Job, out: Path, root: Path | None) -> dict[str, Any]:
+def run_in_process(job: Job, out: Path, root: Path | None, rooms: Path | None = None) -> dict[str, Any]:
     """Run a job in a process of its own.
+
+    Args:
+        job: What is run.
+        out: Folder of the suite's results.
+        root: Folder in which recordings are looked for first.
+        rooms: Folder in which rendered frames are kept for others of the suite.
 
     Returns:
         Its figures. If the process failed, `status` is `failed` and `problem` says how; that is kept in no file, so
@@ -133,7 +151,9 @@ def run_in_process(job: Job, out: Path, root: Path | None) -> dict[str, Any]:
     folder.mkdir(parents=True, exist_ok=True)
     (folder / RESULT).unlink(missing_ok=True)
     write_atomically(folder / _JOB, job.to_json().encode(), BenchmarkError)
-    command = [sys.executable, "-m", "jaxslam.benchmark.job", str(folder), *([] if root is None else [str(root)])]
+    command = [sys.executable, "-m", "jaxslam.benchmark.job", str(folder)]
+    for name, path in (("--root", root), ("--rooms", rooms)):
+        command += [] if path is None else [name, str(path)]
     reading, writing = os.pipe()  # which closes if this process ends, however it does
     try:
         done = subprocess.run(command, stdin=reading, capture_output=True, text=True, errors="replace", check=False)
@@ -153,7 +173,7 @@ def failed(job: Job, problem: str) -> dict[str, Any]:
     return _figures(job) | {"status": "failed", "problem": problem}
 
 
-def run_here(folder: Path, root: Path | None) -> None:
+def run_here(folder: Path, root: Path | None, rooms: Path | None) -> None:
     """Run the job that is written in a folder; its results go there.
 
     Raises:
@@ -161,7 +181,7 @@ def run_here(folder: Path, root: Path | None) -> None:
     """
     prefer_one_thread()
     job = Job.of_json((folder / _JOB).read_text())
-    whole, recording = opened(job.clip, root)
+    whole, recording = opened(job.clip, root, rooms)
     dataset, truth = with_true_masks(whole, job.config.semantics)
     flow_ms = flow_time_ms(dataset)
     pictures = RunPictures(len(dataset))
@@ -263,8 +283,13 @@ def _end_with_parent() -> None:
 
 def _main(arguments: Sequence[str]) -> None:
     _end_with_parent()
+    parser = argparse.ArgumentParser()
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--root", type=Path)
+    parser.add_argument("--rooms", type=Path)
+    chosen = parser.parse_args(arguments)
     try:
-        run_here(Path(arguments[0]), Path(arguments[1]) if len(arguments) > 1 else None)
+        run_here(chosen.folder, chosen.root, chosen.rooms)
     except JaxSlamError as error:
         sys.exit(f"error: {error}")
 

@@ -1,6 +1,8 @@
 """Runs of a suite: planned, spread over processes, and gone on with where they were broken off."""
 
 import json
+import shutil
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
@@ -15,6 +17,8 @@ from jaxslam.files import write_atomically
 from jaxslam.recordings import found_recordings
 
 RESULTS = "results.json"
+_ROOMS = ".rooms"
+"""Frames of rendered rooms, as long as there are runs that need them."""
 
 
 class Executor(Protocol):
@@ -146,6 +150,16 @@ class _Local:
     recordings: Collection[str]
 
     def run(self, jobs: Sequence[Job], out: Path) -> Iterator[tuple[Job, dict[str, Any]]]:
-        waiting = {self.pool.submit(run_in_process, job, out, self.root): job for job in jobs}
-        for future in as_completed(waiting):
-            yield waiting[future], future.result()
+        rooms = out / _ROOMS
+        shutil.rmtree(rooms, ignore_errors=True)  # of a suite that was killed
+        waiting = {self.pool.submit(run_in_process, job, out, self.root, rooms): job for job in jobs}
+        runs_left = Counter(job.clip.name for job in jobs)
+        try:
+            for future in as_completed(waiting):
+                job = waiting[future]
+                runs_left[job.clip.name] -= 1
+                if not runs_left[job.clip.name]:  # 0.3 GB for two seconds of a room
+                    shutil.rmtree(rooms / job.clip.name, ignore_errors=True)
+                yield job, future.result()
+        finally:
+            shutil.rmtree(rooms, ignore_errors=True)

@@ -124,6 +124,24 @@ def region_weights(
     return jnp.where(regions.num_pixels > 0, jnp.where(known, recovering, before), 1)
 
 
+def lasting_weights(
+    regions: Regions,
+    verdicts: Sequence[RegionVerdict],
+    before: Float[Array, " k"],
+    agreeing: Mask,
+    plan: RegionPlan,
+) -> Float[Array, " k"]:
+    """`(k,)` what becomes of verdicts on regions, what was said before being forgotten where it has proved wrong.
+
+    It has where it speaks against most of the points that agree on a pose now: somebody has carried the pose with him
+    for a moment, and the room would be left out until nothing is left to track by.
+    """
+    fresh, lasting = (region_weights(regions, verdicts, old, plan) for old in (jnp.ones_like(before), before))
+    one = jnp.ones_like(before[0])
+    left = [jnp.sum(agreeing & (of_points(weight, regions, one) >= 0.5)) for weight in (fresh, lasting)]
+    return jnp.where(2 * left[1] >= left[0], lasting, fresh)
+
+
 def moving_pixels(
     regions: Regions, weight: Float[Array, " k"], height: int, width: int, plan: RegionPlan
 ) -> Bool[Array, "h w"]:

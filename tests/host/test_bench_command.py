@@ -81,6 +81,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 class TestResults:
     def test_of_every_run(self, out: Path) -> None:
+        assert {path.name for path in out.iterdir()} == {"results.json", "report.md", "report.html", "room"}
         results = json.loads((out / "results.json").read_text())
         assert [(run["label"], run["seed"]) for run in results] == [
             ("static", 0), ("static", 1), ("default", 0), ("default", 1)
@@ -207,6 +208,7 @@ class TestGoingOn:
         main(["bench", suite, "--out", str(folder), "--resume"])
         assert {path: path.stat().st_mtime_ns for path in done} == before
         assert len(json.loads((folder / "results.json").read_text())) == 4
+        assert not (folder / ".rooms").exists()
 
 
 class TestTrouble:
@@ -237,7 +239,7 @@ class TestTrouble:
             main(["bench", "kitti_stereo", "--out", str(tmp_path / "out")])
         out, error = capsys.readouterr()
         assert ended.value.code == 1
-        assert error.strip() == "nothing could be run"
+        assert error.strip() == "error: nothing could be run"
         assert out.count("stereo input is not supported yet") == 1
         assert "Not run: kitti_00, kitti_01, " in out
         assert "11 recordings not run." in out

@@ -66,12 +66,17 @@ class TestCarried:
         assert changed(state, after) == {
             ".T_world_cam",
             ".points.X_world",
+            ".points.X_anchor",
             ".keyframes.T_world_cam",
             ".keyframes.X_world",
         }
         apart = between(np.asarray(after.T_world_cam.wxyz_xyz), compose(now, np.asarray(state.T_world_cam.wxyz_xyz)))
         np.testing.assert_allclose(apart, IDENTITY, atol=1e-6)
-        np.testing.assert_allclose(after.points.X_world, transform(now, np.asarray(state.points.X_world)), atol=3e-6)
+        for moved, old in (
+            (after.points.X_world, state.points.X_world),
+            (after.points.X_anchor, state.points.X_anchor),
+        ):
+            np.testing.assert_allclose(moved, transform(now, np.asarray(old)), atol=3e-6)
         for slot, by in enumerate(each):
             kept, old = after.keyframes, state.keyframes
             apart = between(np.asarray(kept.T_world_cam[slot]), compose(by, np.asarray(old.T_world_cam[slot])))

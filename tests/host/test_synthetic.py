@@ -14,7 +14,8 @@ from jaxslam.datasets.synthetic import SensorConfig, SyntheticConfig, SyntheticD
 from jaxslam.datasets.synthetic.camera_path import CAMERA_PATHS, LOOP_SECONDS, camera_path
 from jaxslam.datasets.synthetic.rigid import inverse, matrix_from_pose
 from jaxslam.datasets.synthetic.scene import ROOM_HALF_M
-from jaxslam.errors import ConfigError
+from jaxslam.datasets.synthetic.stored import StoredRoom
+from jaxslam.errors import ConfigError, DatasetError
 
 SMALL = SyntheticConfig(width=160, height=120, frames=40, people=2, boxes=1)
 
@@ -117,6 +118,23 @@ class TestRepeatability:
     def test_frame_does_not_depend_on_their_number(self, small):
         longer = SyntheticDataset(dataclasses.replace(SMALL, frames=400))
         assert fields_of(longer.render(7)) == fields_of(small.render(7))
+
+    def test_stored_frames_are_the_same(self, small, tmp_path, monkeypatch):
+        fields = [fields_of(small.render(index)) for index in range(4)]
+        config = dataclasses.replace(SMALL, frames=4)
+        StoredRoom(config, tmp_path / "a" / "room").render_all()
+        # From here on nothing is rendered.
+        monkeypatch.setattr(SyntheticDataset, "render", None)
+        stored = StoredRoom(config, tmp_path / "a" / "room")
+        assert [fields_of(stored.render(index)) for index in (0, 1, 2, -1)] == fields
+        assert stored[1].timestamp_ns == small.timestamps_ns[1]
+        with pytest.raises(IndexError):
+            stored.render(4)
+
+    def test_frames_that_cannot_be_stored(self, tmp_path):
+        (tmp_path / "file").write_text("")
+        with pytest.raises(DatasetError, match="file/room: cannot be made: Not a directory"):
+            StoredRoom(dataclasses.replace(SMALL, frames=1), tmp_path / "file" / "room").render_all()
 
     def test_seed_changes_everything(self, small):
         other = SyntheticDataset(dataclasses.replace(SMALL, seed=1)).render(0)

@@ -1,0 +1,138 @@
+"""What all cues of a plan say of the points and the regions of one frame, and what is left out of it for that."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxlie import SE3
+from jaxslam_kernels.camera import to_pixels, without_distortion
+from jaxslam_kernels.types import Flag, Mask, Pixels, Weights
+from jaxtyping import Array, Bool, Float
+
+from jaxslam.dynamics.cue import Scene, Verdict, combined
+from jaxslam.dynamics.regions import RegionMemory, Regions, lasting_weights, moving_pixels, of_points
+from jaxslam.observe import View, observe_points
+from jaxslam.state import TrackParams, TrackPlan, TrackState
+
+
+class PointsSeen(NamedTuple):
+    """The points of a state in a frame, `(n,)` each.
+
+    Attributes:
+        uv: `(2, n)` where they are, pixels.
+        followed: Which are there under no mask.
+        masked: Which are there under one.
+        agreeing: Which of those that are followed agree with the coarse pose.
+        trust: How much each counts, before anything is said of it.
+    """
+
+    uv: Pixels
+    followed: Mask
+    masked: Mask
+    agreeing: Mask
+    trust: Weights
+
+
+class Judged(NamedTuple):
+    """What cues say, and the pixels that are left out for it.
+
+    Attributes:
+        verdicts: Of each cue, in the order of `TrackPlan.cues`.
+        regions: The surfaces of the frame, if something asks for them.
+        memory: What the next frame has of them.
+        remembered: `(n,)` 0 for points in regions that moved a moment ago.
+        moving: Pixels of regions that move.
+    """
+
+    verdicts: tuple[Verdict, ...] = ()
+    regions: Regions | None = None
+    memory: RegionMemory | None = None
+    remembered: Weights | None = None
+    moving: Bool[Array, "h w"] | None = None
+
+    def weights(self, weight: Weights) -> Weights:
+        """Weights of the points, times those of the cues, and 0 in regions that moved a moment ago."""
+        weight = combined(self.verdicts, weight)
+        return weight if self.remembered is None else weight * self.remembered
+
+    def counts(self) -> Mask | Flag:
+        """`(n,)` which points no cue says anything against."""
+        return self.weights(jnp.ones(())) > 0
+
+    def without_movers(self, view: View) -> View:
+        """The frame with nothing trusted where regions move."""
+        if self.moving is None:
+            return view
+        return view._replace(frame=view.frame._replace(ignore=view.frame.ignore | self.moving))
+
+    def at_rest(self, uv: Pixels) -> Mask:
+        """`(n,)` which pixels are in no region that moves.
+
+        New points are taken there all the same, and are witnesses in the next frame: without them nothing is known of
+        the region then, and what moves passes for a room in every other frame.
+        """
+        if self.moving is None:
+            return jnp.ones(uv.shape[1], bool)
+        column, row = jnp.round(lax.stop_gradient(uv)).astype(jnp.int32)
+        return ~self.moving.at[row, column].get(mode="fill", fill_value=False)
+
+
+def judge_points(
+    state: TrackState,
+    view: View,
+    seen: PointsSeen,
+    regions: Regions | None,
+    coarse: SE3,
+    twist: Float[Array, "6"],
+    params: TrackParams,
+    plan: TrackPlan,
+) -> Judged:
+    """What cues say of the points, given the coarse pose, which most of those at rest have made."""
+    verdicts = _verdicts(state, view, seen, regions, coarse, twist, params, plan)
+    if regions is None or plan.regions is None:
+        return Judged(verdicts)
+    of_regions = [verdict.regions for verdict in verdicts if verdict.regions is not None]
+    if not of_regions:
+        return Judged(verdicts, regions, RegionMemory(regions.centers, state.regions.weight))
+    weight = lasting_weights(regions, of_regions, state.regions.weight, seen.agreeing, plan.regions)
+    remembered = of_points((weight >= 0.5).astype(weight.dtype), regions, jnp.ones_like(weight[0]))
+    height, width = view.depth.shape
+    moving = moving_pixels(regions, weight, height, width, plan.regions)
+    return Judged(verdicts, regions, RegionMemory(regions.centers, weight), remembered, moving)
+
+
+def _verdicts(
+    state: TrackState,
+    view: View,
+    seen: PointsSeen,
+    regions: Regions | None,
+    coarse: SE3,
+    twist: Float[Array, "6"],
+    params: TrackParams,
+    plan: TrackPlan,
+) -> tuple[Verdict, ...]:
+    if not plan.cues:
+        return ()
+    points, ideal = state.points, without_distortion(params.intrinsics)
+    observed = observe_points(points.X_world, seen.uv, coarse, twist, view, params)
+    height, width = view.frame.image.shape
+    scene = Scene(
+        uv_before=to_pixels(ideal, points.xy),
+        uv=to_pixels(ideal, observed.xy),
+        followed=seen.followed,
+        masked=seen.masked,
+        agrees=seen.agreeing,
+        weight=seen.trust,
+        depth_before=points.depth,
+        depth=observed.depth,
+        X_world=points.X_world,
+        X_anchor=points.X_anchor,
+        T_world_before=state.T_world_cam,
+        T_world_cam=coarse,
+        intrinsics=ideal,
+        size=jnp.array([width, height], seen.uv.dtype),
+        key=jax.random.fold_in(jax.random.fold_in(state.key, -1 - state.frame), 1),
+        regions=regions,
+    )
+    return tuple(cue(scene, chosen) for cue, chosen in zip(plan.cues, params.cues, strict=True))
