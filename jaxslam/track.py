@@ -75,6 +75,20 @@ class _Outcome(NamedTuple):
     inlier_ratio: Scalar
 
 
+class _Kept(NamedTuple):
+    """The points of the last frame as they are in this one: those at rest, and those on what moves.
+
+    Attributes:
+        points: Both.
+        tracked: `(n,)` those at rest.
+        witnesses: `(n,)` those on what moves.
+    """
+
+    points: TrackedPoints
+    tracked: Mask
+    witnesses: Mask
+
+
 def init_state(
     height: int,
     width: int,
@@ -197,7 +211,8 @@ def track_followed(
     looked_up = look_up(state.keyframes, coarse, twist, judged.without_movers(view), params, plan)
     refined, inliers = _refine(state, view, uv, jnp.where(agreeing, trust, 0), looked_up, coarse, twist, params)
     verdict = _judge(state, view, refined, followed & judged.counts(), inliers, params)
-    kept = _update_points(state, view, uv, inliers, refined.T_world_cam, params)
+    witnesses = judged.witnesses(uv, state.points.anchor_age, followed & ~inliers)
+    kept = _update_points(state, view, uv, inliers, witnesses, refined.T_world_cam, params)
     new_state, output = _conclude(state, view, kept, refined, looked_up, verdict, judged, params, plan)
     return new_state, output._replace(verdicts=judged.verdicts, regions=judged.regions, moving=judged.moving)
 
@@ -324,11 +339,19 @@ def _code(value: enum.IntEnum) -> Code:
 
 
 def _update_points(
-    state: TrackState, view: View, uv: Pixels, inliers: Mask, T_world_cam: SE3, params: TrackParams
-) -> TrackedPoints:
+    state: TrackState,
+    view: View,
+    uv: Pixels,
+    inliers: Mask,
+    witnesses: Mask,
+    T_world_cam: SE3,
+    params: TrackParams,
+) -> _Kept:
     """Keep the inliers, and fuse the depth measured now into where they are.
 
     A point counts as at most `_MAX_FUSED` measurements, so that an early error of the pose is forgotten.
+
+    Witnesses, on what moves, are kept too, measured anew in every frame.
     """
     points = state.points
     twist = _twist(state.T_world_cam, T_world_cam, view.elapsed_s)
@@ -342,26 +365,31 @@ def _update_points(
     X_world = to_world(T_world_cam, fused)
     cap = _MAX_FUSED * information
     X_world = jnp.where(agrees[None, :], X_world, points.X_world)
+    information = jnp.where(agrees, jnp.minimum(points.information + information, cap), points.information)
+    witnesses &= seen.depth > 0
+    X_world = jnp.where(witnesses[None, :], to_world(T_world_cam, seen.in_camera()), X_world)
+    there = inliers | witnesses
     anchored = points.anchor_age.astype(X_world.dtype) < params.anchor_frames
-    return TrackedPoints(
-        uv=jnp.where(inliers[None, :], uv, points.uv),
-        xy=jnp.where(inliers[None, :], seen.xy, points.xy),
-        depth=jnp.where(inliers, seen.depth, points.depth),
+    updated = TrackedPoints(
+        uv=jnp.where(there[None, :], uv, points.uv),
+        xy=jnp.where(there[None, :], seen.xy, points.xy),
+        depth=jnp.where(there, seen.depth, points.depth),
         X_world=X_world,
         X_anchor=jnp.where(anchored[None, :], points.X_anchor, X_world),
-        information=jnp.where(agrees, jnp.minimum(points.information + information, cap), points.information),
+        information=jnp.where(witnesses, 1 / jnp.square(sigma), information),
         weight=points.weight,
-        age=points.age + inliers.astype(jnp.int32),
+        age=jnp.where(witnesses, 0, points.age + inliers.astype(jnp.int32)),
         anchor_age=jnp.where(anchored, points.anchor_age + 1, 0),
         id=points.id,
-        valid=points.valid & inliers,
+        valid=points.valid & there,
     )
+    return _Kept(updated, points.valid & inliers, witnesses)
 
 
 def _conclude(
     state: TrackState,
     view: View,
-    kept: TrackedPoints,
+    kept: _Kept,
     refined: PoseRefinement,
     looked_up: LookedUp,
     verdict: _Outcome,
@@ -378,7 +406,7 @@ def _conclude(
     )
     pose = choose(state.T_world_cam, refined.T_world_cam)
     twist = choose(jnp.zeros_like(state.twist), _twist(state.T_world_cam, pose, view.elapsed_s))
-    points = choose(state.points._replace(valid=state.points.valid & held), kept)
+    points = choose(state.points._replace(valid=state.points.valid & held), kept.points)
     since_keyframe_s = state.since_keyframe_s + jnp.maximum(view.frame.dt_s, 0)
     reason_to_keep = lambda started: _keyframe_reason(
         state, kept, looked_up, verdict, started, since_keyframe_s, params
@@ -387,7 +415,9 @@ def _conclude(
     may = few if plan.new_points == "always" else few & (reason_to_keep(start) > 0)
     points = lax.cond(
         start | (may & ~verdict.lost),
-        lambda p: refill(p, state.next_id, view, pose, twist, params, plan),
+        lambda p: refill(
+            p, state.next_id, judged.without_watched(view, kept.witnesses, plan), pose, twist, params, plan
+        ),
         lambda p: p,
         points,
     )
@@ -425,13 +455,13 @@ def _conclude(
         covariance=jnp.where(verdict.lost, jnp.eye(6, dtype=twist.dtype) * _UNKNOWN_VARIANCE, refined.covariance),
         status=status,
         reason=reason,
-        num_inliers=jnp.where(verdict.lost, 0, jnp.sum(kept.valid)),
+        num_inliers=jnp.where(verdict.lost, 0, jnp.sum(kept.tracked)),
         inlier_ratio=jnp.where(verdict.lost, 0, verdict.inlier_ratio),
         num_looked_up=jnp.sum(found.weight > 0),
         residual_px=refined.residual_scale * params.pixel_sigma,
         uv=points.uv,
         weights=jnp.where(points.valid & at_rest & ~held, points.weight, 0),
-        tracked=kept.valid & ~verdict.lost,
+        tracked=kept.tracked & ~verdict.lost,
         X_world=points.X_world,
         id=points.id,
         looked_up=found,
@@ -443,7 +473,7 @@ def _conclude(
 
 def _keyframe_reason(
     state: TrackState,
-    kept: TrackedPoints,
+    kept: _Kept,
     looked_up: LookedUp,
     verdict: _Outcome,
     started: Flag,
@@ -451,11 +481,11 @@ def _keyframe_reason(
     params: TrackParams,
 ) -> Code:
     """Why to keep the frame, if at all."""
-    old = kept.valid & (kept.age > state.since_keyframe)
-    num_kept = jnp.sum(kept.valid, dtype=since_keyframe_s.dtype)
+    old = kept.tracked & (kept.points.age > state.since_keyframe)
+    num_kept = jnp.sum(kept.tracked, dtype=since_keyframe_s.dtype)
     share = jnp.sum(old, dtype=since_keyframe_s.dtype) / jnp.maximum(num_kept, 1)
     tracked = ~verdict.lost
-    enough = params.keyframe_points_below * kept.valid.shape[0]
+    enough = params.keyframe_points_below * kept.tracked.shape[0]
     few, hardly_any = tracked & (num_kept < enough), num_kept < 0.5 * enough
     causes = (
         (started, KeyframeReason.STARTED),

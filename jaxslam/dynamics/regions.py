@@ -15,6 +15,7 @@ from jaxslam_kernels.kmeans import kmeans
 from jaxslam_kernels.types import DepthImage, Mask, Points, Weights
 from jaxtyping import Array, Bool, Float, Int, Key
 
+_PER_LIMIT = 0.25
 Centers = Float[Array, "3 k"]
 """Of regions, in the axes of the camera, metres; not finite where none is known."""
 
@@ -26,7 +27,8 @@ class RegionPlan(NamedTuple):
         num_regions: How many regions.
         step_px: One pixel of so many is looked at, in rows and in columns.
         num_steps: Steps of K-means a frame, from where the last frame left off.
-        recover_frames: Frames without motion after which a region that moved counts again: what is carried pauses.
+        recover_frames: Frames without motion after which a region that moved counts again, if it moved for long: what
+            is carried pauses.
     """
 
     num_regions: int = 24
@@ -70,7 +72,7 @@ class RegionMemory(NamedTuple):
 
     Attributes:
         centers: `(3, k)` see `Regions`.
-        weight: `(k,)` 0 for what moved, 1 for what has been at rest for long; below one half it moves.
+        weight: `(k,)` 0 for what has moved much, 1 for what has been at rest for long; below one half it moves.
     """
 
     centers: Centers
@@ -108,20 +110,42 @@ def find_regions(
     return Regions(found.label.reshape(sampled.shape), _nearest(X_cam, centers), centers, found.counts)
 
 
-def region_weights(
+def region_weights(verdicts: Sequence[RegionVerdict]) -> Float[Array, " k"]:
+    """`(k,)` the product of the weights of verdicts on the same regions, at least one."""
+    weight = verdicts[0].weight
+    for verdict in verdicts[1:]:
+        weight = weight * verdict.weight
+    return weight
+
+
+def remembered_weights(
     regions: Regions, verdicts: Sequence[RegionVerdict], before: Float[Array, " k"], plan: RegionPlan
 ) -> Float[Array, " k"]:
-    """`(k,)` what becomes of verdicts on regions: the product of their weights, but not much more than before.
+    """`(k,)` what is remembered of regions: below one half, one moves whatever is said of it now.
 
     What is carried stops now and then, and a box before the camera that is taken for a wall while it does takes the
-    pose with it when it goes on. Where no verdict is known the weight stays: nobody has seen the region stop. A region
+    pose with it when it goes on. So evidence is summed up (the cumulative sum of Page, "Continuous inspection
+    schemes", Biometrika 1954): what is beyond the limit, in limits, takes a quarter of that away, and a frame without
+    motion gives little back. Where no verdict is known the weight stays: nobody has seen the region stop. A region
     without pixels is gone.
+
+    With one verdict enough, a region at rest that is beyond the limit in one frame of ten, where the pose is not that
+    precise, was left out for good: 41 % of what is at rest in a kitchen with people, now 17 %, and 11 % of a rendered
+    room with boxes, now 2 %. What moves is missed as rarely in the room, and in 8 % of the kitchen instead of 1 %.
+
+    Args:
+        regions: Of the frame.
+        verdicts: On them, at least one.
+        before: What was remembered in the last frame.
+        plan: Static.
     """
-    weight, known = jnp.ones_like(before), jnp.zeros(before.shape, bool)
+    evidence, known = jnp.zeros_like(before), jnp.zeros(before.shape, bool)
     for verdict in verdicts:
-        weight, known = weight * verdict.weight, known | verdict.known
-    recovering = jnp.minimum(weight, before + 0.5 / plan.recover_frames)
-    return jnp.where(regions.num_pixels > 0, jnp.where(known, recovering, before), 1)
+        evidence = jnp.maximum(evidence, jnp.where(verdict.known, verdict.evidence, 0))
+        known = known | verdict.known
+    beyond = lax.stop_gradient(evidence) - 1
+    change = jnp.where(beyond > 0, -_PER_LIMIT * beyond, 0.5 / plan.recover_frames)
+    return jnp.where(regions.num_pixels > 0, jnp.where(known, jnp.clip(before + change, 0, 1), before), 1)
 
 
 def lasting_weights(
@@ -131,14 +155,21 @@ def lasting_weights(
     agreeing: Mask,
     plan: RegionPlan,
 ) -> Float[Array, " k"]:
-    """`(k,)` what becomes of verdicts on regions, what was said before being forgotten where it has proved wrong.
+    """`remembered_weights`, all before this frame forgotten where it has proved wrong.
 
     It has where it speaks against most of the points that agree on a pose now: somebody has carried the pose with him
     for a moment, and the room would be left out until nothing is left to track by.
+
+    Args:
+        regions: Of the frame.
+        verdicts: On them, at least one.
+        before: What was remembered in the last frame.
+        agreeing: `(n,)` which points agree on a pose now.
+        plan: Static.
     """
-    fresh, lasting = (region_weights(regions, verdicts, old, plan) for old in (jnp.ones_like(before), before))
-    one = jnp.ones_like(before[0])
-    left = [jnp.sum(agreeing & (of_points(weight, regions, one) >= 0.5)) for weight in (fresh, lasting)]
+    fresh, lasting = (remembered_weights(regions, verdicts, old, plan) for old in (jnp.ones_like(before), before))
+    now, one = region_weights(verdicts), jnp.ones_like(before[0])
+    left = [jnp.sum(agreeing & (of_points(weight, regions, one) >= 0.5)) for weight in (now, jnp.minimum(now, lasting))]
     return jnp.where(2 * left[1] >= left[0], lasting, fresh)
 
 

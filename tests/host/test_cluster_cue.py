@@ -20,9 +20,11 @@ from jaxslam.dynamics.regions import (
     RegionVerdict,
     even_votes,
     find_regions,
+    lasting_weights,
     moving_pixels,
     no_regions,
     region_weights,
+    remembered_weights,
 )
 
 HEIGHT, WIDTH = 118, 158
@@ -92,19 +94,40 @@ class TestRegions:
         assert moving.any()
         assert (box_before_wall()[moving] == 1).mean() > 0.9
 
-    def test_verdicts_become_one_and_are_remembered(self) -> None:
+    def test_verdicts_become_one(self) -> None:
+        one, known = jnp.array([0.5, 1.0, 0.0]), jnp.array([True, True, True])
+        verdicts = [RegionVerdict(one, jnp.zeros(3), known), RegionVerdict(jnp.array([0.5, 1.0, 1.0]), one, known)]
+        assert region_weights(verdicts[:1]).tolist() == [0.5, 1.0, 0.0]
+        assert region_weights(verdicts).tolist() == [0.25, 1.0, 0.0]
+
+    def test_evidence_is_summed_up(self) -> None:
+        """In limits beyond the limit; a little is given back in frames without; the rest stays as it is."""
         found = divided(box_before_wall())
         found = found._replace(num_pixels=jnp.array([9, 9, 9, 9, 0, 9]))
-        known = jnp.array([True, True, False, False, False, False])
-        first = RegionVerdict(jnp.array([0.5, 1.0, 1, 1, 1, 1]), jnp.zeros(6), known)
-        second = RegionVerdict(jnp.array([0.5, 1.0, 1, 0, 1, 1]), jnp.zeros(6), known.at[3].set(True))
-        before = jnp.array([1.0, 0.0, 0.2, 1.0, 0.0, 1.0])
+        known = jnp.array([True, True, True, False, True, True])
+        first = RegionVerdict(jnp.ones(6), jnp.array([2.0, 0.9, 1.4, 9, 0, 9]), known)
+        second = RegionVerdict(jnp.ones(6), jnp.array([1.5, 0.2, 1.6, 9, 0, 0]), known.at[3].set(False))
+        before = jnp.array([1.0, 0.0, 0.6, 0.2, 0.0, 1.0])
         plan = PLAN._replace(recover_frames=5)
-        weight = region_weights(found, [first, second], before, plan)
-        assert weight.tolist() == pytest.approx([0.25, 0.1, 0.2, 0, 1, 1])
+        weight = remembered_weights(found, [first, second], before, plan)
+        assert weight.tolist() == pytest.approx([0.75, 0.1, 0.45, 0.2, 1, 0])
+        at_rest = RegionVerdict(jnp.ones(6), jnp.full(6, 0.9), known)
         for _ in range(4):
-            weight = region_weights(found, [second], weight, plan)
-        assert weight.tolist() == pytest.approx([0.5, 0.5, 0.2, 0, 1, 1])
+            weight = remembered_weights(found, [at_rest], weight, plan)
+        assert weight.tolist() == pytest.approx([1, 0.5, 0.85, 0.2, 1, 0.4])
+
+    def test_what_proves_wrong_is_forgotten(self) -> None:
+        """Where memory is against more than half of what agrees on a pose and is not said to move now."""
+        of_point = jnp.array([0] * 6 + [1] * 4 + [2] * 9 + [-1])
+        found = divided(box_before_wall())._replace(of_point=of_point, num_pixels=jnp.full(6, 9))
+        evidence = jnp.array([0.0, 0.0, 3.0, 0, 0, 0])
+        verdict = RegionVerdict((evidence <= 1).astype(float), evidence, jnp.ones(6, bool))
+        last = lambda before, agreeing=True: lasting_weights(
+            found, [verdict], jnp.array(before), jnp.full(20, agreeing), PLAN._replace(recover_frames=5)
+        ).tolist()
+        assert last([1.0, 0, 1, 1, 1, 1]) == pytest.approx([1, 0.1, 0.5, 1, 1, 1])
+        assert last([0.0, 1, 0, 1, 1, 1]) == pytest.approx([1, 1, 0.5, 1, 1, 1])
+        assert last([0.0, 1, 0, 1, 1, 1], False) == pytest.approx([0.1, 1, 0, 1, 1, 1])
 
     def test_even_votes(self) -> None:
         """Ten points on the box and two on the wall, of which one has half the weight; one in no region."""

@@ -11,7 +11,9 @@ from small_scene import PLAN, QUICK_COMPILE, TRACK, WIDTH, at, clip, new_state, 
 from jaxslam.config import Config, DynamicsConfig, load_config
 from jaxslam.dynamics.cue import Scene, Verdict, judge
 from jaxslam.dynamics.known import with_cue_params, with_cues
+from jaxslam.dynamics.regions import Regions
 from jaxslam.errors import ConfigError
+from jaxslam.judging import Judged
 from jaxslam.slam import Slam
 from jaxslam.state import TrackOutput, TrackPlan, TrackState, TrackStatus
 from jaxslam.track import track_step
@@ -45,6 +47,13 @@ class TestOwnCue:
         assert (np.asarray(output.uv)[0, kept] > WIDTH / 2 - 2).all()
         assert set(np.asarray(verdict.weight)[np.asarray(verdict.known)].tolist()) == {0.0, 1.0}
 
+    def test_that_would_lose_the_frame_is_not_heard(self) -> None:
+        _, without = tracked(PLAN, ())
+        _, output = tracked(PLAN._replace(cues=(left_of,)), (jnp.asarray(float(10 * WIDTH)),))
+        assert int(output.status) == TrackStatus.OK
+        np.testing.assert_allclose(output.T_world_cam.wxyz_xyz, without.T_world_cam.wxyz_xyz, atol=1e-6)
+        assert not np.asarray(output.verdicts[0].weight)[np.asarray(output.verdicts[0].known)].any()
+
     def test_that_lets_all_pass_changes_nothing(self) -> None:
         _, without = tracked(PLAN, ())
         _, passed = tracked(PLAN._replace(cues=(left_of,)), (jnp.asarray(0.0),))
@@ -62,6 +71,23 @@ class TestOwnCue:
         for limit_px in (10.0, 20.0):
             tracked(PLAN._replace(cues=(counted,)), (jnp.asarray(limit_px),))
         assert traces == 1
+
+
+class TestWitnesses:
+    def test_some_of_each_region_that_moves(self) -> None:
+        """Old ones first; none where nothing moves, and none of the points that are left out for another reason."""
+        num = 40
+        of_point = np.repeat([0, 1, -1], [30, 8, 2])
+        pixels = np.zeros((4, 40), bool)
+        pixels[:, :34] = True  # the first region, and four points of the second
+        regions = Regions(jnp.zeros((1, 1), int), jnp.asarray(of_point), jnp.zeros((3, 2)), jnp.ones(2, int))
+        judged = Judged((), regions, moving=jnp.asarray(pixels))
+        uv = jnp.stack([jnp.arange(num, dtype=float), jnp.ones(num)])
+        age = jnp.asarray(np.where((np.arange(num) >= 20) & (np.arange(num) < 27), 3, 0))
+        asked = jnp.ones(num, bool).at[30].set(False)
+        chosen = np.flatnonzero(np.asarray(judged.witnesses(uv, age, asked)))
+        assert chosen.tolist() == [0, 1, 2, *range(20, 27), 31, 32, 33]
+        assert not np.asarray(judged._replace(moving=None).witnesses(uv, age, asked)).any()
 
 
 class TestSettings:
