@@ -75,9 +75,7 @@ class Judged(NamedTuple):
 
     def without_movers(self, view: View) -> View:
         """The frame with nothing trusted where regions move."""
-        if self.moving is None:
-            return view
-        return view._replace(frame=view.frame._replace(ignore=view.frame.ignore | self.moving))
+        return view if self.moving is None else view.without(self.moving)
 
     def witnesses(self, uv: Pixels, age: Int[Array, " n"], points: Mask) -> Mask:
         """`(n,)` which points, now at `uv`, are to be followed in regions that move, to see whether they go on.
@@ -102,7 +100,7 @@ class Judged(NamedTuple):
         watched = jnp.sum(self._in_regions(witnesses), axis=1) >= _ENOUGH_WITNESSES
         height, width = view.depth.shape
         pixels = moving_pixels(self.regions, 1.0 - watched.astype(view.depth.dtype), height, width, plan.regions)
-        return view._replace(frame=view.frame._replace(ignore=view.frame.ignore | pixels))
+        return view.without(pixels)
 
     def _in_regions(self, points: Mask) -> Bool[Array, "k n"]:
         assert self.regions is not None
@@ -132,28 +130,29 @@ def judge_points(
     plan: TrackPlan,
 ) -> Judged:
     """What cues say of the points, given the coarse pose, which most of those at rest have made."""
-    judged = _judged(state, view, seen, regions, coarse, twist, params, plan)
+    verdicts = _verdicts(state, view, seen, regions, coarse, twist, params, plan)
+    judged = _with_regions(verdicts, regions, state.regions.weight, view, seen.agreeing, plan)
+    if not verdicts:
+        return judged
     left = jnp.sum(seen.agreeing & (judged.weights(seen.trust) > 0), dtype=seen.trust.dtype)
     return judged._replace(heard=left >= params.min_inliers)
 
 
-def _judged(
-    state: TrackState,
-    view: View,
-    seen: PointsSeen,
+def _with_regions(
+    verdicts: tuple[Verdict, ...],
     regions: Regions | None,
-    coarse: SE3,
-    twist: Float[Array, "6"],
-    params: TrackParams,
+    before: Float[Array, " k"],
+    view: View,
+    agreeing: Mask,
     plan: TrackPlan,
 ) -> Judged:
-    verdicts = _verdicts(state, view, seen, regions, coarse, twist, params, plan)
+    """Verdicts, and what becomes of those on regions, given what was remembered before."""
     if regions is None or plan.regions is None:
         return Judged(verdicts)
     of_regions = [verdict.regions for verdict in verdicts if verdict.regions is not None]
     if not of_regions:
-        return Judged(verdicts, regions, RegionMemory(regions.centers, state.regions.weight))
-    weight = lasting_weights(regions, of_regions, state.regions.weight, seen.agreeing, plan.regions)
+        return Judged(verdicts, regions, RegionMemory(regions.centers, before))
+    weight = lasting_weights(regions, of_regions, before, agreeing, plan.regions)
     remembered = of_points((weight >= 0.5).astype(weight.dtype), regions, jnp.ones_like(weight[0]))
     height, width = view.depth.shape
     moving = moving_pixels(regions, jnp.minimum(weight, region_weights(of_regions)), height, width, plan.regions)

@@ -10,7 +10,7 @@ from jaxslam_kernels.image import Pyramid
 from jaxslam_kernels.rolling_shutter import as_if_at_once, image_velocity, row_time
 from jaxslam_kernels.transform import to_camera
 from jaxslam_kernels.types import DepthImage, Pixels, Points, Scalar, Weights
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxslam.frame_arrays import FrameArrays
 from jaxslam.state import TrackParams
@@ -30,6 +30,10 @@ class View(NamedTuple):
     pyramid: Pyramid
     depth: DepthImage
     elapsed_s: Scalar
+
+    def without(self, pixels: Bool[Array, "h w"]) -> "View":
+        """The same frame with these pixels to be ignored too."""
+        return self._replace(frame=self.frame._replace(ignore=self.frame.ignore | pixels))
 
 
 class Observed(NamedTuple):

@@ -31,7 +31,7 @@ class StoredRoom(SyntheticDataset):
             DatasetError: If it cannot be kept.
         """
         index = range(len(self))[index]
-        path = self._folder / f"{index}.npz"
+        path = self._path(index)
         if path.exists():
             with np.load(path) as arrays:
                 return SyntheticFrame(int(self.timestamps_ns[index]), **arrays)
@@ -48,5 +48,8 @@ class StoredRoom(SyntheticDataset):
     def render_all(self) -> None:
         """Render what is not there yet, so that no time taken later is that of rendering."""
         for index in range(len(self)):
-            if not (self._folder / f"{index}.npz").exists():
+            if not self._path(index).exists():
                 self.render(index)
+
+    def _path(self, index: int) -> Path:
+        return self._folder / f"{index}.npz"
