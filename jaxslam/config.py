@@ -137,7 +137,7 @@ class SemanticsConfig(Checked):
     """Detections below this score are dropped."""
     threads: Annotated[int, Range(at_least=1, at_most=64)] = 1
     """Threads the network may use."""
-    frames: Literal["every", "keyframes"] = "every"
+    frames: Literal["every", "keyframes"] = "keyframes"
     """What the network looks at: every frame it has time for, to make masks of all, or `keyframes` alone: what may move
     then leaves keyframe and map when it is found, and frames have no mask of it (TRS-SLAM)."""
     latency_frames: Annotated[int, Range(at_least=0, at_most=100)] = 2
@@ -173,8 +173,8 @@ class EpipolarCueConfig(Checked):
     """Points closer to the border of the picture are not judged."""
     ransac_px: Annotated[float, Positive] = 0.5
     """Distance up to which a point supports a fundamental matrix."""
-    num_hypotheses: Annotated[int, Range(at_least=8, at_most=4096)] = 128
-    """Fundamental matrices tried a frame."""
+    num_hypotheses: Annotated[int, Range(at_least=8, at_most=4096)] = 32
+    """Fundamental matrices tried a frame, besides that of the coarse motion of the camera."""
 
 
 @dataclass(frozen=True)
@@ -191,11 +191,11 @@ class ClusterCueConfig(Checked):
     """Frames without motion after which a surface that moved counts again."""
     times_mean: Annotated[float, Positive] = 1.5
     """A surface moves if its mean error is beyond so many times that of all points."""
-    least_px: Annotated[float, Range(at_least=0)] = 1.4
+    least_px: Annotated[float, Range(at_least=0)] = 1.75
     """A surface with a root mean squared error below is at rest."""
     robust_px: Annotated[float, Positive] = 2.45
     """Errors beyond count hardly more; 95 % of those with a standard deviation of a pixel are below."""
-    fewest: Annotated[int, Range(at_least=1)] = 3
+    fewest: Annotated[int, Range(at_least=1)] = 6
     """Least number of points of which a mean is taken."""
     as_published: bool = False
     """Take the mean over all points, not over those that agree with the pose."""
@@ -221,15 +221,15 @@ _CueName = Literal["trajectory", "epipolar", "clusters"]
 class DynamicsConfig(Checked):
     """Finding what moves without a network."""
 
-    newcomers: bool = True
+    newcomers: bool = False
     """Leave out what has come before surfaces that were seen earlier: people, doors, things that are carried."""
-    cues: tuple[_CueName, ...] = ()
+    cues: tuple[_CueName, ...] = ("clusters",)
     """What else tells points that move, each with a veto."""
     reach_px: Annotated[int, Range(at_least=0, at_most=100)] = 12
     """How far around a point that moves by its cues the map gets nothing, on surfaces as far away as it is."""
-    even_votes: bool = False
-    """Give no surface more of a say in the pose than an even share: whoever carries a large box has most of the points,
-    and the room behind it most of the surfaces. They are those of `clusters`."""
+    even_votes: bool = True
+    """Give no surface more of a say than an even share where the pose is sought: whoever carries a large box has most
+    of the points, and the room behind it most of the surfaces. They are those of `clusters`."""
     temperature: Annotated[float, Range(at_least=0)] = 0.0
     """Of the limits of cues: 0 compares and drops; above, points count less the further they are beyond."""
     trajectory: TrajectoryCueConfig = field(default_factory=TrajectoryCueConfig)

@@ -206,7 +206,7 @@ def track_followed(
     twist = _twist(state.T_world_cam, coarse, view.elapsed_s)
     points = PointsSeen(uv, followed, found & masked, agreeing, trust)
     judged = judge_points(state, view, points, regions, coarse, twist, params, plan)
-    trust = judged.weights(votes)
+    trust = judged.weights(trust)
     agreeing &= trust > 0
     looked_up = look_up(state.keyframes, coarse, twist, judged.without_movers(view), params, plan)
     refined, inliers = _refine(state, view, uv, jnp.where(agreeing, trust, 0), looked_up, coarse, twist, params)

@@ -11,8 +11,11 @@ import math
 
 import jax.numpy as jnp
 from jax import lax
+from jaxlie import SE3
 from jaxtyping import Array, Bool, Float
 
+from jaxslam_kernels.camera import Intrinsics
+from jaxslam_kernels.transform import between
 from jaxslam_kernels.types import Pixels, Weights
 
 _CUBIC_STEPS = 2  # after the closed form, which float32 leaves short of a few digits
@@ -62,6 +65,27 @@ def sampson_squared(F: Matrices, before: Pixels, after: Pixels) -> Float[Array, 
     x, y = a * u + d * v + g, b * u + e * v + h
     error = u * X + v * Y + Z
     return error * error / jnp.maximum(X * X + Y * Y + x * x + y * y, LEAST_SLOPE)
+
+
+def fundamental_of_poses(T_world_before: SE3, T_world_after: SE3, intrinsics: Intrinsics) -> Float[Array, "3 3"]:
+    """The fundamental matrix of two poses of one camera, `K⁻ᵀ [t]ₓ R K⁻¹`; zero where the camera only turned.
+
+    Source: Hartley and Zisserman 2004, equation 9.12.
+
+    Args:
+        T_world_before: Of the first view.
+        T_world_after: Of the second view.
+        intrinsics: The camera; lens distortion is left out.
+    """
+    T_after_before = between(T_world_after, T_world_before)
+    tx, ty, tz = T_after_before.translation()
+    zero, one = jnp.zeros_like(tx), jnp.ones_like(tx)
+    cross = jnp.stack([jnp.stack([zero, -tz, ty]), jnp.stack([tz, zero, -tx]), jnp.stack([-ty, tx, zero])])
+    fx, fy, cx, cy = intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy
+    rays = jnp.stack(
+        [jnp.stack([1 / fx, zero, -cx / fx]), jnp.stack([zero, 1 / fy, -cy / fy]), jnp.stack([zero, zero, one])]
+    )
+    return rays.T @ cross @ T_after_before.rotation().as_matrix() @ rays
 
 
 def seven_point(

@@ -23,7 +23,6 @@ from jaxslam_kernels.types import Code, Mask, Pixels, Scalar, Weights
 
 SAMPLE_SIZE = 7
 
-_IMPROVING_STEPS = 12
 _SIDEWAYS = 0.5**0.5 * np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # where there is no hypothesis
 
 
@@ -69,6 +68,8 @@ def ransac_fundamental(
     threshold_px: Scalar | float = 1.0,
     num_hypotheses: int = 640,
     num_improved: int = 8,
+    improving_steps: int = 12,
+    initial: Matrix | None = None,
     min_inliers: int = 15,
     max_steps: int = 25,
 ) -> FundamentalResult:
@@ -87,6 +88,9 @@ def ransac_fundamental(
         num_hypotheses: How many samples are drawn, static.
         num_improved: How many of the best hypotheses are improved, static: half of the time with 8. Over 60 scenes with
             30 % wrong matches, 4 give a median error of 0.099 px and 8 one of 0.098.
+        improving_steps: Bound on the steps of that, static.
+        initial: `(3, 3)` a matrix for pixels to be tried besides, of any scale; without effect where it is zero or not
+            finite. Where it is good, few hypotheses and steps do.
         min_inliers: Fewer than this is no consensus.
         max_steps: Bound on the steps of the last refinement, static.
 
@@ -98,8 +102,13 @@ def ransac_fundamental(
     draw_key, plane_key = jax.random.split(key)
     samples = draw_samples(draw_key, fixed.weights, num_hypotheses, SAMPLE_SIZE)
     hypotheses, real = seven_point(fixed.before[:, samples], fixed.after[:, samples])
+    hypotheses, real = hypotheses.reshape(3, 3, -1), real.reshape(-1)
+    if initial is not None:
+        given, usable = _of_clean_points(lax.stop_gradient(initial), shift, scale)
+        hypotheses = jnp.concatenate([hypotheses, given[:, :, None]], axis=2)
+        real = jnp.append(real, usable)
     scores = jnp.where(real, score_matrices(hypotheses, fixed), -1.0)
-    consensus = _improved(hypotheses.reshape(3, 3, -1), scores.reshape(-1), fixed, num_improved)
+    consensus = _improved(hypotheses, scores, fixed, num_improved, improving_steps)
     on_inliers = views._replace(weights=jnp.where(_agree(consensus, fixed), views.weights, 0.0))
     F, converged, determined = refine_matrix(consensus, on_inliers, "huber", 0.5, max_steps)
     inliers = _agree(lax.stop_gradient(F), fixed)
@@ -150,13 +159,13 @@ def _two_views(
     return TwoViews(before, after, jnp.where(counts, weights, 0.0), threshold), shift, scale
 
 
-def _improved(F: Float[Array, "3 3 h"], scores: Float[Array, " h"], views: TwoViews, num: int) -> Matrix:
+def _improved(F: Float[Array, "3 3 h"], scores: Float[Array, " h"], views: TwoViews, num: int, steps: int) -> Matrix:
     """The best matrix after a redescending refinement of the best few; constant for differentiation."""
     sideways = jnp.asarray(_SIDEWAYS, F.dtype)
     _, best = lax.top_k(scores, num)
     starts = jnp.moveaxis(F[:, :, best], 2, 0)
     starts = jnp.where(scores[best][:, None, None] >= 0, starts, sideways[None])
-    improve = lambda F: solve_matrix(F, views, "geman_mcclure", 1.0, _IMPROVING_STEPS)[0]
+    improve = lambda F: solve_matrix(F, views, "geman_mcclure", 1.0, steps)[0]
     ends = jnp.moveaxis(jax.vmap(improve)(starts), 0, 2)
     candidates = jnp.concatenate([ends, jnp.moveaxis(starts, 0, 2)], axis=2)
     usable = jnp.isfinite(candidates).all(axis=(0, 1))
@@ -170,14 +179,26 @@ def _agree(F: Matrix, views: TwoViews) -> Bool[Array, " n"]:
 
 def _in_pixels(F: Matrix, shift: Float[Array, "2 2"], scale: Scalar) -> Matrix:
     """`T2ᵀ F T1`, of unit norm and with its largest entry positive."""
-    zero, one = jnp.zeros_like(scale), jnp.ones_like(scale)
-    before, after = (
-        jnp.stack(
-            [jnp.stack([scale, zero, -scale * u]), jnp.stack([zero, scale, -scale * v]), jnp.stack([zero, zero, one])]
-        )
-        for u, v in shift
-    )
-    F = after.T @ F @ before
+    F = _substituted(F, -scale * shift, scale)
     F = F * lax.rsqrt(jnp.maximum(jnp.square(F).sum(), 1e-30))
     largest = F.reshape(-1)[jnp.argmax(jnp.abs(F))]
-    return F * lax.stop_gradient(jnp.where(largest < 0, -one, one))
+    return F * lax.stop_gradient(jnp.where(largest < 0, -1.0, 1.0).astype(F.dtype))
+
+
+def _of_clean_points(F: Matrix, shift: Float[Array, "2 2"], scale: Scalar) -> tuple[Matrix, Bool[Array, ""]]:
+    """A matrix for pixels as one for clean points, of unit norm, and whether it is one at all."""
+    norm = jnp.sqrt(jnp.square(F).sum())  # before anything is squared twice
+    usable = jnp.isfinite(norm) & (norm > 0)
+    F = jnp.where(usable, F, jnp.asarray(_SIDEWAYS, F.dtype)) / jnp.where(usable, norm, 1)
+    F = _substituted(F, shift, 1 / scale)
+    return F * lax.rsqrt(jnp.maximum(jnp.square(F).sum(), 1e-30)), usable
+
+
+def _substituted(F: Matrix, shift: Float[Array, "2 2"], scale: Scalar) -> Matrix:
+    """The matrix for points p of the one for `scale p + shift`."""
+    zero, one = jnp.zeros_like(scale), jnp.ones_like(scale)
+    before, after = (
+        jnp.stack([jnp.stack([scale, zero, u]), jnp.stack([zero, scale, v]), jnp.stack([zero, zero, one])])
+        for u, v in shift
+    )
+    return after.T @ F @ before

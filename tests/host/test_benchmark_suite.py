@@ -38,9 +38,9 @@ class TestSuite:
         assert suite.about
         assert plan(suite)
 
-    @pytest.mark.parametrize(("name", "rooms", "runs"), [("unknown_movers", 16, 64), ("seated", 4, 16)])
+    @pytest.mark.parametrize(("name", "rooms", "runs"), [("unknown_movers", 16, 128), ("seated", 4, 48)])
     def test_of_rooms_with_true_masks(self, name: str, rooms: int, runs: int) -> None:
-        """All four paths, the same rooms for both kinds of masks, and few runs."""
+        """All four paths, the same rooms for both kinds of masks, and a run of each."""
         suite = load_suite(name)
         assert len(suite.sequences) == rooms
         assert len(plan(suite)) == runs

@@ -103,7 +103,7 @@ class TestSettings:
         """With somebody walking through the room, and nothing else that would leave him out."""
         recording = clip(1)
         slam = Slam(
-            recording.camera, Config(track=TRACK, dynamics=DynamicsConfig(cues=("trajectory",), newcomers=False))
+            recording.camera, Config(track=TRACK, dynamics=DynamicsConfig(cues=("trajectory",), even_votes=False))
         )
         with slam:
             records = slam.run(recording)
@@ -112,7 +112,7 @@ class TestSettings:
     def test_gradient_of_the_pose_by_a_tolerance(self) -> None:
         """With a temperature the pose has a derivative, equal to finite differences."""
         with jax.enable_x64(True):
-            config = DynamicsConfig(cues=("trajectory",), temperature=0.5)
+            config = DynamicsConfig(cues=("trajectory",), even_votes=False, temperature=0.5)
             plan = with_cues(PLAN.exact(), config)
             frames, state = stacked(clip(1).frames[:FRAMES], np.float64, np.float64), new_state(np.float64, np.float64)
             given = with_cue_params(params(np.float64), config, np.float64)

@@ -321,8 +321,10 @@ class TestFailure:
 
 
 def config(*, newcomers: bool = True, **semantics: Any) -> Config:
-    dynamics = DynamicsConfig(newcomers=newcomers)
-    return Config(track=PLAN, semantics=SemanticsConfig(model=None, **semantics), dynamics=dynamics)
+    """Masks of every frame, and no cues."""
+    dynamics = DynamicsConfig(newcomers=newcomers, cues=(), even_votes=False)
+    every = SemanticsConfig(model=None, frames="every", **semantics)
+    return Config(track=PLAN, semantics=every, dynamics=dynamics)
 
 
 class TestSlam:

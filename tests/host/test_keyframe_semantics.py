@@ -49,7 +49,7 @@ def config(*, deterministic: bool = True, frames: Any = "keyframes", latency_fra
         track=PLAN,
         run=RunConfig(deterministic=deterministic),
         semantics=SemanticsConfig(model=None, frames=frames, latency_frames=latency_frames, dilate_px=DILATE_PX),
-        dynamics=DynamicsConfig(newcomers=False),
+        dynamics=DynamicsConfig(cues=(), even_votes=False),
     )
 
 
@@ -201,9 +201,9 @@ class TestRun:
         for file in ("{}", "{}.npy"):
             assert (tmp_path / file.format("one")).read_bytes() == (tmp_path / file.format("two")).read_bytes()
 
-    def test_every_frame_is_as_before(self) -> None:
-        """The default: the detector looks at frames whether they are kept or not, and no point is taken back."""
-        assert SemanticsConfig().frames == "every"
+    def test_every_frame(self) -> None:
+        """The other setting: the detector looks at frames whether they are kept or not, and no point is taken back."""
+        assert SemanticsConfig().frames == "keyframes"
         looks = Looks()
         with Slam(source().camera, config(frames="every"), detector=looks) as slam:
             results = track(slam, 20)

@@ -251,7 +251,7 @@ class TestHeldToMap:
     def test_which_frames(self, which: str) -> None:
         """Matching begins as soon as the map has a keyframe."""
         track = replace(TRACK, hold_to_map=which, keyframe_after_s=0.3)
-        alone = {"semantics": SemanticsConfig(model=None), "dynamics": DynamicsConfig(newcomers=False)}
+        alone = {"semantics": SemanticsConfig(model=None), "dynamics": DynamicsConfig(cues=(), even_votes=False)}
         results = slam_results(Config(track=track, **alone))
         assert {result.status for result in results[1:]} == {TrackStatus.OK}
         matched = np.array([result.num_matched > 0 for result in results])

@@ -40,12 +40,16 @@ def ate_m(preset: str, *overrides: str, true_masks: bool = False) -> float:
     return max(evaluate(slam.trajectory, clip.ground_truth).ate_rmse_m, FLOOR_M)
 
 
+WITHOUT = ("dynamics.cues=[]", "dynamics.even_votes=false")
+
+
 def test_votes_of_points_follow_a_box() -> None:
-    """What `dynamics.even_votes` is for."""
-    assert ate_m("default", "semantics.model=null", "dynamics.even_votes=false") > 0.02
+    """What cues and even votes are for."""
+    assert ate_m("default", "semantics.model=null", *WITHOUT) > 0.02
 
 
 @pytest.mark.parametrize("preset", ["default", "trs-geometry"])
 def test_as_good_as_with_true_masks(preset: str) -> None:
-    truth_m = ate_m("default", "semantics.latency_frames=0", true_masks=True)
-    assert ate_m(preset, "semantics.model=null", "dynamics.even_votes=true") <= 1.5 * truth_m
+    in_every_frame = "semantics.frames=every", "semantics.latency_frames=0"
+    truth_m = ate_m("default", *in_every_frame, *WITHOUT, true_masks=True)
+    assert ate_m(preset, "semantics.model=null") <= 1.5 * truth_m

@@ -11,8 +11,17 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from jaxslam_kernels.epipolar import epipolar_distances, sampson_distances, sampson_squared, seven_point
+from jaxlie import SE3
+from jaxslam_kernels.camera import Intrinsics, project
+from jaxslam_kernels.epipolar import (
+    epipolar_distances,
+    fundamental_of_poses,
+    sampson_distances,
+    sampson_squared,
+    seven_point,
+)
 from jaxslam_kernels.fundamental import FundamentalResult, FundamentalStatus, ransac_fundamental
+from jaxslam_kernels.transform import moved, to_camera, to_world
 
 from jaxslam.benchmark.kernels.two_views import KINDS, TwoViewScene, make_two_views
 
@@ -88,6 +97,68 @@ class TestDistances:
                 gradients = jax.grad(lambda *a, f=f: f(*a).sum(), argnums=(0, 1, 2))(matrix, before, after)
                 np.testing.assert_array_equal(value if f is epipolar_distances else value[1:], 0.0)
                 assert all(np.isfinite(x).all() for x in (value, *gradients))
+
+
+def _camera() -> Intrinsics:
+    return Intrinsics(*(jnp.asarray(value) for value in (517.0, 516.0, 318.6, 255.3)), distortion=jnp.zeros(5))
+
+
+def _poses(seed: int) -> tuple[SE3, SE3]:
+    rng = np.random.default_rng(seed)
+    first = moved(SE3(jnp.asarray([1.0, 0, 0, 0, 0, 0, 0])), jnp.asarray(rng.normal(size=6)))
+    return first, moved(first, jnp.asarray(0.1 * rng.normal(size=6)))
+
+
+class TestOfPoses:
+    def test_shapes(self):
+        F = jax.eval_shape(fundamental_of_poses, SE3.identity(), SE3.identity(), _camera())
+        assert F.shape == (3, 3)
+        assert F.dtype == jnp.float32
+
+    def test_matches_reference(self):
+        """What both cameras see of a point is on one line, and the epipole is where one sees the other."""
+        rng = np.random.default_rng(0)
+        with jax.enable_x64(True):
+            camera = _camera()
+            for seed in range(5):
+                before, after = _poses(seed)
+                X_before = np.concatenate([rng.normal(size=(2, 20)), rng.uniform(3.0, 6.0, (1, 20))])
+                X_world = to_world(before, jnp.asarray(X_before))
+                uv = [project(camera, to_camera(pose, X_world)) for pose in (before, after)]
+                F = fundamental_of_poses(before, after, camera)
+                np.testing.assert_allclose(_to_line(np.asarray(F), *map(np.asarray, uv)), 0, atol=1e-8)
+                epipole = to_camera(before, after.translation()[:, None])
+                K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+                np.testing.assert_allclose(np.asarray(F) @ K @ np.asarray(epipole), 0, atol=1e-12)
+
+    def test_vmap_equals_loop(self):
+        with jax.enable_x64(True):
+            pairs = [_poses(seed) for seed in range(3)]
+            before, after = (SE3(jnp.stack([pair[k].wxyz_xyz for pair in pairs])) for k in (0, 1))
+            batch = jax.vmap(fundamental_of_poses, in_axes=(0, 0, None))(before, after, _camera())
+            for one, pair in zip(batch, pairs, strict=True):
+                np.testing.assert_allclose(one, fundamental_of_poses(*pair, _camera()), rtol=1e-12)
+
+    def test_gradient(self):
+        """By the second pose, forward = reverse = finite differences."""
+        with jax.enable_x64(True):
+            before, after = _poses(1)
+            weights = jnp.asarray(np.random.default_rng(2).normal(size=(3, 3)))
+            f = lambda tangent: jnp.vdot(weights, fundamental_of_poses(before, moved(after, tangent), _camera()))
+            zero, direction = jnp.zeros(6), jnp.asarray(np.random.default_rng(3).normal(size=6))
+            _, forward = jax.jvp(f, (zero,), (direction,))
+            h = 1e-6
+            numeric = (f(h * direction) - f(-h * direction)) / (2 * h)
+            np.testing.assert_allclose(forward, numeric, rtol=1e-6)
+            np.testing.assert_allclose(jnp.vdot(jax.grad(f)(zero), direction), forward, rtol=1e-9)
+
+    def test_degenerate(self):
+        """A camera that only turns or stands has no lines."""
+        with jax.enable_x64(True):
+            pose, _ = _poses(4)
+            turned = moved(pose, jnp.asarray([0.0, 0, 0, 0.1, -0.2, 0.05]))
+            for after in (pose, turned):
+                np.testing.assert_allclose(fundamental_of_poses(pose, after, _camera()), 0, atol=1e-15)
 
 
 def _samples(seed: int, h: int) -> tuple[np.ndarray, np.ndarray]:
@@ -293,6 +364,40 @@ class TestRansac:
         for seed in range(60):
             scene = make_two_views(seed, N, kind=kinds[seed % len(kinds)], outliers=0.5 * (seed % 3 > 0))
             assert _all_finite(_run(seed, _inputs(scene)))
+
+    def test_initial(self):
+        """Six matches of ten wrong, and eight samples: lost without a matrix to begin with, found with the true one."""
+
+        def solve(key: jax.Array, inputs: Inputs, initial: jax.Array) -> FundamentalResult:
+            few = {"num_hypotheses": 8, "num_improved": 1, "improving_steps": 4}
+            before, after, weights, threshold = inputs
+            return ransac_fundamental(
+                key, before, after, weights=weights, threshold_px=threshold, initial=initial, **few
+            )
+
+        compiled = _compile(solve)
+        shares: dict[str, list[float]] = {"true": [], "zero": [], "NaN": []}
+        for seed in range(10):
+            scene = make_two_views(seed, N, outliers=0.6)
+            true = jnp.asarray(7.0 * scene.F, jnp.float32)
+            for name, initial in (("true", true), ("zero", 0 * true), ("NaN", true.at[0, 0].set(jnp.nan))):
+                result = compiled(jax.random.key(seed), _inputs(scene), initial)
+                assert _all_finite(result)
+                shares[name].append(float(np.asarray(result.inliers)[~scene.outlier].mean()))
+        assert np.min(shares["true"]) > 0.75
+        assert np.median(shares["zero"]) < 0.6
+        assert shares["NaN"] == shares["zero"]
+
+    def test_wrong_initial_changes_nothing(self):
+        """One matrix more to try, that few matches agree with."""
+        scene, other = (make_two_views(seed, N, outliers=0.3) for seed in (3, 4))
+        plain, *_ = _run(0, _inputs(scene))
+        before, after, weights, threshold = _inputs(scene)
+        tried = _compile(ransac_fundamental)(
+            jax.random.key(0), before, after, weights=weights, threshold_px=threshold, initial=jnp.asarray(other.F)
+        )
+        np.testing.assert_array_equal(tried.inliers, plain.inliers)
+        assert _apart(np.asarray(tried.F), plain.F) < 1e-4
 
     def test_same_key_same_bytes(self):
         inputs = _inputs(make_two_views(5, N))
