@@ -11,7 +11,7 @@ import pytest
 from small_scene import TRACK
 
 from jaxslam.camera import Camera
-from jaxslam.config import Config, SemanticsConfig
+from jaxslam.config import Config, DynamicsConfig, SemanticsConfig
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset, SyntheticFrame
 from jaxslam.datasets.synthetic.camera_path import CameraPathKind
 from jaxslam.dynamic_masks import DynamicMasks, FrameMask, MaskSource
@@ -30,7 +30,9 @@ STEP_PX = 2
 """A pixel of the coarse size in those of the image."""
 AGO_S = 0.27
 TRACKER = Config(
-    track=replace(TRACK, num_points=256, points_per_source=96, cell_px=16), semantics=SemanticsConfig(model=None)
+    track=replace(TRACK, num_points=256, points_per_source=96, cell_px=16),
+    semantics=SemanticsConfig(model=None),
+    dynamics=DynamicsConfig(newcomers=True, cues=(), even_votes=False),
 )
 
 
