@@ -16,7 +16,7 @@ from jax import lax
 from jaxlie import SE3, SO3
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam_kernels.transform import lenient_promotion
+from jaxslam_kernels.transform import cross_matrix, lenient_promotion
 from jaxslam_kernels.types import Code, Mask, Points, Scalar, Weights
 
 AlignmentKind: TypeAlias = Literal["none", "se3", "sim3"]
@@ -214,7 +214,7 @@ def _nearest_rotation_jvp(primals: tuple[_Matrix], tangents: tuple[_Matrix]) -> 
         lambda _, vector: axes @ (inverse * (axes.T @ vector)),
         symmetric=True,
     )
-    return R, R @ _hat(omega)
+    return R, R @ cross_matrix(omega)
 
 
 def _axes(P: _Matrix) -> tuple[_Matrix, _Vector, Bool[Array, "3"]]:
@@ -223,12 +223,6 @@ def _axes(P: _Matrix) -> tuple[_Matrix, _Vector, Bool[Array, "3"]]:
     sums = jnp.roll(eigenvalues, -1) + jnp.roll(eigenvalues, -2)
     precision = jnp.finfo(P.dtype)
     return axes, sums, sums > jnp.maximum(32.0 * precision.eps * jnp.max(sums), 1e8 * precision.tiny)
-
-
-def _hat(omega: _Vector) -> _Matrix:
-    x, y, z = omega
-    zero = jnp.zeros_like(x)
-    return jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
 
 
 def _fit(x: Points, y: Points, weights: Weights, with_scale: bool) -> tuple[Alignment, Points]:

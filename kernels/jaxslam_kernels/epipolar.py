@@ -15,7 +15,7 @@ from jaxlie import SE3
 from jaxtyping import Array, Bool, Float
 
 from jaxslam_kernels.camera import Intrinsics
-from jaxslam_kernels.transform import between
+from jaxslam_kernels.transform import between, cross_matrix
 from jaxslam_kernels.types import Pixels, Weights
 
 _CUBIC_STEPS = 2  # after the closed form, which float32 leaves short of a few digits
@@ -78,14 +78,12 @@ def fundamental_of_poses(T_world_before: SE3, T_world_after: SE3, intrinsics: In
         intrinsics: The camera; lens distortion is left out.
     """
     T_after_before = between(T_world_after, T_world_before)
-    tx, ty, tz = T_after_before.translation()
-    zero, one = jnp.zeros_like(tx), jnp.ones_like(tx)
-    cross = jnp.stack([jnp.stack([zero, -tz, ty]), jnp.stack([tz, zero, -tx]), jnp.stack([-ty, tx, zero])])
     fx, fy, cx, cy = intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy
+    zero, one = jnp.zeros_like(fx), jnp.ones_like(fx)
     rays = jnp.stack(
         [jnp.stack([1 / fx, zero, -cx / fx]), jnp.stack([zero, 1 / fy, -cy / fy]), jnp.stack([zero, zero, one])]
     )
-    return rays.T @ cross @ T_after_before.rotation().as_matrix() @ rays
+    return rays.T @ cross_matrix(T_after_before.translation()) @ T_after_before.rotation().as_matrix() @ rays
 
 
 def seven_point(

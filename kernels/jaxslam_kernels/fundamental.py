@@ -180,7 +180,6 @@ def _agree(F: Matrix, views: TwoViews) -> Bool[Array, " n"]:
 def _in_pixels(F: Matrix, shift: Float[Array, "2 2"], scale: Scalar) -> Matrix:
     """`T2ᵀ F T1`, of unit norm and with its largest entry positive."""
     F = _substituted(F, -scale * shift, scale)
-    F = F * lax.rsqrt(jnp.maximum(jnp.square(F).sum(), 1e-30))
     largest = F.reshape(-1)[jnp.argmax(jnp.abs(F))]
     return F * lax.stop_gradient(jnp.where(largest < 0, -1.0, 1.0).astype(F.dtype))
 
@@ -190,15 +189,15 @@ def _of_clean_points(F: Matrix, shift: Float[Array, "2 2"], scale: Scalar) -> tu
     norm = jnp.sqrt(jnp.square(F).sum())  # before anything is squared twice
     usable = jnp.isfinite(norm) & (norm > 0)
     F = jnp.where(usable, F, jnp.asarray(_SIDEWAYS, F.dtype)) / jnp.where(usable, norm, 1)
-    F = _substituted(F, shift, 1 / scale)
-    return F * lax.rsqrt(jnp.maximum(jnp.square(F).sum(), 1e-30)), usable
+    return _substituted(F, shift, 1 / scale), usable
 
 
 def _substituted(F: Matrix, shift: Float[Array, "2 2"], scale: Scalar) -> Matrix:
-    """The matrix for points p of the one for `scale p + shift`."""
+    """The matrix for points p of the one for `scale p + shift`, of unit norm."""
     zero, one = jnp.zeros_like(scale), jnp.ones_like(scale)
     before, after = (
         jnp.stack([jnp.stack([scale, zero, u]), jnp.stack([zero, scale, v]), jnp.stack([zero, zero, one])])
         for u, v in shift
     )
-    return after.T @ F @ before
+    F = after.T @ F @ before
+    return F * lax.rsqrt(jnp.maximum(jnp.square(F).sum(), 1e-30))

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam_kernels.pose_cost import retract, tangent_basis
 from jaxslam_kernels.robust import Loss, loss_value, loss_weight
-from jaxslam_kernels.transform import between
+from jaxslam_kernels.transform import between, cross_matrix
 from jaxslam_kernels.types import Scalar
 
 Nodes = Float[Array, "k 8"]
@@ -200,13 +200,13 @@ def _jacobians(source: Array, target: Array, measured: Array) -> tuple[Float[Arr
     shrink = jnp.exp(-source[7])
     one = jnp.ones((1, 1), w.dtype)
     by_source = [
-        [-shrink * to_error, to_error @ _cross(u), -(to_error @ u)[:, None]],
-        [zero, -sign * (w * identity - _cross(v)) @ R_measured, column],
+        [-shrink * to_error, to_error @ cross_matrix(u), -(to_error @ u)[:, None]],
+        [zero, -sign * (w * identity - cross_matrix(v)) @ R_measured, column],
         [column.T, column.T, -one],
     ]
     by_target = [
         [shrink * to_error @ T_ab.rotation().as_matrix(), zero, column],
-        [zero, sign * (w * identity + _cross(v)), column],
+        [zero, sign * (w * identity + cross_matrix(v)), column],
         [column.T, column.T, one],
     ]
     return jnp.block(by_source), jnp.block(by_target)
@@ -253,8 +253,3 @@ def _measures_all(information: Blocks) -> Bool[Array, " m"]:
     scaled = jnp.where(usable[:, None, None], information * unit[:, :, None] * unit[:, None, :], eye)
     pivots = jnp.square(jnp.diagonal(jnp.linalg.cholesky(scaled), axis1=1, axis2=2))
     return usable & (pivots > _SMALLEST_PIVOT).all(axis=1)  # NaN compares false
-
-
-def _cross(u: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    zero = jnp.zeros_like(u[0])
-    return jnp.stack([zero, -u[2], u[1], u[2], zero, -u[0], -u[1], u[0], zero]).reshape(3, 3)

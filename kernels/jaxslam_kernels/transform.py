@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import jax
+import jax.numpy as jnp
 from jaxlie import SE3
 from jaxtyping import Array, Float
 
@@ -54,6 +55,13 @@ def to_camera(T_world_cam: SE3, X_world: Points) -> Points:
 def to_world(T_world_cam: SE3, X_cam: Points) -> Points:
     """Points in the axes of the camera, in the world."""
     return T_world_cam.rotation().as_matrix() @ X_cam + T_world_cam.translation()[:, None]
+
+
+def cross_matrix(v: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """The matrix whose product with a vector is the cross product of `v` with it."""
+    x, y, z = v
+    zero = jnp.zeros_like(x)
+    return jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
 
 
 def _typed(T: SE3, like: SE3) -> SE3:

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxlie import SE3
-from jaxslam_kernels.transform import between, displacement, moved, to_camera, to_world
+from jaxslam_kernels.transform import between, cross_matrix, displacement, moved, to_camera, to_world
 from scipy.linalg import expm
 
 
@@ -78,3 +78,8 @@ class TestTransform:
         np.testing.assert_allclose(nothing, 0, atol=1e-15)
         half_turn = moved(SE3.identity(), jnp.asarray([0, 0, 0, np.pi, 0, 0]))
         assert np.isfinite(displacement(SE3.identity(), half_turn)).all()
+
+    def test_cross_matrix(self):
+        u, v = jnp.asarray(np.random.default_rng(3).normal(size=(2, 3)))
+        np.testing.assert_allclose(cross_matrix(u) @ v, np.cross(u, v), atol=1e-15)
+        assert cross_matrix(u.astype(jnp.float32)).dtype == jnp.float32
