@@ -1,6 +1,7 @@
 """`jaxslam bench`: run a suite of recordings with presets, and write a report."""
 
 import re
+from collections.abc import Collection
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -49,14 +50,20 @@ class RunsOfSuite:
     sweep: tuple[str, ...] = ()
     """Settings with several values each, all combinations of which are run: `track.num_points=256,512`."""
 
-    def results(self, name: str) -> list[dict[str, Any]]:
-        """Run what has not been run; the report is written, and the results given back."""
+    def results(self, name: str, rows: Collection[str] | None = None) -> list[dict[str, Any]]:
+        """Run what has not been run; the report is written, and the results given back.
+
+        Args:
+            name: Of the suite.
+            rows: What to run of it, as "sequence, label"; all if not given.
+        """
         for option, value in (("--runs", self.runs), ("--workers", self.workers)):
             if value is not None and value < 1:
                 raise BenchmarkError(f"{option}: expected at least 1, got {value}")
         suite = swept(load_suite(name), self.sweep)
         chosen = checked_presets(self.presets) if self.presets else ()
         jobs = plan(replace(suite, settings=(*self.set, *suite.settings)), presets=chosen, runs=self.runs)
+        jobs = [job for job in jobs if rows is None or f"{job.clip.name}, {job.label}" in rows]
         for preset, settings in {(job.preset, job.settings) for job in jobs}:
             load_config(preset, overrides=settings)  # an error now, not after hours
         out = self.out or Path("results") / "bench" / suite.name
