@@ -20,13 +20,13 @@ from jaxslam_kernels.transform import to_camera
 from jaxslam_kernels.types import DepthImage, Mask, Pixels, Points, Scalar, Weights
 from jaxtyping import Array, Bool, Float, Float32, Float64, Int8, Int64
 
-from jaxslam.aligned import aligned_array
 from jaxslam.config import OcclusionConfig
 from jaxslam.dynamics.occlusion import PointState, States, next_states, occluded_share
 from jaxslam.frame_arrays import FrameArrays
 from jaxslam.map import NONE, Map, has, rows, visibility
 from jaxslam.map_edit import with_states
 from jaxslam.observe import depth_sigma, observe, predict_pixels
+from jaxslam.padding import padded
 from jaxslam.pose import IDENTITY, to_local
 from jaxslam.state import TrackParams
 from jaxslam.xla import IN_ITS_THREAD
@@ -57,28 +57,40 @@ class StateChanges(NamedTuple):
     states: Int8[np.ndarray, " c"]
 
 
+class _Columns(NamedTuple):
+    """Points, padded to the size that the program is compiled for, where it finds them without a copy.
+
+    Attributes:
+        states: `(n,)` as they are now.
+        X_keyframe: `(3, n)` where they are in the axes of the keyframe, metres.
+        there: `(n,)` which slots hold a point,
+        own: `(n,)` and which of them one that the keyframe saw.
+    """
+
+    states: States
+    X_keyframe: Points
+    there: Mask
+    own: Mask
+
+
 class _Shown(NamedTuple):
-    """The points that are looked at, those of a keyframe first, padded to the size that the program is compiled for.
+    """The points that are looked at, those of a keyframe first.
 
     Attributes:
         map: The map they are of.
         keyframe: The keyframe,
         submap: and its submap.
         ids: Of the points.
-        X_keyframe: `(3, n)` where they are in the axes of the keyframe, metres.
-        there: `(n,)` which slots hold a point,
-        own: `(n,)` and which of them one that the keyframe saw.
-        states: `(n,)` as they are now.
+        states: `(n,)` as they are now, padded,
+        columns: and the same with what else is known of them.
     """
 
     map: Map
     keyframe: int
     submap: int
     ids: np.ndarray
-    X_keyframe: np.ndarray
-    there: np.ndarray
-    own: np.ndarray
     states: np.ndarray
+    columns: _Columns
 
 
 class PointStates:
@@ -105,9 +117,9 @@ class PointStates:
 
     def compile(self, frame: FrameArrays) -> None:
         """Compile what a frame of this size needs."""
-        nothing = self._filled(np.zeros(0, bool))
-        points = self._filled(np.zeros(0, np.int8)), self._filled(np.zeros((3, 0), np.float32)), nothing, nothing
-        jax.block_until_ready(self._after(points, IDENTITY, np.zeros(6, np.float32), frame))
+        nothing = np.zeros(0, bool)
+        columns = self._columns(np.zeros(0, np.int8), np.zeros((3, 0), np.float32), nothing, nothing)
+        jax.block_until_ready(self._after(columns, IDENTITY, np.zeros(6, np.float32), frame))
 
     def see(
         self, map: Map, keyframe_id: int, T_keyframe_cam: np.ndarray, twist: np.ndarray, arrays: FrameArrays
@@ -125,14 +137,16 @@ class PointStates:
             The share of the points of the keyframe that are OCCLUDED.
         """
         shown = self._points_of(map, keyframe_id)
-        points = shown.states, shown.X_keyframe, shown.there, shown.own
-        after, share = self._after(points, T_keyframe_cam, twist, arrays)
-        states = np.asarray(after)
-        changed = np.flatnonzero(states != shown.states)
-        ids = shown.ids[changed]
-        self._state[ids], self._change[ids] = states[changed], self._number
-        self._shown = shown._replace(states=states)
-        return float(share)
+        after, counted = self._after(shown.columns, T_keyframe_cam, twist, arrays)
+        num_changed, share = np.asarray(counted).tolist()
+        if num_changed:
+            states = np.asarray(after)
+            changed = np.flatnonzero(states != shown.states)
+            ids = shown.ids[changed]
+            self._state[ids], self._change[ids] = states[changed], self._number
+            shown = shown._replace(states=states, columns=shown.columns._replace(states=after))
+        self._shown = shown
+        return share
 
     def weights(self, map: Map, point_ids: np.ndarray) -> Float32[np.ndarray, " n"]:
         """How much points of the map that arrived last count beside each other, 1 on average.
@@ -171,16 +185,10 @@ class PointStates:
         blocked = self._blocked(map) if shown is not None and shown.submap == submap else own[:0]
         ids = np.concatenate([own, blocked[~np.isin(blocked, own)][:_MOST_BLOCKED]])
         X_keyframe = to_local(map.pose(keyframe_id), map.points.X_world[:, rows(map.points.ids, ids)])
-        return _Shown(
-            map,
-            keyframe_id,
-            submap,
-            ids,
-            X_keyframe=self._filled(X_keyframe.astype(np.float32)),
-            there=self._filled(np.ones(len(ids), bool)),
-            own=self._filled(np.ones(len(own), bool)),
-            states=self._filled(self._of(map, ids)),
+        columns = self._columns(
+            self._of(map, ids), X_keyframe.astype(np.float32), np.ones(len(ids), bool), np.ones(len(own), bool)
         )
+        return _Shown(map, keyframe_id, submap, ids, np.asarray(columns.states), columns)
 
     def _blocked(self, map: Map) -> np.ndarray:
         """Those of the points looked at that are blocked and in the map still, the latest first."""
@@ -188,19 +196,17 @@ class PointStates:
         ids = ids[has(map.points.ids, ids)]
         return ids[self._of(map, ids) == PointState.BLOCKED]
 
-    def _filled(self, columns: np.ndarray) -> np.ndarray:
+    def _columns(self, *columns: np.ndarray) -> _Columns:
         """One column a point, filled up with zeros to the size that the program is compiled for."""
-        filled = aligned_array((*columns.shape[:-1], self._room), columns.dtype)
-        filled[:] = 0
-        filled[..., : columns.shape[-1]] = columns
-        return filled
+        filled: Any = (jnp.asarray(padded(column, self._room, axis=-1)) for column in columns)
+        return _Columns(*filled)
 
     def _after(
-        self, points: tuple[np.ndarray, ...], T_keyframe_cam: np.ndarray, twist: np.ndarray, arrays: FrameArrays
-    ) -> Any:
+        self, columns: _Columns, T_keyframe_cam: np.ndarray, twist: np.ndarray, arrays: FrameArrays
+    ) -> tuple[States, Float[Array, "2"]]:
         motion = T_keyframe_cam.astype(np.float32), twist
         seen = arrays.ignore, arrays.depth, arrays.depth_delay_s
-        return _after_frame(*points, *motion, *seen, self._params, guard=self._config.guard)
+        return _after_frame(columns, *motion, *seen, self._params, guard=self._config.guard)
 
 
 def with_changes(map: Map, changes: StateChanges) -> Map:
@@ -222,10 +228,7 @@ def occluded_shares(map: Map) -> Float64[np.ndarray, " k"]:
 
 @partial(jax.jit, static_argnames="guard", compiler_options=IN_ITS_THREAD)
 def _after_frame(
-    states: States,
-    X_keyframe: Points,
-    there: Mask,
-    own: Mask,
+    columns: _Columns,
     T_keyframe_cam: Float[Array, "7"],
     twist: Float[Array, "6"],
     ignore: Bool[Array, "h w"],
@@ -234,20 +237,21 @@ def _after_frame(
     params: TrackParams,
     *,
     guard: bool,
-) -> tuple[States, Scalar]:
-    """States of points after a frame, and the share of the keyframe's own that is OCCLUDED."""
+) -> tuple[States, Float[Array, "2"]]:
+    """States after a frame, how many have another state, and the share of the keyframe's own that is OCCLUDED."""
     height, width = ignore.shape
-    X_cam = to_camera(SE3(T_keyframe_cam), X_keyframe)
+    X_cam = to_camera(SE3(T_keyframe_cam), columns.X_keyframe)
     uv = predict_pixels(X_cam, twist, height, params)
     size = jnp.array([[width], [height]], uv.dtype)
     pixel = jnp.round(uv)
-    inside = there & _before_the_lens(X_cam, size, params) & ((pixel >= 0) & (pixel < size)).all(axis=0)
+    inside = columns.there & _before_the_lens(X_cam, size, params) & ((pixel >= 0) & (pixel < size)).all(axis=0)
     column, row = jnp.clip(pixel, 0, size - 1).astype(jnp.int32)
     displaced = jnp.zeros_like(inside)
     if guard:
         displaced = _displaced(X_cam[2], uv, twist, depth, depth_delay_s, params)
-    states = next_states(states, inside, ignore[row, column], displaced)
-    return states, occluded_share(states, own)
+    states = next_states(columns.states, inside, ignore[row, column], displaced)
+    num_changed = jnp.sum(states != columns.states, dtype=jnp.float32)
+    return states, jnp.stack([num_changed, occluded_share(states, columns.own)])
 
 
 def _before_the_lens(X_cam: Points, size: Float[Array, "2 1"], params: TrackParams) -> Mask:

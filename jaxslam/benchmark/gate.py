@@ -3,8 +3,8 @@
 Runs are deterministic and have the same seeds, so that on one machine their errors are equal to the last digit as long
 as nothing has changed. Times are not, even as ratios to OpenCV's flow, which has a noise of its own: a flow slowed down
 by somebody else's work makes a tracker look fast. The least time of flow of all runs of a sequence is what counts, and
-beside it the fastest run of each row is compared with the median run of the baseline. Of three suites on a busy
-virtual machine, figures of one row differed by 7 % so, in one row by 20 %; ratios run by run by 50 %.
+beside it the fastest run of each row is compared with the median run of the baseline. Of four suites on a busy
+virtual machine, a row differed by 8 % at the median and 22 % at most so; ratios run by run by up to 50 %.
 
 Another processor rounds otherwise, and so do other releases of the compiler: that changes errors as another seed does.
 There, what counts as worse is more than the seeds' own spread explains, and times of other processors are left alone.
