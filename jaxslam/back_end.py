@@ -313,11 +313,11 @@ class BackEnd:
             is another place, and the map may grow.
         """
         features = features_of(arrays, np.zeros(6, np.float32), self._params, self._plan.features)
-        if np.count_nonzero(features.depth) < MIN_INLIERS:
-            return None, False
         near = None if predicted is None else self._in_local_map(features, predicted)
         if near is not None:
             return near, False
+        if np.count_nonzero(features.depth) < MIN_INLIERS:
+            return None, False
         if not self._lock.acquire(timeout=_PATIENCE_S):
             return None, False
         try:

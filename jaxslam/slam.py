@@ -32,7 +32,7 @@ from jaxslam.map_link import Hung
 from jaxslam.pose import IDENTITY, compose, moved
 from jaxslam.semantics import Detector
 from jaxslam.stage_times import StageTimes
-from jaxslam.state import TrackOutput, TrackParams, TrackPlan, TrackState, TrackStatus
+from jaxslam.state import TrackOutput, TrackParams, TrackPlan, TrackReason, TrackState, TrackStatus
 from jaxslam.track import Followed, follow_points, init_state, track_followed
 from jaxslam.tracked import FrameRecord, Rejected, Tracked, tracked_of
 from jaxslam.trajectory import PathLike, Trajectory
@@ -429,7 +429,11 @@ class Slam:
         if int(output.status) == TrackStatus.STARTED:
             return output, placed
         self._state = self._state._replace(lost_frames=jnp.zeros((), jnp.int32))  # not to start by itself
-        return output, None
+        if placed is None:
+            return output, None
+        # Nothing here has a depth from which to go on, but what the map shows is a pose all the same.
+        covariance = placed.covariance.astype(np.float32)
+        return output._replace(status=TrackStatus.RELOCALISED, reason=TrackReason.NONE, covariance=covariance), placed
 
     def _recorded(self, tracked: Tracked, dt_s: float, depth_delay_s: float) -> Tracked:
         """The result as it is given out, and remembered."""

@@ -133,6 +133,25 @@ class TestKidnap:
         print(f"recognised after {found - 59} frames; largest error after it {errors.max() * 1e3:.1f} mm")
         assert errors.max() < 0.03
 
+    def test_without_depth(self) -> None:
+        """With nothing to follow and no depth to begin with, the map still shows where the frame was taken."""
+        frames = room()
+        frames.frames[41] = replace(frames[41], depth_m=np.zeros_like(frames[41].depth_m))
+        with Slam(frames.camera, CONFIG) as slam:
+            before = Played(slam, frames, range(41), FPS)
+            slam._state = slam._back.restarted(slam._state, before.results[-1].T_world_cam)
+            after = Played(slam, frames, range(41, 46), FPS)
+        assert after.statuses == [*[TrackStatus.RELOCALISED] * 2, *[TrackStatus.OK] * 3]
+        found = after.results[0]
+        assert not found.reason
+        assert found.num_matched >= 30
+        assert np.sqrt(np.diag(found.covariance)).max() < 0.03
+        true = [between(before.truth.T_world_cam[0], pose) for pose in after.truth.T_world_cam]
+        apart = [
+            np.linalg.norm(result.T_world_cam[4:] - pose[4:]) for result, pose in zip(after.results, true, strict=True)
+        ]
+        assert max(apart) < 0.03
+
     def test_keyframes_are_at_hand_at_once(self) -> None:
         """Those that show the place are recalled with the relocalisation: their points are found again."""
         played = play([*BEFORE, *[BLACK] * 3, *AFTER])
