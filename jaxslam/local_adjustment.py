@@ -10,10 +10,10 @@ from jaxslam_kernels.bundle_cost import Observations
 from jaxslam_kernels.types import Scalar
 from jaxtyping import Array, Bool, Float
 
+from jaxslam.dynamics.occlusion import state_weights
 from jaxslam.map import NONE, Map, Sightings, covisible, has, rows, sightings_at
 from jaxslam.map_edit import moved, without_sightings
 from jaxslam.padding import padded
-from jaxslam.point_states import state_weights
 from jaxslam.pose import between, compose, inverse, rotate, to_local, transform
 
 _NUM_FIXED = 4

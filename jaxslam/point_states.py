@@ -21,7 +21,7 @@ from jaxslam_kernels.types import DepthImage, Mask, Pixels, Points, Scalar, Weig
 from jaxtyping import Array, Bool, Float, Float32, Float64, Int8, Int64
 
 from jaxslam.config import OcclusionConfig
-from jaxslam.dynamics.occlusion import PointState, States, next_states, occluded_share
+from jaxslam.dynamics.occlusion import PointState, States, next_states, occluded_share, state_weights
 from jaxslam.frame_arrays import FrameArrays
 from jaxslam.map import NONE, Map, has, rows, visibility
 from jaxslam.map_edit import with_states
@@ -213,11 +213,6 @@ def with_changes(map: Map, changes: StateChanges) -> Map:
     """The map with changed states of those points that are in it still."""
     there = has(map.points.ids, changes.ids)
     return with_states(map, changes.ids[there], changes.states[there])
-
-
-def state_weights(states: np.ndarray, occluded_weight: float) -> Float32[np.ndarray, " n"]:
-    """How much points in these states count: `occluded_weight` if OCCLUDED, 1 otherwise (formula 2)."""
-    return np.where(states == PointState.OCCLUDED, np.float32(occluded_weight), np.float32(1))
 
 
 def occluded_shares(map: Map) -> Float64[np.ndarray, " k"]:

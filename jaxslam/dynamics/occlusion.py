@@ -8,8 +8,9 @@ Source: Occlusion SLAM, algorithm 1 and formula 3; weights 1 and 3 there.
 import enum
 
 import jax.numpy as jnp
+import numpy as np
 from jaxslam_kernels.types import Mask, Scalar, Weights
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float32, Int
 
 States = Int[Array, " n"]
 """A `PointState` of each of `n` map points."""
@@ -51,6 +52,11 @@ def next_states(states: States, inside: Mask, masked: Mask, displaced: Mask) -> 
 def occlusion_weights(states: States, occluded_weight: Scalar) -> Weights:
     """`(n,)` how much each point counts: `occluded_weight` if it is OCCLUDED, 1 otherwise."""
     return jnp.where(states == PointState.OCCLUDED, occluded_weight, jnp.ones_like(occluded_weight))
+
+
+def state_weights(states: np.ndarray, occluded_weight: float) -> Float32[np.ndarray, " n"]:
+    """`occlusion_weights` of any number of points of a map, nothing compiled."""
+    return np.where(states == PointState.OCCLUDED, np.float32(occluded_weight), np.float32(1))
 
 
 def occluded_share(states: States, counts: Mask) -> Scalar:

@@ -22,7 +22,7 @@ from wall_map import POINTS, at, seen_from
 from jaxslam.camera import Camera
 from jaxslam.config import Config, OcclusionConfig, TrackConfig, load_config
 from jaxslam.datasets.synthetic import SceneDetector, SyntheticConfig, SyntheticDataset
-from jaxslam.dynamics.occlusion import PointState
+from jaxslam.dynamics.occlusion import PointState, state_weights
 from jaxslam.errors import MapFileError
 from jaxslam.feature_pose import FeaturePose
 from jaxslam.features import FeaturePlan, Features
@@ -38,7 +38,7 @@ from jaxslam.map_file import load_map, save_map
 from jaxslam.map_matching import feature_sightings
 from jaxslam.map_part import part_around, put_back
 from jaxslam.new_points import new_points
-from jaxslam.point_states import PointStates, StateChanges, occluded_shares, state_weights, with_changes
+from jaxslam.point_states import PointStates, StateChanges, occluded_shares, with_changes
 from jaxslam.pose import IDENTITY, between, to_local
 from jaxslam.results import RunInfo, write_results
 from jaxslam.slam import Slam, track_params
