@@ -81,15 +81,13 @@ class _Shown(NamedTuple):
         keyframe: The keyframe,
         submap: and its submap.
         ids: Of the points.
-        states: `(n,)` as they are now, padded,
-        columns: and the same with what else is known of them.
+        columns: What is known of them.
     """
 
     map: Map
     keyframe: int
     submap: int
     ids: np.ndarray
-    states: np.ndarray
     columns: _Columns
 
 
@@ -141,10 +139,10 @@ class PointStates:
         num_changed, share = np.asarray(counted).tolist()
         if num_changed:
             states = np.asarray(after)
-            changed = np.flatnonzero(states != shown.states)
+            changed = np.flatnonzero(states != np.asarray(shown.columns.states))
             ids = shown.ids[changed]
             self._state[ids], self._change[ids] = states[changed], self._number
-            shown = shown._replace(states=states, columns=shown.columns._replace(states=after))
+            shown = shown._replace(columns=shown.columns._replace(states=after))
         self._shown = shown
         return share
 
@@ -188,7 +186,7 @@ class PointStates:
         columns = self._columns(
             self._of(map, ids), X_keyframe.astype(np.float32), np.ones(len(ids), bool), np.ones(len(own), bool)
         )
-        return _Shown(map, keyframe_id, submap, ids, np.asarray(columns.states), columns)
+        return _Shown(map, keyframe_id, submap, ids, columns)
 
     def _blocked(self, map: Map) -> np.ndarray:
         """Those of the points looked at that are blocked and in the map still, the latest first."""

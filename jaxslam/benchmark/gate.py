@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxslam.benchmark.rows import rows_of
+from jaxslam.benchmark.rows import by_sequence, row_name, rows_of
 from jaxslam.errors import BenchmarkError
 from jaxslam.files import write_atomically
 
@@ -124,7 +124,9 @@ def complaints(baseline: Baseline, results: Sequence[Mapping[str, Any]]) -> list
     are not compared.
     """
     found = [
-        Complaint(f"{result['sequence']}, {result['label']}, seed {result['seed']}", result["problem"], None, None)
+        Complaint(
+            f"{row_name(result['sequence'], result['label'])}, seed {result['seed']}", result["problem"], None, None
+        )
         for result in results
         if result["status"] != "done"
     ]
@@ -176,15 +178,11 @@ def save_baseline(path: Path, baseline: Baseline) -> None:
 
 def _figures_of(results: Sequence[Mapping[str, Any]], which_time: str) -> dict[str, dict[str, float]]:
     """By row: the median error, the least share of tracked frames, and the median or least time."""
-    flow_ms: dict[str, float] = {}
-    for run in results:
-        if run["status"] == "done":
-            flow_ms[run["sequence"]] = min(run["flow_ms"], flow_ms.get(run["sequence"], np.inf))
+    done = [run for run in results if run["status"] == "done"]
+    flow_ms = {sequence: min(run["flow_ms"] for run in runs) for sequence, runs in by_sequence(done).items()}
     figures: dict[str, dict[str, float]] = {}
-    for row in rows_of(results):
-        if not row["done"]:
-            continue
-        of_row = figures[f"{row['sequence']}, {row['label']}"] = {_TRACKED: row[_TRACKED]["least"]}
+    for row in rows_of(done):
+        of_row = figures[row_name(row["sequence"], row["label"])] = {_TRACKED: row[_TRACKED]["least"]}
         if row[_ATE] is not None:
             of_row[_ATE] = round(row[_ATE]["median"], 7)
         if row["track_ms_median"] is not None:

@@ -51,6 +51,11 @@ RUNNING = (
 """How they came about."""
 
 
+def row_name(sequence: str, label: str) -> str:
+    """What a row is called."""
+    return f"{sequence}, {label}"
+
+
 def rows_of(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Results by sequence and label: how many runs, and the figures of those that are done.
 

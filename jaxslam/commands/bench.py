@@ -14,6 +14,7 @@ from rich.table import Table
 from jaxslam.benchmark.job import Job
 from jaxslam.benchmark.page import html_report
 from jaxslam.benchmark.report import markdown_report
+from jaxslam.benchmark.rows import row_name
 from jaxslam.benchmark.runner import RESULTS, Executor, local, missing, plan, run_jobs, swept
 from jaxslam.benchmark.suite import checked_presets, load_suite, suites
 from jaxslam.commands.console import console
@@ -55,7 +56,7 @@ class RunsOfSuite:
 
         Args:
             name: Of the suite.
-            rows: What to run of it, as "sequence, label"; all if not given.
+            rows: What to run of it, by `row_name`; all if not given.
         """
         for option, value in (("--runs", self.runs), ("--workers", self.workers)):
             if value is not None and value < 1:
@@ -63,7 +64,7 @@ class RunsOfSuite:
         suite = swept(load_suite(name), self.sweep)
         chosen = checked_presets(self.presets) if self.presets else ()
         jobs = plan(replace(suite, settings=(*self.set, *suite.settings)), presets=chosen, runs=self.runs)
-        jobs = [job for job in jobs if rows is None or f"{job.clip.name}, {job.label}" in rows]
+        jobs = [job for job in jobs if rows is None or row_name(job.clip.name, job.label) in rows]
         for preset, settings in {(job.preset, job.settings) for job in jobs}:
             load_config(preset, overrides=settings)  # an error now, not after hours
         out = self.out or Path("results") / "bench" / suite.name
@@ -156,7 +157,7 @@ class Bench(RunsOfSuite):
 
 
 def _line(result: dict[str, Any]) -> str:
-    name = f"{result['sequence']}, {result['label']}, seed {result['seed']}"
+    name = f"{row_name(result['sequence'], result['label'])}, seed {result['seed']}"
     if result["status"] != "done":
         return f"{name}: {result['problem']}"
     ate = result["ate_rmse_m"]

@@ -282,17 +282,20 @@ class TestGate:
         main(command)
         assert "Nothing is worse" in capsys.readouterr().out
 
-    @pytest.mark.parametrize(("figure", "factor"), [("ate_rmse_m", 0.95), ("time_of_flows", 1 / 4)])
+    @pytest.mark.parametrize(("figure", "factor"), [("ate_rmse_m", 0.95), ("time_of_flows", 1 / 1.5)])
     def test_planted_loss(
         self, command: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path, figure: str, factor: float
     ) -> None:
-        """As if it had been 5 % better, or four times as fast, before: times are measured again."""
+        """As if it had been 5 % better, or 1.5 times as fast, before. Times, measured again, are what they were."""
         better = json.loads(Path(command[3]).read_text())
         better["rows"]["room, default"][figure] *= factor
         (tmp_path / "better.json").write_text(json.dumps(better))
+        out = Path(command[5])
+        for again in ("again-1", "again-2"):
+            shutil.copytree(out / "room", out / again / "room", dirs_exist_ok=True)
         error = fails(capsys, "gate", "--baseline", str(tmp_path / "better.json"), *command[4:])
         assert "1 figures are worse" in error
-        assert figure != "time_of_flows" or (Path(command[5]) / "again-2" / "results.json").exists()
+        assert figure != "time_of_flows" or (out / "again-2" / "results.json").exists()
         assert "as it is now" in error
 
     def test_wrong_options(self, command: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
