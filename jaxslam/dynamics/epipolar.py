@@ -35,10 +35,6 @@ class EpipolarParams(NamedTuple):
     temperature: Scalar
 
 
-_NUM_IMPROVED, _IMPROVING_STEPS = 1, 4
-"""Most matches are right, and the motion of the camera is known: where half are wrong, and it is not, the kernel needs
-more."""
-
 EpipolarCue: TypeAlias = Callable[[Scene, EpipolarParams], Verdict]
 
 
@@ -77,8 +73,7 @@ def _matrix(scene: Scene, judged: Mask, params: EpipolarParams, num_hypotheses: 
         weights=voters.astype(scene.uv.dtype),
         threshold_px=params.ransac_px,
         num_hypotheses=num_hypotheses,
-        num_improved=_NUM_IMPROVED,
-        improving_steps=_IMPROVING_STEPS,
+        num_improved=0,
         initial=fundamental_of_poses(scene.T_world_before, scene.T_world_cam, scene.intrinsics),
     )
 

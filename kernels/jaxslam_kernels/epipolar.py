@@ -163,23 +163,27 @@ def _in_pixels(F: Array, shift1: Array, scale1: Array, shift2: Array, scale2: Ar
 
 
 def _null_space(columns: Float[Array, "9 7 h"]) -> Float[Array, "9 2 h"]:
-    """Two orthonormal vectors orthogonal to seven, by Householder reflections: fixed shapes, backward stable."""
-    reflections, rest = [], columns
-    for k in range(columns.shape[1]):
-        x = rest[:, 0]
+    """Two orthonormal vectors orthogonal to seven, by Householder reflections: fixed shapes, backward stable.
+
+    Loops with masks: unrolled it is ten times the code, and takes 0.1 ms more where that is not in the caches.
+    """
+    rows, steps = jnp.arange(9)[:, None], columns.shape[1]
+
+    def reflected(x: Array, normal: Array) -> Array:
+        return x - normal[:, None] * (normal[:, None] * x).sum(axis=0)[None]
+
+    def reduced(k: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        rest, normals = state
+        x = jnp.where(rows >= k, rest[:, k], 0.0)
         size = jnp.sqrt(jnp.square(x).sum(axis=0))
-        normal = x.at[0].add(jnp.where(x[0] < 0, -size, size))
+        normal = x + jnp.where(rows == k, jnp.where(x[k] < 0, -size, size), 0.0)
         factor = jnp.square(normal).sum(axis=0)
         normal = normal * jnp.sqrt(2.0 / jnp.where(factor > 0, factor, jnp.inf))[None, :]
-        reflections.append((k, normal))
-        rest = rest[:, 1:]
-        rest = (rest - normal[:, None] * (normal[:, None] * rest).sum(axis=0)[None])[1:]
-    last = jnp.eye(9, dtype=columns.dtype)[:, 7:, None]
-    null = jnp.broadcast_to(last, (9, 2, columns.shape[2]))
-    for k, normal in reversed(reflections):
-        moved = null[k:] - normal[:, None] * (normal[:, None] * null[k:]).sum(axis=0)[None]
-        null = jnp.concatenate([null[:k], moved])
-    return null
+        return reflected(rest, normal), normals.at[k].set(normal)
+
+    _, normals = lax.fori_loop(0, steps, reduced, (columns, jnp.zeros_like(columns.swapaxes(0, 1))))
+    last = jnp.broadcast_to(jnp.eye(9, dtype=columns.dtype)[:, 7:, None], (9, 2, columns.shape[2]))
+    return lax.fori_loop(0, steps, lambda k, null: reflected(null, normals[steps - 1 - k]), last)
 
 
 def _singular_members(first: Matrices, second: Matrices) -> tuple[Array, Array]:

@@ -1,9 +1,9 @@
 """A fundamental matrix refined on the Sampson distances of matched points, seven unknowns, differentiable.
 
 Matrices of rank two and unit norm form a surface of seven dimensions. With the epipoles `F v3 = 0`, `u3ᵀ F = 0`
-completed to orthonormal bases U and V, `F = U diag(S, 0) Vᵀ` with S of 2 x 2, and every change keeps the rank to first
-order if it has no part in the last corner; the corner that keeps it exactly is `a S⁻¹ b`, a Schur complement.
-No singular value decomposition takes part.
+completed to orthonormal bases U and V, `F = U diag(S, 0) Vᵀ` with S of 2 x 2: a step turns each basis so that its
+epipole moves (two numbers each) and changes S (three). Bartoli and Sturm have singular values and turns about both
+epipoles instead of S; where the singular values are equal those two turns are one. No decomposition takes part.
 
 Source: Bartoli and Sturm, "Nonlinear estimation of the fundamental matrix with minimal parameters", PAMI 2004, for
 the idea; Absil, Mahony and Sepulchre, "Optimization Algorithms on Matrix Manifolds", 2008, for matrices of fixed rank.
@@ -43,16 +43,34 @@ class TwoViews(NamedTuple):
     threshold: Scalar
 
 
+class FramedMatrix(NamedTuple):
+    """A matrix of rank two and unit norm, `U diag(S, 0) Vᵀ`.
+
+    Attributes:
+        U: Orthonormal; the epipole of the second view in its last column.
+        V: Orthonormal; the epipole of the first view in its last column.
+        S: Of unit norm.
+    """
+
+    U: Matrix
+    V: Matrix
+    S: Float[Array, "2 2"]
+
+    def matrix(self) -> Matrix:
+        """The matrix itself."""
+        return self.U[:, :2] @ self.S @ self.V[:, :2].T
+
+
 def refine_matrix(F: Matrix, views: TwoViews, loss: Loss, scale: float, max_steps: int) -> tuple[Matrix, Flag, Flag]:
     """The optimum near F with its derivative by the points, whether it converged, and whether it is determined."""
     optimum, hessian, converged = solve_matrix(F, views, loss, scale, max_steps)
-    refined = optimum + jnp.tensordot(_basis(optimum), _optimum_shift(optimum, views, loss, scale), 1)
-    return refined, converged, _is_determined(hessian)
+    refined = _retract(optimum, _optimum_shift(optimum, views, loss, scale))
+    return refined.matrix(), converged, _is_determined(hessian)
 
 
 def solve_matrix(
     F: Matrix, views: TwoViews, loss: Loss, scale: float, max_steps: int
-) -> tuple[Matrix, Float[Array, "7 7"], Flag]:
+) -> tuple[FramedMatrix, Float[Array, "7 7"], Flag]:
     """The optimum, the Hessian there up to scale and whether it converged; constant for differentiation.
 
     Args:
@@ -67,7 +85,7 @@ def solve_matrix(
     solution = optx.minimise(
         lambda F, views: _equations(F, views, loss, scale),
         ManifoldLevenbergMarquardt(retract=_retract, atol=3.0 * epsilon**0.5, rtol=8.0 * epsilon),
-        F,
+        _framed(F),
         views,
         has_aux=True,
         max_steps=max_steps,
@@ -82,63 +100,60 @@ def score_matrices(F: Float[Array, "3 3 *batch"], views: TwoViews) -> Float[Arra
     return (1.0 - jnp.minimum(sampson_squared(F, views.before, views.after) * inverse, 1.0)) @ views.weights
 
 
-def _equations(F: Matrix, views: TwoViews, loss: Loss, scale: float) -> tuple[Scalar, NormalEquations]:
+def _equations(F: FramedMatrix, views: TwoViews, loss: Loss, scale: float) -> tuple[Scalar, NormalEquations]:
     """The cost at F and its normal equations in the tangent of `_retract`."""
-    u1, v1 = views.before
-    u2, v2 = views.after
-    one = jnp.ones_like(u1)
-    p1, p2 = jnp.stack([u1, v1, one]), jnp.stack([u2, v2, one])
-    line, back = F @ p1, F.T @ p2
-    error = (p2 * line).sum(axis=0)
-    inverse = lax.rsqrt(jnp.maximum(jnp.square(line[:2]).sum(axis=0) + jnp.square(back[:2]).sum(axis=0), LEAST_SLOPE))
-    residual = error * inverse / views.threshold
-    # d residual / d F, row by column: of the error, and of the length it is divided by
-    pull = residual * inverse
-    after = (p2 * (inverse / views.threshold)[None]).at[:2].add(-(pull * inverse)[None] * line[:2])
-    before = ((pull * inverse)[None] * back).at[2].set(0.0)
-    by_F = after[:, None] * p1[None] - p2[:, None] * before[None]
-    jacobian = _basis(F).reshape(9, 7).T @ by_F.reshape(9, -1)
+    one = jnp.ones_like(views.weights)[None]
+    p1, p2 = F.V.T @ jnp.concatenate([views.before, one]), F.U.T @ jnp.concatenate([views.after, one])
+    line, back = F.S @ p1[:2], F.S.T @ p2[:2]  # in the axes of U and V; their last entries are 0
+    error = (p2[:2] * line).sum(axis=0)
+    slope, slope_back = F.U[:2, :2] @ line, F.V[:2, :2] @ back
+    inverse = lax.rsqrt(jnp.maximum((jnp.square(slope) + jnp.square(slope_back)).sum(axis=0), LEAST_SLOPE))
+    unit = inverse / views.threshold
+    residual = error * unit
+    # d residual / d entry (i, j) in those axes: of the error, and of the length that it is divided by
+    pull = residual * jnp.square(inverse)
+    after, before = unit[None] * p2 - pull[None] * (F.U[:2].T @ slope), pull[None] * (F.V[:2].T @ slope_back)
+    by_entry = after[:, None] * p1[None] - p2[:, None] * before[None]
+    inner = jnp.tensordot(_turns_of(F.S), by_entry[:2, :2], 2)
+    jacobian = jnp.concatenate([inner, by_entry[:2, 2], by_entry[2, :2]])
     squared = jnp.square(residual)
     weight = views.weights * loss_weight(squared, scale, loss)
     cost = 0.5 * jnp.sum(views.weights * loss_value(squared, scale, loss))
     return cost, NormalEquations(jacobian @ (weight * residual), (jacobian * weight[None]) @ jacobian.T)
 
 
-def _basis(F: Matrix) -> Float[Array, "3 3 7"]:
-    """Seven orthonormal directions in which F may change: rank and norm stay to first order."""
-    U, V, S = _frames(F)
-    (a, b), (c, d) = S
-    zero = jnp.zeros_like(a)
-    inner = [(-b, a, -d, c), (-c, d, a, -b), (-d, -c, b, a)]  # orthogonal to (a, b, c, d) and to each other
-    changes = [
-        jnp.stack([jnp.stack([x, y, zero]), jnp.stack([z, w, zero]), jnp.stack([zero] * 3)]) for x, y, z, w in inner
-    ]
-    unit = jnp.eye(9, dtype=F.dtype).reshape(9, 3, 3)
-    changes = jnp.concatenate([jnp.stack(changes), unit[jnp.array([2, 5, 6, 7])]])
-    return jnp.einsum("ij,kjl,ml->imk", U, changes, V)
+def _retract(F: FramedMatrix, tangent: Float[Array, "7"]) -> FramedMatrix:
+    """A step: three entries along `_turns_of(S)`, the last column of `Uᵀ F V`, its last row; orthonormal directions.
 
-
-def _retract(F: Matrix, tangent: Float[Array, "7"]) -> Matrix:
-    """The matrix of rank two and unit norm at a step along `_basis`."""
-    U, V, _ = _frames(F)
-    moved = F + jnp.tensordot(_basis(F), tangent, 1)
-    (a, b, e), (c, d, f), (g, h, _) = U.T @ moved @ V
+    An entry in the last column moves the epipole of the first view, one in the last row that of the second.
+    """
+    (a, b), (c, d) = F.S
     determinant = a * d - b * c
     regular = jnp.abs(determinant) > 1e-12
     inverse = jnp.where(regular, 1.0 / jnp.where(regular, determinant, 1.0), 0.0)
-    corner = inverse * (g * (d * e - b * f) + h * (a * f - c * e))
-    moved = moved + corner * jnp.outer(U[:, 2], V[:, 2])
-    return moved * lax.rsqrt(jnp.maximum(jnp.square(moved).sum(), 1e-24))
+    x, y, z, w = tangent[3:] * inverse
+    moved = F.S + jnp.tensordot(tangent[:3], _turns_of(F.S), 1)
+    return FramedMatrix(
+        U=F.U @ _completed(jnp.stack([c * w - d * z, b * z - a * w, jnp.ones_like(z)])),
+        V=F.V @ _completed(jnp.stack([b * y - d * x, c * x - a * y, jnp.ones_like(x)])),
+        S=moved * lax.rsqrt(jnp.square(moved).sum()),  # not shorter than S
+    )
 
 
-def _frames(F: Matrix) -> tuple[Matrix, Matrix, Float[Array, "2 2"]]:
-    """Orthonormal U and V, the epipoles in their last columns, and S of unit norm, `F ~ U diag(S, 0) Vᵀ`."""
+def _turns_of(S: Float[Array, "2 2"]) -> Float[Array, "3 2 2"]:
+    """Three directions orthonormal to S and to each other."""
+    (a, b), (c, d) = S
+    return jnp.stack([-b, a, -d, c, -c, d, a, -b, -d, -c, b, a]).reshape(3, 2, 2)
+
+
+def _framed(F: Matrix) -> FramedMatrix:
+    """F, of rank two, of unit norm."""
     cofactors = adjugate(F)  # v3 u3ᵀ up to scale
     u3 = cofactors[jnp.argmax(jnp.square(cofactors).sum(axis=1))]
     v3 = cofactors[:, jnp.argmax(jnp.square(cofactors).sum(axis=0))]
     U, V = _completed(u3), _completed(v3)
     S = U[:, :2].T @ F @ V[:, :2]
-    return U, V, S * lax.rsqrt(jnp.maximum(jnp.square(S).sum(), 1e-24))
+    return FramedMatrix(U, V, S * lax.rsqrt(jnp.maximum(jnp.square(S).sum(), 1e-24)))
 
 
 def _completed(axis: Float[Array, "3"]) -> Matrix:
@@ -155,20 +170,20 @@ def _completed(axis: Float[Array, "3"]) -> Matrix:
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(2, 3))
-def _optimum_shift(optimum: Matrix, views: TwoViews, loss: Loss, scale: float) -> Float[Array, "7"]:
+def _optimum_shift(optimum: FramedMatrix, views: TwoViews, loss: Loss, scale: float) -> Float[Array, "7"]:
     """Zero, with the derivative of the optimum by the points, in the tangent of `_retract`.
 
     At the optimum the gradient g of the cost vanishes whatever the points θ, so dξ = -H⁻¹ (∂g/∂θ) dθ with H the
     exact Hessian.
     """
     del views, loss, scale
-    return jnp.zeros(7, optimum.dtype)
+    return jnp.zeros(7, optimum.S.dtype)
 
 
 @_optimum_shift.defjvp
 def _optimum_shift_jvp(loss: Loss, scale: float, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     optimum, views = lax.stop_gradient(primals[0]), primals[1]
-    zero = jnp.zeros(7, optimum.dtype)
+    zero = jnp.zeros(7, optimum.S.dtype)
 
     def gradient(tangent: Array, views: TwoViews) -> Array:
         return jax.grad(lambda t: _cost(_retract(optimum, t), views, loss, scale))(tangent)
@@ -184,8 +199,8 @@ def _optimum_shift_jvp(loss: Loss, scale: float, primals: tuple, tangents: tuple
     return zero, -unit * cho_solve(cho_factor(scaled), unit * jnp.where(determined, change, 0.0))
 
 
-def _cost(F: Matrix, views: TwoViews, loss: Loss, scale: float) -> Scalar:
-    squared = sampson_squared(F, views.before, views.after) / jnp.square(views.threshold)
+def _cost(F: FramedMatrix, views: TwoViews, loss: Loss, scale: float) -> Scalar:
+    squared = sampson_squared(F.matrix(), views.before, views.after) / jnp.square(views.threshold)
     return 0.5 * jnp.sum(views.weights * loss_value(squared, scale, loss))
 
 

@@ -12,7 +12,7 @@ import math
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Int, Key
 
 from jaxslam_kernels.epipolar import sampson_squared
 from jaxslam_kernels.fundamental_refine import Matrix, TwoViews
@@ -82,14 +82,14 @@ def _best_homography(key: Key[Array, ""], views: TwoViews) -> Matrix:
     def agreement(H: Float[Array, "3 3 h"]) -> Array:
         return jnp.minimum(homography_squared(H, views) / gate, 1.0) @ views.weights
 
-    best = H[:, :, jnp.argmin(agreement(H))]
-    for _ in range(_STEPS):
+    def step(_: Int[Array, ""], best: Matrix) -> Matrix:
         squared = homography_squared(best[:, :, None], views)[0]
         weights = views.weights / jnp.square(1.0 + squared / (4.0 * gate))
         refined = _least_squares(best, views, jnp.where(squared < 9.0 * gate, weights, 0.0))
         costs = agreement(jnp.stack([best, refined], axis=2))
-        best = jnp.where(costs[1] < costs[0], refined, best)
-    return best
+        return jnp.where(costs[1] < costs[0], refined, best)
+
+    return lax.fori_loop(0, _STEPS, step, H[:, :, jnp.argmin(agreement(H))])
 
 
 def four_point(before: Float[Array, "2 4 h"], after: Float[Array, "2 4 h"]) -> Float[Array, "3 3 h"]:
