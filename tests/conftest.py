@@ -11,6 +11,14 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 
+_LONGEST = ("test_readme", "test_pose_graph", "test_bench_command", "test_notebooks", "test_cluster")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files that take minutes come first, so that at the end no process waits for another one."""
+    items.sort(key=lambda item: _LONGEST.index(item.path.stem) if item.path.stem in _LONGEST else len(_LONGEST))
+
+
 def _folder(variable: str) -> Path:
     value = os.environ.get(variable)
     if not value:
