@@ -132,16 +132,14 @@ def _frame_of(clip: FrameArrays, index: int) -> FrameArrays:
 def _check_clips(clips: Sequence[FrameArrays]) -> None:
     if not clips:
         raise FrameError("clips: expected at least one, got none")
-    kinds = [[(np.shape(array), str(array.dtype)) for array in clip] for clip in clips]
-    if len(kinds[0][0][0]) != 3 or not kinds[0][0][0][0]:
-        raise FrameError(f"clips: expected images (frames, h, w) of at least one frame, got {kinds[0][0][0]}")
+    shape = np.shape(clips[0].image)
+    if len(shape) != 3 or not shape[0]:
+        raise FrameError(f"clips: expected images (frames, h, w) of at least one frame, got {shape}")
+    kinds = [["none" if array is None else f"{array.dtype} {np.shape(array)}" for array in clip] for clip in clips]
     for index, kind in enumerate(kinds):
         for name, one, other in zip(FrameArrays._fields, kinds[0], kind, strict=True):
             if one != other:
-                raise FrameError(
-                    f"clips: {name}: expected {one[1]} {one[0]} as in the first clip, got {other[1]}"
-                    f" {other[0]} in clip {index}"
-                )
+                raise FrameError(f"clips: {name}: expected {one} as in the first clip, got {other} in clip {index}")
 
 
 def _check_settings(batch: _Batch, at_once: int, threads: int) -> None:

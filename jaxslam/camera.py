@@ -113,6 +113,11 @@ class Camera(Checked):
         lines = [_line(key, value) for key, value in dataclasses.asdict(self).items() if value is not None]
         write_atomically(path, ("\n".join(lines) + "\n").encode(), CameraError)
 
+    @property
+    def is_stereo(self) -> bool:
+        """Whether it takes rectified pairs: it has a baseline and no depth images. ORB-SLAM's RGB-D files have both."""
+        return self.baseline_m is not None and self.depth_scale_per_m is None
+
     def intrinsics(self, dtype: DTypeLike = np.float32) -> Intrinsics:
         """The part of the calibration that the kernels compute with, as arrays of `dtype`."""
         return make_intrinsics(self.fx, self.fy, self.cx, self.cy, self.distortion, dtype)

@@ -56,6 +56,10 @@ class TrackConfig(Checked):
     """Nearest depth believed, metres."""
     max_depth_m: Annotated[float, Positive] = 6.0
     """Farthest depth believed, metres."""
+    disparity_sigma_px: Annotated[float, Positive] = 0.5
+    """Standard deviation of the disparity of a stereo pair, pixels; it stands for the noise of depth there."""
+    far_baselines: Annotated[float, Positive] = 75.0
+    """Farthest depth believed of a stereo pair whose camera file does not say, in baselines (ORB-SLAM's `ThDepth`)."""
     pixel_sigma: Annotated[float, Positive] = 1.0
     """Standard deviation of a tracked point, pixels."""
     loss_scale: Annotated[float, Positive] = 1.0

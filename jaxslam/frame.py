@@ -13,7 +13,7 @@ _INT64 = np.iinfo(np.int64)
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A colour or grey image with depth, taken at one time.
+    """A colour or grey image with depth, or a rectified pair of images, taken at one time.
 
     Only the structure is checked: a black image, a frozen one or a depth of NaN is a frame like any other,
     and the tracker reports what it makes of it. Arrays are kept as they are, not copied: do not write to them
@@ -22,27 +22,43 @@ class Frame:
     Attributes:
         timestamp_ns: Time of exposure, int nanoseconds on any clock that only goes forward.
         image: `(height, width, 3)` RGB or `(height, width)` grey, uint8.
-        depth_m: `(height, width)` float32 depth along the optical axis in metres; 0 or NaN where missing.
+        depth_m: `(height, width)` float32 depth along the optical axis in metres; 0 or NaN where missing. `None` for
+            a pair.
         dynamic_mask: `(height, width)` bool, true where something moves or may move; `None` if unknown.
         depth_timestamp_ns: Time of the depth image where the sensor takes it apart from the colour image; `None` if
             both are of one time.
+        right: What the right camera of a rectified pair saw, as `image`, the left one, of the same size; `None` for a
+            camera that measures depth. With it `depth_m` is no more than where matching begins.
 
     Raises:
-        FrameError: If a field has the wrong type or shape, or the images differ in size.
+        FrameError: If a field has the wrong type or shape, the images differ in size, or there is neither depth nor a
+            right image.
     """
 
     timestamp_ns: int
     image: np.ndarray
-    depth_m: np.ndarray
+    depth_m: np.ndarray | None = None
     dynamic_mask: np.ndarray | None = None
     depth_timestamp_ns: int | None = None
+    right: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         _check_timestamp("timestamp_ns", self.timestamp_ns)
         if self.depth_timestamp_ns is not None:
             _check_timestamp("depth_timestamp_ns", self.depth_timestamp_ns)
-        _check_image(self.image)
-        _check_plane("depth_m", self.depth_m, np.float32, self.size)
+        _check_image("image", self.image)
+        if self.depth_m is not None:
+            _check_plane("depth_m", self.depth_m, np.float32, self.size)
+        elif self.right is None:
+            raise FrameError(
+                "depth_m: expected (height, width) float32, or a right image of a stereo pair, got neither"
+            )
+        if self.right is not None:
+            _check_image("right", self.right)
+            if self.right.shape != self.image.shape:
+                raise FrameError(
+                    f"right: expected the shape of the left image, {self.image.shape}, got {self.right.shape}"
+                )
         if self.dynamic_mask is not None:
             _check_plane("dynamic_mask", self.dynamic_mask, np.bool_, self.size)
 
@@ -52,7 +68,9 @@ class Frame:
         return self.image.shape[1], self.image.shape[0]
 
 
-def check_frame(frame: Frame, width: int, height: int, last_timestamp_ns: int | None = None) -> None:
+def check_frame(
+    frame: Frame, width: int, height: int, last_timestamp_ns: int | None = None, *, pair: bool = False
+) -> None:
     """Refuse a frame that does not fit the camera or the time already reached.
 
     Args:
@@ -60,12 +78,20 @@ def check_frame(frame: Frame, width: int, height: int, last_timestamp_ns: int | 
         width: The camera's width in pixels.
         height: The camera's height in pixels.
         last_timestamp_ns: Time of the frame before this one; `None` for the first.
+        pair: Whether the camera takes stereo pairs.
 
     Raises:
-        FrameError: If the size differs from the camera's, or time stands still or goes backwards.
+        FrameError: If the size differs from the camera's, it is a pair and should not be, or the other way round, or
+            time stands still or goes backwards.
     """
     if frame.size != (width, height):
         raise FrameError(f"image: expected the camera's {_by((width, height))} pixels, got {_by(frame.size)}")
+    if pair and frame.right is None:
+        raise FrameError("right: expected the right image, as the camera is a stereo pair, got none")
+    if not pair and frame.depth_m is None:
+        raise FrameError(
+            "depth_m: expected depth, as the camera is no stereo pair (baseline_m), got a right image alone"
+        )
     if last_timestamp_ns is not None and frame.timestamp_ns <= last_timestamp_ns:
         raise FrameError(
             f"timestamp_ns: expected more than the last frame's {last_timestamp_ns}, got {frame.timestamp_ns}"
@@ -96,16 +122,16 @@ def _check_timestamp(field: str, timestamp_ns: object) -> None:
         raise FrameError(f"{field}: expected an int that fits 64 bits, got {timestamp_ns}")
 
 
-def _check_image(image: object) -> None:
+def _check_image(field: str, image: object) -> None:
     expected = "expected (height, width, 3) RGB or (height, width) grey, uint8"
     if not isinstance(image, np.ndarray):
-        raise FrameError(f"image: {expected}, got {type(image).__name__}")
+        raise FrameError(f"{field}: {expected}, got {type(image).__name__}")
     if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3) or image.size == 0:
-        hint = "; drop the alpha channel: image[..., :3]" if image.shape[2:] == (4,) else ""
-        raise FrameError(f"image: {expected}, got shape {image.shape}{hint}")
+        hint = f"; drop the alpha channel: {field}[..., :3]" if image.shape[2:] == (4,) else ""
+        raise FrameError(f"{field}: {expected}, got shape {image.shape}{hint}")
     if image.dtype != np.uint8:
         hint = "; scale it to 0 to 255 and use astype(numpy.uint8)" if image.dtype.kind == "f" else ""
-        raise FrameError(f"image: {expected}, got {image.dtype}{hint}")
+        raise FrameError(f"{field}: {expected}, got {image.dtype}{hint}")
 
 
 def _check_plane(field: str, plane: object, dtype: type[np.generic], size: tuple[int, int]) -> None:

@@ -21,6 +21,8 @@ class FrameArrays(NamedTuple):
         ignore: `(h, w)` true where nothing is to be trusted (people, the robot itself).
         dt_s: Seconds since the frame before.
         depth_delay_s: Seconds from the time of the image to the time of the depth.
+        right: `(h, w)` the right image of a rectified pair, as `image`; `None` where depth is measured. With it `depth`
+            is where matching begins.
     """
 
     image: Num[Array, "*time h w"]
@@ -28,19 +30,21 @@ class FrameArrays(NamedTuple):
     ignore: Bool[Array, "*time h w"]
     dt_s: Float[Array, "*time"]
     depth_delay_s: Float[Array, "*time"]
+    right: Num[Array, "*time h w"] | None = None
 
 
 def frame_arrays(frame: Frame, dt_s: float, dtype: DTypeLike = np.float32) -> FrameArrays:
     """A frame for `track_step`, as NumPy arrays; nothing that has the right type is copied.
 
     Args:
-        frame: The frame; colour becomes grey.
+        frame: The frame; colour becomes grey. A stereo pair needs depth to begin with, see `stereo.with_depth`.
         dt_s: Seconds since the frame before; for the first one any number.
         dtype: Floating-point type of everything but the image, that of the state.
     """
-    ignore = np.zeros(frame.depth_m.shape, bool) if frame.dynamic_mask is None else frame.dynamic_mask
-    depth = frame.depth_m.astype(dtype, copy=False)
-    arrays: Any = (to_grey(frame.image), depth, ignore, *_times(frame, dt_s, dtype))
+    ignore = np.zeros(frame.size[::-1], bool) if frame.dynamic_mask is None else frame.dynamic_mask
+    depth = _depth(frame).astype(dtype, copy=False)
+    right = None if frame.right is None else to_grey(frame.right)
+    arrays: Any = (to_grey(frame.image), depth, ignore, *_times(frame, dt_s, dtype), right)
     return FrameArrays(*arrays)
 
 
@@ -50,8 +54,9 @@ class FrameMemory:
     XLA computes on it in place: see `aligned_array`.
     """
 
-    def __init__(self, height: int, width: int) -> None:
-        """Make room for frames of one size."""
+    def __init__(self, height: int, width: int, *, pairs: bool = False) -> None:
+        """Make room for frames of one size, or for pairs."""
+        self._right = aligned_array((height, width), np.uint8) if pairs else None
         self._image, self._depth = aligned_array((height, width), np.uint8), aligned_array((height, width), np.float32)
         self._ignore, self._nothing = (aligned_array((height, width), np.bool_) for _ in range(2))
         self._nothing[:] = False
@@ -59,12 +64,13 @@ class FrameMemory:
     def hold(self, frame: Frame, dt_s: float) -> FrameArrays:
         """The arrays of a frame, as of `frame_arrays`, until the next one is held."""
         to_grey(frame.image, out=self._image)
-        np.copyto(self._depth, frame.depth_m)
+        np.copyto(self._depth, _depth(frame))
+        right = self._right if self._right is None or frame.right is None else to_grey(frame.right, out=self._right)
         ignore = self._nothing
         if frame.dynamic_mask is not None:
             ignore = self._ignore
             np.copyto(ignore, frame.dynamic_mask)
-        arrays: Any = (self._image, self._depth, ignore, *_times(frame, dt_s, np.float32))
+        arrays: Any = (self._image, self._depth, ignore, *_times(frame, dt_s, np.float32), right)
         return FrameArrays(*arrays)
 
     def ignoring(self, arrays: FrameArrays, mask: np.ndarray) -> FrameArrays:
@@ -84,19 +90,27 @@ def stack_frames(frames: Sequence[Frame], previous_ns: int | None = None, dtype:
         dtype: As for `frame_arrays`.
 
     Raises:
-        FrameError: If there is no frame, or their sizes differ.
+        FrameError: If there is no frame, their sizes differ, or only some are stereo pairs.
     """
     if not frames:
         raise FrameError("frames: expected at least one, got none")
     sizes = {frame.size for frame in frames}
     if len(sizes) > 1:
         raise FrameError(f"frames: expected one size, got {sorted(sizes)} (width, height)")
+    if len({frame.right is None for frame in frames}) > 1:
+        raise FrameError("frames: expected stereo pairs or frames with depth, got both")
     times_ns = np.array([frame.timestamp_ns for frame in frames], np.int64)
     before = 2 * times_ns[0] - times_ns[min(1, len(times_ns) - 1)] if previous_ns is None else np.int64(previous_ns)
     steps_s = np.diff(times_ns, prepend=before) * 1e-9
     arrays = [frame_arrays(frame, step_s, dtype) for frame, step_s in zip(frames, steps_s, strict=True)]
-    stacked: Any = (np.stack(column) for column in zip(*arrays, strict=True))
+    stacked: Any = (None if column[0] is None else np.stack(column) for column in zip(*arrays, strict=True))
     return FrameArrays(*stacked)
+
+
+def _depth(frame: Frame) -> np.ndarray:
+    if frame.depth_m is None:
+        raise FrameError("depth_m: expected depth for matching to begin with, got none; use stereo.with_depth first")
+    return frame.depth_m
 
 
 def _times(frame: Frame, dt_s: float, dtype: DTypeLike) -> tuple[np.ndarray, np.ndarray]:

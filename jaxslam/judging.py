@@ -172,7 +172,7 @@ def _verdicts(
     if not plan.cues:
         return ()
     points, ideal = state.points, without_distortion(params.intrinsics)
-    observed = observe_points(points.X_world, seen.uv, coarse, twist, view, params)
+    observed = observe_points(points.X_world, seen.uv, coarse, twist, view, params, view.matched)
     height, width = view.frame.image.shape
     scene = Scene(
         uv_before=to_pixels(ideal, points.xy),

@@ -5,11 +5,12 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxlie import SE3
 from jaxslam_kernels.camera import distort, normalise, to_pixels
-from jaxslam_kernels.depth_image import sample_depth
+from jaxslam_kernels.depth_image import believable, sample_depth
+from jaxslam_kernels.disparity import row_disparities
 from jaxslam_kernels.image import Pyramid
 from jaxslam_kernels.rolling_shutter import as_if_at_once, image_velocity, row_time
 from jaxslam_kernels.transform import to_camera
-from jaxslam_kernels.types import DepthImage, Pixels, Points, Scalar, Weights
+from jaxslam_kernels.types import DepthImage, Mask, Pixels, Points, Scalar, Weights
 from jaxtyping import Array, Bool, Float
 
 from jaxslam.frame_arrays import FrameArrays
@@ -24,12 +25,17 @@ class View(NamedTuple):
         pyramid: Of its image.
         depth: Its depth image, 0 where missing or not to be believed.
         elapsed_s: Seconds since the last good frame.
+        right: Finest levels of the right image of a pair; `None` where depth is measured.
+        matched: `(n,)` depth of the points followed, by matching left and right, metres, 0 where that failed; `None`
+            where depth is measured.
     """
 
     frame: FrameArrays
     pyramid: Pyramid
     depth: DepthImage
     elapsed_s: Scalar
+    right: Pyramid | None = None
+    matched: Weights | None = None
 
     def without(self, pixels: Bool[Array, "h w"]) -> "View":
         """The same frame with these pixels to be ignored too."""
@@ -61,6 +67,7 @@ def observe(
     params: TrackParams,
     *,
     reach: int = 1,
+    matched: Weights | None = None,
 ) -> Observed:
     """Remove distortion, rolling shutter and the delay of the depth image from what was seen.
 
@@ -72,21 +79,55 @@ def observe(
         depth_delay_s: Seconds from the time of the image to that of the depth.
         params: Camera and its readout time.
         reach: As for `sample_depth`, static.
+        matched: `(n,)` depth at the pixels by `match_depth`, which then is what was measured.
     """
     xy = normalise(params.intrinsics, uv)
     focal = jnp.stack([params.intrinsics.fx, params.intrinsics.fy])[:, None]
     velocity = image_velocity(xy, expected_depth, twist)
     at_once = as_if_at_once(xy, velocity, uv[1], depth.shape[0], params.readout_s)
+    if matched is not None:
+        return Observed(at_once, matched)
     later = uv + focal * velocity * depth_delay_s
     return Observed(at_once, sample_depth(depth, later, reach=reach))
 
 
 def observe_points(
-    X_world: Points, uv: Pixels, pose: SE3, twist: Float[Array, "6"], view: View, params: TrackParams
+    X_world: Points,
+    uv: Pixels,
+    pose: SE3,
+    twist: Float[Array, "6"],
+    view: View,
+    params: TrackParams,
+    matched: Weights | None = None,
 ) -> Observed:
-    """What a frame says of map points, `(3, n)` metres, seen at pixels `uv` from about `pose`."""
+    """What a frame says of map points, `(3, n)` metres, seen at pixels `uv` from about `pose`; `matched` as above."""
     expected = jnp.maximum(to_camera(pose, X_world)[2], params.min_depth_m)
-    return observe(uv, expected, twist, view.depth, view.frame.depth_delay_s, params)
+    return observe(uv, expected, twist, view.depth, view.frame.depth_delay_s, params, matched=matched)
+
+
+def match_depth(view: View, uv: Pixels, expected_depth: Weights, mask: Mask, params: TrackParams) -> Weights | None:
+    """Depth of pixels of the left image of a pair by matching them in the right one; `None` without a pair.
+
+    Args:
+        view: The frame.
+        uv: `(2, n)` pixels as seen.
+        expected_depth: `(n,)` metres, where matching begins; where it is not positive, the frame's own rough depth.
+        mask: `(n,)` which to match.
+        params: Camera, and the depths to be believed.
+
+    Returns:
+        `(n,)` metres, 0 where there is no match.
+    """
+    if view.right is None:
+        return None
+    focal_baseline = params.intrinsics.fx * params.baseline_m
+    rough = jnp.where(expected_depth > 0, expected_depth, sample_depth(view.depth, uv, reach=0))
+    known = mask & (rough > 0)
+    left = Pyramid(view.pyramid.levels[: len(view.right.levels)], view.pyramid.border)
+    guess = focal_baseline / jnp.where(known, rough, 1)
+    match = row_disparities(left, view.right, uv, guess, known)
+    depth = focal_baseline / jnp.where(match.found, match.disparity, 1)
+    return believable(jnp.where(match.found, depth, 0), params.min_depth_m, params.max_depth_m)
 
 
 def predict_pixels(X_cam: Points, twist: Float[Array, "6"], height: int, params: TrackParams) -> Pixels:

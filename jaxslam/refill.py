@@ -7,7 +7,7 @@ from jaxslam_kernels.depth_image import sample_depth
 from jaxslam_kernels.transform import to_world
 from jaxtyping import Array, Float, Int
 
-from jaxslam.observe import View, depth_sigma, observe
+from jaxslam.observe import Observed, View, depth_sigma, match_depth, observe
 from jaxslam.state import TrackedPoints, TrackParams, TrackPlan
 
 _MIN_SCORE = 2.0
@@ -49,8 +49,6 @@ def refill(
 
     rough = sample_depth(depth, uv, reach=2)
     seen = observe(uv, rough, twist, depth, view.frame.depth_delay_s, params, reach=2)
-    X_world = to_world(T_world_cam, seen.in_camera())
-    sigma = depth_sigma(seen.depth, params)
 
     good = (corners.score > _MIN_SCORE) & ~taken & (rough > 0) & (seen.depth > 0)
     one_surface = sample_depth(depth, uv, reach=plan.flow.finest.window // 2, max_step=_DEPTH_STEP) > 0
@@ -58,14 +56,19 @@ def refill(
     rank = jnp.cumsum(~points.valid, dtype=jnp.int32) - 1
     candidate = order[jnp.clip(rank, 0, order.shape[0] - 1)]
     new = ~points.valid & (rank < jnp.sum(good, dtype=jnp.int32))
-    put = lambda old, fresh: jnp.where(new, jnp.take(fresh, candidate, axis=-1), old)
+    uv, rough, *chosen = (jnp.take(array, candidate, axis=-1) for array in (uv, rough, *seen))
+    seen, matched = Observed(*chosen), match_depth(view, uv, rough, new, params)
+    if matched is not None:
+        seen, new = seen._replace(depth=matched), new & (matched > 0)
+    X_world = to_world(T_world_cam, seen.in_camera())
+    put = lambda old, fresh: jnp.where(new, fresh, old)
     return TrackedPoints(
         uv=put(points.uv, uv),
         xy=put(points.xy, seen.xy),
         depth=put(points.depth, seen.depth),
         X_world=put(points.X_world, X_world),
         X_anchor=put(points.X_anchor, X_world),
-        information=put(points.information, 1 / jnp.square(sigma)),
+        information=put(points.information, 1 / jnp.square(depth_sigma(seen.depth, params))),
         weight=jnp.where(new, 1, points.weight),
         age=jnp.where(new, 0, points.age),
         anchor_age=jnp.where(new, 0, points.anchor_age),

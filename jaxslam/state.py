@@ -164,6 +164,7 @@ class TrackParams(NamedTuple):
         restart_after: Frames of loss after which tracking starts anew at the held pose.
         max_speed_m_per_s: Highest believed speed of the camera.
         max_turn_rad_per_s: Highest believed angular speed of the camera.
+        baseline_m: From the left to the right camera of a rectified pair, metres; 0 for a camera that measures depth.
         cues: Parameters of each of `TrackPlan.cues`.
     """
 
@@ -193,6 +194,7 @@ class TrackParams(NamedTuple):
     restart_after: Scalar
     max_speed_m_per_s: Scalar
     max_turn_rad_per_s: Scalar
+    baseline_m: Scalar
     cues: tuple[Any, ...] = ()
 
 

@@ -268,13 +268,18 @@ def _from_kitti(path: PathLike, rows: _Rows, times: PathLike | None) -> Trajecto
     if times is None:
         stamps = np.round(np.arange(len(rows)) * (1e9 / _KITTI_RATE_HZ)).astype(np.int64)
     else:
-        stamps = _read_times(times)
+        stamps = read_times(times)
         if len(stamps) != len(rows):
             raise TrajectoryError(f"{times}: expected one stamp a pose, {len(rows)}, got {len(stamps)}")
     return _checked(path, rows, stamps, np.hstack([quaternions(R), top[:, :, 3]]))
 
 
-def _read_times(path: PathLike) -> np.ndarray:
+def read_times(path: PathLike) -> np.ndarray:
+    """`(n,)` int64 nanoseconds of a file of one stamp in seconds a line, as KITTI's `times.txt`.
+
+    Raises:
+        TrajectoryError: If the file is missing, unreadable or empty, or a line is not one number.
+    """
     rows = list(_rows(path))
     _table(path, rows, 1, "timestamp")
     return _stamps(path, rows)

@@ -141,8 +141,9 @@ class Viewer:
 
     def _log_images(self, frame: Frame) -> None:
         self._stream.log("world/camera/image/rgb", rr.Image(frame.image).compress(_JPEG_QUALITY))
-        depth = rr.EncodedDepthImage(_depth_png(frame.depth_m), media_type="image/png", meter=_DEPTH_PER_M)
-        self._stream.log("world/camera/image/depth", depth)
+        if frame.depth_m is not None:
+            depth = rr.EncodedDepthImage(_depth_png(frame.depth_m), media_type="image/png", meter=_DEPTH_PER_M)
+            self._stream.log("world/camera/image/depth", depth)
 
     def _log_mask(self, tracked: Tracked) -> None:
         shown = bool(tracked.dynamic_mask.any())

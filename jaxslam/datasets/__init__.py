@@ -63,8 +63,8 @@ def _loader(folder: Path, kind: str) -> Loader:
     best = max(_loaders().values(), key=lambda loader: loader.fit(folder))
     if best.fit(folder) is Fit.NO:
         raise DatasetError(
-            f"{folder}: expected a recording of kind {' or '.join(dataset_kinds())} (rgb.txt and depth.txt),"
-            " got a folder without those files"
+            f"{folder}: expected a recording of kind {' or '.join(dataset_kinds())} (rgb.txt and depth.txt;"
+            " or calib.txt, times.txt, image_0 and image_1), got a folder without those files"
         )
     return best
 
@@ -76,6 +76,8 @@ def _camera(folder: Path, loader: Loader, camera: Camera | str | Path | None) ->
         return Camera.load(camera)
     if (folder / "camera.yaml").is_file():
         return Camera.load(folder / "camera.yaml")
+    if loader.camera is not None:
+        return loader.camera(folder)
     name = loader.camera_name(folder)
     if name is None:
         raise CameraError(

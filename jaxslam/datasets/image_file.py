@@ -20,6 +20,15 @@ def read_color(path: Path) -> np.ndarray:
     return cv2.cvtColor(_decode(path, cv2.IMREAD_COLOR | _AS_STORED), cv2.COLOR_BGR2RGB)
 
 
+def read_grey(path: Path) -> np.ndarray:
+    """`(height, width)` uint8; a colour file becomes grey.
+
+    Raises:
+        DatasetError: If the file is missing, cut short or no image.
+    """
+    return _decode(path, cv2.IMREAD_GRAYSCALE | _AS_STORED)
+
+
 def read_depth(path: Path, scale_per_m: float) -> np.ndarray:
     """`(height, width)` float32 metres from a uint16 file with `scale_per_m` counts a metre; 0 where missing.
 

@@ -79,9 +79,11 @@ class Loader:
         fit: How surely a folder is of this kind.
         camera_name: The known camera that a folder was taken with; `None` if its name does not say.
         open: Opens a folder with its camera.
+        camera: Reads the camera from the folder's own calibration, if folders of this kind have one.
     """
 
     kind: str
     fit: Callable[[Path], Fit]
     camera_name: Callable[[Path], str | None]
     open: Callable[[Path, Camera], Dataset]
+    camera: Callable[[Path], Camera] | None = None

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Float
 
 from jaxslam_kernels.types import DepthImage, Pixels, Scalar, Weights
 
@@ -10,7 +11,9 @@ _NOISE_M = 0.02
 """A difference that noise alone makes, at any depth."""
 
 
-def believable(depth: DepthImage, nearest: Scalar | float, farthest: Scalar | float) -> DepthImage:
+def believable(
+    depth: Float[Array, "*shape"], nearest: Scalar | float, farthest: Scalar | float
+) -> Float[Array, "*shape"]:
     """Depth in metres where it is a number between `nearest` and `farthest`, 0 elsewhere."""
     inside = (depth > nearest) & (depth < farthest)
     return jnp.where(inside, depth, 0)

@@ -78,7 +78,8 @@ def lk_flow(
         previous: Pyramid of the image the points are in; its border at least half the largest window plus 6.
         current: Pyramid of the image they are searched in, of the same sizes.
         points: `(2, n)` pixel coordinates in the previous image.
-        guess: `(2, n)` where to start the search in the current image; `points` if not given.
+        guess: `(2, n)` where to start the search in the current image; `points` if not given. With a plan along rows,
+            in the rows of `points`.
         mask: `(n,)` which points to track; all if not given.
         plan: Windows and iterations, static.
         min_texture: Smallest accepted eigenvalue of the mean gradient matrix, in squared intensity a squared pixel;
@@ -167,9 +168,13 @@ def _solve(inputs: _Inputs, *, plan: FlowPlan) -> Found:
 def _explain(position: Pixels, inputs: _Inputs, *, plan: FlowPlan) -> tuple[Pixels, _End]:
     """The slope of half the squared difference at the finest level, zero where the search ends, and the measures."""
     window, border = Window(plan.finest.window), inputs.previous.border
-    template = make_template(inputs.previous.levels[0], inputs.points, border, window, once=lambda compute: compute())
+    template = make_template(
+        inputs.previous.levels[0], inputs.points, border, window, lambda compute: compute(), plan.along_rows
+    )
     error = difference(look(position, inputs.current.levels[0], border, window), template.patch, window)
     slope = jnp.einsum("nkl,nl->kn", template.gradient, error)
+    if plan.along_rows:
+        slope = slope.at[1].set(position[1] - inputs.points[1])
     return slope, _End(mean_absolute(error, window), template.texture, jnp.zeros_like(position[0]))
 
 

@@ -60,12 +60,15 @@ class FlowPlan(NamedTuple):
         chunk: Points searched together; the search stops when all of them are done. It also bounds memory: XLA's
             buffers for 1000 points at once are 52 MB, and freshly mapped memory of that size costs 25 ms a call in
             page faults alone.
+        along_rows: Whether points only move along their row, as from left to right in a rectified pair. What the two
+            images differ by in brightness over a window does not count then: two cameras expose apart.
     """
 
     coarsest: LevelPlan = LevelPlan(21, 12, 0.2)
     middle: LevelPlan = LevelPlan(11, 5, 0.2)
     finest: LevelPlan = LevelPlan(21, 6, 0.03)
     chunk: int = 32
+    along_rows: bool = False
 
     def level(self, level: int, num_levels: int) -> LevelPlan:
         """The plan of a level, 0 the finest."""
@@ -81,7 +84,7 @@ class Template(NamedTuple):
         patch: Intensities over the window.
         gradient: Their derivatives along `u` and `v`; zero where a pixel does not count.
         inverse: `a, b, c` of the symmetric inverse `[[a, b], [b, c]]` of the gradient matrix.
-        texture: Smaller eigenvalue of the mean gradient matrix.
+        texture: Smaller eigenvalue of the mean gradient matrix; along rows, its first entry.
     """
 
     patch: Float[Array, "n l"]
@@ -122,7 +125,12 @@ class Search(NamedTuple):
 
 
 def make_template(
-    level: Float[Array, "h w"], position: Pixels, border: int, window: Window, once: Callable[[Callable[[], Any]], Any]
+    level: Float[Array, "h w"],
+    position: Pixels,
+    border: int,
+    window: Window,
+    once: Callable[[Callable[[], Any]], Any],
+    along_rows: bool = False,
 ) -> Template:
     """The templates around `position`; `once` runs the parts that must not be fused, see `patches.at_once`."""
     corner, fraction = patches.corner(position, border, window.half + 1)
@@ -131,7 +139,25 @@ def make_template(
     smooth = once(lambda: patches.bilinear(cut, fraction, stride, length + 2 * stride + 2))
     counts = patches.in_image(position, level, border, window).astype(smooth.dtype)
     gradient = once(lambda: patches.gradients(smooth, window) * counts[:, None, :])
-    return template_with(smooth[:, stride + 1 : stride + 1 + length], gradient, window)
+    patch = smooth[:, stride + 1 : stride + 1 + length]
+    return _row_template(patch, gradient, counts, window) if along_rows else template_with(patch, gradient, window)
+
+
+def _row_template(
+    patch: Float[Array, "n l"], gradient: Float[Array, "n 2 l"], counts: Float[Array, "n l"], window: Window
+) -> Template:
+    """The templates of points that move along their row, their gradients of mean zero: brightness drops out."""
+    along = gradient[:, 0]
+    mean = jnp.sum(along, axis=1) / jnp.maximum(jnp.sum(counts, axis=1), 1)
+    along = along - counts * mean[:, None]
+    squared = jnp.einsum("nl,nl->n", along, along)
+    nothing = jnp.zeros_like(squared)
+    return Template(
+        patch=patch,
+        gradient=jnp.stack([along, jnp.zeros_like(along)], axis=1),
+        inverse=jnp.stack([1 / jnp.where(squared > 0, squared, 1), nothing, nothing]),
+        texture=squared / window.side**2,
+    )
 
 
 def template_with(patch: Float[Array, "n l"], gradient: Float[Array, "n 2 l"], window: Window) -> Template:
@@ -231,7 +257,7 @@ def _search_chunk(
         start = points / 2**level
         if level > 0:
             start = _move_inside(start, flow, previous.levels[level], border, window)
-        template = make_template(previous.levels[level], start, border, window, once)
+        template = make_template(previous.levels[level], start, border, window, once, plan.along_rows)
         active = usable & (template.texture > min_texture)
         search = Search(start + flow, jnp.zeros_like(points[0]), active)
         search = iterate(search, template, current.levels[level], border, level_plan)

@@ -35,7 +35,7 @@ SPOILED: dict[str, Spoil] = {
     "no depth": lambda frame, last: replace(frame, depth_m=np.zeros_like(frame.depth_m)),
     "saturated depth": lambda frame, last: replace(frame, depth_m=np.full_like(frame.depth_m, 65535 / 5000)),
     "infinite depth": lambda frame, last: replace(frame, depth_m=np.full_like(frame.depth_m, np.inf)),
-    "all masked": lambda frame, last: replace(frame, dynamic_mask=np.ones(frame.depth_m.shape, bool)),
+    "all masked": lambda frame, last: replace(frame, dynamic_mask=np.ones(frame.image.shape[:2], bool)),
 }
 BLIND = {"black", "white", "noise", "all masked"}
 """What leaves nothing to follow: the pose is held. The others still show where the points went."""

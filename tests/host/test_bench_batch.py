@@ -22,7 +22,6 @@ from jaxslam.benchmark.batch import Task, Way, make_task, measure, ways
 from jaxslam.benchmark.batch_report import COLUMNS, cells, markdown_report, picture
 from jaxslam.cli import main
 from jaxslam.errors import ConfigError, FrameError
-from jaxslam.frame_arrays import FrameArrays
 from jaxslam.state import TrackParams, TrackStatus
 from jaxslam.track import track_step
 
@@ -111,7 +110,7 @@ class TestTrackClips:
             track_clips([], params)
         with pytest.raises(FrameError, match=r"clips: expected images \(frames, h, w\).*got \(120, 160\)"):
             track_clips([jax.tree.map(lambda array: array[0], clip)], params)
-        shorter = FrameArrays(*(array[:-1] for array in clip))
+        shorter = jax.tree.map(lambda array: array[:-1], clip)
         with pytest.raises(FrameError, match=r"image: expected uint8 \(4, 120, 160\).*got uint8 \(3, 120, 160\) in cl"):
             track_clips([clip, shorter], params)
         with pytest.raises(FrameError, match=r"depth: expected float32.*got float64 \(4, 120, 160\) in clip 1"):

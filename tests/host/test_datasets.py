@@ -44,6 +44,7 @@ class TestReading:
         for index, frame in enumerate(dataset[i] for i in range(6)):
             np.testing.assert_array_equal(frame.image, color(index))
             np.testing.assert_array_equal(frame.depth_m, depth_counts(index) / np.float32(SCALE))
+            assert frame.depth_m is not None
             assert frame.depth_m.dtype == np.float32
             assert frame.timestamp_ns == dataset.timestamps_ns[index]
 
@@ -146,13 +147,13 @@ class TestRecognition:
             open_dataset(write_recording(tmp_path), camera=camera)
 
     def test_kinds(self, tmp_path: Path) -> None:
-        assert dataset_kinds() == ["bonn", "tum"]
+        assert dataset_kinds() == ["bonn", "kitti", "tum"]
         assert open_dataset(write_recording(tmp_path / "walk"), kind="bonn").camera == Camera.load("bonn")
         with pytest.raises(DatasetError, match=r"kind: expected 'auto' or a known one, got 'tumm' \(did you mean"):
             open_dataset(tmp_path / "walk", kind="tumm")
 
     def test_no_recording(self, tmp_path: Path) -> None:
-        with pytest.raises(DatasetError, match="expected a recording of kind bonn or tum"):
+        with pytest.raises(DatasetError, match="expected a recording of kind bonn or kitti or tum"):
             open_dataset(tmp_path)
         with pytest.raises(DatasetError, match="expected the folder of a recording, got nothing there"):
             open_dataset(tmp_path / "none")
@@ -374,4 +375,5 @@ class TestRealRecordings:
         assert len(dataset.ground_truth.timestamps_ns) == poses
         frame = dataset[len(dataset) // 2]
         assert frame.size == (640, 480)
+        assert frame.depth_m is not None
         assert 0.5 < np.median(frame.depth_m[frame.depth_m > 0]) < 4

@@ -76,6 +76,7 @@ def mask_of(made: DynamicMasks, index: int, moved_to: np.ndarray | None = None) 
     frame, time_s = rendered()[0].frames[index], float(1e-9 * source().timestamps_ns[index])
     pose: np.ndarray = source().T_world_cam[index] if moved_to is None else moved_to
     turn = float(turns()[index])
+    assert frame.depth_m is not None
     mask = made.of_frame(index, frame.image, to_grey(frame.image), frame.depth_m)
     made.tracked(index, time_s, pose, turn)
     made.look(index, frame.image)

@@ -49,6 +49,7 @@ def slam() -> Slam:
 def points(uv: np.ndarray, frame: Frame, camera: Camera) -> np.ndarray:
     """`(n, 3)` metres in the axes of the camera, of `(n, 2)` pixels; depth 0 where it is missing."""
     u, v = np.clip(np.round(uv).astype(int), 0, [camera.width - 1, camera.height - 1]).T
+    assert frame.depth_m is not None
     depth = frame.depth_m[v, u]
     return np.stack([(u - camera.cx) / camera.fx * depth, (v - camera.cy) / camera.fy * depth, depth], axis=1)
 

@@ -39,7 +39,8 @@ class TestStructure:
             ("image", np.zeros((HEIGHT, WIDTH, 4), np.uint8), "got shape (12, 16, 4); drop the alpha"),
             ("image", np.zeros((HEIGHT, WIDTH, 1), np.uint8), "got shape (12, 16, 1)"),
             ("image", np.zeros((0, 0, 3), np.uint8), "got shape (0, 0, 3)"),
-            ("depth_m", None, "float32, got NoneType"),
+            ("depth_m", None, "a right image of a stereo pair, got neither"),
+            ("depth_m", [[1.0]], "float32, got list"),
             (
                 "depth_m",
                 (DEPTH * 5000).astype(np.uint16),

@@ -1,5 +1,7 @@
 """Frames as the compiled step takes them."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -19,7 +21,8 @@ class TestFrameArrays:
         arrays = frame_arrays(frame(100), 0.1)
         np.testing.assert_array_equal(arrays.image, np.full((4, 6), 100, np.uint8))
         assert not np.any(arrays.ignore)
-        assert [array.dtype for array in arrays] == [np.uint8, np.float32, bool, np.float32, np.float32]
+        assert [array.dtype for array in arrays[:-1]] == [np.uint8, np.float32, bool, np.float32, np.float32]
+        assert arrays.right is None
         assert (float(arrays.dt_s), float(arrays.depth_delay_s)) == (pytest.approx(0.1), 0)
 
     def test_mask_and_delay(self) -> None:
@@ -34,7 +37,7 @@ class TestFrameArrays:
 
     def test_double_precision(self) -> None:
         arrays = frame_arrays(frame(100), 0.1, np.float64)
-        assert {array.dtype for array in arrays} == {np.dtype("uint8"), np.dtype("bool"), np.dtype("float64")}
+        assert {array.dtype for array in arrays[:-1]} == {np.dtype("uint8"), np.dtype("bool"), np.dtype("float64")}
 
 
 class TestStackFrames:
@@ -43,6 +46,14 @@ class TestStackFrames:
         assert clip.image.shape == clip.depth.shape == clip.ignore.shape == (3, 4, 6)
         np.testing.assert_allclose(clip.dt_s, [0.03, 0.03, 0.06], rtol=1e-6)
         np.testing.assert_array_equal(clip.image[:, 0, 0], [100, 130, 190])
+
+    def test_pairs(self) -> None:
+        pair = dataclasses.replace(frame(100), right=np.full((4, 6, 3), 50, np.uint8))
+        clip = stack_frames([pair, dataclasses.replace(pair, timestamp_ns=130 * MS)])
+        assert clip.right is not None
+        assert clip.right.shape == (2, 4, 6)
+        with pytest.raises(FrameError, match="expected stereo pairs or frames with depth, got both"):
+            stack_frames([pair, frame(130)])
 
     def test_goes_on_after_a_clip(self) -> None:
         clip = stack_frames([frame(100), frame(130)], previous_ns=60 * MS)

@@ -109,7 +109,7 @@ class TestCompiling:
         assert len(compiled) <= MOST_PROGRAMS
 
         compiled.clear()
-        shape = frames[0].depth_m.shape
+        shape = frames[0].image.shape[:2]
         masked = {"dynamic_mask": np.ones(shape, bool), "depth_timestamp_ns": frames[20].timestamp_ns + 5_000_000}
         grey, black = frames[21].image[..., 1].copy(), np.zeros_like(frames[22].image)
         frames[20] = dataclasses.replace(frames[20], **masked)

@@ -271,6 +271,8 @@ class TestHardness:
             start, end = corners[:, 0], moved[:, 0]
             inside = np.all((end >= 0) & (end <= [dataset.width - 1, dataset.height - 1]), axis=1)
             kept = (found[:, 0] == 1) & inside
+            assert last.depth_m is not None
+            assert frame.depth_m is not None
             before = self.lift(dataset, last.depth_m, start[kept])
             after = self.lift(dataset, frame.depth_m, end[kept])
             measured = (before[:, 2] > 0) & (after[:, 2] > 0)

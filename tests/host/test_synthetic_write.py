@@ -69,6 +69,8 @@ def test_our_loader_reads_it(dataset, folder):
     assert loaded.camera == dataset.camera
     for written, read in ((dataset[index], loaded[index]) for index in range(FRAMES)):
         np.testing.assert_array_equal(read.image, written.image)
+        assert read.depth_m is not None
+        assert written.depth_m is not None
         np.testing.assert_allclose(read.depth_m, written.depth_m, atol=1e-6)
 
 

@@ -140,6 +140,7 @@ def test_images(run: Run) -> None:
     with Image.open(io.BytesIO(bytes(png))) as picture:
         depth = np.asarray(picture)
     assert (depth.shape, depth.dtype) == ((HEIGHT, WIDTH), np.uint16)
+    assert frame.depth_m is not None
     np.testing.assert_allclose(depth[::2, ::2] / 1000, np.nan_to_num(frame.depth_m[::2, ::2]), atol=5.1e-4)
     np.testing.assert_array_equal(depth[1::2, 1::2], depth[::2, ::2])
     assert len(jpeg) + len(png) < 2 * HEIGHT * WIDTH

@@ -45,7 +45,8 @@ class SyntheticConfig(Checked):
         fy: Focal length along a column in pixels; `None` for the same as `fx`.
         cx: Principal point in pixels; `None` for the middle of the image.
         cy: Principal point in pixels; `None` for the middle of the image.
-        sensor: The faults of the camera.
+        baseline_m: Of a rectified stereo pair instead of a camera that measures depth; `None` for that.
+        sensor: The faults of the camera, of both if there are two.
 
     Raises:
         ConfigError: A field has the wrong type or is out of range, or `sensor.exposure_samples` is even.
@@ -64,6 +65,7 @@ class SyntheticConfig(Checked):
     fy: Annotated[float, Range(above=0)] | None = None
     cx: float | None = None
     cy: float | None = None
+    baseline_m: Annotated[float, Range(above=0, at_most=1)] | None = None
     sensor: SensorConfig = field(default_factory=SensorConfig)
 
     def __post_init__(self) -> None:
@@ -82,11 +84,12 @@ class SyntheticFrame:
     Attributes:
         timestamp_ns: Time of the middle of the exposure.
         rgb: `(height, width, 3)` uint8, as measured.
-        depth_m: `(height, width)` float32 depth as measured; 0 where missing.
+        depth_m: `(height, width)` float32 depth as measured by a camera that does; 0 where missing.
         exact_depth_m: `(height, width)` float32 depth at the pixels' centres; never missing.
         instance_mask: `(height, width)` int32; 0 on static things, otherwise the number of the actor.
         T_world_cam: `(7,)` float64 camera pose, wxyz_xyz.
         T_world_actor: `(actors, 7)` float64 poses of the actors, wxyz_xyz; that of actor `k` is in row `k - 1`.
+        right: `(height, width, 3)` uint8, what the right camera of a pair measured; `None` without one.
     """
 
     timestamp_ns: int
@@ -96,11 +99,12 @@ class SyntheticFrame:
     instance_mask: np.ndarray
     T_world_cam: np.ndarray
     T_world_actor: np.ndarray
+    right: np.ndarray | None = None
 
     @property
     def measured(self) -> Frame:
-        """What a camera would deliver of it: no mask of what moves."""
-        return Frame(self.timestamp_ns, self.rgb, self.depth_m)
+        """What a camera would deliver of it: no mask of what moves, and of a pair no depth."""
+        return Frame(self.timestamp_ns, self.rgb, self.depth_m if self.right is None else None, right=self.right)
 
 
 class SyntheticDataset:
@@ -115,7 +119,8 @@ class SyntheticDataset:
     def __init__(self, config: SyntheticConfig | None = None) -> None:
         self.config = config = config or SyntheticConfig()
         seated = f"_{config.seated}seated" if config.seated else ""
-        self.name = f"synthetic_{config.path}_{config.people}people_{config.boxes}boxes{seated}_seed{config.seed}"
+        pair = "_stereo" if config.baseline_m else ""
+        self.name = f"synthetic_{config.path}_{config.people}people_{config.boxes}boxes{seated}{pair}_seed{config.seed}"
         self.width, self.height, self.fps = config.width, config.height, config.fps
         self.fx = 525.0 * config.width / 640.0 if config.fx is None else config.fx
         self.fy = self.fx if config.fy is None else config.fy
@@ -135,8 +140,9 @@ class SyntheticDataset:
             self.fy,
             self.cx,
             self.cy,
-            depth_scale_per_m=DEPTH_COUNTS_PER_M,
+            depth_scale_per_m=None if config.baseline_m else DEPTH_COUNTS_PER_M,
             fps=self.fps,
+            baseline_m=config.baseline_m,
         )
         self.actors = cast(config.path, config.people, config.boxes, config.seated, config.seed)
         static = furnish(config.seed) + chairs(config.seated, config.seed)
@@ -161,44 +167,50 @@ class SyntheticDataset:
         """
         index = range(len(self))[index]
         time_s = float(self._time_s[index])
-        moments = self._expose(time_s)
-        own = moments[len(moments) // 2]
-        channels, depth_m = measure(
-            tuple(moment.colour for moment in moments),
-            own.depth_m,
-            own.incidence,
-            self.fx,
-            self._gain(time_s),
-            sensor_params(self.config.sensor),
-            jax.random.fold_in(self._key, index),
-        )
+        key = jax.random.fold_in(self._key, index)
+        own, rgb, depth_m = self._taken(time_s, key)
+        right = None
+        if self.config.baseline_m is not None:
+            _, right, _ = self._taken(time_s, jax.random.fold_in(key, 1), self.config.baseline_m)
         return SyntheticFrame(
             timestamp_ns=int(self.timestamps_ns[index]),
-            # XLA needs as long to interleave the channels as to render a moment.
-            rgb=cv2.merge(list(np.asarray(channels))),
-            depth_m=np.asarray(depth_m),
+            rgb=rgb,
+            depth_m=depth_m,
             exact_depth_m=np.asarray(own.depth_m),
             instance_mask=np.asarray(own.owner),
             T_world_cam=self.T_world_cam[index].copy(),
             T_world_actor=self.T_world_actor(np.array([time_s]))[0],
+            right=right,
         )
+
+    def _taken(
+        self, time_s: float, key: jax.Array, to_the_right_m: float = 0.0
+    ) -> tuple[Rendering, np.ndarray, np.ndarray]:
+        """The moment of the frame itself, and colour and depth as measured, by the camera or one to its right."""
+        moments = self._expose(time_s, to_the_right_m)
+        own = moments[len(moments) // 2]
+        colours, sensor = tuple(moment.colour for moment in moments), sensor_params(self.config.sensor)
+        channels, depth_m = measure(colours, own.depth_m, own.incidence, self.fx, self._gain(time_s), sensor, key)
+        # XLA needs as long to interleave the channels as to render a moment.
+        return own, cv2.merge(list(np.asarray(channels))), np.asarray(depth_m)
 
     def T_world_actor(self, time_s: np.ndarray) -> np.ndarray:
         """Poses of the actors at `(t,)` seconds since the start: `(t, actors, 7)` float64, wxyz_xyz."""
         poses = [actor.root(time_s) for actor in self.actors]
         return np.stack(poses, axis=1) if poses else np.zeros((len(time_s), 0, 7))
 
-    def _expose(self, time_s: float) -> list[Rendering]:
+    def _expose(self, time_s: float, to_the_right_m: float) -> list[Rendering]:
         """The moments of one exposure, evenly in time, each on its own row and column within the pixel."""
         n = self.config.sensor.exposure_samples
         rank = np.arange(n)
         centred = (rank + 0.5) / n - 0.5
         offsets = np.stack([centred, centred[(2 * rank + (n + 1) // 2) % n]], axis=1)
-        views = self._views(time_s + self.config.sensor.exposure_s * centred, offsets)
+        views = self._views(time_s + self.config.sensor.exposure_s * centred, offsets, to_the_right_m)
         return [render(self._scene, view, height=self.height, width=self.width) for view in views]
 
-    def _views(self, time_s: np.ndarray, offsets: np.ndarray) -> list[View]:
+    def _views(self, time_s: np.ndarray, offsets: np.ndarray, to_the_right_m: float) -> list[View]:
         world_from_cam = rigid.matrix_from_pose(camera_path(self.config.path, time_s, self.config.seed))
+        world_from_cam[:, :3, 3] += to_the_right_m * world_from_cam[:, :3, 0]
         from_world = [np.broadcast_to(self._static_from_world, (len(time_s), *self._static_from_world.shape))]
         for actor in self.actors:
             root = rigid.matrix_from_pose(actor.root(time_s))

@@ -32,8 +32,10 @@ def write_tum(
         progress: Called after each frame with the number of frames written and to be written.
 
     Raises:
-        DatasetError: The folder is in use, or a file cannot be written.
+        DatasetError: The folder is in use, a file cannot be written, or it is of a stereo pair.
     """
+    if dataset.camera.is_stereo:
+        raise DatasetError(f"{dataset.name}: expected a camera with depth images, got a stereo pair (baseline_m)")
     folder = Path(folder).resolve()
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise DatasetError(f"{folder}: expected no such folder or an empty one, got one in use")
