@@ -50,10 +50,12 @@ _RIGHT_LEVELS = 2
 """Of the pyramid of the right image: where matching begins is known to a few pixels."""
 _UNKNOWN_VARIANCE = 1e2
 _DEPTH_GATE_M, _DEPTH_SIGMAS = 0.1, 3.0
-"""Of depth that supports a pose hypothesis: without even votes and a pair, and with one of them. With the first for even
-votes too a rendered room with people who sit has 2.4 mm instead of 4.1, but Bonn `crowd` loses a frame in two of five
-runs, and a frame of noise moves what follows by 7 mm instead of 6. With the larger of 0.1 m and one deviation for all,
-`crowd` has 0.0097-0.0099 m instead of 0.0102-0.0121, but `static` 36 mm instead of 16 in the room xyz."""
+"""Of depth that supports a pose hypothesis: metres, and deviations with even votes or of a pair.
+
+Metres with even votes too: a rendered room with people who sit has 2.4 mm instead of 4.1, but Bonn `crowd` loses a
+frame in two of five runs, and a frame of noise moves what follows by 7 mm instead of 6. The larger of 0.1 m and one
+deviation for all: `crowd` 0.0097-0.0099 m instead of 0.0102-0.0121, but `static` 36 mm instead of 16 in the room xyz.
+"""
 
 
 class Followed(NamedTuple):

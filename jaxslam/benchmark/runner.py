@@ -53,7 +53,7 @@ def plan(suite: Suite, *, presets: Sequence[str] = (), runs: int | None = None) 
 
 
 def missing(suite: Suite, found: Collection[str]) -> dict[str, str]:
-    """Recordings that cannot be run, by name, and why: what nothing tracks yet, and what is not there.
+    """Recordings that cannot be run, by name, and why: stereo, and what is not there.
 
     Args:
         suite: What is run.
@@ -63,7 +63,7 @@ def missing(suite: Suite, found: Collection[str]) -> dict[str, str]:
     for clip in suite.sequences:
         name = clip.recording
         if clip.sensor == "stereo":
-            why[name] = "stereo input is not supported yet"
+            why[name] = "suites run no stereo yet"
         elif name and name not in found:
             why[name] = f"not there; to get it: jaxslam data get {name}"
     return why

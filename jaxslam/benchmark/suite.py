@@ -11,7 +11,7 @@ sequences:
   - name: room                       # what it is called in tables; a recording's own name if not given
     room: {frames: 90, people: 2}    # rendered, see `SyntheticConfig`
   - recording: kitti_00
-    sensor: stereo                   # rgbd if not given; stereo is listed, not run: nothing tracks it yet
+    sensor: stereo                   # rgbd if not given; stereo is listed, not run
 ablation: false                      # true shows published figures of parts of systems too
 variants:                            # every preset with each of these settings too
   few-points: [track.num_points=256]
@@ -44,7 +44,7 @@ class Sequence(Checked):
         stop: The frame after the last; `None` for all.
         every: All frames, or every nth, as if the camera were slower.
         camera: Known camera of the recording, or a camera file, seen from the suite's; `None` if its folder tells.
-        sensor: What it was taken with. Nothing tracks stereo yet, see `runner.missing`.
+        sensor: What it was taken with. No suite runs stereo yet, see `runner.missing`.
     """
 
     _error: ClassVar[type[JaxSlamError]] = BenchmarkError

@@ -240,11 +240,11 @@ class TestTrouble:
         out, error = capsys.readouterr()
         assert ended.value.code == 1
         assert error.strip() == "error: nothing could be run"
-        assert out.count("stereo input is not supported yet") == 1
+        assert out.count("suites run no stereo yet") == 1
         assert "Not run: kitti_00, kitti_01, " in out
         assert "11 recordings not run." in out
         for report in ("report.md", "report.html"):
-            assert (tmp_path / "out" / report).read_text().count("kitti_10: stereo input is not supported yet") == 1
+            assert (tmp_path / "out" / report).read_text().count("kitti_10: suites run no stereo yet") == 1
 
     def test_wrong_options(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         suite, file = suite_file(tmp_path), tmp_path / "file"

@@ -128,7 +128,7 @@ class TestMissing:
         assert names == [recording.name for recording in known_recordings().values() if recording.kind == "kitti"]
         assert len(names) == 11
         for found in ([], names):
-            assert missing(suite, found) == dict.fromkeys(names, "stereo input is not supported yet")
+            assert missing(suite, found) == dict.fromkeys(names, "suites run no stereo yet")
 
 
 class TestPlan:
