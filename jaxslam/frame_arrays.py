@@ -37,7 +37,7 @@ def frame_arrays(frame: Frame, dt_s: float, dtype: DTypeLike = np.float32) -> Fr
     """A frame for `track_step`, as NumPy arrays; nothing that has the right type is copied.
 
     Args:
-        frame: The frame; colour becomes grey. A stereo pair needs depth to begin with, see `stereo.with_depth`.
+        frame: The frame; colour becomes grey. A stereo pair needs rough depth, see `stereo.RoughDepth`.
         dt_s: Seconds since the frame before; for the first one any number.
         dtype: Floating-point type of everything but the image, that of the state.
     """
@@ -109,7 +109,7 @@ def stack_frames(frames: Sequence[Frame], previous_ns: int | None = None, dtype:
 
 def _depth(frame: Frame) -> np.ndarray:
     if frame.depth_m is None:
-        raise FrameError("depth_m: expected depth for matching to begin with, got none; use stereo.with_depth first")
+        raise FrameError("depth_m: expected depth for matching to begin with, got none; see jaxslam.stereo.RoughDepth")
     return frame.depth_m
 
 
