@@ -75,10 +75,10 @@ class Slam:
         camera: That takes the frames.
         config: Settings in effect.
         compile_s: Seconds that compiling took.
-        times: Of the stages of every frame: `match pair` of a stereo camera, `take over` what mapping has done, `flow`, `wait for mask`, `pose`, `match
-            with map`, `hand over` to mapping and the detector; and of the jobs beside them: `masks`, `detector`,
-            `mapping`, `places`. In a deterministic run those are parts of stages: `masks` in `flow` and `hand over`,
-            the others in `hand over`.
+        times: Of the stages of every frame: `match pair` of a stereo camera, `take over` what mapping has done, `flow`,
+            `wait for mask`, `pose`, `match with map`, `hand over` to mapping and the detector; and of the jobs beside
+            them: `masks`, `detector`, `mapping`, `places`. In a deterministic run those are parts of stages: `masks` in
+            `flow` and `hand over`, the others in `hand over`.
     """
 
     def __init__(
