@@ -26,7 +26,7 @@ def small() -> SyntheticDataset:
 
 
 def fields_of(frame: SyntheticFrame) -> list[bytes]:
-    return [np.asarray(value).tobytes() for value in vars(frame).values()]
+    return [np.asarray(value).tobytes() for value in vars(frame).values() if value is not None]
 
 
 class TestProtocol:
@@ -130,6 +130,12 @@ class TestRepeatability:
         assert stored[1].timestamp_ns == small.timestamps_ns[1]
         with pytest.raises(IndexError):
             stored.render(4)
+
+    def test_stored_pairs(self, tmp_path):
+        config = dataclasses.replace(SMALL, frames=1, baseline_m=0.1)
+        rendered, stored = (StoredRoom(config, tmp_path / "room").render(0) for _ in range(2))
+        assert stored.right is not None
+        assert fields_of(stored) == fields_of(rendered)
 
     def test_frames_that_cannot_be_stored(self, tmp_path):
         (tmp_path / "file").write_text("")

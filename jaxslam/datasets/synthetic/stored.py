@@ -1,6 +1,7 @@
 """A rendered room whose frames are kept in files, for those who track it several times."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -36,7 +37,7 @@ class StoredRoom(SyntheticDataset):
             with np.load(path) as arrays:
                 return SyntheticFrame(int(self.timestamps_ns[index]), **arrays)
         frame = super().render(index)
-        arrays = {name: value for name, value in vars(frame).items() if name != "timestamp_ns"}
+        arrays: dict[str, Any] = {name: value for name, value in vars(frame).items() if isinstance(value, np.ndarray)}
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
         except OSError as problem:
