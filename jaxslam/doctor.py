@@ -86,7 +86,7 @@ def diagnose(path: str | Path, kind: str = "auto", camera: Camera | str | Path |
             *_calibration(dataset.camera),
             *unreadable,
             *_images(frames),
-            *_depth([frame.depth_m for frame in frames if frame.depth_m is not None], dataset.camera),
+            *_depth([frame.depth_m for frame in frames if frame.depth_m is not None], dataset.camera.depth_scale_per_m),
             _ground_truth(dataset),
         )
     )
@@ -186,10 +186,9 @@ def _fault(grey: np.ndarray) -> str | None:
     return "blurred or blank" if cv2.Laplacian(grey, cv2.CV_32F).var() < 25 else None
 
 
-def _depth(depths: Sequence[np.ndarray], camera: Camera) -> Iterator[Finding]:
+def _depth(depths: Sequence[np.ndarray], scale: float | None) -> Iterator[Finding]:
     if not depths:
         return
-    scale = camera.depth_scale_per_m
     pixels = np.stack(depths)[:, ::4, ::4]
     measured = pixels[np.isfinite(pixels) & (pixels > 0)]
     missing = 1 - measured.size / pixels.size

@@ -65,7 +65,7 @@ class FrameMemory:
         """The arrays of a frame, as of `frame_arrays`, until the next one is held."""
         to_grey(frame.image, out=self._image)
         np.copyto(self._depth, _depth(frame))
-        right = self._right if self._right is None or frame.right is None else to_grey(frame.right, out=self._right)
+        right = None if self._right is None or frame.right is None else to_grey(frame.right, out=self._right)
         ignore = self._nothing
         if frame.dynamic_mask is not None:
             ignore = self._ignore

@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from jaxslam.camera import Camera
 from jaxslam.errors import DatasetError
 
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
@@ -40,6 +41,20 @@ def read_depth(path: Path, scale_per_m: float) -> np.ndarray:
         channels = 1 if counts.ndim == 2 else counts.shape[2]
         raise DatasetError(f"{path}: expected depth as one uint16 a pixel, got {channels} x {counts.dtype}")
     return counts.astype(np.float32) / np.float32(scale_per_m)
+
+
+def check_size(path: Path, image: np.ndarray, camera: Camera) -> None:
+    """Refuse an image that is not of the camera's size.
+
+    Raises:
+        DatasetError: If it is not.
+    """
+    height, width = image.shape[:2]
+    if (height, width) != (camera.height, camera.width):
+        raise DatasetError(
+            f"{path}: expected {camera.width}x{camera.height} pixels, the size of camera '{camera.name}',"
+            f" got {width}x{height}"
+        )
 
 
 def _decode(path: Path, flags: int) -> np.ndarray:

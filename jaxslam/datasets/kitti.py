@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxslam.camera import Camera
-from jaxslam.datasets.image_file import read_color, read_grey
+from jaxslam.datasets.image_file import check_size, read_color, read_grey
 from jaxslam.datasets.protocol import Fit, Loader
 from jaxslam.errors import CameraError, DatasetError, TrajectoryError
 from jaxslam.frame import Frame
@@ -99,11 +99,7 @@ class KittiDataset:
         read = read_grey if self._pair.grey else read_color
         images = [read(file) for file in self._files[index]]
         for file, image in zip(self._files[index], images, strict=True):
-            if image.shape[:2] != (self.camera.height, self.camera.width):
-                raise DatasetError(
-                    f"{file}: expected {self.camera.width}x{self.camera.height} pixels, the size of camera"
-                    f" '{self.camera.name}', got {image.shape[1]}x{image.shape[0]}"
-                )
+            check_size(file, image, self.camera)
         return Frame(int(self.timestamps_ns[index]), images[0], right=images[1])
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxslam.camera import Camera
 from jaxslam.datasets.file_list import FileList, read_file_list
-from jaxslam.datasets.image_file import read_color, read_depth
+from jaxslam.datasets.image_file import check_size, read_color, read_depth
 from jaxslam.datasets.protocol import Fit, Loader, Unmatched
 from jaxslam.errors import CameraError, DatasetError
 from jaxslam.frame import Frame
@@ -81,12 +81,8 @@ class TumDataset:
         """
         color_file, depth_file = self._files[index]
         image, depth_m = read_color(color_file), read_depth(depth_file, self._depth_scale_per_m)
-        for file, shape in ((color_file, image.shape), (depth_file, depth_m.shape)):
-            if shape[:2] != (self.camera.height, self.camera.width):
-                raise DatasetError(
-                    f"{file}: expected {self.camera.width}x{self.camera.height} pixels, the size of camera"
-                    f" '{self.camera.name}', got {shape[1]}x{shape[0]}"
-                )
+        check_size(color_file, image, self.camera)
+        check_size(depth_file, depth_m, self.camera)
         depth_time = int(self._depth_timestamps_ns[index])
         return Frame(int(self.timestamps_ns[index]), image, depth_m, depth_timestamp_ns=depth_time)
 
