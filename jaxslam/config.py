@@ -90,6 +90,16 @@ class TrackConfig(Checked):
     """when the last one was made so many seconds ago,"""
     keyframe_weak_after_s: Annotated[float, Positive] = 0.3
     """or so many while tracking is weak or has few points."""
+    keyframe_choice: Literal["as_needed", "sparing"] = "as_needed"
+    """Make a keyframe as soon as there is a reason, or at the right moment after (USD-SLAM): unless points are few,"""
+    keyframe_least_s: Annotated[float, Range(at_least=0)] = 0.3
+    """not before so many seconds have gone since the last one, fewer the less is left in view of it,"""
+    keyframe_motion: Annotated[float, Range(at_least=0)] = 0.05
+    """nor before points have moved by this part of their depth, for the camera,"""
+    keyframe_movable_below: Annotated[float, Share] = 0.3
+    """nor while more than this share of the picture may move,"""
+    keyframe_patience_s: Annotated[float, Range(at_least=0)] = 0.5
+    """for which it waits so many seconds at most."""
     probation_frames: Annotated[float, Range(at_least=1)] = 8
     """Frames after which a point counts in full: what moves on its own is an outlier before that."""
     anchor_frames: Annotated[float, Range(at_least=1)] = 15
@@ -207,6 +217,34 @@ class ClusterCueConfig(Checked):
 
 
 @dataclass(frozen=True)
+class MotionConfig(Checked):
+    """Whether what may move does: what masks show stays in while it stands still (USD-SLAM)."""
+
+    enabled: bool = False
+    """Judge what masks show; needs a network that looks at every frame."""
+    num_objects: Annotated[int, Range(at_least=1, at_most=64)] = 16
+    """Things in a frame that are judged, the largest; others are taken to move."""
+    reserved: Annotated[int, Range(at_least=0, at_most=512)] = 48
+    """Of `track.num_points`, how many are kept for what moves."""
+    dense_cell_px: Annotated[int, Range(at_least=8, at_most=80)] = 14
+    """Instead of `track.cell_px` where such things cover over half of the picture."""
+    sigmas: Annotated[float, Positive] = 3.0
+    """A point moves if it moves more than points at rest do by so many standard deviations."""
+    share: Annotated[float, Range(at_least=0, below=1)] = 0.7
+    """A thing is at rest while this share of its points does not move."""
+    least: Annotated[float, Range(at_least=0)] = 0.3
+    """Mean motion of a thing that is none, in standard deviations of a point (`track.pixel_sigma`)."""
+    fewest: Annotated[int, Range(at_least=1)] = 4
+    """Least number of points that say anything of a thing."""
+    still_frames: Annotated[int, Range(at_least=1)] = 3
+    """Frames in which a thing must be at rest to be taken to stand still,"""
+    moving_frames: Annotated[int, Range(at_least=1)] = 2
+    """and in which it must move to be taken to move again."""
+    as_published: bool = False
+    """Motion in metres from frame to frame, its limit from mean and standard deviation; points are counted alone."""
+
+
+@dataclass(frozen=True)
 class OcclusionConfig(Checked):
     """Points of the map that something passed before and that are there again count more (Occlusion SLAM)."""
 
@@ -240,6 +278,7 @@ class DynamicsConfig(Checked):
     trajectory: TrajectoryCueConfig = field(default_factory=TrajectoryCueConfig)
     epipolar: EpipolarCueConfig = field(default_factory=EpipolarCueConfig)
     clusters: ClusterCueConfig = field(default_factory=ClusterCueConfig)
+    motion: MotionConfig = field(default_factory=MotionConfig)
     occlusion: OcclusionConfig = field(default_factory=OcclusionConfig)
 
 

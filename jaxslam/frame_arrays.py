@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Bool, Float, Num
+from jaxtyping import Array, Bool, Float, Num, UInt8
 from numpy.typing import DTypeLike
 
 from jaxslam.aligned import aligned_array
@@ -23,6 +23,8 @@ class FrameArrays(NamedTuple):
         depth_delay_s: Seconds from the time of the image to the time of the depth.
         right: `(h, w)` the right image of a rectified pair, as `image`; `None` where depth is measured. With it `depth`
             is where matching begins.
+        movable: `(h, w)` number of the thing that may move at each pixel, from 1, 0 for none; for a plan with `motion`,
+            which finds out whether it does. `None` without.
     """
 
     image: Num[Array, "*time h w"]
@@ -31,6 +33,7 @@ class FrameArrays(NamedTuple):
     dt_s: Float[Array, "*time"]
     depth_delay_s: Float[Array, "*time"]
     right: Num[Array, "*time h w"] | None = None
+    movable: UInt8[Array, "*time h w"] | None = None
 
 
 def frame_arrays(frame: Frame, dt_s: float, dtype: DTypeLike = np.float32) -> FrameArrays:
@@ -54,8 +57,9 @@ class FrameMemory:
     XLA computes on it in place: see `aligned_array`.
     """
 
-    def __init__(self, height: int, width: int, *, pairs: bool = False) -> None:
-        """Make room for frames of one size, or for pairs."""
+    def __init__(self, height: int, width: int, *, pairs: bool = False, movable: bool = False) -> None:
+        """Make room for frames of one size, or for pairs; with what may move in them, or without."""
+        self._movable = aligned_array((height, width), np.uint8) if movable else None
         self._right = aligned_array((height, width), np.uint8) if pairs else None
         self._image, self._depth = aligned_array((height, width), np.uint8), aligned_array((height, width), np.float32)
         self._ignore, self._nothing = (aligned_array((height, width), np.bool_) for _ in range(2))
@@ -70,8 +74,17 @@ class FrameMemory:
         if frame.dynamic_mask is not None:
             ignore = self._ignore
             np.copyto(ignore, frame.dynamic_mask)
-        arrays: Any = (self._image, self._depth, ignore, *_times(frame, dt_s, np.float32), right)
+        if self._movable is not None:
+            self._movable[:] = 0
+        arrays: Any = (self._image, self._depth, ignore, *_times(frame, dt_s, np.float32), right, self._movable)
         return FrameArrays(*arrays)
+
+    def with_movable(self, arrays: FrameArrays, labels: np.ndarray) -> FrameArrays:
+        """The arrays held, with the numbers `(h, w)` of things that may move."""
+        assert self._movable is not None
+        np.copyto(self._movable, labels)
+        movable: Any = self._movable
+        return arrays._replace(movable=movable)
 
     def ignoring(self, arrays: FrameArrays, mask: np.ndarray) -> FrameArrays:
         """The arrays held, with nothing trusted where `mask` `(h, w)` is true."""

@@ -1,4 +1,4 @@
-"""What all cues of a plan say of the points and the regions of one frame, and what is left out of it for that."""
+"""What all cues of a plan say of the points, regions and things of one frame, and what is left out of it for that."""
 
 from typing import NamedTuple
 
@@ -7,10 +7,12 @@ import jax.numpy as jnp
 from jax import lax
 from jaxlie import SE3
 from jaxslam_kernels.camera import to_pixels, without_distortion
+from jaxslam_kernels.transform import to_world
 from jaxslam_kernels.types import Flag, Mask, Pixels, Weights
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.dynamics.cue import Scene, Verdict, combined
+from jaxslam.dynamics.motion_state import MeasuredPoints, MotionState, judge_motion
 from jaxslam.dynamics.regions import (
     RegionMemory,
     Regions,
@@ -19,7 +21,7 @@ from jaxslam.dynamics.regions import (
     of_points,
     region_weights,
 )
-from jaxslam.observe import View, observe_points
+from jaxslam.observe import View, depth_sigma, observe_points
 from jaxslam.state import TrackParams, TrackPlan, TrackState
 
 _MOST_WITNESSES, _ENOUGH_WITNESSES = 10, 5
@@ -35,6 +37,8 @@ class PointsSeen(NamedTuple):
         masked: Which are there under one.
         agreeing: Which of those that are followed agree with the coarse pose.
         trust: How much each counts, before anything is said of it.
+        there: Which are there under nothing that is left out in any case.
+        thing: Number of the thing that may move that each is on, from 1; 0 for none.
     """
 
     uv: Pixels
@@ -42,6 +46,8 @@ class PointsSeen(NamedTuple):
     masked: Mask
     agreeing: Mask
     trust: Weights
+    there: Mask
+    thing: Int[Array, " n"]
 
 
 class Judged(NamedTuple):
@@ -52,8 +58,9 @@ class Judged(NamedTuple):
         regions: The surfaces of the frame, if something asks for them.
         memory: What the next frame has of them.
         remembered: `(n,)` 0 for points in regions that moved a moment ago.
-        moving: Pixels of regions that move.
+        moving: Pixels of regions and things that move.
         heard: Whether it counts for points: not where the frame would be lost for it.
+        motion: What is known of the things that may move.
     """
 
     verdicts: tuple[Verdict, ...] = ()
@@ -62,6 +69,7 @@ class Judged(NamedTuple):
     remembered: Weights | None = None
     moving: Bool[Array, "h w"] | None = None
     heard: Flag | bool = True
+    motion: MotionState | None = None
 
     def weights(self, weight: Weights) -> Weights:
         """Weights of the points, times those of the cues, and 0 in regions that moved a moment ago."""
@@ -77,16 +85,24 @@ class Judged(NamedTuple):
         """The frame with nothing trusted where regions move."""
         return view if self.moving is None else view.without(self.moving)
 
+    def with_motion(self, motion: MotionState, view: View) -> "Judged":
+        """The same, with what is known of the things that may move."""
+        assert view.frame.movable is not None
+        moving = motion.moving_pixels(view.frame.movable)
+        return self._replace(motion=motion, moving=moving if self.moving is None else self.moving | moving)
+
     def witnesses(self, uv: Pixels, age: Int[Array, " n"], points: Mask) -> Mask:
-        """`(n,)` which points, now at `uv`, are to be followed in regions that move, to see whether they go on.
+        """`(n,)` which points, now at `uv`, are to be followed on what moves, to see whether it goes on.
 
         A few of each, those of some age first. New points in their place in every frame show the motion of one frame
         only, and a box that comes nearer by 5 mm is at rest then: the rendered room rpy with two boxes 0.024 to 0.12 m,
         with witnesses 0.002. With all of them as witnesses little room is left for points of the room: xyz 0.042 m.
         """
-        if self.regions is None or self.moving is None:
+        if self.moving is None:
             return jnp.zeros_like(points)
         points = points & ~self.at_rest(uv)
+        if self.motion is not None:
+            points = points | self.motion.watched()
         old = points & (age > 0)
         there_old, there_new = self._in_regions(old), self._in_regions(points & ~old)
         after = jnp.sum(there_old, axis=1, dtype=jnp.int32)[:, None]
@@ -94,18 +110,38 @@ class Judged(NamedTuple):
         return jnp.any((there_old | there_new) & (rank <= _MOST_WITNESSES), axis=0)
 
     def without_watched(self, view: View, witnesses: Mask, plan: TrackPlan) -> View:
-        """The frame with nothing new to be followed where a region that moves has witnesses."""
-        if self.regions is None or self.moving is None or plan.regions is None:
+        """The frame with nothing new to be followed where what moves has witnesses."""
+        if self.moving is None:
             return view
         watched = jnp.sum(self._in_regions(witnesses), axis=1) >= _ENOUGH_WITNESSES
         height, width = view.depth.shape
-        pixels = moving_pixels(self.regions, 1.0 - watched.astype(view.depth.dtype), height, width, plan.regions)
-        return view.without(pixels)
+        if self.regions is not None and plan.regions is not None:
+            num = self.regions.centers.shape[1]
+            weight = 1.0 - watched[:num].astype(view.depth.dtype)
+            view = view.without(moving_pixels(self.regions, weight, height, width, plan.regions))
+            watched = watched[num:]
+        return view if self.motion is None else view.without(self._of_things(watched & ~self.motion.at_rest, view))
+
+    def unwatched(self, view: View, witnesses: Mask) -> Bool[Array, "h w"] | None:
+        """Pixels of things that move, for all that is known, and have too few points to tell; `None` without things."""
+        if self.motion is None:
+            return None
+        few = jnp.sum(self._in_regions(witnesses), axis=1) < _ENOUGH_WITNESSES
+        return self._of_things(few[-len(self.motion.at_rest) :] & ~self.motion.at_rest, view)
+
+    def _of_things(self, chosen: Bool[Array, " k"], view: View) -> Bool[Array, "h w"]:
+        assert view.frame.movable is not None
+        by_label = jnp.concatenate([jnp.zeros(1, bool), chosen])
+        return by_label[view.frame.movable.astype(jnp.int32)]
 
     def _in_regions(self, points: Mask) -> Bool[Array, "k n"]:
-        assert self.regions is not None
-        region = jnp.arange(self.regions.centers.shape[1])[:, None]
-        return points[None, :] & (self.regions.of_point[None, :] == region)
+        """Which points are in each region, and on each thing."""
+        parts: list[Bool[Array, "_k n"]] = []
+        if self.regions is not None:
+            parts.append(self.regions.of_point[None, :] == jnp.arange(self.regions.centers.shape[1])[:, None])
+        if self.motion is not None:
+            parts.append(self.motion.of_point[None, :] == jnp.arange(1, len(self.motion.at_rest) + 1)[:, None])
+        return points[None, :] & jnp.concatenate(parts)
 
     def at_rest(self, uv: Pixels) -> Mask:
         """`(n,)` which pixels are in no region that moves.
@@ -129,7 +165,44 @@ def judge_points(
     params: TrackParams,
     plan: TrackPlan,
 ) -> Judged:
-    """What cues say of the points, given the coarse pose, which most of those at rest have made."""
+    """What is said of points and things, given the coarse pose, which most of the points at rest have made."""
+    judged = _by_cues(state, view, seen, regions, coarse, twist, params, plan)
+    if plan.motion is None:
+        return judged
+    motion = _motion(state, view, seen, coarse, twist, params)
+    return judged.with_motion(motion, view)
+
+
+def _motion(
+    state: TrackState, view: View, seen: PointsSeen, coarse: SE3, twist: Float[Array, "6"], params: TrackParams
+) -> MotionState:
+    """What is known of the things that may move."""
+    assert params.motion is not None
+    points = state.points
+    observed = observe_points(points.X_world, seen.uv, coarse, twist, view, params, view.matched)
+    there = seen.there & (observed.depth > 0) & (points.depth > 0)
+    across = (
+        params.pixel_sigma * observed.depth[None, :] / jnp.stack([params.intrinsics.fx, params.intrinsics.fy])[:, None]
+    )
+    sigma = jnp.concatenate([across, depth_sigma(observed.depth, params)[None, :]])
+    measured = jnp.concatenate([points.xy, jnp.ones_like(points.xy[:1])]) * points.depth[None, :]
+    before = to_world(state.T_world_cam, measured)
+    X_world = jnp.where(params.motion.as_published, before, points.X_world)
+    measured = MeasuredPoints(X_world, observed.in_camera(), sigma, there)
+    background = seen.agreeing.astype(sigma.dtype)
+    return judge_motion(measured, seen.thing, background, coarse, state.motion, params.motion)
+
+
+def _by_cues(
+    state: TrackState,
+    view: View,
+    seen: PointsSeen,
+    regions: Regions | None,
+    coarse: SE3,
+    twist: Float[Array, "6"],
+    params: TrackParams,
+    plan: TrackPlan,
+) -> Judged:
     verdicts = _verdicts(state, view, seen, regions, coarse, twist, params, plan)
     judged = _with_regions(verdicts, regions, state.regions.weight, view, seen.agreeing, plan)
     if not verdicts:

@@ -5,7 +5,7 @@ from jaxlie import SE3
 from jaxslam_kernels.corners import corner_score, grid_corners, occupied_cells
 from jaxslam_kernels.depth_image import sample_depth
 from jaxslam_kernels.transform import to_world
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.observe import Observed, View, depth_sigma, match_depth, observe
 from jaxslam.state import TrackedPoints, TrackParams, TrackPlan
@@ -25,6 +25,9 @@ def refill(
     twist: Float[Array, "6"],
     params: TrackParams,
     plan: TrackPlan,
+    *,
+    first: Bool[Array, "h w"] | None = None,
+    cell_px: int | None = None,
 ) -> TrackedPoints:
     """Put the best corners of empty grid cells into free slots, numbered from `next_id` on.
 
@@ -36,8 +39,19 @@ def refill(
     16.6 instead of 11.7 on the start of Bonn `crowd`, but 8.3 instead of 9.2 on TUM `fr1_rpy`. Refusing mixed windows
     leaves too few points (`fr1_rpy` 10.2); giving them a fifth of the weight hands the scene to people, who are one
     surface (two people 145).
+
+    Args:
+        points: As they are.
+        next_id: Number of the first new one.
+        view: The frame.
+        T_world_cam: Its pose.
+        twist: Velocity of the camera.
+        params: Thresholds and camera.
+        plan: Static.
+        first: Pixels whose corners come before all others; some slots are kept free for them.
+        cell_px: Side of the cells instead of that of the plan, static.
     """
-    border, cell, depth = view.pyramid.border, plan.cell_px // 2, view.depth
+    border, cell, depth = view.pyramid.border, (cell_px or plan.cell_px) // 2, view.depth
     image = view.pyramid.levels[1][border:-border, border:-border]
     v, u = jnp.mgrid[: image.shape[0], : image.shape[1]]
     edge = _EDGE_PX // 2
@@ -52,10 +66,16 @@ def refill(
 
     good = (corners.score > _MIN_SCORE) & ~taken & (rough > 0) & (seen.depth > 0)
     one_surface = sample_depth(depth, uv, reach=plan.flow.finest.window // 2, max_step=_DEPTH_STEP) > 0
-    order = jnp.lexsort((-corners.score, ~one_surface, ~good))
     rank = jnp.cumsum(~points.valid, dtype=jnp.int32) - 1
+    keys, room = (-corners.score, ~one_surface, ~good), jnp.sum(good, dtype=jnp.int32)
+    if first is not None and plan.motion is not None:
+        column, row = jnp.round(uv).astype(jnp.int32)
+        ahead = good & first.at[row, column].get(mode="fill", fill_value=False)
+        keys, num_ahead = (*keys[:2], ~ahead, keys[2]), jnp.sum(ahead, dtype=jnp.int32)
+        room = jnp.minimum(room, jnp.maximum(num_ahead, rank[-1] + 1 - plan.motion.reserved))
+    order = jnp.lexsort(keys)
     candidate = order[jnp.clip(rank, 0, order.shape[0] - 1)]
-    new = ~points.valid & (rank < jnp.sum(good, dtype=jnp.int32))
+    new = ~points.valid & (rank < room)
     uv, rough, *chosen = (jnp.take(array, candidate, axis=-1) for array in (uv, rough, *seen))
     seen, matched = Observed(*chosen), match_depth(view, uv, rough, new, params)
     if matched is not None:

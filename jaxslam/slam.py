@@ -29,6 +29,7 @@ from jaxslam.frame_arrays import FrameArrays, FrameMemory
 from jaxslam.map import Map
 from jaxslam.map_file import load_map, save_map
 from jaxslam.map_link import Hung
+from jaxslam.masks.objects import ObjectFinder
 from jaxslam.pose import IDENTITY, compose, moved
 from jaxslam.semantics import Detector
 from jaxslam.stage_times import StageTimes
@@ -121,7 +122,9 @@ class Slam:
         self._plan = with_cues(track_plan(self.config.track), self.config.dynamics)
         self._detector = detector or detector_of(self.config.semantics)
         self._rough_depth = RoughDepth(camera) if camera.is_stereo else None
-        self._memory = FrameMemory(camera.height, camera.width, pairs=camera.is_stereo)
+        motion = self._plan.motion
+        self._memory = FrameMemory(camera.height, camera.width, pairs=camera.is_stereo, movable=motion is not None)
+        self._objects = None if motion is None else ObjectFinder(camera, motion.num_objects)
         self._ready = False
         self._begin()
 
@@ -211,7 +214,7 @@ class Slam:
         watch.ends("flow")
         mask: FrameMask = self._beside.drain()[-1]
         mask = mask._replace(error=mask.error or self._back.told_error())
-        arrays = self._memory.ignoring(arrays, mask.mask)
+        arrays = self._masked(arrays, mask.mask, frame.dynamic_mask)
         watch.ends("wait for mask")
         output, placed, num_matched = self._advance(arrays, followed), None, 0
         arrays, mask = self._without_movers(arrays, mask, followed, output)
@@ -393,6 +396,17 @@ class Slam:
             mask = mask._replace(mask=mask.mask | given, source=mask.source or MaskSource.CALLER)
         return mask
 
+    def _masked(self, arrays: FrameArrays, mask: np.ndarray, given: np.ndarray | None) -> FrameArrays:
+        """The frame without what may move; or with it, divided into things, if the tracker judges them.
+
+        What the caller has masked is left out in any case.
+        """
+        if self._objects is None:
+            return self._memory.ignoring(arrays, mask)
+        objects = self._objects.divided(mask if given is None else mask & ~given, np.asarray(arrays.depth))
+        arrays = self._memory.with_movable(arrays, objects.labels)
+        return self._memory.ignoring(arrays, objects.rest if given is None else objects.rest | given)
+
     def _advance(self, arrays: FrameArrays, followed: Followed) -> TrackOutput:
         params = self._patient_params if self._back.is_behind else self._params
         self._state, output = _track_followed(self._state, arrays, followed, params, self._plan)
@@ -401,7 +415,9 @@ class Slam:
     def _without_movers(
         self, arrays: FrameArrays, mask: FrameMask, followed: Followed, output: TrackOutput
     ) -> tuple[FrameArrays, FrameMask]:
-        """The frame and its mask with what cues say moves, regions and points: the map gets nothing of it."""
+        """The frame and its mask with what is said to move, regions, things and points: the map gets nothing of it."""
+        if self._objects is not None:  # what may move and stands still is out of the mask
+            mask = mask._replace(mask=np.array(arrays.ignore))
         moving = None if output.moving is None else np.asarray(output.moving)
         points, reach_px = moving_points(output.verdicts), self.config.dynamics.reach_px
         if reach_px and points.any():
@@ -490,7 +506,7 @@ def track_plan(config: TrackConfig) -> TrackPlan:
 def track_params(camera: Camera, config: TrackConfig, dtype: type[np.floating] = np.float32) -> TrackParams:
     """The traced part of the tracker's settings, with the camera; `track_step` takes it."""
     of_camera = {"readout_s": camera.readout_s, "baseline_m": camera.baseline_m if camera.is_stereo else 0.0}
-    traced = (name for name in TrackParams._fields if name not in ("intrinsics", "cues", *of_camera))
+    traced = (name for name in TrackParams._fields if name not in ("intrinsics", "cues", "motion", *of_camera))
     settings = {name: getattr(config, name) for name in traced} | of_camera | _of_pair(camera, config)
     arrays: dict[str, Any] = {name: jnp.asarray(value, dtype) for name, value in settings.items()}
     return TrackParams(intrinsics=camera.intrinsics(dtype), **arrays)

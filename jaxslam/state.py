@@ -11,6 +11,7 @@ from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Points, Scalar, Weig
 from jaxtyping import Array, Bool, Float, Int, Key, Num
 
 from jaxslam.dynamics.cue import Cue, Verdict
+from jaxslam.dynamics.motion_state import MotionMemory, MotionParams, MotionPlan, MotionState
 from jaxslam.dynamics.regions import RegionMemory, RegionPlan, Regions
 
 
@@ -96,6 +97,8 @@ class TrackPlan(NamedTuple):
         cues: What tells points that move, see `dynamics.cue.Cue`; functions, in the order of `TrackParams.cues`.
         regions: How the depth image is divided for cues that judge whole surfaces; `None` if none does.
         even_votes: Whether no region has more of a say in the pose than an even share.
+        motion: How things that may move are judged, see `FrameArrays.movable`; `None` if they are not.
+        keyframe_choice: Whether a keyframe is made as soon as there is a reason, or at the right moment after.
         look_up: How points of keyframes are searched. A window of 21 takes 1 ms a frame more and is no more accurate;
             17, 15 and 13 are alike too: TUM `fr1_rpy` 10.2, 10.2, 10.2 mm, Bonn `crowd` (start) 9.7, 9.6, 9.5.
     """
@@ -114,6 +117,8 @@ class TrackPlan(NamedTuple):
     cues: tuple[Cue, ...] = ()
     regions: RegionPlan | None = None
     even_votes: bool = False
+    motion: MotionPlan | None = None
+    keyframe_choice: Literal["as_needed", "sparing"] = "as_needed"
 
     def exact(self) -> "TrackPlan":
         """The same with searches that go on until nothing moves, for derivatives that must be exact; in float64.
@@ -158,6 +163,10 @@ class TrackParams(NamedTuple):
             if the last one was made just now,
         keyframe_after_s: or when the last one was made this many seconds ago (`TIME`),
         keyframe_weak_after_s: or this many while tracking is weak (`WEAK`) or has few points.
+        keyframe_least_s: With a sparing choice, not before this many seconds have gone since the last one,
+        keyframe_motion: nor before points have moved by this part of their depth in the axes of the camera,
+        keyframe_movable_below: nor while more than this share of the picture may move,
+        keyframe_patience_s: for so many seconds more.
         probation_frames: Frames after which a point counts in full. What moves on its own is an outlier within a few
             frames, so that it never counts for much.
         anchor_frames: Frames after which the place of a point counts as where it was, for cues to slow motion.
@@ -166,6 +175,7 @@ class TrackParams(NamedTuple):
         max_turn_rad_per_s: Highest believed angular speed of the camera.
         baseline_m: From the left to the right camera of a rectified pair, metres; 0 for a camera that measures depth.
         cues: Parameters of each of `TrackPlan.cues`.
+        motion: Parameters of `TrackPlan.motion`; `None` without.
     """
 
     intrinsics: Intrinsics
@@ -189,6 +199,10 @@ class TrackParams(NamedTuple):
     keyframe_points_below: Scalar
     keyframe_after_s: Scalar
     keyframe_weak_after_s: Scalar
+    keyframe_least_s: Scalar
+    keyframe_motion: Scalar
+    keyframe_movable_below: Scalar
+    keyframe_patience_s: Scalar
     probation_frames: Scalar
     anchor_frames: Scalar
     restart_after: Scalar
@@ -196,6 +210,7 @@ class TrackParams(NamedTuple):
     max_turn_rad_per_s: Scalar
     baseline_m: Scalar
     cues: tuple[Any, ...] = ()
+    motion: MotionParams | None = None
 
 
 class TrackedPoints(NamedTuple):
@@ -285,6 +300,7 @@ class TrackState(NamedTuple):
         next_id: Number of the next new point.
         key: Source of every random choice.
         regions: What is kept of the regions of the last frame, see `TrackPlan.regions`.
+        motion: What is kept of the things in it that may move, see `TrackPlan.motion`.
     """
 
     pyramid: Pyramid
@@ -300,6 +316,7 @@ class TrackState(NamedTuple):
     next_id: Code
     key: Key[Array, ""]
     regions: RegionMemory
+    motion: MotionMemory
 
 
 class TrackOutput(NamedTuple):
@@ -324,7 +341,8 @@ class TrackOutput(NamedTuple):
         keyframe: A `KeyframeReason`.
         verdicts: What each of `TrackPlan.cues` says of the points that were followed,
         regions: and the regions they speak of.
-        moving: `(h, w)` true in regions that move; `None` without regions.
+        moving: `(h, w)` true in regions and things that move; `None` without either.
+        motion: What is known of the things that may move; `None` without `TrackPlan.motion`.
     """
 
     T_world_cam: SE3
@@ -346,6 +364,7 @@ class TrackOutput(NamedTuple):
     verdicts: tuple[Verdict, ...] = ()
     regions: Regions | None = None
     moving: Bool[Array, "h w"] | None = None
+    motion: MotionState | None = None
 
     @property
     def is_keyframe(self) -> Flag:

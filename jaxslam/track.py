@@ -7,6 +7,7 @@ carries it, by the implicit function theorem.
 """
 
 import enum
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -22,16 +23,17 @@ from jaxslam_kernels.pose_refine import PoseRefinement, refine_pose
 from jaxslam_kernels.robust import weighted_median
 from jaxslam_kernels.transform import displacement, moved, to_camera, to_world
 from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Points, Scalar, Weights
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
+from jaxslam.dynamics.motion_state import labels_at, no_motion
 from jaxslam.dynamics.regions import Regions, even_votes, find_regions, no_regions
 from jaxslam.frame_arrays import FrameArrays
 from jaxslam.judging import Judged, PointsSeen, judge_points
+from jaxslam.keyframe_choice import Candidate, keyframe_reason
 from jaxslam.keyframes import empty_keyframes, look_up, with_keyframe
 from jaxslam.observe import View, depth_sigma, match_depth, observe_points, predict_pixels
 from jaxslam.refill import refill
 from jaxslam.state import (
-    KeyframeReason,
     LookedUp,
     TrackedPoints,
     TrackOutput,
@@ -49,6 +51,8 @@ _MAX_FUSED = 4
 _RIGHT_LEVELS = 2
 """Of the pyramid of the right image: where matching begins is known to a few pixels."""
 _UNKNOWN_VARIANCE = 1e2
+_LOOK_EVERY = 3
+"""Frames from one search for points on things that have too few to the next."""
 _DEPTH_GATE_M, _DEPTH_SIGMAS = 0.1, 3.0
 """Of depth that supports a pose hypothesis: metres, and deviations with even votes or of a pair.
 
@@ -147,6 +151,7 @@ def init_state(
         next_id=jnp.zeros((), jnp.int32),
         key=jax.random.key(seed),
         regions=no_regions(plan.regions, dtype),
+        motion=no_motion(plan.motion, n, dtype),
     )
 
 
@@ -203,7 +208,8 @@ def track_followed(
     view = _matched(View(frame, pyramid, depth, state.elapsed_s + frame.dt_s), state, uv, found, predicted, params)
     column, row = jnp.round(lax.stop_gradient(uv)).astype(jnp.int32)
     masked = frame.ignore.at[row, column].get(mode="fill", fill_value=True)
-    followed = found & ~masked
+    thing = _things_at(frame, uv, plan)
+    followed = _background(state, found & ~masked, thing, params)
     params = _widened(params, state.points.uv, uv, followed)
     regions = _regions(state, view, uv, predicted, params, plan)
     trust = _trust(state.points, params)
@@ -212,8 +218,11 @@ def track_followed(
         votes = even_votes(votes, regions)
     coarse, agreeing = _coarse_pose(state, view, uv, votes, predicted, params, plan)
     twist = _twist(state.T_world_cam, coarse, view.elapsed_s)
-    points = PointsSeen(uv, followed, found & masked, agreeing, trust)
+    points = PointsSeen(uv, followed, found & masked, agreeing, trust, found & ~masked, thing)
     judged = judge_points(state, view, points, regions, coarse, twist, params, plan)
+    if judged.motion is not None:
+        joining = judged.motion.joining()
+        followed, agreeing = followed | joining, agreeing | (joining & _fits(state, view, uv, coarse, twist, params))
     # Not `votes`: what carries the pose is out by now, and with even votes here too the kitchen has 0.029 m, not 0.025.
     trust = judged.weights(trust)
     agreeing &= trust > 0
@@ -223,7 +232,40 @@ def track_followed(
     witnesses = judged.witnesses(uv, state.points.anchor_age, followed & ~inliers)
     kept = _update_points(state, view, uv, inliers, witnesses, refined.T_world_cam, params)
     new_state, output = _conclude(state, view, kept, refined, looked_up, verdict, judged, params, plan)
-    return new_state, output._replace(verdicts=judged.verdicts, regions=judged.regions, moving=judged.moving)
+    said = {"verdicts": judged.verdicts, "regions": judged.regions, "moving": judged.moving, "motion": judged.motion}
+    return new_state, output._replace(**said)
+
+
+def _things_at(frame: FrameArrays, uv: Pixels, plan: TrackPlan) -> Int[Array, " n"]:
+    """Number of the thing that may move at each pixel; 0 for none, and where nobody asks."""
+    if plan.motion is None:
+        return jnp.zeros(uv.shape[1], jnp.int32)
+    if frame.movable is None:
+        raise ValueError("frame.movable: expected numbers of what may move for a plan with `motion`, got None")
+    return labels_at(frame.movable, uv)
+
+
+def _background(state: TrackState, there: Mask, thing: Int[Array, " n"], params: TrackParams) -> Mask:
+    """`(n,)` which points the coarse pose is made of: those on nothing that may move.
+
+    Where such things cover nearly all, those that stood still in the last frame count too.
+    """
+    outside = there & (thing == 0)
+    if not state.motion.at_rest.shape[0]:
+        return outside
+    before = state.motion.of_point
+    stood = there & (before > 0) & state.motion.at_rest[jnp.maximum(before - 1, 0)]
+    few = jnp.sum(outside, dtype=params.weak_inliers.dtype) < params.weak_inliers
+    return outside | (few & stood)
+
+
+def _fits(state: TrackState, view: View, uv: Pixels, pose: SE3, twist: Float[Array, "6"], params: TrackParams) -> Mask:
+    """Which points are where a pose puts them, in the picture and in depth where that is measured."""
+    X_world = state.points.X_world
+    seen = observe_points(X_world, uv, pose, twist, view, params, view.matched)
+    apart_m = jnp.abs(to_camera(pose, X_world)[2] - seen.depth)
+    fits = (seen.depth <= 0) | (apart_m < _DEPTH_SIGMAS * depth_sigma(seen.depth, params))
+    return _close(pose, X_world, seen.xy, params) & fits
 
 
 def _matched(view: View, state: TrackState, uv: Pixels, found: Mask, predicted: SE3, params: TrackParams) -> View:
@@ -431,19 +473,34 @@ def _conclude(
     twist = choose(jnp.zeros_like(state.twist), _twist(state.T_world_cam, pose, view.elapsed_s))
     points = choose(state.points._replace(valid=state.points.valid & held), kept.points)
     since_keyframe_s = state.since_keyframe_s + jnp.maximum(view.frame.dt_s, 0)
-    reason_to_keep = lambda started: _keyframe_reason(
-        state, kept, looked_up, verdict, started, since_keyframe_s, params
+    movable = (
+        jnp.zeros_like(twist[0]) if view.frame.movable is None else jnp.mean(view.frame.movable > 0, dtype=twist.dtype)
     )
+    candidate = Candidate(
+        refined.T_world_cam,
+        kept.points,
+        kept.tracked,
+        looked_up.overlap,
+        verdict.lost,
+        verdict.weak,
+        start,
+        since_keyframe_s,
+        movable,
+    )
+    reason_to_keep = lambda started: keyframe_reason(state, candidate._replace(started=started), params, plan)
     few = jnp.sum(points.valid, dtype=twist.dtype) < params.refill_below * plan.num_points
     may = few if plan.new_points == "always" else few & (reason_to_keep(start) > 0)
-    points = lax.cond(
-        start | (may & ~verdict.lost),
-        lambda p: refill(
-            p, state.next_id, judged.without_watched(view, kept.witnesses, plan), pose, twist, params, plan
-        ),
-        lambda p: p,
-        points,
-    )
+    unwatched = judged.unwatched(view, kept.witnesses)
+    may = may if unwatched is None else may | (jnp.any(unwatched) & (state.frame % _LOOK_EVERY == 0))
+    free = judged.without_watched(view, kept.witnesses, plan)
+    seek = partial(refill, first=unwatched, next_id=state.next_id, view=free)
+    seek = partial(seek, T_world_cam=pose, twist=twist, params=params, plan=plan)
+    sought = (start | (may & ~verdict.lost)).astype(jnp.int32)
+    branches = [lambda p: p, seek]
+    if plan.motion is not None:  # more features from the rest, as in USD-SLAM
+        branches.append(partial(seek, cell_px=plan.motion.dense_cell_px))
+        sought = sought * jnp.where(movable > 0.5, 2, 1)
+    points = lax.switch(sought, branches, points)
     failed = start & (jnp.sum(points.valid, dtype=twist.dtype) < params.min_inliers)
     started, stale = start & ~failed, held | failed
     keyframe = reason_to_keep(started)
@@ -465,6 +522,7 @@ def _conclude(
         next_id=jnp.maximum(state.next_id, jnp.max(jnp.where(points.valid, points.id + 1, 0))),
         key=state.key,
         regions=judged.memory or state.regions,
+        motion=state.motion if judged.motion is None else choose(state.motion, judged.motion.memory),
     )
     status = jnp.select(
         [started, verdict.lost, verdict.weak],
@@ -492,31 +550,3 @@ def _conclude(
         keyframe=keyframe,
     )
     return new_state, output
-
-
-def _keyframe_reason(
-    state: TrackState,
-    kept: _Kept,
-    looked_up: LookedUp,
-    verdict: _Outcome,
-    started: Flag,
-    since_keyframe_s: Scalar,
-    params: TrackParams,
-) -> Code:
-    """Why to keep the frame, if at all."""
-    old = kept.tracked & (kept.points.age > state.since_keyframe)
-    num_kept = jnp.sum(kept.tracked, dtype=since_keyframe_s.dtype)
-    share = jnp.sum(old, dtype=since_keyframe_s.dtype) / jnp.maximum(num_kept, 1)
-    tracked = ~verdict.lost
-    enough = params.keyframe_points_below * kept.tracked.shape[0]
-    few, hardly_any = tracked & (num_kept < enough), num_kept < 0.5 * enough
-    causes = (
-        (started, KeyframeReason.STARTED),
-        (tracked & (looked_up.overlap < params.keyframe_below), KeyframeReason.NEW_AREA),
-        (tracked & (share < params.keyframe_followed_below), KeyframeReason.FEW_FOLLOWED),
-        (few & (hardly_any | (since_keyframe_s > params.keyframe_weak_after_s)), KeyframeReason.FEW_POINTS),
-        (verdict.weak & (since_keyframe_s > params.keyframe_weak_after_s), KeyframeReason.WEAK),
-        (tracked & (since_keyframe_s > params.keyframe_after_s), KeyframeReason.TIME),
-    )
-    conditions = [condition for condition, _ in causes]
-    return jnp.select(conditions, [_code(reason) for _, reason in causes], _code(KeyframeReason.NONE))

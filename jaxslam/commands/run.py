@@ -53,6 +53,8 @@ class Demo:
     """Boxes carried about in it, which no network knows."""
     seated: int = 0
     """People sitting at the desk, who hardly move."""
+    parked: int = 0
+    """Boxes that stand, and are pushed about now and then."""
     seed: int = 0
     """Seed of room, people, path and noise."""
     viz: bool = False
@@ -71,6 +73,7 @@ class Demo:
             people=self.people,
             boxes=self.boxes,
             seated=self.seated,
+            parked=self.parked,
             seed=self.seed,
         )
         console.print(f"Rendering a room with {self._who()}, the camera moving as in '{self.path}'.")
@@ -81,7 +84,8 @@ class Demo:
 
     def _who(self) -> str:
         boxes = f", {self.boxes} boxes carried about" if self.boxes else ""
-        return f"{self.people} people{boxes}" + (f", {self.seated} people at the desk" if self.seated else "")
+        parked = f", {self.parked} boxes pushed now and then" if self.parked else ""
+        return f"{self.people} people{boxes}{parked}" + (f", {self.seated} people at the desk" if self.seated else "")
 
 
 @dataclass(frozen=True)

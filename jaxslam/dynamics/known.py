@@ -6,10 +6,11 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.config import DynamicsConfig
+from jaxslam.config import DynamicsConfig, MotionConfig
 from jaxslam.dynamics.clusters import ClusterParams, cluster_cue
 from jaxslam.dynamics.cue import Cue
 from jaxslam.dynamics.epipolar import EpipolarParams, make_epipolar_cue
+from jaxslam.dynamics.motion_state import MotionParams, MotionPlan
 from jaxslam.dynamics.regions import RegionPlan
 from jaxslam.dynamics.trajectory import TrajectoryParams, trajectory_cue
 from jaxslam.state import TrackParams, TrackPlan
@@ -45,16 +46,22 @@ def with_cues(plan: TrackPlan, config: DynamicsConfig) -> TrackPlan:
         cues=tuple(known.cue(config) for known in chosen),
         regions=regions if needed else None,
         even_votes=config.even_votes,
+        motion=_motion_plan(config.motion),
     )
 
 
 def with_cue_params(params: TrackParams, config: DynamicsConfig, dtype: type[np.floating] = np.float32) -> TrackParams:
     """The parameters with those of the cues of the settings, all of one floating-point type but for flags."""
-    return params._replace(cues=tuple(_params_of(name, config, dtype) for name in config.cues))
+    cues = tuple(_params_of(getattr(config, name), _KNOWN[name].params, config, dtype) for name in config.cues)
+    motion = _params_of(config.motion, MotionParams, config, dtype) if config.motion.enabled else None
+    return params._replace(cues=cues, motion=motion)
 
 
-def _params_of(name: str, config: DynamicsConfig, dtype: type[np.floating]) -> Any:
-    make, chosen = _KNOWN[name].params, getattr(config, name)
+def _motion_plan(config: MotionConfig) -> MotionPlan | None:
+    return MotionPlan(config.num_objects, config.reserved, config.dense_cell_px) if config.enabled else None
+
+
+def _params_of(chosen: Any, make: Callable[..., Any], config: DynamicsConfig, dtype: type[np.floating]) -> Any:
     fields: Any = make._fields  # type: ignore[attr-defined]
     values = {field: getattr(chosen, field) for field in fields if field != "temperature"}
     values["temperature"] = config.temperature

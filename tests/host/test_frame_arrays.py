@@ -21,8 +21,9 @@ class TestFrameArrays:
         arrays = frame_arrays(frame(100), 0.1)
         np.testing.assert_array_equal(arrays.image, np.full((4, 6), 100, np.uint8))
         assert not np.any(arrays.ignore)
-        assert [array.dtype for array in arrays[:-1]] == [np.uint8, np.float32, bool, np.float32, np.float32]
+        assert [array.dtype for array in arrays[:5]] == [np.uint8, np.float32, bool, np.float32, np.float32]
         assert arrays.right is None
+        assert arrays.movable is None
         assert (float(arrays.dt_s), float(arrays.depth_delay_s)) == (pytest.approx(0.1), 0)
 
     def test_mask_and_delay(self) -> None:
@@ -37,7 +38,7 @@ class TestFrameArrays:
 
     def test_double_precision(self) -> None:
         arrays = frame_arrays(frame(100), 0.1, np.float64)
-        assert {array.dtype for array in arrays[:-1]} == {np.dtype("uint8"), np.dtype("bool"), np.dtype("float64")}
+        assert {array.dtype for array in arrays[:5]} == {np.dtype("uint8"), np.dtype("bool"), np.dtype("float64")}
 
 
 class TestStackFrames:

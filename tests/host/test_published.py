@@ -141,6 +141,26 @@ ABLATIONS = {
             S + "static": (0.0101, 0.0083, 0.0099, 0.0079, 0.0068),
         },
     ),
+    "usd_ablation": (
+        "USD-SLAM",
+        {
+            "static": ("ORB-SLAM2", None),
+            "usd-segmentation": ("USD-SLAM", "segmentation"),
+            "usd": ("USD-SLAM", None),
+        },
+        {
+            W + "xyz": (0.459, 0.037, 0.035),
+            W + "halfsphere": (0.351, 0.021, 0.020),
+            W + "rpy": (0.662, 0.058, 0.035),
+            B + "balloon": (0.065, 0.029, 0.028),
+            B + "balloon2": (0.230, 0.030, 0.029),
+            B + "crowd2": (0.603, 0.028, 0.028),
+            B + "crowd3": (0.524, 0.029, 0.026),
+            B + "person_tracking": (0.796, 0.029, 0.028),
+            B + "person_tracking2": (1.068, 0.046, 0.041),
+            B + "moving_obstructing_box2": (0.622, 0.173, 0.178),
+        },
+    ),
     "occlusion_ablation": (  # Table 2; the world as static is in Table 1
         "Occlusion SLAM",
         {

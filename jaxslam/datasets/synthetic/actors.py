@@ -1,4 +1,4 @@
-"""Who moves in the room: walking people of capsules, boxes that are carried, and people who sit.
+"""Who moves in the room: walking people of capsules, boxes that are carried or pushed, and people who sit.
 
 Each actor has a frame of its own: origin on the floor under it (a person) or in its centre (a box), x forward, z up.
 Motions are closed forms of time in float64, so that ground truth is exact and any frame can be asked for.
@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from jaxslam.datasets.synthetic.body import TRUNK, below, body, bone
+from jaxslam.datasets.synthetic.parked import ParkedBox
 from jaxslam.datasets.synthetic.rigid import transform
 from jaxslam.datasets.synthetic.seated import SeatedPerson
 from jaxslam.datasets.synthetic.solids import Solid, box
@@ -55,7 +56,7 @@ _ACROSS_VIEW = (
 _ROUND_DESK = (Lane((0.4, 0.0), (0.85, 1.10), 0.45),)
 
 
-def cast(path: str, people: int, boxes: int, seated: int, seed: int) -> list[Actor]:
+def cast(path: str, people: int, boxes: int, seated: int, parked: int, seed: int) -> list[Actor]:
     """The actors of a scene.
 
     The first two cross the view of the camera close in front of it and in front of the desk, the others go round
@@ -66,7 +67,8 @@ def cast(path: str, people: int, boxes: int, seated: int, seed: int) -> list[Act
         path: The camera's path.
         people: How many people walk; they are actors 1 to `people`.
         boxes: How many boxes are carried; the actors after them.
-        seated: How many people sit, see `seated`; the last actors.
+        seated: How many people sit, see `seated`; the actors after those.
+        parked: How many boxes stand and are pushed now and then, see `parked`; the last actors.
         seed: Chooses where they start, their sizes and clothes.
     """
     lanes = _ROUND_DESK if path == "loop" else _ACROSS_VIEW
@@ -78,7 +80,8 @@ def cast(path: str, people: int, boxes: int, seated: int, seed: int) -> list[Act
         start += 2.0 * np.pi * (index - lane) / sharing
         kind = Person if index < people else CarriedBox
         actors.append(kind(lanes[lane], start, np.random.default_rng([seed, 200, index])))
-    return actors + [SeatedPerson(place, seed) for place in range(seated)]
+    actors += [SeatedPerson(place, seed) for place in range(seated)]
+    return actors + [ParkedBox(place, seed) for place in range(parked)]
 
 
 def _walk(lane: Lane, start: float, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

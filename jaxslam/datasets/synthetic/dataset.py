@@ -13,6 +13,7 @@ from jaxslam.checked import Checked, Range
 from jaxslam.datasets.synthetic import rigid
 from jaxslam.datasets.synthetic.actors import cast
 from jaxslam.datasets.synthetic.camera_path import CameraPathKind, camera_path
+from jaxslam.datasets.synthetic.parked import MOST_PARKED
 from jaxslam.datasets.synthetic.render import Rendering, View, pack_scene, render
 from jaxslam.datasets.synthetic.scene import furnish
 from jaxslam.datasets.synthetic.seated import MOST_SEATED, chairs
@@ -37,7 +38,8 @@ class SyntheticConfig(Checked):
         people: Number of walking people: actors 1 to `people`. Two or three at times fill half of the picture.
         boxes: Number of carried boxes: the actors after the people.
         seated: Number of people who sit at the ends of the desk and move a little, as in the `sitting` recordings of
-            TUM RGB-D: the last actors. Their chairs are static.
+            TUM RGB-D: the actors after the boxes. Their chairs are static.
+        parked: Number of boxes that stand for five seconds, are pushed for five, and so on: the last actors.
         width: Pixels of a row.
         height: Pixels of a column.
         fps: Frames a second.
@@ -58,6 +60,7 @@ class SyntheticConfig(Checked):
     people: Annotated[int, Range(at_least=0, at_most=24)] = 2
     boxes: Annotated[int, Range(at_least=0, at_most=24)] = 0
     seated: Annotated[int, Range(at_least=0, at_most=MOST_SEATED)] = 0
+    parked: Annotated[int, Range(at_least=0, at_most=MOST_PARKED)] = 0
     width: Annotated[int, Range(at_least=8, at_most=8192)] = 640
     height: Annotated[int, Range(at_least=8, at_most=8192)] = 480
     fps: Annotated[float, Range(above=0, at_most=1000)] = 30.0
@@ -119,8 +122,10 @@ class SyntheticDataset:
     def __init__(self, config: SyntheticConfig | None = None) -> None:
         self.config = config = config or SyntheticConfig()
         seated = f"_{config.seated}seated" if config.seated else ""
+        parked = f"_{config.parked}parked" if config.parked else ""
         pair = "_stereo" if config.baseline_m else ""
-        self.name = f"synthetic_{config.path}_{config.people}people_{config.boxes}boxes{seated}{pair}_seed{config.seed}"
+        actors = f"{config.people}people_{config.boxes}boxes{seated}{parked}"
+        self.name = f"synthetic_{config.path}_{actors}{pair}_seed{config.seed}"
         self.width, self.height, self.fps = config.width, config.height, config.fps
         self.fx = 525.0 * config.width / 640.0 if config.fx is None else config.fx
         self.fy = self.fx if config.fy is None else config.fy
@@ -144,7 +149,7 @@ class SyntheticDataset:
             fps=self.fps,
             baseline_m=config.baseline_m,
         )
-        self.actors = cast(config.path, config.people, config.boxes, config.seated, config.seed)
+        self.actors = cast(config.path, config.people, config.boxes, config.seated, config.parked, config.seed)
         static = furnish(config.seed) + chairs(config.seated, config.seed)
         owned = [(solid, number) for number, actor in enumerate(self.actors, 1) for solid in actor.solids]
         solids = [(placed.solid, 0) for placed in static] + owned
