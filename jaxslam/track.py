@@ -14,20 +14,20 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxlie import SE3
-from jaxslam_kernels.camera import to_pixels, without_distortion
+from jaxslam_kernels.camera import without_distortion
 from jaxslam_kernels.depth_image import believable
 from jaxslam_kernels.image import Pyramid, build_pyramid
 from jaxslam_kernels.lk_flow import lk_flow
-from jaxslam_kernels.pnp import ransac_pnp
-from jaxslam_kernels.pose_refine import PoseRefinement, refine_pose
+from jaxslam_kernels.pose_refine import PoseRefinement
 from jaxslam_kernels.robust import weighted_median
 from jaxslam_kernels.transform import displacement, moved, to_camera, to_world
-from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Points, Scalar, Weights
+from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Scalar, Weights
 from jaxtyping import Array, Float, Int
 
 from jaxslam.dynamics.motion_state import labels_at, no_motion
 from jaxslam.dynamics.regions import Regions, even_votes, find_regions, no_regions
 from jaxslam.frame_arrays import FrameArrays
+from jaxslam.frame_pose import coarse_pose, fits, refined_pose
 from jaxslam.judging import Judged, PointsSeen, judge_points
 from jaxslam.keyframe_choice import Candidate, keyframe_reason
 from jaxslam.keyframes import empty_keyframes, look_up, with_keyframe
@@ -53,13 +53,6 @@ _RIGHT_LEVELS = 2
 _UNKNOWN_VARIANCE = 1e2
 _LOOK_EVERY = 3
 """Frames from one search for points on things that have too few to the next."""
-_DEPTH_GATE_M, _DEPTH_SIGMAS = 0.1, 3.0
-"""Of depth that supports a pose hypothesis: metres, and deviations with even votes or of a pair.
-
-Metres with even votes too: a rendered room with people who sit has 2.4 mm instead of 4.1, but Bonn `crowd` loses a
-frame in two of five runs, and a frame of noise moves what follows by 7 mm instead of 6. The larger of 0.1 m and one
-deviation for all: `crowd` 0.0097-0.0099 m instead of 0.0102-0.0121, but `static` 36 mm instead of 16 in the room xyz.
-"""
 
 
 class Followed(NamedTuple):
@@ -216,18 +209,18 @@ def track_followed(
     votes = jnp.where(followed, trust, 0)
     if regions is not None and plan.even_votes:
         votes = even_votes(votes, regions)
-    coarse, agreeing = _coarse_pose(state, view, uv, votes, predicted, params, plan)
+    coarse, agreeing = coarse_pose(state, view, uv, votes, predicted, params, plan)
     twist = _twist(state.T_world_cam, coarse, view.elapsed_s)
     points = PointsSeen(uv, followed, found & masked, agreeing, trust, found & ~masked, thing)
     judged = judge_points(state, view, points, regions, coarse, twist, params, plan)
     if judged.motion is not None:
         joining = judged.motion.joining()
-        followed, agreeing = followed | joining, agreeing | (joining & _fits(state, view, uv, coarse, twist, params))
+        followed, agreeing = followed | joining, agreeing | (joining & fits(state, view, uv, coarse, twist, params))
     # Not `votes`: what carries the pose is out by now, and with even votes here too the kitchen has 0.029 m, not 0.025.
     trust = judged.weights(trust)
     agreeing &= trust > 0
     looked_up = look_up(state.keyframes, coarse, twist, judged.without_movers(view), params, plan)
-    refined, inliers = _refine(state, view, uv, jnp.where(agreeing, trust, 0), looked_up, coarse, twist, params)
+    refined, inliers = refined_pose(state, view, uv, jnp.where(agreeing, trust, 0), looked_up, coarse, twist, params)
     verdict = _judge(state, view, refined, followed & judged.counts(), inliers, params)
     witnesses = judged.witnesses(uv, state.points.anchor_age, followed & ~inliers)
     kept = _update_points(state, view, uv, inliers, witnesses, refined.T_world_cam, params)
@@ -257,15 +250,6 @@ def _background(state: TrackState, there: Mask, thing: Int[Array, " n"], params:
     stood = there & (before > 0) & state.motion.at_rest[jnp.maximum(before - 1, 0)]
     few = jnp.sum(outside, dtype=params.weak_inliers.dtype) < params.weak_inliers
     return outside | (few & stood)
-
-
-def _fits(state: TrackState, view: View, uv: Pixels, pose: SE3, twist: Float[Array, "6"], params: TrackParams) -> Mask:
-    """Which points are where a pose puts them, in the picture and in depth where that is measured."""
-    X_world = state.points.X_world
-    seen = observe_points(X_world, uv, pose, twist, view, params, view.matched)
-    apart_m = jnp.abs(to_camera(pose, X_world)[2] - seen.depth)
-    fits = (seen.depth <= 0) | (apart_m < _DEPTH_SIGMAS * depth_sigma(seen.depth, params))
-    return _close(pose, X_world, seen.xy, params) & fits
 
 
 def _matched(view: View, state: TrackState, uv: Pixels, found: Mask, predicted: SE3, params: TrackParams) -> View:
@@ -306,74 +290,10 @@ def _regions(
     return find_regions(key, view.depth, state.regions.centers, seen.in_camera(), ideal, plan.regions)
 
 
-def _coarse_pose(
-    state: TrackState, view: View, uv: Pixels, votes: Weights, predicted: SE3, params: TrackParams, plan: TrackPlan
-) -> tuple[SE3, Mask]:
-    """The pose that gets most votes of points, and which agree with it."""
-    seen = observe_points(state.points.X_world, uv, predicted, state.twist, view, params, view.matched)
-    by_noise = plan.even_votes or view.right is not None
-    result = ransac_pnp(
-        jax.random.fold_in(state.key, state.frame),
-        state.points.X_world,
-        to_pixels(params.intrinsics, seen.xy),
-        without_distortion(params.intrinsics),
-        weights=votes,
-        depth=seen.depth,
-        threshold_px=params.ransac_px,
-        threshold_depth=_DEPTH_SIGMAS * depth_sigma(seen.depth, params) if by_noise else _DEPTH_GATE_M,
-        averaged=plan.even_votes,
-        num_hypotheses=plan.num_hypotheses,
-        initial=predicted,
-    )
-    return result.T_world_cam, result.inliers
-
-
 def _twist(before: SE3, after: SE3, elapsed_s: Scalar) -> Float[Array, "6"]:
     """Velocity of the camera in its own axes."""
     known = elapsed_s > 1e-4
     return jnp.where(known, displacement(before, after) / jnp.where(known, elapsed_s, 1), 0)
-
-
-def _refine(
-    state: TrackState,
-    view: View,
-    uv: Pixels,
-    trust: Weights,
-    looked_up: LookedUp,
-    coarse: SE3,
-    twist: Float[Array, "6"],
-    params: TrackParams,
-) -> tuple[PoseRefinement, Mask]:
-    """The pose that fits followed points and points of keyframes together, and which followed points it fits."""
-    X_world = jnp.concatenate([state.points.X_world, looked_up.X_world], axis=1)
-    expected = to_camera(coarse, looked_up.X_world)[2]
-    matched = match_depth(view, looked_up.uv, expected, looked_up.weight > 0, params)
-    matched = None if view.matched is None or matched is None else jnp.concatenate([view.matched, matched])
-    seen = observe_points(X_world, jnp.concatenate([uv, looked_up.uv], axis=1), coarse, twist, view, params, matched)
-    weights = jnp.concatenate([trust, looked_up.weight])
-    refined = refine_pose(
-        coarse,
-        X_world,
-        to_pixels(params.intrinsics, seen.xy),
-        without_distortion(params.intrinsics),
-        weights=weights,
-        depth=seen.depth,
-        sigma_px=params.pixel_sigma,
-        sigma_depth=depth_sigma(seen.depth, params),
-        loss="cauchy",
-        scale=params.loss_scale,
-    )
-    close = _close(refined.T_world_cam, X_world, seen.xy, params)
-    return refined, (trust > 0) & close[: trust.shape[0]]
-
-
-def _close(T_world_cam: SE3, X_world: Points, xy: Pixels, params: TrackParams) -> Mask:
-    """Which points are seen within the outlier threshold of where the pose puts them."""
-    X_cam = to_camera(T_world_cam, X_world)
-    front = X_cam[2] > params.min_depth_m / 2
-    predicted = X_cam[:2] / jnp.where(front, X_cam[2], 1)[None, :]
-    error = to_pixels(params.intrinsics, predicted) - to_pixels(params.intrinsics, xy)
-    return front & (jnp.sum(jnp.square(error), axis=0) < jnp.square(params.outlier_px))
 
 
 def _judge(
