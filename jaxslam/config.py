@@ -149,6 +149,17 @@ class SemanticsConfig(Checked):
     """What may move, as the network names it; in a rendered room `person` and `box`."""
     min_score: Annotated[float, Share] = 0.3
     """Detections below this score are dropped."""
+    prompt_encoder: str | None = None
+    """Encoder of a promptable segmenter (SAM and its family), which makes masks of the boxes that `model` finds: a name
+    of `jaxslam models list`, or an ONNX file. Not with `scene`. Where a known one is not on this machine, which is
+    said, masks are made by depth."""
+    prompt_decoder: str | None = None
+    """Its decoder."""
+    prompt_min_iou: Annotated[float, Share] = 0.5
+    """Masks that it judges to fit less are dropped; those of boxes are then made by depth."""
+    examples: str | None = None
+    """YAML file or folder that shows what may move: images with masks if `model` is an in-context segmenter (SegGPT);
+    boxes and points of every frame for a promptable one. `labels` do not choose among them."""
     threads: Annotated[int, Range(at_least=1, at_most=64)] = 1
     """Threads the network may use."""
     frames: Literal["every", "keyframes"] = "keyframes"

@@ -14,6 +14,10 @@ _NANODET = "https://github.com/RangiLyu/nanodet"
 _FASTESTDET = "https://github.com/dog-qiuqiu/FastestDet"
 _DEEPLAB = "https://github.com/tensorflow/models/blob/master/research/deeplab/g3doc/model_zoo.md"
 _TFLITE = "https://github.com/google-coral/test_data"
+_MOBILE_SAM = "https://huggingface.co/Acly/MobileSAM"
+_EFFICIENT_SAM = "https://github.com/yformer/EfficientSAM"
+_SLIM_SAM = "https://huggingface.co/Xenova/slimsam-77-uniform"
+_SAM2 = "https://huggingface.co/SharpAI/sam2-hiera-tiny-onnx"
 _ULTRALYTICS = "https://docs.ultralytics.com/modes/export"
 
 
@@ -23,7 +27,7 @@ class KnownModel:
 
     Attributes:
         name: What commands and settings call it.
-        file: Name of its file.
+        file: Name of its file here.
         licence: Of the weights, as an SPDX identifier.
         page: Who made it.
         adapter: What reads its outputs.
@@ -140,6 +144,117 @@ KNOWN_MODELS: dict[str, KnownModel] = {
                 ("yolo11n", "boxes of the 80 COCO classes"),
                 ("yolo11n-seg", "boxes and masks of the 80 COCO classes"),
             )
+        ),
+        # Promptable segmenters, in pairs. Sizes and SHA-256 are those that several projects, independent of each other,
+        # pin for these files. The files themselves were never at hand here: the adapters were run on graphs with the
+        # names and shapes that their exporters write. Files published under a name that says nothing ("encoder.onnx")
+        # are kept under that of the entry.
+        *(
+            KnownModel(
+                name=name,
+                file=file,
+                url=url,
+                size_bytes=size_bytes,
+                sha256=sha256,
+                licence="Apache-2.0",
+                page=page,
+                adapter=adapter,
+                about=about,
+            )
+            for name, file, page, url, size_bytes, sha256, adapter, about in (
+                (
+                    "mobilesam-encoder",
+                    "mobile_sam_image_encoder.onnx",
+                    _MOBILE_SAM,
+                    f"{_MOBILE_SAM}/resolve/0d3b403339b4674a82493d5e97964dd78089ddc8/mobile_sam_image_encoder.onnx",
+                    28_157_093,
+                    "580f5fb648ea1062c0aabc26217aed56921985f03f0cbbd852bba81d760cc749",
+                    "sam",
+                    "for semantics.prompt_encoder, with mobilesam-decoder",
+                ),
+                (
+                    "mobilesam-decoder",
+                    "sam_mask_decoder_multi.onnx",
+                    _MOBILE_SAM,
+                    f"{_MOBILE_SAM}/resolve/0d3b403339b4674a82493d5e97964dd78089ddc8/sam_mask_decoder_multi.onnx",
+                    16_496_559,
+                    "8976b90a87ba50a6a72217a5ff994f7d25ce16f2229fcc1ed259e1294c622ffe",
+                    "sam",
+                    "for semantics.prompt_decoder, with mobilesam-encoder",
+                ),
+                (
+                    "efficientsam-encoder",
+                    "efficient_sam_vitt_encoder.onnx",
+                    _EFFICIENT_SAM,
+                    "https://raw.githubusercontent.com/yformer/EfficientSAM/f13035d925a0de803e8f733f3239fa05b1fcf36f"
+                    "/weights/efficient_sam_vitt_encoder.onnx",
+                    24_799_761,
+                    "84ed466ffcc5c1f8d08409bc34a23bb364ab2c15e402cb12d4335a42be0e0951",
+                    "efficient_sam",
+                    "for semantics.prompt_encoder, with efficientsam-decoder",
+                ),
+                (
+                    "efficientsam-decoder",
+                    "efficient_sam_vitt_decoder.onnx",
+                    _EFFICIENT_SAM,
+                    "https://raw.githubusercontent.com/yformer/EfficientSAM/f13035d925a0de803e8f733f3239fa05b1fcf36f"
+                    "/weights/efficient_sam_vitt_decoder.onnx",
+                    16_565_728,
+                    "a62f8fa5ea080447c0689418d69e58f1e83e0b7adf9c142e2bd9bcc8045c0b11",
+                    "efficient_sam",
+                    "for semantics.prompt_decoder, with efficientsam-encoder",
+                ),
+                (
+                    "slimsam-encoder",
+                    "slimsam-encoder.onnx",
+                    _SLIM_SAM,
+                    f"{_SLIM_SAM}/resolve/5850ab45f587c112167512ffef949107115e26a0/onnx/vision_encoder.onnx",
+                    23_276_014,
+                    "9f8433273a6750b587779baa0cf5508111001bf7e7acfcf585d370139fd366d0",
+                    "transformers_sam",
+                    "for semantics.prompt_encoder, with slimsam-decoder; boxes are asked for by their middle",
+                ),
+                (
+                    "slimsam-decoder",
+                    "slimsam-decoder.onnx",
+                    _SLIM_SAM,
+                    f"{_SLIM_SAM}/resolve/5850ab45f587c112167512ffef949107115e26a0/onnx"
+                    "/prompt_encoder_mask_decoder.onnx",
+                    16_557_892,
+                    "f4514391764fbd56e08e119060d874ecd7d52994bfb1968af159e12d4943b5bb",
+                    "transformers_sam",
+                    "for semantics.prompt_decoder, with slimsam-encoder",
+                ),
+                (
+                    "sam2-tiny-encoder",
+                    "sam2-tiny-encoder.onnx",
+                    _SAM2,
+                    f"{_SAM2}/resolve/main/encoder.onnx",
+                    134_261_315,
+                    "df265cb552475e1b3a6cb57c939e57c95ed849bfc2f985c06efab85d8bca6db9",
+                    "sam2",
+                    "for semantics.prompt_encoder, with sam2-tiny-decoder",
+                ),
+                (
+                    "sam2-tiny-decoder",
+                    "sam2-tiny-decoder.onnx",
+                    _SAM2,
+                    f"{_SAM2}/resolve/main/decoder.onnx",
+                    20_639_854,
+                    "63198f1f1e273d8f2f4a9d1baf926e53a01d78dc50e0674640e1513dc00d9927",
+                    "sam2",
+                    "for semantics.prompt_decoder, with sam2-tiny-encoder",
+                ),
+            )
+        ),
+        KnownModel(
+            name="seggpt",
+            file="seggpt.onnx",
+            licence="MIT",
+            page="https://github.com/baaivision/Painter",
+            adapter="in_context",
+            about="what is like examples, 448x448; a ViT-L",
+            how="export BAAI/seggpt-vit-large of transformers as jaxslam/semantics/prompted/in_context.py says",
         ),
     )
 }

@@ -11,10 +11,12 @@ import cv2
 import numpy as np
 import tyro
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
-from rich.table import Table
+from rich.table import Column, Table
 
 from jaxslam.commands.console import plain_console
+from jaxslam.config import SemanticsConfig
 from jaxslam.datasets.image_file import read_color
+from jaxslam.detector_choice import detector_of
 from jaxslam.download import download, sha256_of
 from jaxslam.draw_detections import draw_detections
 from jaxslam.errors import ConfigError, ModelError
@@ -28,9 +30,10 @@ from jaxslam.known_models import (
     local_file,
     models_dir,
 )
-from jaxslam.semantics import Detections, load_detector
+from jaxslam.semantics import Detections, Detector, load_detector
 
 _REPEATS = 5
+_NONE = "none"
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,8 @@ class ListModels:
 
     def main(self) -> None:
         """Run the command."""
-        table = Table("name", "size", "licence", "adapter", "here", title="Known models", title_justify="left")
+        name = Column("name", no_wrap=True)  # to be copied, on a narrow screen too
+        table = Table(name, "size", "licence", "adapter", "here", title="Known models", title_justify="left")
         files = {model.name: local_file(model) for model in KNOWN_MODELS.values()}
         for model in KNOWN_MODELS.values():
             size = "-" if model.size_bytes is None else f"{model.size_bytes / 1e6:.1f} MB"
@@ -91,7 +95,8 @@ class CheckModel:
     """Run a network on an image: print what it finds and how long it takes, and draw it."""
 
     file: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
-    """Model file (ONNX), or the name of a known model."""
+    """Model file (ONNX), or the name of a known model; with `--prompt-encoder` its boxes are prompts, and `none` is for
+    prompts of `--examples` alone."""
     image: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="IMAGE")]
     """Image to look at."""
     out: Path = Path("detections.png")
@@ -102,6 +107,12 @@ class CheckModel:
     """What reads the outputs of the network; recognised from them if not given."""
     min_score: float = 0.3
     """Leave out what is less sure than this, 0 to 1."""
+    prompt_encoder: str | None = None
+    """Encoder of a promptable segmenter, which makes masks: model file, or the name of a known model."""
+    prompt_decoder: str | None = None
+    """Its decoder."""
+    examples: Path | None = None
+    """YAML file or folder of examples: for an in-context segmenter images with masks, else boxes and points."""
 
     def main(self) -> None:
         """Run the command."""
@@ -112,14 +123,36 @@ class CheckModel:
             raise ConfigError(f"--min-score: expected 0 to 1, got {self.min_score}")
         if self.out.suffix.lower() != ".png":
             raise ConfigError(f"--out: expected a name that ends in .png, got '{self.out}'")
-        path, image = find_model(self.file), read_color(self.image)
-        detector = load_detector(path, labels=labels, min_score=self.min_score, adapter=self.adapter)
+        image = read_color(self.image)
+        detector, files = self._detector(labels)
         found, first_ms, median_ms = _timed(detector, image)
         _print_found(found, labels, self.min_score)
-        plain_console.print(f"{median_ms:.1f} ms an image, the first {first_ms:.1f} ms ({path})")
+        plain_console.print(f"{median_ms:.1f} ms an image, the first {first_ms:.1f} ms ({', '.join(map(str, files))})")
         bgr = cv2.cvtColor(draw_detections(image, found), cv2.COLOR_RGB2BGR)
         write_atomically(self.out, cv2.imencode(".png", bgr)[1].tobytes())
         plain_console.print(f"Picture: {self.out}")
+
+    def _detector(self, labels: tuple[str, ...]) -> tuple[Detector, list[Path]]:
+        """What finds, and the files of its networks. Unlike in a run, a known one that is not here is an error."""
+        prompts = (self.prompt_encoder, self.prompt_decoder)
+        if self.examples is None and prompts == (None, None):
+            path = find_model(self.file)
+            return load_detector(path, labels=labels, min_score=self.min_score, adapter=self.adapter), [path]
+        if self.adapter is not None:
+            raise ConfigError(f"--adapter: expected none with prompts or examples, got '{self.adapter}'")
+        model = None if self.file == _NONE else self.file
+        files = [find_model(name) for name in (model, *prompts) if name is not None]
+        settings = SemanticsConfig(
+            model=model,
+            labels=labels,
+            min_score=self.min_score,
+            prompt_encoder=self.prompt_encoder,
+            prompt_decoder=self.prompt_decoder,
+            examples=None if self.examples is None else str(self.examples),
+        )
+        detector = detector_of(settings)
+        assert detector is not None  # all files are here
+        return detector, files
 
 
 _Command: TypeAlias = (
@@ -172,7 +205,9 @@ def _print_found(found: Detections, labels: tuple[str, ...], min_score: float) -
     if len(found.labels):
         table = Table("label", "score", "left", "top", "right", "bottom", "mask", title="Found", title_justify="left")
         shares = (
-            ["-"] * len(found.labels) if found.masks is None else [f"{share:.1%}" for share in found.masks.mean((1, 2))]
+            ["-"] * len(found.labels)
+            if found.masks is None
+            else [f"{share:.1%}" if share else "-" for share in found.masks.mean((1, 2))]
         )
         for label, score, box, share in zip(found.labels, found.scores, found.boxes, shares, strict=True):
             table.add_row(label, f"{score:.2f}", *(f"{edge:.0f}" for edge in box), share)

@@ -31,6 +31,8 @@ def mask_of_detections(
 ) -> Bool[np.ndarray, "h w"]:
     """Where detected objects are: the network's own masks where it gives them, else from boxes and depth.
 
+    A box whose mask is empty is one for which the network gave none that it believes in.
+
     Args:
         detections: Of the image.
         depth: Metres, 0 where missing.
@@ -39,11 +41,13 @@ def mask_of_detections(
     mask = np.zeros(depth.shape, bool)
     if detections.class_mask is not None:
         mask |= detections.class_mask
-    if detections.masks is not None:
-        mask |= detections.masks.any(axis=0)
+    if detections.masks is None:
+        boxes = detections.boxes
     else:
-        for box in detections.boxes:
-            add_box(mask, depth, box)
+        mask |= detections.masks.any(axis=0)
+        boxes = detections.boxes[~detections.masks.any(axis=(1, 2))]
+    for box in boxes:
+        add_box(mask, depth, box)
     return dilated(mask, dilate_px)
 
 

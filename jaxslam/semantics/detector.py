@@ -45,7 +45,7 @@ class OnnxDetector:
             FrameError: If it is no such image.
             ModelError: If the network fails, or gives shapes or numbers that it cannot mean.
         """
-        _check_image(image)
+        check_image(image)
         tensor, placement = self._adapter.prepare(image)
         outputs = self._network.run(tensor)
         try:
@@ -78,10 +78,9 @@ def load_detector(
         ConfigError: If a label is none of the network's, or a number is out of range.
         ModelError: If the file is missing or damaged, or of no family, or not of the one named.
     """
-    _check_range("min_score", min_score)
-    _check_range("nms_iou", nms_iou)
-    if isinstance(num_threads, bool) or not isinstance(num_threads, int) or num_threads < 1:
-        raise ConfigError(f"num_threads: expected an integer >= 1, got {num_threads!r}")
+    check_share("min_score", min_score)
+    check_share("nms_iou", nms_iou)
+    check_threads(num_threads)
     if adapter is not None and adapter not in ADAPTERS:
         raise ModelError(f"adapter: expected one of {', '.join(ADAPTERS)}, got {adapter!r}{nearest(adapter, ADAPTERS)}")
     network = Network(Path(path), num_threads)
@@ -131,12 +130,32 @@ def _wanted_classes(labels: Collection[str], names: tuple[str, ...]) -> np.ndarr
     return np.array([name in wanted for name in names])
 
 
-def _check_range(field: str, value: float) -> None:
+def check_share(field: str, value: float) -> None:
+    """Refuse what is no number from 0 to 1.
+
+    Raises:
+        ConfigError: If it is none.
+    """
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= 1:
         raise ConfigError(f"{field}: expected a number from 0 to 1, got {value!r}")
 
 
-def _check_image(image: object) -> None:
+def check_threads(num_threads: int) -> None:
+    """Refuse what is no number of threads.
+
+    Raises:
+        ConfigError: If it is none.
+    """
+    if isinstance(num_threads, bool) or not isinstance(num_threads, int) or num_threads < 1:
+        raise ConfigError(f"num_threads: expected an integer >= 1, got {num_threads!r}")
+
+
+def check_image(image: object) -> None:
+    """Refuse what is no image that a detector takes.
+
+    Raises:
+        FrameError: If it is none.
+    """
     expected = "image: expected (height, width, 3) RGB uint8"
     if not isinstance(image, np.ndarray):
         raise FrameError(f"{expected}, got {type(image).__name__}")

@@ -2,6 +2,7 @@
 
 import ast
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -28,22 +29,27 @@ _DTYPES: dict[str, str] = {"float": "float32", "double": "float64"}
 
 
 class Network:
-    """A network that takes one image.
+    """A network, of one image or of whatever inputs.
 
     Attributes:
         path: Its file.
         graph: Its inputs and outputs.
     """
 
-    def __init__(self, path: Path, num_threads: int) -> None:
-        """Open a file, and run it once on an empty image: declared sizes of outputs may be open, or wrong.
+    def __init__(self, path: Path, num_threads: int, free_size: int = FREE_SIZE) -> None:
+        """Open a file; one that takes one image runs once on an empty one: declared sizes of outputs may be wrong.
+
+        Args:
+            path: The file.
+            num_threads: Threads it may use.
+            free_size: Width and height of an image whose size the network leaves open, pixels.
 
         Raises:
             ModelError: If there is no such file, if it cannot be read, or if the network does not run.
         """
         self.path = path
         self._session = _open(path, num_threads)
-        self.graph = self._look()
+        self.graph = self._look(free_size)
 
     def run(self, tensor: np.ndarray) -> list[Any]:
         """All outputs for an input: arrays, or whatever else the graph declares.
@@ -51,17 +57,25 @@ class Network:
         Raises:
             ModelError: If onnxruntime fails.
         """
+        return self.feed({self._session.get_inputs()[0].name: tensor})
+
+    def feed(self, inputs: Mapping[str, np.ndarray]) -> list[Any]:
+        """All outputs for inputs by name.
+
+        Raises:
+            ModelError: If onnxruntime fails.
+        """
         try:
-            return list(self._session.run(None, {self._session.get_inputs()[0].name: tensor}))
+            return list(self._session.run(None, dict(inputs)))
         except _ORT_ERRORS as error:
             raise ModelError(f"{self.path}: the network does not run: {_first_line(error)}") from error
 
-    def _look(self) -> Graph:
+    def _look(self, free_size: int) -> Graph:
         metadata = self._session.get_modelmeta().custom_metadata_map
         inputs, outputs = (
             tuple(map(_port, ports)) for ports in (self._session.get_inputs(), self._session.get_outputs())
         )
-        image = image_input(inputs, _free_size(metadata))
+        image = image_input(inputs, _free_size(metadata, free_size))
         if image is not None:
             blank = np.zeros((image.height, image.width, 3), image.dtype)
             blank = blank.transpose(2, 0, 1) if image.channels_first else blank
@@ -120,14 +134,14 @@ def _seen(port: Port, value: object) -> Port:
     return port._replace(shape=value.shape) if isinstance(value, np.ndarray) else port
 
 
-def _free_size(metadata: dict[str, str]) -> int:
+def _free_size(metadata: dict[str, str], otherwise: int) -> int:
     """The size a network was exported for, where its metadata says so (Ultralytics' `imgsz`, [height, width])."""
     try:
         sizes = ast.literal_eval(metadata.get("imgsz", ""))
     except (ValueError, SyntaxError):
-        return FREE_SIZE
+        return otherwise
     largest = max(sizes, default=0) if isinstance(sizes, list | tuple) else sizes
-    return largest if isinstance(largest, int) and largest > 0 else FREE_SIZE
+    return largest if isinstance(largest, int) and largest > 0 else otherwise
 
 
 def _count_bad(value: np.ndarray) -> str:

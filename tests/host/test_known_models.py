@@ -35,7 +35,8 @@ class TestTable:
         assert bool(model.url) != bool(model.how)  # it is either published or to be made
         if model.url is not None:
             assert model.url.startswith("https://")
-            assert model.url.endswith("/" + model.file)
+            assert model.url.endswith("/" + model.file) or model.file == f"{name}.onnx"
+            assert model.url.endswith(".onnx")
             assert re.fullmatch(r"[0-9a-f]{64}", model.sha256 or "")
 
     def test_default_can_be_downloaded_and_used_freely(self) -> None:
@@ -47,6 +48,15 @@ class TestTable:
         restricted = [model for model in KNOWN_MODELS.values() if model.licence.startswith("AGPL")]
         assert restricted
         assert all(model.url is None and "AGPL-3.0" in model.how for model in restricted)
+
+    def test_segmenters_come_in_pairs(self) -> None:
+        pairs = {name.removesuffix("-encoder") for name in KNOWN_MODELS if name.endswith("-encoder")}
+        assert pairs == {name.removesuffix("-decoder") for name in KNOWN_MODELS if name.endswith("-decoder")}
+        for pair in pairs:
+            encoder, decoder = (KNOWN_MODELS[f"{pair}-{part}"] for part in ("encoder", "decoder"))
+            assert encoder.adapter == decoder.adapter
+            assert decoder.name in encoder.about
+            assert encoder.name in decoder.about
 
     def test_is_known(self) -> None:
         assert is_known(DEFAULT_MODEL)

@@ -20,6 +20,7 @@ from jaxslam.errors import DownloadError
 from jaxslam.known_models import KNOWN_MODELS, known_model
 from jaxslam.semantics import Detections, no_detections
 from jaxslam.semantics.adapters import ADAPTERS
+from jaxslam.semantics.prompted import PROMPT_ADAPTERS
 
 fails = failing("models")
 
@@ -63,7 +64,7 @@ class TestHelp:
 
 class TestTable:
     def test_adapters_exist(self) -> None:
-        assert {model.adapter for model in KNOWN_MODELS.values()} <= set(ADAPTERS)
+        assert {model.adapter for model in KNOWN_MODELS.values()} <= {*ADAPTERS, *PROMPT_ADAPTERS, "in_context"}
 
     def test_lists_them_all(self, capsys: pytest.CaptureFixture[str], models_cache: Path) -> None:
         (models_cache / "FastestDet.onnx").write_bytes(CONTENT)
