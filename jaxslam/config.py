@@ -151,8 +151,8 @@ class SemanticsConfig(Checked):
     """Detections below this score are dropped."""
     prompt_encoder: str | None = None
     """Encoder of a promptable segmenter (SAM and its family), which makes masks of the boxes that `model` finds: a name
-    of `jaxslam models list`, or an ONNX file. Not with `scene`. Where a known one is not on this machine, which is
-    said, masks are made by depth."""
+    of `jaxslam models list`, or an ONNX file. Where a known one is not on this machine, which is said, masks are made
+    by depth."""
     prompt_decoder: str | None = None
     """Its decoder."""
     prompt_min_iou: Annotated[float, Share] = 0.5

@@ -16,12 +16,13 @@ from command_line import failing
 from tiny_models import Thing
 from tiny_segmenters import SURE
 
-from jaxslam import Slam
 from jaxslam.cli import main
 from jaxslam.config import SemanticsConfig, load_config
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.detector_choice import detector_of
+from jaxslam.dynamic_masks import DynamicMasks, MaskSource
 from jaxslam.errors import ConfigError, FrameError, JaxSlamError, ModelError
+from jaxslam.frame import to_grey
 from jaxslam.semantics import OnnxDetector
 from jaxslam.semantics.network import Network
 from jaxslam.semantics.prompted import (
@@ -385,20 +386,22 @@ class TestSettings:
             assert isinstance(detector_of(settings), OnnxDetector)
         assert "masks are made by depth: mobilesam-encoder is not on this machine" in caplog.text
 
-    def test_tracked(self, pair: dict[str, Any], tmp_path: Path) -> None:
-        """A box of the network in front leaves the picture, by the mask that is prompted for."""
-        room = SyntheticDataset(SyntheticConfig(frames=2, width=192, height=128, people=0))
-        box = Thing((13.0, 5.0, 45.0, 31.0), score=0.8)
-        yolox = tiny_models.yolox(tmp_path / "yolox.onnx", [box])
-        overrides = [f"semantics.{key}={value}" for key, value in {"model": yolox, **pair}.items()]
-        overrides += ["semantics.frames=every", "semantics.dilate_px=0", "track.cell_px=10", "track.num_levels=3"]
-        with Slam(room.camera, load_config(overrides=overrides)) as slam:
-            tracked = slam.track(room[0])
-        assert tracked.detector_error == ""
-        assert tracked.dynamic_mask is not None
+    def test_mask_of_a_frame(self, pair: dict[str, Any], yolox: str) -> None:
+        """What the tracker leaves out is the box of the network in front, by the mask that is prompted for."""
+        room = SyntheticDataset(SyntheticConfig(frames=1, width=192, height=128, people=0))
+        frame, detector = room[0], detector_of(SemanticsConfig(model=yolox, **pair))
+        assert frame.depth_m is not None
+        made = DynamicMasks(
+            room.camera, detector, deterministic=True, latency_frames=0, propagate=True, newcomers=False, dilate_px=0
+        )
+        try:
+            mask = made.of_frame(0, frame.image, to_grey(frame.image), frame.depth_m)
+        finally:
+            made.close()
+        assert (mask.error, mask.source) == ("", MaskSource.DETECTOR)
         expected = np.zeros((128, 192), bool)
         expected[10:62, 26:90] = True
-        assert np.count_nonzero(tracked.dynamic_mask != expected) < 0.02 * expected.sum()
+        assert np.count_nonzero(mask.mask != expected) < 0.02 * expected.sum()
 
 
 class TestCommand:

@@ -249,6 +249,26 @@ class TestRefused:
         with pytest.raises(ModelError, match=r"of one of these families: sam: image -> .*; got .*sam_decoder.onnx"):
             load_segmenter(decoder, encoder)
 
+    def test_input_that_is_not_known(self, tmp_path: Path) -> None:
+        """As that of SAM-HQ, which wants more of the encoder."""
+        encoder, decoder = tiny_segmenters.sam(tmp_path)
+        model = onnx.load(decoder)
+        more = onnx.helper.make_tensor_value_info("interm_embeddings", onnx.TensorProto.FLOAT, (1,))
+        model.graph.input.append(more)
+        onnx.save(model, decoder)
+        with pytest.raises(ModelError, match=r"of one of these families: .*interm_embeddings float32 1; outputs"):
+            load_segmenter(encoder, decoder)
+
+    def test_decoder_that_does_not_run(self, tmp_path: Path) -> None:
+        encoder, decoder = tiny_segmenters.sam(tmp_path)
+        model = onnx.load(decoder)
+        plane = next(each for each in model.graph.initializer if each.name == "plane")
+        plane.CopyFrom(onnx.numpy_helper.from_array(np.array([7, 9]), "plane"))
+        del model.graph.value_info[:]
+        onnx.save(model, decoder)
+        with pytest.raises(ModelError, match=r"sam_decoder.onnx: "):
+            load_segmenter(encoder, decoder)(white((64, 48)), [prompt("", box=(0, 0, 4, 4))])
+
     def test_adapter(self, tmp_path: Path) -> None:
         pair = tiny_segmenters.sam(tmp_path)
         with pytest.raises(ModelError, match=r"adapter: expected one of sam, sam2, .* got 'sam3' \(did you mean 'sam"):

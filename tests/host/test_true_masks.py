@@ -95,6 +95,11 @@ class TestWithTrueMasks:
         with pytest.raises(ConfigError, match=r"labels: no actor is a 'car'"):
             with_true_masks(room, dataclasses.replace(TRUTH, labels=("car",)))
 
+    @pytest.mark.parametrize("key", ["prompt_encoder", "prompt_decoder", "examples"])
+    def test_nothing_is_prompted_for(self, room: SyntheticDataset, key: str) -> None:
+        with pytest.raises(ConfigError, match=f"semantics.{key}: expected null with semantics.model=scene, got 'x'"):
+            with_true_masks(room, dataclasses.replace(TRUTH, **{key: "x"}))
+
 
 class TestNoNetwork:
     def test_is_no_file(self) -> None:

@@ -7,6 +7,7 @@ with the highest score is right, the others are wrong all over; on the right sid
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -27,7 +28,7 @@ _KINDS = ("none", "beside", "on", "first", "second")
 _SCORES = {4: (0.1, 0.2, 1.0, 0.3), 3: (0.2, 1.0, 0.1)}
 
 
-def build(path: Path, text: str, constants: Mapping[str, object]) -> Path:
+def build(path: Path, text: str, constants: Mapping[str, Any]) -> Path:
     """A graph of ONNX's own text format."""
     model = onnx.parser.parse_model(f'<ir_version: 9, opset_import: ["" : 17]> {text}')
     onnx.helper.set_model_props(model, {"imgsz": str(SIDE)})  # where real ones leave the size open, and mean 1024
@@ -314,7 +315,7 @@ def _offered(num: int) -> str:
     """
 
 
-def _constants(cells: int, num: int) -> dict[str, object]:
+def _constants(cells: int, num: int) -> dict[str, Any]:
     centres = (np.arange(cells) + 0.5) * SIDE / cells
     grid = np.stack(np.meshgrid(centres, centres))[None]
     kinds = {f"kind_{name}": float(kind) for kind, name in enumerate(_KINDS, start=-1)}

@@ -28,7 +28,8 @@ def with_true_masks(dataset: Dataset, config: SemanticsConfig) -> tuple[Dataset,
         other `model`, the recording as it is, and `None`.
 
     Raises:
-        ConfigError: If that is no rendered room, nor a part of one, or a label is neither `person` nor `box`.
+        ConfigError: If that is no rendered room, nor a part of one, if a label is neither `person` nor `box`, or if
+            masks shall be made by prompts, which has nothing to add to the truth.
     """
     if config.model != SCENE:
         return dataset, None
@@ -36,6 +37,9 @@ def with_true_masks(dataset: Dataset, config: SemanticsConfig) -> tuple[Dataset,
     room, indices = (dataset.whole, dataset.indices) if part else (dataset, range(len(dataset)))
     if not isinstance(room, SyntheticDataset):
         raise ConfigError(f"semantics.model: '{SCENE}' expected a rendered room, got the recording {dataset.name}")
+    for key in ("prompt_encoder", "prompt_decoder", "examples"):
+        if (value := getattr(config, key)) is not None:
+            raise ConfigError(f"semantics.{key}: expected null with semantics.model={SCENE}, got '{value}'")
     detector = SceneDetector(room, labels=config.labels)
     return _Noted(dataset, room, indices, detector), detector
 

@@ -45,6 +45,7 @@ class PromptAdapter(ABC):
         kinds: Its input of what they are.
         outputs: The decoder's outputs: one of those of masks, and that of their scores.
         size: Its input of the image's height and width, where it has one.
+        optional: Inputs of the decoder that it may have besides.
         prompt_axis: The axis of prompts.
         knows: Numbers of the points that it understands.
         knows_boxes: Whether boxes tell it where a thing ends; if not, its masks are cut off there.
@@ -59,6 +60,7 @@ class PromptAdapter(ABC):
     kinds: ClassVar[str] = "point_labels"
     outputs: ClassVar[tuple[tuple[str, ...], str]] = (("low_res_masks", "masks"), "iou_predictions")
     size: ClassVar[str] = "orig_im_size"
+    optional: ClassVar[tuple[str, ...]] = ()
     prompt_axis: ClassVar[int] = 0
     knows: ClassVar[tuple[int, ...]] = (0, 1, 2, 3)
     knows_boxes: ClassVar[bool] = True
@@ -76,7 +78,8 @@ class PromptAdapter(ABC):
         taken, given = ({port.name for port in ports} for ports in (decoder.inputs, decoder.outputs))
         masks, scores = cls.outputs
         needs = {*cls.embeddings, cls.points, cls.kinds}
-        return encoder.image is not None and needs <= taken and scores in given and not given.isdisjoint(masks)
+        answers = scores in given and not given.isdisjoint(masks)
+        return encoder.image is not None and needs <= taken <= needs | {*cls.optional} and answers
 
     @property
     def takes_many(self) -> bool:

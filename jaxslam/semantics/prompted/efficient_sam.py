@@ -8,7 +8,7 @@ from typing import ClassVar
 import cv2
 import numpy as np
 
-from jaxslam.semantics.graph import Colours
+from jaxslam.semantics.graph import Colours, Graph
 from jaxslam.semantics.placement import Placement
 from jaxslam.semantics.prompted.base import Arrays, Kinds, Points, PromptAdapter
 
@@ -29,8 +29,14 @@ class EfficientSam(PromptAdapter):
     points: ClassVar[str] = "batched_point_coords"
     kinds: ClassVar[str] = "batched_point_labels"
     outputs: ClassVar[tuple[tuple[str, ...], str]] = (("output_masks",), "iou_predictions")
+    optional: ClassVar[tuple[str, ...]] = ("orig_im_size",)
     prompt_axis: ClassVar[int] = 1
     knows: ClassVar[tuple[int, ...]] = (1, 2, 3)
+
+    @classmethod
+    def fits(cls, encoder: Graph, decoder: Graph) -> bool:
+        """By names; what the graph needs the size for is not done here."""
+        return super().fits(encoder, decoder) and any(port.name == cls.size for port in decoder.inputs)
 
     def prepare(self, pixels: np.ndarray) -> tuple[np.ndarray, Placement]:
         """As it is where the encoder takes any size, else stretched."""

@@ -1,13 +1,15 @@
 """In-context segmenters: an image and its mask are the prompt, and what is like it is found in other images.
 
 Wang et al., SegGPT (arXiv 2304.03284): the example lies above the image, its mask above what the network paints. Inputs
-and output as of transformers' `SegGptForImageSegmentation`, which stacks them itself:
+and output are those of transformers' `SegGptForImageSegmentation`, which stacks them itself:
 
-    torch.onnx.export(model, (image, example, mask), "seggpt.onnx", input_names=["pixel_values", "prompt_pixel_values",
-        "prompt_masks"], output_names=["pred_masks"])
+    model = SegGptForImageSegmentation.from_pretrained("BAAI/seggpt-vit-large").eval()
+    names = ["pixel_values", "prompt_pixel_values", "prompt_masks"]
+    torch.onnx.export(model, tuple(torch.zeros(3, 1, 3, 448, 448)), "seggpt.onnx", input_names=names,
+        output_names=["pred_masks"], opset_version=17, dynamo=False)
 
-With `dynamic_axes` for the batch, all examples of a class are given at once; the network averages their features if it
-was exported with `feature_ensemble=True`, and what it paints for each is averaged here in any case.
+With `dynamic_axes` for the first axis all examples of a class are given at once. A network that was exported with
+`feature_ensemble=True` then averages their features; what it paints for each is averaged here in any case.
 """
 
 from collections.abc import Sequence

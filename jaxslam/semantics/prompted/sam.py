@@ -28,6 +28,7 @@ class Sam(PromptAdapter):
         "image -> image_embeddings; point_coords, point_labels (mask_input, has_mask_input, orig_im_size)"
         " -> masks or low_res_masks, iou_predictions"
     )
+    optional: ClassVar[tuple[str, ...]] = ("mask_input", "has_mask_input", "orig_im_size")
 
     def feed(self, embedding: Arrays, points: Points, kinds: Kinds, placement: Placement) -> dict[str, np.ndarray]:
         """Without a box, SAM expects one row that is no point."""

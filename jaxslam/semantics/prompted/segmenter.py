@@ -123,9 +123,12 @@ class PromptSegmenter:
         points, kinds = np.stack([each.points for each in prompts]), np.array([each.kinds for each in prompts])
         try:
             fed = self._adapter.feed(embedding.values, points, kinds, embedding.placement)
-            ports = {port.name: port for port in self._decoder.graph.inputs}
-            outputs = self._decoder.feed({name: np.asarray(value, ports[name].dtype) for name, value in fed.items()})
-            named = {port.name: value for port, value in zip(self._decoder.graph.outputs, outputs, strict=True)}
+        except ModelError as error:
+            raise ModelError(f"{self._decoder.path.name}: {error}") from None
+        dtypes = {port.name: port.dtype for port in self._decoder.graph.inputs}
+        outputs = self._decoder.feed({name: np.asarray(value, dtypes[name]) for name, value in fed.items()})
+        named = {port.name: value for port, value in zip(self._decoder.graph.outputs, outputs, strict=True)}
+        try:
             return self._adapter.read(named, len(prompts))
         except ModelError as error:
             raise ModelError(f"{self._decoder.path.name}: {error}") from None
