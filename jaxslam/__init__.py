@@ -21,6 +21,9 @@ from jaxslam.frame import Frame as Frame
 from jaxslam.frame_arrays import FrameArrays as FrameArrays
 from jaxslam.frame_arrays import frame_arrays as frame_arrays
 from jaxslam.frame_arrays import stack_frames as stack_frames
+from jaxslam.rectification import RectifiedPair as RectifiedPair
+from jaxslam.rig import Lens as Lens
+from jaxslam.rig import Rig as Rig
 from jaxslam.slam import Slam as Slam
 from jaxslam.slam import track_params as track_params
 from jaxslam.slam import track_plan as track_plan

@@ -79,8 +79,8 @@ class Camera(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check_axis("x", self.fx, self.cx, self.width)
-        _check_axis("y", self.fy, self.cy, self.height)
+        check_axis("Camera", "x", self.fx, self.cx, self.width)
+        check_axis("Camera", "y", self.fy, self.cy, self.height)
 
     @classmethod
     def load(cls, source: str | Path) -> "Camera":
@@ -132,15 +132,20 @@ def _cameras_dir() -> Path:
     return configs_dir() / "cameras"
 
 
-def _check_axis(axis: str, focal: float, centre: float, extent: int) -> None:
+def check_axis(whose: str, axis: str, focal: float, centre: float, extent: int) -> None:
+    """Refuse a focal length that does not suit the image, or a principal point outside it.
+
+    Raises:
+        CameraError: If so.
+    """
     shortest, longest = extent / 20, extent * 50  # 169 and 1.1 degrees of view
     if not shortest <= focal <= longest:
         raise CameraError(
-            f"Camera.f{axis}: expected pixels that suit an image of {extent}, {shortest:g} to {longest:g},"
+            f"{whose}.f{axis}: expected pixels that suit an image of {extent}, {shortest:g} to {longest:g},"
             f" got {focal:g} (millimetres, or relative to the width?)"
         )
     if not 0 < centre < extent:
-        raise CameraError(f"Camera.c{axis}: expected a pixel inside the image, 0 to {extent}, got {centre:g}")
+        raise CameraError(f"{whose}.c{axis}: expected a pixel inside the image, 0 to {extent}, got {centre:g}")
 
 
 def _line(key: str, value: object) -> str:

@@ -31,6 +31,11 @@ _ORB_SLAM3 = _SHARED | {
 _FISHEYE = "KannalaBrandt8"
 
 
+def is_pair(raw: Mapping[str, Any]) -> bool:
+    """Whether a camera file describes two cameras as they are, of a pair that is not rectified."""
+    return any(key in ("left", "right", "cam0", "cam1") or key.startswith("Camera2.") for key in raw)
+
+
 def read_camera_fields(path: Path, fields: list[str]) -> dict[str, Any]:
     """The values a camera file holds, under the names of `Camera`'s fields; `Camera` checks their types.
 
@@ -42,6 +47,8 @@ def read_camera_fields(path: Path, fields: list[str]) -> dict[str, Any]:
         CameraError: If the file is unreadable, lacks a needed key, or (our format) has an unknown one.
     """
     raw = read_mapping(path, CameraError)
+    if is_pair(raw):
+        raise CameraError(f"{path}: expected one camera, got an unrectified pair (jaxslam.RectifiedPair.load reads it)")
     if any(key.startswith("Camera1.") for key in raw) or "File.version" in raw:
         values = _orb_slam(raw, _ORB_SLAM3, path)
     elif any(key.startswith("Camera.") for key in raw):

@@ -17,7 +17,8 @@ from jaxslam.yaml_file import check_keys, parse_yaml
 
 _DEPTH = 3
 _NEEDED = ("dataset", "kind", "licence", "page", "about")
-_MARKS = ("rgb.txt", "times.txt")  # the first is in every recording of TUM's layout, the second in every one of KITTI's
+_MARKS = ("rgb.txt", "times.txt", "mav0/cam0/data.csv", "pose_left.txt")
+"""Files of which one is in every recording of the layouts of TUM, KITTI, EuRoC and TartanAir."""
 _SHORTENED = ((re.compile(r"\Argbd_dataset_freiburg"), "fr"), (re.compile(r"\Argbd_bonn_"), "bonn_"))
 _NAME = re.compile(r"[a-z0-9_]+\Z")
 _SHA256 = re.compile(r"[0-9a-f]{64}\Z")
@@ -140,7 +141,7 @@ def found_recordings(root: str | os.PathLike[str] | None = None) -> dict[str, Pa
     found: dict[str, Path] = {}
     for place in _places(root):
         for folder in _recordings_below(place):
-            found.setdefault(_name_of(folder), folder)
+            found.setdefault(name_of(folder), folder)
     return found
 
 
@@ -215,5 +216,6 @@ def _subfolders(folder: Path) -> list[Path]:
     return [folder / name for name in names if os.path.isdir(folder / name)]
 
 
-def _name_of(folder: Path) -> str:
+def name_of(folder: Path) -> str:
+    """What a recording is called: by its folder, and KITTI's `sequences/05` is `kitti_05`."""
     return f"kitti_{folder.name}" if folder.parent.name == "sequences" else folder.name

@@ -27,13 +27,13 @@ from jaxslam.run_pictures import RunPictures
 from jaxslam.slam import Slam
 from jaxslam.state import TrackStatus
 from jaxslam.tracked import FrameRecord
-from jaxslam.trajectory import write_tum
+from jaxslam.trajectory import write_kitti_frames, write_tum
 from jaxslam.visualize import Snapshot, plot_map, plot_snapshots, plot_trajectory
 from jaxslam.xla import threads, usable_cores
 
 _PACKAGES = ("jaxslam", "jax", "jaxlib", "jaxlie", "equinox", "optimistix", "numpy", "opencv-python-headless")
 _ALWAYS = ("trajectory.txt", "trajectory_online.txt", "frames.csv", "summary.json", "config.yaml")
-_OF_THE_PATH = ("plot.png",)
+_OF_THE_PATH = ("plot.png", "trajectory_kitti.txt")
 _OF_THE_MAP = ("trajectory_keyframes.txt", "map.png")
 _ERRORS, _FAILURES = "errors.csv", "failures.png"
 _OF_MASKS = ("masks.png", "masks.gif")
@@ -102,6 +102,7 @@ def _write_pictures(
         plot_trajectory(
             slam.trajectory, info.dataset.ground_truth, evaluation, folder / _OF_THE_PATH[0], pictures.snapshots
         )
+        write_kitti_frames(folder / _OF_THE_PATH[1], slam.trajectory, info.dataset.timestamps_ns)
         written += _OF_THE_PATH
     if len(slam.map.ids):
         write_keyframe_trajectory(folder / _OF_THE_MAP[0], slam.map)

@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxslam.errors import TrajectoryError
 from jaxslam.files import write_atomically
+from jaxslam.pose import between
 from jaxslam.rotation import matrices, quaternions, slerp
 from jaxslam.timestamp import decimal_seconds, nanoseconds
 
@@ -202,6 +203,32 @@ def write_kitti(path: PathLike, trajectory: Trajectory, frames_ns: np.ndarray | 
     lines = (f"{_numbers(row)}\n" for row in top.reshape(-1, 12).tolist())
     write_atomically(path, "".join(lines).encode(), TrajectoryError)
     return filled
+
+
+def write_kitti_frames(path: PathLike, trajectory: Trajectory, frames_ns: np.ndarray) -> int:
+    """Write what KITTI's development kit reads: a row for every frame, in the axes of the first.
+
+    A frame without a pose of its own (lost, rejected, dropped) has the one before it, and those before the first pose
+    have that: what a robot would have known then. Nothing is interpolated, which would make losses look smaller.
+
+    Args:
+        path: Where to write.
+        trajectory: The poses.
+        frames_ns: `(m,)` stamps of all frames, in the order of time.
+
+    Returns:
+        How many rows were filled in.
+
+    Raises:
+        TrajectoryError: If the file cannot be written, or there is no pose.
+    """
+    if not len(trajectory):
+        raise TrajectoryError("no pose to write: the trajectory is empty")
+    stamps = np.asarray(frames_ns)
+    held = np.maximum(np.searchsorted(trajectory.timestamps_ns, stamps, side="right") - 1, 0)
+    poses = trajectory.T_world_cam[held]
+    write_kitti(path, Trajectory(stamps, between(poses[:1], poses)))
+    return int((trajectory.timestamps_ns[held] != stamps).sum())
 
 
 def _first_problem(stamps: np.ndarray, poses: np.ndarray) -> tuple[int, str] | None:

@@ -105,7 +105,7 @@ def opened(clip: Clip, root: Path | None, rooms: Path | None = None) -> tuple[Da
             them as they are asked for.
 
     Raises:
-        BenchmarkError: If its recording is not on this machine.
+        BenchmarkError: If its recording is not on this machine, or of another sensor than it says.
     """
     folder = None
     if clip.room is not None and rooms is not None:
@@ -118,6 +118,9 @@ def opened(clip: Clip, root: Path | None, rooms: Path | None = None) -> tuple[Da
         if folder is None:
             raise BenchmarkError(f"{clip.recording}: not on this machine; to get it: jaxslam data get {clip.recording}")
         dataset = open_dataset(folder, camera=clip.camera)
+        taken_with = "stereo" if dataset.camera.is_stereo else "rgbd"
+        if clip.sensor not in (None, taken_with):
+            raise BenchmarkError(f"{clip.name}: sensor: expected {clip.sensor}, got a recording of {taken_with}")
     return (dataset if clip.whole else Subset(dataset, clip.start, clip.stop, clip.every)), folder
 
 

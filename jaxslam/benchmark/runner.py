@@ -53,20 +53,14 @@ def plan(suite: Suite, *, presets: Sequence[str] = (), runs: int | None = None) 
 
 
 def missing(suite: Suite, found: Collection[str]) -> dict[str, str]:
-    """Recordings that cannot be run, by name, and why: stereo, and what is not there.
+    """Recordings that are not there, by name, and how to get them.
 
     Args:
         suite: What is run.
         found: Names of the recordings that are there.
     """
-    why: dict[str, str] = {}
-    for clip in suite.sequences:
-        name = clip.recording
-        if clip.sensor == "stereo":
-            why[name] = "suites run no stereo yet"
-        elif name and name not in found:
-            why[name] = f"not there; to get it: jaxslam data get {name}"
-    return why
+    names = [clip.recording for clip in suite.sequences if clip.recording and clip.recording not in found]
+    return {name: f"not there; to get it: jaxslam data get {name}" for name in names}
 
 
 def swept(suite: Suite, sweeps: Iterable[str]) -> Suite:

@@ -9,9 +9,9 @@ sequences:
     stop: 220                        # frames from `start` to before `stop`
     camera: my_camera.yaml           # if the recording's folder does not tell; beside the suite's file, or a known one
   - name: room                       # what it is called in tables; a recording's own name if not given
-    room: {frames: 90, people: 2}    # rendered, see `SyntheticConfig`
+    room: {frames: 90, people: 2}    # rendered, see `SyntheticConfig`; `baseline_m: 0.1` makes stereo pairs of it
   - recording: kitti_00
-    sensor: stereo                   # rgbd if not given; stereo is listed, not run
+    sensor: stereo                   # or rgbd: what the recording must be; whichever it is if not given
 ablation: false                      # true shows published figures of parts of systems too
 variants:                            # every preset with each of these settings too
   few-points: [track.num_points=256]
@@ -27,6 +27,7 @@ from jaxslam.config import Config, configs_dir, load_config, presets, updated
 from jaxslam.datasets.synthetic import SyntheticConfig
 from jaxslam.detector_choice import SCENE
 from jaxslam.errors import BenchmarkError, JaxSlamError, nearest
+from jaxslam.recordings import name_of
 from jaxslam.yaml_file import read_mapping
 
 _Positive = Range(at_least=1)
@@ -44,7 +45,7 @@ class Sequence(Checked):
         stop: The frame after the last; `None` for all.
         every: All frames, or every nth, as if the camera were slower.
         camera: Known camera of the recording, or a camera file, seen from the suite's; `None` if its folder tells.
-        sensor: What it was taken with. No suite runs stereo yet, see `runner.missing`.
+        sensor: What it must have been taken with; `None` for whichever it was.
     """
 
     _error: ClassVar[type[JaxSlamError]] = BenchmarkError
@@ -56,14 +57,17 @@ class Sequence(Checked):
     stop: Annotated[int, _Positive] | None = None
     every: Annotated[int, _Positive] = 1
     camera: str | None = None
-    sensor: Literal["rgbd", "stereo"] = "rgbd"
+    sensor: Literal["rgbd", "stereo"] | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if bool(self.recording) == (self.room is not None):
             raise BenchmarkError(f"sequence {self.name}: expected either `recording` or `room`, got both or neither")
-        if self.room is not None and self.sensor != "rgbd":
-            raise BenchmarkError(f"sequence {self.name}: expected a `room` with sensor rgbd, got {self.sensor}")
+        if self.room is not None and self.sensor not in (None, "stereo" if self.room.baseline_m else "rgbd"):
+            raise BenchmarkError(
+                f"sequence {self.name}: expected a `room` with baseline_m for stereo, and without for rgbd, got"
+                f" baseline_m {self.room.baseline_m} for {self.sensor}"
+            )
         if not self.name or "/" in self.name or self.name.startswith("."):
             raise BenchmarkError(f"sequence: expected a name that can be a folder's, got '{self.name}'")
 
@@ -143,13 +147,16 @@ def checked_presets(names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _suite_of_folder(folder: Path) -> Suite:
-    recordings = sorted(path.parent for path in folder.glob("**/rgb.txt"))
-    if not recordings:
-        raise BenchmarkError(f"{folder}: expected a folder with recordings in it (rgb.txt), got none")
+    lists = [*folder.glob("**/rgb.txt"), *folder.glob("**/sequences/*/times.txt")]
+    names = [name_of(path.resolve().parent) for path in sorted(lists)]
+    if not names:
+        raise BenchmarkError(
+            f"{folder}: expected a folder with recordings in it (rgb.txt, or sequences/NN/times.txt), got none"
+        )
     return Suite(
         folder.resolve().name,
         f"all recordings in {folder}",
-        tuple(Sequence(path.resolve().name, path.resolve().name) for path in recordings),
+        tuple(Sequence(name, name) for name in names),
         ("static", "ngd", "default"),
     )
 

@@ -9,6 +9,7 @@ from jaxslam.camera import Camera, known_cameras
 from jaxslam.datasets.protocol import Associated, Dataset, Fit, Loader, Unmatched
 from jaxslam.datasets.stream import Subset, prefetch
 from jaxslam.errors import CameraError, DatasetError, nearest
+from jaxslam.rectification import RectifiedPair, load_camera
 
 __all__ = [
     "Associated",
@@ -22,14 +23,16 @@ __all__ = [
 ]
 
 
-def open_dataset(path: str | Path, kind: str = "auto", camera: Camera | str | Path | None = None) -> Dataset:
+def open_dataset(
+    path: str | Path, kind: str = "auto", camera: Camera | RectifiedPair | str | Path | None = None
+) -> Dataset:
     """Open a recording.
 
     Args:
         path: Its folder.
         kind: One of `dataset_kinds()`, or `auto` to recognise it by its files and name.
-        camera: A camera, the name of a known one or a camera file. `None` takes `camera.yaml` in the folder
-            or, without one, the camera that the folder's name tells.
+        camera: A camera, the name of a known one or a camera file; for raw images of two cameras a rectified pair or
+            its file. `None` takes `camera.yaml` in the folder or, without one, the camera that the folder tells.
 
     Raises:
         DatasetError: If the folder is missing, of no known kind, incomplete or unreadable.
@@ -40,7 +43,12 @@ def open_dataset(path: str | Path, kind: str = "auto", camera: Camera | str | Pa
         what = "a file (an archive must be unpacked first)" if folder.exists() else "nothing there"
         raise DatasetError(f"{path}: expected the folder of a recording, got {what}")
     loader = _loader(folder, kind)
-    return loader.open(folder, _camera(folder, loader, camera))
+    chosen = _camera(folder, loader, camera)
+    if isinstance(chosen, RectifiedPair) and not loader.rectifies:
+        raise CameraError(
+            f"rig '{chosen.rig.name}': expected one camera, as recordings of kind {loader.kind} are rectified, got two"
+        )
+    return loader.open(folder, chosen)
 
 
 def dataset_kinds() -> list[str]:
@@ -64,24 +72,23 @@ def _loader(folder: Path, kind: str) -> Loader:
     if best.fit(folder) is Fit.NO:
         raise DatasetError(
             f"{folder}: expected a recording of kind {' or '.join(dataset_kinds())} (rgb.txt and depth.txt;"
-            " or calib.txt, times.txt, image_0 and image_1), got a folder without those files"
+            " calib.txt, times.txt, image_0 and image_1; mav0/cam0 and mav0/cam1; pose_left.txt and image_left;"
+            " or folders left and right, or rgb and depth), got a folder without those files"
         )
     return best
 
 
-def _camera(folder: Path, loader: Loader, camera: Camera | str | Path | None) -> Camera:
-    if isinstance(camera, Camera):
+def _camera(folder: Path, loader: Loader, camera: Camera | RectifiedPair | str | Path | None) -> Camera | RectifiedPair:
+    if isinstance(camera, Camera | RectifiedPair):
         return camera
     if camera is not None:
-        return Camera.load(camera)
+        return load_camera(camera)
     if (folder / "camera.yaml").is_file():
-        return Camera.load(folder / "camera.yaml")
-    if loader.camera is not None:
-        return loader.camera(folder)
-    name = loader.camera_name(folder)
-    if name is None:
+        return load_camera(folder / "camera.yaml")
+    told = loader.camera(folder)
+    if told is None:
         raise CameraError(
             f"{folder.name}: its name does not tell the camera; give --camera with a camera file or one of "
             + ", ".join(known_cameras())
         )
-    return Camera.load(name)
+    return told

@@ -6,6 +6,7 @@ Residuals", IROS 2019.
 
 from pathlib import Path
 
+from jaxslam.camera import Camera
 from jaxslam.datasets.protocol import Fit, Loader
 from jaxslam.datasets.tum import TumDataset, has_layout
 
@@ -16,8 +17,8 @@ def _fit(folder: Path) -> Fit:
     return Fit.NAME if folder.name.startswith(_PREFIX) and has_layout(folder) else Fit.NO
 
 
-def _camera_name(_: Path) -> str:
-    return "bonn"
+def _camera(_: Path) -> Camera:
+    return Camera.load("bonn")
 
 
-LOADER = Loader("bonn", _fit, _camera_name, TumDataset)
+LOADER = Loader("bonn", _fit, _camera, TumDataset)

@@ -43,6 +43,22 @@ def read_depth(path: Path, scale_per_m: float) -> np.ndarray:
     return counts.astype(np.float32) / np.float32(scale_per_m)
 
 
+def read_depth_metres(path: Path) -> np.ndarray:
+    """`(height, width)` float32 metres from a NumPy file of floats; 0 where it is not finite or not positive.
+
+    Raises:
+        DatasetError: If the file is missing or damaged, or holds no plane of floats.
+    """
+    try:
+        depth_m = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as problem:
+        raise DatasetError(f"{path}: cannot be read: {problem}") from None
+    if not isinstance(depth_m, np.ndarray) or depth_m.ndim != 2 or depth_m.dtype.kind != "f":
+        got = f"{depth_m.dtype} {depth_m.shape}" if isinstance(depth_m, np.ndarray) else type(depth_m).__name__
+        raise DatasetError(f"{path}: expected (height, width) floats, metres, got {got}")
+    return np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, 0).astype(np.float32)
+
+
 def check_size(path: Path, image: np.ndarray, camera: Camera) -> None:
     """Refuse an image that is not of the camera's size.
 

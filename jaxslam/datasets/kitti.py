@@ -170,4 +170,4 @@ def _fit(folder: Path) -> Fit:
     return Fit.LAYOUT if there and any((folder / pair.left).is_dir() for pair in _PAIRS) else Fit.NO
 
 
-LOADER = Loader("kitti", _fit, lambda _: None, KittiDataset, _camera)
+LOADER = Loader("kitti", _fit, _camera, KittiDataset)

@@ -4,12 +4,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
 from jaxslam.camera import Camera
 from jaxslam.frame import Frame
+from jaxslam.rectification import RectifiedPair
 from jaxslam.trajectory import Trajectory
 
 
@@ -44,7 +45,10 @@ class Dataset(Protocol):
 
 
 class Unmatched(NamedTuple):
-    """Images left out because no image of the other kind was taken at nearly the same time."""
+    """Images left out because no image of the other kind was taken at nearly the same time.
+
+    Of a pair `color` counts those of the left camera, and `depth` those of the right one, which stand in for depth.
+    """
 
     color: int
     depth: int
@@ -52,7 +56,7 @@ class Unmatched(NamedTuple):
 
 @runtime_checkable
 class Associated(Protocol):
-    """A recording whose colour and depth were taken apart and have been matched by time."""
+    """A recording whose two images of a frame were taken apart and have been matched by time."""
 
     @property
     def unmatched(self) -> Unmatched:
@@ -64,9 +68,11 @@ class Fit(IntEnum):
     """How surely a loader recognises a folder; the surest loader opens it."""
 
     NO = 0
-    LAYOUT = 1
+    FOLDERS = 1
+    """Folders of images are there."""
+    LAYOUT = 2
     """The files are there."""
-    NAME = 2
+    NAME = 3
     """The files are there and the folder's name says so too."""
 
 
@@ -77,13 +83,13 @@ class Loader:
     Attributes:
         kind: The name by which it is chosen.
         fit: How surely a folder is of this kind.
-        camera_name: The known camera that a folder was taken with; `None` if its name does not say.
+        camera: What a folder was taken with, as its name or a calibration in it tells; `None` if neither does.
         open: Opens a folder with its camera.
-        camera: Reads the camera from the folder's own calibration, if folders of this kind have one.
+        rectifies: Whether `open` also takes a pair that is not rectified.
     """
 
     kind: str
     fit: Callable[[Path], Fit]
-    camera_name: Callable[[Path], str | None]
-    open: Callable[[Path, Camera], Dataset]
-    camera: Callable[[Path], Camera] | None = None
+    camera: Callable[[Path], Camera | RectifiedPair | None]
+    open: Callable[[Path, Any], Dataset]
+    rectifies: bool = False

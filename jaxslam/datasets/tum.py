@@ -120,9 +120,9 @@ def _fit(folder: Path) -> Fit:
     return Fit.NAME if _NAME.match(folder.name) else Fit.LAYOUT
 
 
-def _camera_name(folder: Path) -> str | None:
+def _camera(folder: Path) -> Camera | None:
     match = _NAME.match(folder.name)
-    return f"tum_fr{match[1]}" if match else None
+    return Camera.load(f"tum_fr{match[1]}") if match else None
 
 
-LOADER = Loader("tum", _fit, _camera_name, TumDataset)
+LOADER = Loader("tum", _fit, _camera, TumDataset)

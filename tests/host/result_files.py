@@ -2,7 +2,14 @@
 
 ALWAYS = {"trajectory.txt", "trajectory_online.txt", "frames.csv", "summary.json", "config.yaml"}
 
-FILES = ALWAYS | {"trajectory_keyframes.txt", "plot.png", "map.png", "errors.csv", "failures.png"}
+FILES = ALWAYS | {
+    "trajectory_keyframes.txt",
+    "plot.png",
+    "trajectory_kitti.txt",
+    "map.png",
+    "errors.csv",
+    "failures.png",
+}
 """Of a run with poses, keyframes and a ground truth."""
 
 MASK_FILES = {"masks.png", "masks.gif"}

@@ -233,18 +233,18 @@ class TestTrouble:
         assert "jaxslam data get rgbd_bonn_nowhere" in (tmp_path / "out" / "report.md").read_text()
         assert "rgbd_bonn_nowhere" in (tmp_path / "out" / "report.html").read_text()
 
-    def test_stereo(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        """One line says that nothing tracks it; the reports say so too."""
-        with pytest.raises(SystemExit) as ended:
-            main(["bench", "kitti_stereo", "--out", str(tmp_path / "out")])
-        out, error = capsys.readouterr()
-        assert ended.value.code == 1
-        assert error.strip() == "error: nothing could be run"
-        assert out.count("suites run no stereo yet") == 1
-        assert "Not run: kitti_00, kitti_01, " in out
-        assert "11 recordings not run." in out
-        for report in ("report.md", "report.html"):
-            assert (tmp_path / "out" / report).read_text().count("kitti_10: suites run no stereo yet") == 1
+    def test_kitti(self, tmp_path: Path, data_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        """What is there of it is run, with the development kit's figures; the other ten are named."""
+        text = "sequences: [{recording: kitti_06, sensor: stereo, stop: 12}, {recording: kitti_10, sensor: stereo}]"
+        suite = suite_file(tmp_path, text + "\nset: [semantics.model=null]\n")
+        main(["bench", suite, "--root", str(data_dir), "--out", str(tmp_path / "out")])
+        out = capsys.readouterr().out
+        assert "Not run: kitti_10: not there" in out
+        assert "1 runs, 0 failed, 1 recordings not run." in out
+        (result,) = json.loads((tmp_path / "out" / "results.json").read_text())
+        assert (result["status"], result["tracked"], result["camera"]) == ("done", 12, "kitti_06")
+        assert result["ate_rmse_m"] < 0.1
+        assert {"kitti_trans_percent", "kitti_rot_deg_per_100m"} <= result["evaluation"].keys()
 
     def test_wrong_options(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         suite, file = suite_file(tmp_path), tmp_path / "file"

@@ -74,8 +74,10 @@ class TestSuite:
         for name in ("b", "a"):
             (tmp_path / "some" / name).mkdir(parents=True)
             (tmp_path / "some" / name / "rgb.txt").touch()
+        (tmp_path / "some" / "sequences" / "04").mkdir(parents=True)
+        (tmp_path / "some" / "sequences" / "04" / "times.txt").touch()
         suite = load_suite(str(tmp_path))
-        assert [clip.recording for clip in suite.sequences] == ["a", "b"]
+        assert [clip.recording for clip in suite.sequences] == ["a", "b", "kitti_04"]
 
     @pytest.mark.parametrize(
         ("text", "what"),
@@ -92,7 +94,10 @@ class TestSuite:
             (SUITE.replace("name: start", "name: a/b"), "expected a name that can be a folder's"),
             (SUITE.replace("recording: rgbd_bonn_crowd\n", "name: x\n").replace("    name: start\n", ""), "either"),
             (SUITE.replace("    stop: 20", "    sensor: lidar"), "sensor: expected one of 'rgbd', 'stereo'"),
-            (SUITE.replace("- name: room", "- name: room\n    sensor: stereo"), "expected a `room` with sensor rgbd"),
+            (
+                SUITE.replace("- name: room", "- name: room\n    sensor: stereo"),
+                "expected a `room` with baseline_m for stereo",
+            ),
             (SUITE.replace("semantics.model", "semantic.model"), "semantic: unknown key"),
             (SUITE.replace("model=null", "model=scene"), "'scene' expected rendered rooms, got the recording start"),
             (SUITE.replace("[semantics.model=null]", "semantics"), "set: expected a list of texts"),
@@ -122,13 +127,13 @@ class TestMissing:
         assert why == {"rgbd_bonn_crowd": "not there; to get it: jaxslam data get rgbd_bonn_crowd"}
 
     def test_stereo(self) -> None:
-        """Known recordings that nothing tracks, also where they are there."""
+        """All of KITTI that has ground truth, and what of it is there is run."""
         suite = load_suite("kitti_stereo")
         names = [clip.recording for clip in suite.sequences]
         assert names == [recording.name for recording in known_recordings().values() if recording.kind == "kitti"]
         assert len(names) == 11
-        for found in ([], names):
-            assert missing(suite, found) == dict.fromkeys(names, "suites run no stereo yet")
+        assert set(missing(suite, ["kitti_06"])) == set(names) - {"kitti_06"}
+        assert missing(suite, names) == {}
 
 
 class TestPlan:

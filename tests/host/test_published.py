@@ -18,6 +18,7 @@ from jaxslam.benchmark.published import (
 )
 from jaxslam.benchmark.report import published_of
 from jaxslam.benchmark.suite import load_suite, suites
+from jaxslam.camera import Camera
 from jaxslam.config import configs_dir
 from jaxslam.datasets import bonn, tum
 from jaxslam.datasets.protocol import Fit
@@ -249,10 +250,10 @@ class TestDataFiles:
             assert 0 <= int(sequence.removeprefix("kitti_")) <= 10  # those with ground truth
         elif sequence.startswith(B):
             assert bonn.LOADER.fit(folder) is Fit.NAME
-            assert bonn.LOADER.camera_name(folder) == "bonn"
+            assert bonn.LOADER.camera(folder) == Camera.load("bonn")
         else:
             assert tum.LOADER.fit(folder) is Fit.NAME
-            assert tum.LOADER.camera_name(folder) == "tum_fr3"
+            assert tum.LOADER.camera(folder) == Camera.load("tum_fr3")
 
     def test_kitti_is_stereo_and_the_rest_is_not(self) -> None:
         assert all((figure.sensor == "stereo") == figure.sequence.startswith("kitti_") for figure in FIGURES)

@@ -67,9 +67,9 @@ class TestCatalogue:
     def test_names_tell_kind_and_camera(self) -> None:
         for name, entry in KNOWN.items():
             if entry.kind == "tum":
-                number = tum.LOADER.camera_name(Path(name))
-                assert number is not None
-                assert f"/freiburg{number[-1]}/" in (entry.url or "")
+                camera = tum.LOADER.camera(Path(name))
+                assert camera is not None
+                assert f"/freiburg{camera.name[-1]}/" in (entry.url or "")
             else:
                 assert name.startswith({"bonn": "rgbd_bonn_", "kitti": "kitti_"}[entry.kind])
 

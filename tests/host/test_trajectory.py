@@ -2,6 +2,7 @@
 
 import os
 from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from jaxslam.trajectory import (
     read_kitti,
     read_tum,
     write_kitti,
+    write_kitti_frames,
     write_tum,
 )
 
@@ -309,3 +311,20 @@ def test_reads_real_files(data_dir, file, poses, first_ns):
     trajectory = read(data_dir / "trajectories" / file)
     assert len(trajectory) == poses
     assert trajectory.timestamps_ns[0] == first_ns
+
+
+class TestKittiFrames:
+    def test_a_row_a_frame_from_the_first(self, tmp_path: Path) -> None:
+        """Frames 0, 2 and 4 have no pose: the first begins with the next one, the others repeat the last."""
+        half = np.sqrt(0.5)
+        poses = np.array([[half, 0, half, 0, 5.0, 0, 0], [half, 0, half, 0, 6.0, 0, 0]])
+        path = tmp_path / "poses.txt"
+        filled = write_kitti_frames(path, Trajectory(np.array([1, 3]), poses), np.arange(5))
+        read = read_kitti(path)
+        assert (filled, len(read)) == (3, 5)
+        np.testing.assert_allclose(read.positions, [[0, 0, 0]] * 3 + [[0, 0, 1]] * 2, atol=1e-9)
+        np.testing.assert_allclose(read.T_world_cam[:, :4], [[1, 0, 0, 0]] * 5, atol=1e-9)
+
+    def test_no_pose(self, tmp_path: Path) -> None:
+        with pytest.raises(TrajectoryError, match="no pose to write"):
+            write_kitti_frames(tmp_path / "poses.txt", Trajectory(np.zeros(0, int), np.zeros((0, 7))), np.arange(3))

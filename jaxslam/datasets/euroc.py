@@ -1,0 +1,197 @@
+"""Recordings in the layout of EuRoC MAV: `mav0/cam0`, `mav0/cam1`, stereo pairs as the cameras take them.
+
+Source: Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016.
+"""
+
+import csv
+import functools
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxslam.camera import Camera
+from jaxslam.datasets.image_file import check_size, read_grey
+from jaxslam.datasets.protocol import Fit, Loader, Unmatched
+from jaxslam.errors import CameraError, DatasetError, TrajectoryError
+from jaxslam.frame import Frame
+from jaxslam.pose import between, compose
+from jaxslam.rectification import RectifiedPair
+from jaxslam.rig import Rig
+from jaxslam.rig_file import lens_of_kalibr, transform_of
+from jaxslam.trajectory import Trajectory
+from jaxslam.yaml_file import read_mapping
+
+_CAMERAS = ("cam0", "cam1")
+_LIST, _SENSOR, _TRUTH = "data.csv", "sensor.yaml", Path("state_groundtruth_estimate0") / "data.csv"
+_POSE_COLUMNS = 8
+
+
+class EurocDataset:
+    """A folder such as `MH_01_easy`, or the `mav0` in it; pairs are rectified as they are decoded.
+
+    A pair is two images of exactly the same time. The ground truth of EuRoC is of the body (the IMU); here it is of
+    the rectified left camera, by `T_BS` of `cam0` and the rotation of rectification.
+
+    Attributes:
+        name: The recording's folder.
+        camera: The rectified left camera, with the baseline.
+        timestamps_ns: `(n,)` int64 nanoseconds, strictly increasing.
+        unmatched: How many images of the left and of the right camera have no partner.
+    """
+
+    def __init__(self, folder: Path, camera: Camera | RectifiedPair) -> None:
+        """Match the images of the two lists; they are decoded when a frame is asked for.
+
+        Raises:
+            DatasetError: If a list is missing or malformed, a listed image is missing, or nothing matches.
+            CameraError: If the camera is no stereo pair, or `T_BS` of `cam0` is missing or malformed.
+        """
+        if not isinstance(camera, RectifiedPair) and not camera.is_stereo:
+            raise CameraError(f"camera '{camera.name}': baseline_m: expected metres for a stereo pair, got none")
+        self._pair = camera if isinstance(camera, RectifiedPair) else None
+        self.camera = camera.camera if isinstance(camera, RectifiedPair) else camera
+        self._root = _mav(folder)
+        self.name = _name(self._root)
+        left, right = (_listed(self._root / which) for which in _CAMERAS)
+        common = sorted(left.keys() & right.keys())
+        if not common:
+            raise DatasetError(
+                f"{self._root / _CAMERAS[1] / _LIST}: expected times of {_CAMERAS[0]}, got {len(right)} others"
+            )
+        self.timestamps_ns = np.array(common, np.int64)
+        self.unmatched = Unmatched(len(left) - len(common), len(right) - len(common))
+        self._files = [(left[stamp], right[stamp]) for stamp in common]
+        missing = [file for pair in self._files for file in pair if not file.is_file()]
+        if missing:
+            raise DatasetError(f"{missing[0]}: listed but missing, one of {len(missing)} such images")
+        self._T_body_camera = _T_body_left(self._root)
+        if self._pair is not None:
+            self._T_body_camera = compose(self._T_body_camera, self._pair.T_left_camera)
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """Poses of the rectified left camera, read when first asked for; `TrajectoryError` if malformed."""
+        return self._ground_truth
+
+    @functools.cached_property
+    def _ground_truth(self) -> Trajectory | None:
+        path = self._root / _TRUTH
+        return _moved(_read_truth(path), self._T_body_camera) if path.is_file() else None
+
+    def __len__(self) -> int:
+        return len(self._files)
+
+    def __getitem__(self, index: int) -> Frame:
+        """Decode and rectify one pair.
+
+        Raises:
+            IndexError: If there is no such frame.
+            DatasetError: If an image is unreadable, or of another size than the camera's.
+        """
+        left, right = (read_grey(file) for file in self._files[index])
+        for file, image in zip(self._files[index], (left, right), strict=True):
+            check_size(file, image, self.camera)
+        stamp = int(self.timestamps_ns[index])
+        return Frame(stamp, left, right=right) if self._pair is None else self._pair.of(stamp, left, right)
+
+
+def _moved(bodies: Trajectory, T_body_camera: np.ndarray) -> Trajectory:
+    return Trajectory(bodies.timestamps_ns, compose(bodies.T_world_cam, T_body_camera[None]))
+
+
+def _mav(folder: Path) -> Path:
+    return folder / "mav0" if (folder / "mav0").is_dir() else folder
+
+
+def _name(mav: Path) -> str:
+    return mav.parent.name if mav.name == "mav0" else mav.name
+
+
+def _listed(folder: Path) -> dict[int, Path]:
+    """Paths of the images of one camera by their times in nanoseconds."""
+    path = folder / _LIST
+    found: dict[int, Path] = {}
+    for number, row in _rows(path, DatasetError):
+        if len(row) != 2 or not row[0].strip().isdecimal():
+            raise DatasetError(f"{path}:{number}: expected `nanoseconds,file`, got '{','.join(row)[:60]}'")
+        stamp = int(row[0])
+        if stamp in found:
+            raise DatasetError(f"{path}:{number}: expected each time once, got {stamp} again")
+        found[stamp] = folder / "data" / row[1].strip()
+    if not found:
+        raise DatasetError(f"{path}: expected at least one line `nanoseconds,file`, got none")
+    return found
+
+
+def _rows(path: Path, error: type[DatasetError | TrajectoryError]) -> list[tuple[int, list[str]]]:
+    """Numbers and cells of the lines that count."""
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as problem:
+        raise error(f"{path}: cannot be read: {problem}") from None
+    return [
+        (number, row)
+        for number, row in enumerate(csv.reader(lines), 1)
+        if row and "".join(row).strip() and not row[0].lstrip().startswith("#")
+    ]
+
+
+def _read_truth(path: Path) -> Trajectory:
+    """Poses of the body: `nanoseconds, x, y, z, qw, qx, qy, qz` and more."""
+    stamps: list[int] = []
+    poses: list[list[float]] = []
+    for number, row in _rows(path, TrajectoryError):
+        try:
+            stamps.append(int(row[0]))
+            x, y, z, *wxyz = (float(cell) for cell in row[1:_POSE_COLUMNS])
+        except (ValueError, IndexError):
+            raise TrajectoryError(f"{path}:{number}: expected nanoseconds, x y z and qw qx qy qz") from None
+        poses.append([*wxyz, x, y, z])
+        if len(poses[-1]) != _POSE_COLUMNS - 1:
+            raise TrajectoryError(f"{path}:{number}: expected at least {_POSE_COLUMNS} columns, got {len(row)}")
+    try:
+        return Trajectory(np.array(stamps, np.int64), np.array(poses))
+    except TrajectoryError as problem:
+        raise TrajectoryError(f"{path}: {problem}") from None
+
+
+def _T_body_left(mav: Path) -> np.ndarray:
+    return _T_body(*_sensor(mav, _CAMERAS[0]))
+
+
+def _T_body(raw: dict[str, Any], path: Path) -> np.ndarray:
+    return transform_of(raw.get("T_BS"), f"{path}: T_BS")
+
+
+def _sensor(mav: Path, which: str) -> tuple[dict[str, Any], Path]:
+    path = mav / which / _SENSOR
+    return read_mapping(path, CameraError), path
+
+
+def _camera(folder: Path) -> RectifiedPair:
+    """The pair of `cam0/sensor.yaml` and `cam1/sensor.yaml`, rectified.
+
+    Raises:
+        CameraError: If one is missing or malformed, or the two are no pair.
+    """
+    mav = _mav(folder)
+    (left, left_path), (right, right_path) = (_sensor(mav, which) for which in _CAMERAS)
+    T_left_right = between(_T_body(left, left_path), _T_body(right, right_path))
+    try:
+        lenses = [lens_of_kalibr(raw, f"{path}: ") for raw, path in ((left, left_path), (right, right_path))]
+        rig = Rig(_name(mav), lenses[0], lenses[1], tuple(T_left_right.tolist()))
+    except CameraError as error:
+        raise CameraError(f"{mav}: {error}") from None
+    rate = left.get("rate_hz")
+    return RectifiedPair(replace(rig, fps=rate) if rate is not None else rig)
+
+
+def _fit(folder: Path) -> Fit:
+    mav = _mav(folder)
+    there = all((mav / which / _LIST).is_file() for which in _CAMERAS)
+    return Fit.LAYOUT if there else Fit.NO
+
+
+LOADER = Loader("euroc", _fit, _camera, EurocDataset, rectifies=True)

@@ -1,0 +1,152 @@
+"""Images of one's own in two folders, `left` and `right` or `rgb` and `depth`, and a camera file."""
+
+import functools
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxslam.camera import Camera
+from jaxslam.datasets.file_names import IMAGES, files_in, times_of
+from jaxslam.datasets.image_file import check_size, read_color, read_depth, read_depth_metres
+from jaxslam.datasets.protocol import Fit, Loader
+from jaxslam.errors import CameraError, DatasetError
+from jaxslam.frame import Frame
+from jaxslam.pose import compose
+from jaxslam.rectification import RectifiedPair
+from jaxslam.trajectory import Trajectory, read_tum
+
+_COLOR, _DEPTH, _LEFT, _RIGHT = ("rgb", "color", "image"), "depth", "left", "right"
+_TIMES, _GROUND_TRUTH = "times.txt", "groundtruth.txt"
+_METRES = ".npy"
+
+
+class _Layout(NamedTuple):
+    """The two folders: of images, and of what goes with them."""
+
+    first: Path
+    second: Path
+    pair: bool
+
+
+class FolderDataset:
+    """Two folders of images, the n-th of one with the n-th of the other, sorted by name.
+
+    `left` and `right` hold a stereo pair; `rgb` (or `color`, `image`) and `depth` colour and depth, as counts in .png
+    (`depth_scale_per_m` of the camera) or as metres in .npy. Times are those of `times.txt` (seconds, one a line);
+    without it those that are the names, as nanoseconds (16 to 19 digits) or seconds (with decimals); without either,
+    frames follow each other at `fps` of the camera. `groundtruth.txt` may hold poses in the format of TUM.
+
+    Attributes:
+        name: The folder's name.
+        camera: The camera, that of the rectified pair if two cameras as they are were given.
+        timestamps_ns: `(n,)` int64 nanoseconds, strictly increasing.
+    """
+
+    def __init__(self, folder: Path, camera: Camera | RectifiedPair) -> None:
+        """List the images; they are decoded when a frame is asked for.
+
+        Raises:
+            DatasetError: If folders are missing or ambiguous, the numbers of images differ, or times are malformed.
+            CameraError: If the camera is not of the kind that the folders need.
+        """
+        layout = _layout(folder)
+        self._pair = camera if isinstance(camera, RectifiedPair) else None
+        self.camera = camera.camera if isinstance(camera, RectifiedPair) else camera
+        self.name, self._folder, self._is_pair = folder.name, folder, layout.pair
+        first = files_in(layout.first, IMAGES)
+        second = files_in(layout.second, IMAGES) if layout.pair else _depth_files(layout.second)
+        _check_camera(self.camera, folder, layout, second[0].suffix)
+        if len(first) != len(second):
+            raise DatasetError(
+                f"{layout.second}: expected as many images as in {layout.first.name}, {len(first)}, got {len(second)}"
+            )
+        self._files = list(zip(first, second, strict=True))
+        self.timestamps_ns = times_of(first, folder / _TIMES, self.camera.fps)
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """The poses of `groundtruth.txt`, read when first asked for; `TrajectoryError` if malformed.
+
+        In the file they are of the camera as it is; here of the rectified one, if the pair is rectified.
+        """
+        return self._ground_truth
+
+    @functools.cached_property
+    def _ground_truth(self) -> Trajectory | None:
+        path = self._folder / _GROUND_TRUTH
+        if not path.is_file():
+            return None
+        truth = read_tum(path)
+        if self._pair is None:
+            return truth
+        return Trajectory(truth.timestamps_ns, compose(truth.T_world_cam, self._pair.T_left_camera[None]))
+
+    def __len__(self) -> int:
+        return len(self._files)
+
+    def __getitem__(self, index: int) -> Frame:
+        """Decode one frame.
+
+        Raises:
+            IndexError: If there is no such frame.
+            DatasetError: If an image is unreadable, or of another size than the camera's.
+        """
+        first, second = self._files[index]
+        stamp, image = int(self.timestamps_ns[index]), read_color(first)
+        other = read_color(second) if self._is_pair else self._depth(second)
+        check_size(first, image, self.camera)
+        check_size(second, other, self.camera)
+        if not self._is_pair:
+            return Frame(stamp, image, other)
+        return Frame(stamp, image, right=other) if self._pair is None else self._pair.of(stamp, image, other)
+
+    def _depth(self, path: Path) -> np.ndarray:
+        if path.suffix == _METRES:
+            return read_depth_metres(path)
+        return read_depth(path, self.camera.depth_scale_per_m or 1.0)  # checked at the start
+
+
+def _layout(folder: Path) -> _Layout:
+    color = [name for name in _COLOR if (folder / name).is_dir()]
+    sides = [name for name in (_LEFT, _RIGHT) if (folder / name).is_dir()]
+    depth = (folder / _DEPTH).is_dir()
+    if len(sides) == 2 and not depth:
+        return _Layout(folder / _LEFT, folder / _RIGHT, True)
+    if len(color) == 1 and depth and not sides:
+        return _Layout(folder / color[0], folder / _DEPTH, False)
+    there = [*color, *sides, *([_DEPTH] if depth else [])]
+    raise DatasetError(
+        f"{folder}: expected the folders left and right, or depth and one of {', '.join(_COLOR)}, got"
+        f" {' and '.join(there) or 'neither'}"
+    )
+
+
+def _depth_files(folder: Path) -> list[Path]:
+    kinds = {path.suffix for path in folder.iterdir() if path.suffix in (".png", _METRES)}
+    if len(kinds) > 1:
+        raise DatasetError(f"{folder}: expected depth as .png or as .npy, got both")
+    return files_in(folder, (".png", _METRES))
+
+
+def _check_camera(camera: Camera, folder: Path, layout: _Layout, suffix: str) -> None:
+    if layout.pair and not camera.is_stereo:
+        raise CameraError(f"camera '{camera.name}': baseline_m: expected metres for a stereo pair, got none")
+    if layout.pair:
+        return
+    if camera.is_stereo:
+        raise CameraError(f"camera '{camera.name}': expected one with depth for {folder}, got a stereo pair")
+    if suffix != _METRES and camera.depth_scale_per_m is None:
+        raise CameraError(f"camera '{camera.name}': depth_scale_per_m: expected a number for depth as .png, got none")
+
+
+def _fit(folder: Path) -> Fit:
+    names = [name for name in (*_COLOR, _DEPTH, _LEFT, _RIGHT) if (folder / name).is_dir()]
+    return Fit.FOLDERS if (_DEPTH in names or _LEFT in names) and len(names) > 1 else Fit.NO
+
+
+def _camera(_: Path) -> None:
+    return None
+
+
+LOADER = Loader("folder", _fit, _camera, FolderDataset, rectifies=True)
