@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxslam.camera import Camera
 from jaxslam.datasets import Associated, Dataset, open_dataset
+from jaxslam.doctor_pair import look_over
 from jaxslam.errors import JaxSlamError
 from jaxslam.frame import Frame, to_grey
 from jaxslam.trajectory import associate
@@ -87,6 +88,10 @@ def diagnose(path: str | Path, kind: str = "auto", camera: Camera | str | Path |
             *unreadable,
             *_images(frames),
             *_depth([frame.depth_m for frame in frames if frame.depth_m is not None], dataset.camera.depth_scale_per_m),
+            *(
+                _graded(found.odd, found.topic, found.text, found.consequence)
+                for found in look_over(frames[:: len(frames) // 3 or 1], dataset.camera)
+            ),
             _ground_truth(dataset),
         )
     )
@@ -125,7 +130,8 @@ def _association(dataset: Dataset) -> Iterator[Finding]:
     if not isinstance(dataset, Associated):
         return
     color, depth = dataset.unmatched
-    text = f"{color} colour and {depth} depth images have no partner in time and are left out"
+    first, second = ("left", "right") if dataset.camera.is_stereo else ("colour", "depth")
+    text = f"{color} {first} and {depth} {second} images have no partner in time and are left out"
     share = max(color, depth) / (len(dataset) + max(color, depth))
     yield _graded(share > 0.05, "association", text, "fewer frames, more motion between them; is it the same clock?")
 

@@ -19,7 +19,15 @@ from jaxslam.errors import ConfigError, nearest
 from jaxslam.yaml_file import check_keys, read_mapping
 
 Metric: TypeAlias = Literal[
-    "ate_rmse_m", "ate_mean_m", "ate_median_m", "ate_std_m", "rpe_trans_m_per_s", "rpe_rot_deg_per_s", "frame_ms"
+    "ate_rmse_m",
+    "ate_mean_m",
+    "ate_median_m",
+    "ate_std_m",
+    "rpe_trans_m_per_s",
+    "rpe_rot_deg_per_s",
+    "kitti_trans_percent",
+    "kitti_rot_deg_per_100m",
+    "frame_ms",
 ]
 """Of one sequence; smaller is better. The names are those of `Evaluation`, and the mean time of a frame."""
 Sensor: TypeAlias = Literal["rgbd", "stereo", "mono"]

@@ -95,9 +95,9 @@ class OfRecording:
     recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
     """Folder of the recording."""
     dataset: str = "auto"
-    """Kind of the recording: auto, tum, bonn."""
+    """Kind of the recording: auto, tum, bonn, kitti, euroc, tartanair, tartanair_stereo, folder."""
     camera: str | None = None
-    """Known camera or camera file (jaxslam, ORB-SLAM2, ORB-SLAM3)."""
+    """Known camera or camera file (jaxslam, ORB-SLAM2, ORB-SLAM3, Kalibr); of two cameras if the pair is not rectified."""
     config: Path | None = None
     """YAML file of settings that differ from the preset."""
     out: Path | None = None

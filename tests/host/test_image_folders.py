@@ -15,7 +15,8 @@ from jaxslam.rig import Lens
 WIDTH, HEIGHT = 64, 48
 DEPTH = Camera("mine", WIDTH, HEIGHT, 60.0, 60.0, 31.5, 23.5, depth_scale_per_m=1000.0, fps=20.0)
 PAIR = Camera("pair", WIDTH, HEIGHT, 60.0, 60.0, 31.5, 23.5, baseline_m=0.2, fps=20.0)
-RIG = Rig("rig", *[Lens(WIDTH, HEIGHT, 42.0, 42.0, 31.0, 24.0, RADTAN[0].distortion)] * 2, (1, 0, 0, 0, 0.1, 0, 0))
+LENS = Lens(WIDTH, HEIGHT, 42.0, 42.0, 31.0, 24.0, RADTAN[0].distortion)
+RIG = Rig("rig", LENS, LENS, (1, 0, 0, 0, 0.1, 0, 0))
 
 
 def _images(folder: Path, names: list[str], seed: int = 0, size: tuple[int, int] = (HEIGHT, WIDTH)) -> None:
@@ -87,7 +88,7 @@ class TestFolder:
         _depths(tmp_path / "depth", NAMES)
         with pytest.raises(CameraError, match="give --camera"):
             open_dataset(tmp_path)
-        with pytest.raises(CameraError, match="expected one with depth for .*, got a stereo pair"):
+        with pytest.raises(CameraError, match=r"expected one with depth for .*, got a stereo pair"):
             open_dataset(tmp_path, camera=PAIR)
         (tmp_path / "times.txt").write_text("1\n2\n")
         with pytest.raises(DatasetError, match="expected one time an image, 3, got 2"):

@@ -78,7 +78,7 @@ def test_blocks_run_in_order(tmp_path: Path) -> None:
 
 
 def test_snippets_are_short() -> None:
-    _, loop, gradient = (block.text for block in _blocks(README) if block.language == "python")
+    _, _, loop, gradient = (block.text for block in _blocks(README) if block.language == "python")
     count = lambda code: sum(bool(line.strip()) for line in code.splitlines())
     assert "slam.track(frame)" in loop
     assert count(loop) <= 12
