@@ -97,7 +97,7 @@ class OfRecording:
     dataset: str = "auto"
     """Kind of the recording: auto, tum, bonn, kitti, euroc, tartanair, tartanair_stereo, folder."""
     camera: str | None = None
-    """Known camera or camera file (jaxslam, ORB-SLAM2, ORB-SLAM3, Kalibr); of two cameras if the pair is not rectified."""
+    """Known camera or camera file (jaxslam, ORB-SLAM2, ORB-SLAM3, Kalibr), of both cameras if a pair is unrectified."""
     config: Path | None = None
     """YAML file of settings that differ from the preset."""
     out: Path | None = None

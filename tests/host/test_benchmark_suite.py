@@ -63,6 +63,13 @@ class TestSuite:
         assert suite.sequences[1] == Sequence("start", "rgbd_bonn_crowd", stop=20)
         assert [clip.whole for clip in suite.sequences] == [True, False]
 
+    def test_room_as_pairs(self, tmp_path: Path) -> None:
+        text = "sequences: [{name: room, sensor: stereo, room: {frames: 1, people: 0, baseline_m: 0.1}}]"
+        (job,) = plan(load_suite(suite_file(tmp_path, text)))
+        dataset, _ = opened(Job.of_json(job.to_json()).clip, None)
+        assert dataset.camera.is_stereo
+        assert dataset[0].right is not None
+
     def test_camera_file_beside_it(self, tmp_path: Path) -> None:
         """It is found from wherever the suite is run; a known camera is left as it is."""
         (tmp_path / "mine_camera.yaml").touch()
