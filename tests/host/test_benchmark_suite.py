@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from jaxslam.benchmark.job import Job
+from jaxslam.benchmark.job import Job, opened
 from jaxslam.benchmark.runner import missing, plan, swept
 from jaxslam.benchmark.suite import Sequence, load_suite, suites
 from jaxslam.datasets.synthetic import SyntheticConfig
