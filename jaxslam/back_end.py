@@ -16,6 +16,7 @@ from jaxlie import SE3
 
 from jaxslam.camera import Camera
 from jaxslam.config import Config
+from jaxslam.dense.mapping import DenseMapping
 from jaxslam.essential_graph import compile_graph
 from jaxslam.feature_pose import MIN_INLIERS
 from jaxslam.features import Features, features_of, no_features
@@ -126,6 +127,7 @@ class BackEnd:
         *,
         localize_only: bool = False,
         detector: Detector | None = None,
+        dense: DenseMapping | None = None,
         times: StageTimes | None = None,
     ) -> None:
         """Start with a map, empty by default.
@@ -138,6 +140,7 @@ class BackEnd:
             map: To start with.
             localize_only: Leave the map as it is.
             detector: Finds in keyframes what may move, which leaves them and the map.
+            dense: Gets keyframes once they are in the map, and where they go.
             times: Where to keep how long the jobs of the threads take.
         """
         self._times = times or StageTimes()
@@ -152,6 +155,7 @@ class BackEnd:
         self._to_mapping: Worker[_MapJob, _MapUpdate] = self._worker(self._map_job, "mapping", 1)
         self._to_places: Worker[_PlaceJob, _PlaceResult] = self._worker(self._place_job, "places", 2)
         self._semantics = None if detector is None else self._semantics_of(detector)
+        self._dense = dense
         self._link = MapLink(plan, start)
         most = config.mapping.num_features + self._num_tracks
         self._states = PointStates(occlusion, params, start, most) if occlusion.enabled else None
@@ -204,6 +208,8 @@ class BackEnd:
             self._states.compile(frame)
         compile_recognition(self._params, self._plan.features)
         self._compile_edits(*frame.image.shape)
+        if self._dense is not None:
+            self._dense.compile()
         if not self._config.run.in_turn:
             compile_graph()  # while frames come, it would take seconds from them
 
@@ -224,6 +230,8 @@ class BackEnd:
             self._take_movers(*self._semantics.take(frame), frame)
         self._take_places(self._to_places.take(frame), frame)
         more = self._take_maps(self._to_mapping.take(frame), frame)
+        if self._dense is not None:
+            self._dense.take(frame)
         state = self._carried(state)
         if more:
             self._offer_recall(self._link.believed(self._link.reference), frame)
@@ -259,6 +267,8 @@ class BackEnd:
             new = self._link.keyframe_made(timestamp_ns, _copied(arrays), output, recognised)
             keyframe = new.id
             states = None if self._states is None else self._states.handed_over()
+            if self._dense is not None:
+                self._dense.keyframe_made(new, image, pose_of(output), frame)
             self._to_mapping.offer(new._replace(features=self._features, states=states), frame)
         if self._semantics is not None:
             self._semantics.offer(keyframe, image, np.asarray(arrays.depth), tracks_of(output), frame)
@@ -370,13 +380,16 @@ class BackEnd:
         self._take_places(self._to_places.drain(), 0)
         while self._take_maps(self._to_mapping.drain(), 0):
             self._take_places(self._to_places.drain(), 0)
+        if self._dense is not None:
+            self._dense.finish()
         return self._carried(state)
 
     def close(self) -> None:
         """End the threads, with the jobs they have not begun, in less than two seconds."""
         self._closed = True
         looking = () if self._semantics is None else (self._semantics.worker,)
-        close_all((self._to_mapping, self._to_places, *looking))
+        dense = () if self._dense is None else (self._dense.worker,)
+        close_all((self._to_mapping, self._to_places, *looking, *dense))
 
     def _in_local_map(self, features: Features, T_world_cam: np.ndarray) -> Placed | None:
         """Where a frame was taken that is about at a pose, if the map around shows it."""
@@ -456,6 +469,8 @@ class BackEnd:
             self._arrived = update.map
             self._loops_closed += update.loops
             self._removed += update.removed
+            if self._dense is not None and not self._closed:
+                self._dense.map_made(update.map, update.keyframe, frame)
             self._states_in_map = max(self._states_in_map, update.states)
             if update.gone is not None:
                 self._gone.append(update.gone)
@@ -482,6 +497,8 @@ class BackEnd:
         self._detector_error = error or self._detector_error
         for movers in found:
             self._gone.append(movers.tracks)
+            if self._dense is not None and movers.mask.any() and not self._closed:
+                self._dense.remove(movers, frame)
             if movers.keyframe != NONE and movers.mask.any() and not self._closed:
                 self._to_mapping.offer(movers, frame)
 

@@ -294,6 +294,42 @@ class DynamicsConfig(Checked):
 
 
 @dataclass(frozen=True)
+class DenseConfig(Checked):
+    """A dense map of what stands still, coloured, made of the depth of keyframes beside tracking."""
+
+    enabled: bool = False
+    """Make one."""
+    voxel_m: Annotated[float, Positive] | None = None
+    """Side of a voxel, each of which has one point, metres; if not set, a 300th of the farthest depth believed: 2 cm
+    for cameras that measure depth."""
+    cell_m: Annotated[float, Positive] | None = None
+    """Side of the smallest cells of the octree, metres; if not set, two and a half voxels."""
+    pixel_step: Annotated[int, Range(at_least=1, at_most=16)] = 2
+    """One pixel of depth in so many is used, in rows and in columns."""
+    max_points: Annotated[int, Range(at_least=1000, at_most=5_000_000)] = 400_000
+    """Voxels at most. When nine tenths are taken, those found free are forgotten, and if that does not help, voxels
+    become twice as large."""
+    keyframe_points: Annotated[int, Range(at_least=500, at_most=500_000)] = 32_768
+    """Points of one keyframe at most; voxels of one that has more are larger."""
+    memory_mb: Annotated[float, Positive] = 256.0
+    """Of what is kept of keyframes, to move their points with them, megabytes. Beyond it, the oldest are forgotten:
+    their points stay where they are then."""
+    carve: bool = True
+    """Remove what other keyframes see past: people that no mask has found, and what was carried away."""
+    corrections: Annotated[int, Range(at_least=1, at_most=100)] = 2
+    """Keyframes that are moved with the map for each new one, those with the largest move first."""
+    key_classes: tuple[str, ...] = ()
+    """Static objects to keep at full density, as the network names them: `book`, `keyboard`, `tv` (RTS-SLAM,
+    Algorithm 2). They take a look of the network at each keyframe."""
+    key_window: Annotated[int, Range(at_least=1, at_most=100)] = 12
+    """How many frames before a keyframe show the same objects,"""
+    key_frames: Annotated[int, Range(at_least=0, at_most=16)] = 3
+    """and how many of those, evenly spread, are used."""
+    key_points: Annotated[int, Range(at_least=1000, at_most=5_000_000)] = 200_000
+    """Points of key objects at most, in voxels of a quarter of the side; as `max_points`."""
+
+
+@dataclass(frozen=True)
 class RunConfig(Checked):
     """How a recording or a live stream is run."""
 
@@ -326,6 +362,7 @@ class Config(Checked):
     mapping: MappingConfig = field(default_factory=MappingConfig)
     semantics: SemanticsConfig = field(default_factory=SemanticsConfig)
     dynamics: DynamicsConfig = field(default_factory=DynamicsConfig)
+    dense: DenseConfig = field(default_factory=DenseConfig)
 
 
 def load_config(preset: str = "default", file: str | Path | None = None, overrides: Sequence[str] = ()) -> Config:

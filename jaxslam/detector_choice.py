@@ -1,10 +1,11 @@
 """The detector that the settings ask for."""
 
+import dataclasses
 import logging
 from collections.abc import Sequence
 from pathlib import Path
 
-from jaxslam.config import SemanticsConfig
+from jaxslam.config import Config, SemanticsConfig
 from jaxslam.errors import ConfigError, ModelError
 from jaxslam.known_models import find_model, is_known
 from jaxslam.semantics import Detector, OnnxDetector, load_detector
@@ -121,3 +122,15 @@ def _found(name: str, otherwise: str) -> Path | None:
             raise
         _log.warning("%s: %s", otherwise, error)
         return None
+
+
+def key_detector_of(config: Config) -> Detector | None:
+    """The detector of the objects that a dense map has at full density; `None` if the settings ask for none.
+
+    Raises:
+        ModelError: As `detector_of`.
+    """
+    dense, semantics = config.dense, config.semantics
+    if not dense.enabled or not dense.key_classes:
+        return None
+    return detector_of(dataclasses.replace(semantics, labels=dense.key_classes))

@@ -16,6 +16,7 @@ import numpy as np
 
 from jaxslam.config import to_yaml
 from jaxslam.datasets import Dataset
+from jaxslam.dense.results import DENSE_FILES, write_dense
 from jaxslam.errors import TrajectoryError
 from jaxslam.evaluation import Evaluation, evaluate
 from jaxslam.files import write_atomically
@@ -37,8 +38,8 @@ _OF_THE_PATH = ("plot.png", "trajectory_kitti.txt")
 _OF_THE_MAP = ("trajectory_keyframes.txt", "map.png")
 _ERRORS, _FAILURES = "errors.csv", "failures.png"
 _OF_MASKS = ("masks.png", "masks.gif")
-RESULT_FILES = (*_ALWAYS, *_OF_THE_PATH, *_OF_THE_MAP, _ERRORS, _FAILURES, *_OF_MASKS)
-"""All that a run can leave behind: no path, no keyframes, no truth, no masks, none of their files."""
+RESULT_FILES = (*_ALWAYS, *_OF_THE_PATH, *_OF_THE_MAP, _ERRORS, _FAILURES, *_OF_MASKS, *DENSE_FILES)
+"""All that a run can leave behind: no path, no keyframes, no truth, no masks, no dense map, none of their files."""
 
 
 @dataclass(frozen=True)
@@ -78,13 +79,14 @@ def write_results(
             evaluation = evaluate(slam.trajectory, truth)
         except TrajectoryError as error:
             problem = str(error)
-    summary = _summary(slam, records, info, evaluation) | {"evaluation_problem": problem}
+    dense, dense_files = write_dense(folder, slam.dense_mapping, slam.trajectory, slam.times.ms)
+    summary = _summary(slam, records, info, evaluation) | {"evaluation_problem": problem, "dense": dense}
     write_tum(folder / "trajectory.txt", slam.trajectory)
     write_tum(folder / "trajectory_online.txt", slam.online_trajectory)
     write_frames(folder / "frames.csv", records)
     write_atomically(folder / "config.yaml", to_yaml(slam.config).encode())
     write_atomically(folder / "summary.json", (json.dumps(summary, indent=2) + "\n").encode())
-    there = {*_ALWAYS, *_write_pictures(folder, slam, info, evaluation, pictures or RunPictures(0))}
+    there = {*_ALWAYS, *dense_files, *_write_pictures(folder, slam, info, evaluation, pictures or RunPictures(0))}
     if evaluation is not None:
         write_errors(folder / _ERRORS, evaluation)
         there.add(_ERRORS)

@@ -19,7 +19,9 @@ from jaxslam.camera import Camera
 from jaxslam.config import Config, TrackConfig
 from jaxslam.datasets import Dataset, prefetch
 from jaxslam.datasets.realtime import in_real_time
-from jaxslam.detector_choice import detector_of
+from jaxslam.dense.cloud import DenseCloud
+from jaxslam.dense.mapping import DenseMapping
+from jaxslam.detector_choice import detector_of, key_detector_of
 from jaxslam.dynamic_masks import DynamicMasks, FrameMask, MaskSource
 from jaxslam.dynamics.known import with_cue_params, with_cues
 from jaxslam.dynamics.point_mask import mask_around, moving_points
@@ -75,10 +77,11 @@ class Slam:
     Attributes:
         camera: That takes the frames.
         config: Settings in effect.
+        dense_mapping: What makes the dense map; `None` without `dense.enabled`.
         compile_s: Seconds that compiling took.
         times: Of the stages of every frame: `match pair` of a stereo camera, `take over` what mapping has done, `flow`,
             `wait for mask`, `pose`, `match with map`, `hand over` to mapping and the detector; and of the jobs beside
-            them: `masks`, `detector`, `mapping`, `places`. In a deterministic run those are parts of stages: `masks` in
+            them: `masks`, `detector`, `mapping`, `places`, `dense` and its parts. In a deterministic run those are parts of stages: `masks` in
             `flow` and `hand over`, the others in `hand over`.
     """
 
@@ -90,6 +93,7 @@ class Slam:
         map: Map | None = None,
         localize_only: bool = False,
         detector: Detector | None = None,
+        key_detector: Detector | None = None,
     ) -> None:
         """Prepare for frames of a camera. Compiling happens at the first frame or in `warm_up`.
 
@@ -99,6 +103,7 @@ class Slam:
             map: To start with: the first frame is `LOST` until its place is recognised.
             localize_only: Leave the map as it is.
             detector: Finds what may move, instead of the network of the settings.
+            key_detector: Finds what a dense map has at full density, instead of the network with `dense.key_classes`.
 
         Raises:
             MapFileError: If the map is of a camera of another size.
@@ -121,6 +126,7 @@ class Slam:
         self._patient_params = self._params._replace(keyframe_weak_after_s=jnp.float32(patient))
         self._plan = with_cues(track_plan(self.config.track), self.config.dynamics)
         self._detector = detector or detector_of(self.config.semantics)
+        self._key_detector = key_detector or key_detector_of(self.config)
         self._rough_depth = RoughDepth(camera) if camera.is_stereo else None
         motion = self._plan.motion
         self._memory = FrameMemory(camera.height, camera.width, pairs=camera.is_stereo, movable=motion is not None)
@@ -229,6 +235,8 @@ class Slam:
         if output.keyframe:
             hung = None if placed is None else placed.hung
             self._back.keyframe_made(frame.timestamp_ns, frame.image, arrays, output, self._frame, hung)
+        if self.dense_mapping is not None and int(output.status) != TrackStatus.LOST:
+            self.dense_mapping.frame_tracked(self._frame, frame.image, arrays, output)
         tracked = tracked_of(
             frame.timestamp_ns, output, correction, num_matched, mask, share, relocalised=placed is not None
         )
@@ -289,6 +297,11 @@ class Slam:
         return self._back.map
 
     @property
+    def dense(self) -> DenseCloud | None:
+        """The dense map as it is now: points, colours and counts; `None` without `dense.enabled`."""
+        return None if self.dense_mapping is None else self.dense_mapping.cloud()
+
+    @property
     def loops_closed(self) -> int:
         """Loops closed so far, submaps that became one included."""
         return self._back.loops_closed
@@ -323,6 +336,7 @@ class Slam:
         self.times = StageTimes()
         run, semantics, dynamics = self.config.run, self.config.semantics, self.config.dynamics
         every = self._detector if semantics.frames == "every" else None
+        self.dense_mapping = self._new_dense_mapping()
         self._back = BackEnd(
             self.camera,
             self._params,
@@ -331,6 +345,7 @@ class Slam:
             self._start_map,
             localize_only=self._localize_only,
             detector=self._detector if every is None else None,
+            dense=self.dense_mapping,
             times=self.times,
         )
         self._masks = (
@@ -365,6 +380,20 @@ class Slam:
         self._times_ns: list[int] = []
         self._poses: list[np.ndarray] = []
         self._hung: list[Hung] = []
+
+    def _new_dense_mapping(self) -> DenseMapping | None:
+        """What makes the dense map, if the settings ask for one and the map may grow."""
+        if not self.config.dense.enabled or self._localize_only:
+            return None
+        return DenseMapping(
+            self.camera,
+            self.config.dense,
+            nearest_m=float(self._params.min_depth_m),
+            farthest_m=float(self._params.max_depth_m),
+            deterministic=self.config.run.in_turn,
+            key_detector=self._key_detector,
+            times=self.times,
+        )
 
     def _fresh_state(self) -> TrackState:
         return _new_state(self.camera.height, self.camera.width, self._plan, seed=self.config.run.seed)

@@ -61,12 +61,14 @@ class Demo:
     """Watch it in the viewer of rerun."""
     rrd: Path | None = None
     """File to write a recording for that viewer to."""
+    dense: bool = False
+    """Make a dense map of what stands still too: points, an octree, and a picture."""
     set: _Settings = ()
     """Settings, as in `--set semantics.model=scene`, which tracks with the true masks of who moves."""
 
     def main(self) -> None:
         """Run the command."""
-        config = load_config(overrides=tuple(itertools.chain(*self.set)))
+        config = load_config(overrides=(*_dense(self.dense), *itertools.chain(*self.set)))
         scene = SyntheticConfig(
             frames=self.frames,
             path=self.path,
@@ -148,6 +150,8 @@ class Run(OfRecording):
     """Preset to start from."""
     map: Path | None = None
     """Map file to start with; the world is that of the map."""
+    dense: bool = False
+    """Make a dense map of what stands still too: points, an octree, and a picture."""
     localize_only: bool = False
     """Only find the camera in the map, which stays as it is."""
     save_map: Path | None = None
@@ -161,7 +165,9 @@ class Run(OfRecording):
         """Run the command."""
         if self.localize_only and self.map is None:
             raise ConfigError("--localize-only: needs the map to localise in: --map FILE")
-        config, dataset = self.settings(self.preset), self.opened()
+        if self.localize_only and self.dense:
+            raise ConfigError("--dense: a map that stays as it is, by --localize-only, gets no dense one")
+        config, dataset = self.settings(self.preset, *_dense(self.dense)), self.opened()
         prefer_one_thread()  # nothing else computes while a recording is tracked
         start = None if self.map is None else load_map(self.map)
         slam = Slam(dataset.camera, config, map=start, localize_only=self.localize_only)
@@ -170,6 +176,11 @@ class Run(OfRecording):
         if self.save_map is not None:
             slam.save(self.save_map)
             console.print(f"Map in {self.save_map}: {len(slam.map.ids)} keyframes, {len(slam.map.points.ids)} points")
+
+
+def _dense(wanted: bool) -> tuple[str, ...]:
+    """The override that has a dense map made."""
+    return ("dense.enabled=true",) if wanted else ()
 
 
 @dataclass
@@ -235,6 +246,11 @@ def _print_summary(summary: dict[str, Any], evaluation: Evaluation | None, out: 
     if (age := summary["mask_age_frames"]) is not None:
         table.add_row("age of masks, median", f"{age['median']:.0f}", f"frames ({age['p95']:.0f} at p95)")
     table.add_row("map", str(summary["keyframes"]), f"keyframes, {summary['map_points']} points")
+    if (dense := summary["dense"]) is not None:
+        made = f"points, {dense['megabytes']:.1f} MB, {100 * dense['share_of_measured']:.1f} % of those measured"
+        table.add_row("dense map", str(dense["points"]), made)
+        if dense["ms_per_keyframe"] is not None:
+            table.add_row("dense map, median", number(dense["ms_per_keyframe"]["median"], 1), "ms a keyframe")
     table.add_row("loops closed", str(summary["loops_closed"]), f"{summary['submaps']} submaps")
     table.add_row("ATE (SE(3) aligned)", number(summary["ate_rmse_m"], 4), "m RMSE")
     table.add_row("ATE (Sim(3) aligned)", number(summary["ate_sim3_rmse_m"], 4), "m RMSE")
