@@ -316,7 +316,7 @@ class DenseConfig(Checked):
     their points stay where they are then."""
     carve: bool = True
     """Remove what other keyframes see past: people that no mask has found, and what was carried away."""
-    corrections: Annotated[int, Range(at_least=1, at_most=100)] = 2
+    corrections: Annotated[int, Range(at_least=1, at_most=100)] = 1
     """Keyframes that are moved with the map for each new one, those with the largest move first."""
     key_classes: tuple[str, ...] = ()
     """Static objects to keep at full density, as the network names them: `book`, `keyboard`, `tv` (RTS-SLAM,

@@ -81,8 +81,8 @@ class Slam:
         compile_s: Seconds that compiling took.
         times: Of the stages of every frame: `match pair` of a stereo camera, `take over` what mapping has done, `flow`,
             `wait for mask`, `pose`, `match with map`, `hand over` to mapping and the detector; and of the jobs beside
-            them: `masks`, `detector`, `mapping`, `places`, `dense` and its parts. In a deterministic run those are parts of stages: `masks` in
-            `flow` and `hand over`, the others in `hand over`.
+            them: `masks`, `detector`, `mapping`, `places`, `dense` and its parts. In a deterministic run those are
+            parts of stages: `masks` in `flow` and `hand over`, the others in `hand over` or `take over`.
     """
 
     def __init__(

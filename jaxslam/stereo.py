@@ -26,8 +26,15 @@ class DenseDepth:
         self._focal_baseline, most = _prepared(camera)
         block = 5
         self._matcher = cv2.StereoSGBM.create(
-            0, most, block, P1=8 * block**2, P2=32 * block**2, disp12MaxDiff=1, uniquenessRatio=10,
-            speckleWindowSize=100, speckleRange=2,
+            0,
+            most,
+            block,
+            P1=8 * block**2,
+            P2=32 * block**2,
+            disp12MaxDiff=1,
+            uniquenessRatio=10,
+            speckleWindowSize=100,
+            speckleRange=2,
         )
 
     def of(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -79,7 +86,9 @@ def _prepared(camera: Camera) -> tuple[float, int]:
     return camera.fx * camera.baseline_m, 16 * max(1, round(camera.width / 20 / 16))
 
 
-def _depth_at_half(matcher: cv2.StereoMatcher, left: np.ndarray, right: np.ndarray, focal_baseline: float) -> np.ndarray:
+def _depth_at_half(
+    matcher: cv2.StereoMatcher, left: np.ndarray, right: np.ndarray, focal_baseline: float
+) -> np.ndarray:
     half = [cv2.pyrDown(to_grey(image)) for image in (left, right)]
     disparity = matcher.compute(*half).astype(np.float32) * np.float32(2 / _UNIT)
     found = disparity >= _LEAST_DISPARITY_PX

@@ -70,9 +70,7 @@ class Neighbours:
         )
 
 
-def object_boxes(
-    found: Detections, depth: Float32[np.ndarray, "_h _w"], view: View
-) -> Float32[np.ndarray, "k 2 3"]:
+def object_boxes(found: Detections, depth: Float32[np.ndarray, "_h _w"], view: View) -> Float32[np.ndarray, "k 2 3"]:
     """Boxes in space, in the axes of the camera, of what was found in a keyframe.
 
     Args:
@@ -113,5 +111,5 @@ def points_inside(
     X = transform(frame.pose, np.concatenate([view.rays[:, seen] * z, z[None]])).astype(np.float32)
     inside = np.zeros(len(seen), bool)
     for low, high in boxes:
-        inside |= ((X > low[:, None]) & (X < high[:, None])).all(axis=0)
+        inside |= (np.abs(X - 0.5 * (low + high)[:, None]) < 0.5 * (high - low)[:, None]).all(axis=0)
     return X[:, inside], view.colours(frame.image)[:, seen[inside]]

@@ -40,7 +40,7 @@ class Occupancy(NamedTuple):
     def at(self, points: Float[np.ndarray, "n 3"]) -> Float32[np.ndarray, " n"]:
         """Log-odds at points in metres; not a number where nothing is known."""
         index = np.floor(np.asarray(points, np.float64) / self.cell_m).astype(np.int64) - self.first
-        inside = ((index >= 0) & (index < self.log_odds.shape)).all(axis=1)
+        inside = np.all((index >= 0) & (index < np.array(self.log_odds.shape)), axis=1)
         x, y, z = np.where(inside[:, None], index, 0).T
         odds = np.where(self.known[x, y, z], self.log_odds[x, y, z], np.float32(np.nan))
         return np.where(inside, odds, np.float32(np.nan))
@@ -65,9 +65,7 @@ def occupancy(
     reached = [np.concatenate([end, pose[4:, None]], axis=1) for end, pose in zip(ends, poses, strict=True)]
     if not sum(end.shape[1] for end in ends):
         raise MapFileError("octree: expected depth of at least one keyframe, got none")
-    low, high = (
-        np.stack([bound(points, axis=1) for points in reached]) for bound in (np.min, np.max)
-    )
+    low, high = (np.stack([bound(points, axis=1) for points in reached]) for bound in (np.min, np.max))
     while True:
         first = np.floor(low.min(axis=0) / cell_m).astype(np.int64) - _MARGIN_CELLS
         shape = np.floor(high.max(axis=0) / cell_m).astype(np.int64) - first + 1 + _MARGIN_CELLS

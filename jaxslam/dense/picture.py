@@ -78,7 +78,7 @@ def picture(cloud: DenseCloud, T_world_cam: Float[np.ndarray, "k 7"]) -> UInt8[n
     below = cloud.points @ stand.axes[1].astype(np.float32) > highest
     views = (
         (cloud, lambda X: _ahead(X, stand)),
-        (DenseCloud(*(array[below] for array in cloud[:4]), cloud.voxel_m), lambda X: _from_above(X, stand)),
+        (_part(cloud, below), lambda X: _from_above(X, stand)),
     )
     panels: list[np.ndarray] = []
     for shown, project in views:
@@ -86,6 +86,11 @@ def picture(cloud: DenseCloud, T_world_cam: Float[np.ndarray, "k 7"]) -> UInt8[n
         _draw_path(panel, project(path))
         panels.append(panel)
     return np.concatenate(panels, axis=1)
+
+
+def _part(cloud: DenseCloud, which: np.ndarray) -> DenseCloud:
+    arrays = cloud.points[which], cloud.colours[which], cloud.counts[which], cloud.is_key[which]
+    return DenseCloud(*arrays, cloud.voxel_m)
 
 
 def _stand(cloud: DenseCloud, T_world_cam: np.ndarray) -> _Stand:

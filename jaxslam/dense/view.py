@@ -59,23 +59,38 @@ class View:
         return np.broadcast_to(small, (3, *self.shape)).reshape(3, -1).astype(np.float32)
 
     def depth(self, depth: Float[np.ndarray, "h w"], ignore: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "_h _w"]:
-        """Depth to be believed at the pixels used: within bounds, not ignored, not at an outline; else 0."""
-        small, (nearest_m, farthest_m) = self.every(depth), self._bounds_m
+        """Depth to be believed at the pixels used: within bounds, not ignored, not at an outline; else 0.
+
+        It is smoothed over five by five of them where no outline is near: far away, noise is larger than voxels, and
+        no centroid would be a mean.
+        """
+        return self.cleaned(self.every(depth), self.every(ignore))
+
+    def cleaned(
+        self, small: Float[np.ndarray, "_h _w"], ignore: Bool[np.ndarray, "_h _w"]
+    ) -> Float32[np.ndarray, "_h _w"]:
+        """The same of an image that has the pixels used only."""
+        nearest_m, farthest_m = self._bounds_m
         with np.errstate(invalid="ignore"):
-            good = (small >= nearest_m) & (small <= farthest_m) & ~self.every(ignore)
+            good = (small >= nearest_m) & (small <= farthest_m) & ~ignore
         small = np.where(good, small, np.float32(0)).astype(np.float32, copy=False)
-        square = np.ones((3, 3), np.uint8)
-        missing_far = np.where(good, small, np.float32(farthest_m * 2))
-        jump = cv2.dilate(small, square) - cv2.erode(missing_far, square)
-        return np.where(jump < _EDGE_SHARE * self.step * small + _EDGE_M, small, np.float32(0))
+        least, most = np.where(good, small, np.float32(2 * farthest_m)), small
+        limit = _EDGE_SHARE * self.step * small + _EDGE_M
+        outline = _dilated(most, 3) - _eroded(least, 3) >= limit
+        # On a plane the inverse of depth is even: its mean is that of the plane.
+        inverse = np.where(good, 1 / np.maximum(small, np.float32(nearest_m)), np.float32(0))
+        count, total = (
+            cv2.boxFilter(array, -1, (5, 5), normalize=False) for array in (good.astype(np.float32), inverse)
+        )
+        smooth = (_dilated(most, 5) - _eroded(least, 5) < limit) & good
+        small = np.where(smooth, count / np.maximum(total, np.float32(1e-6)), small)
+        return np.where(outline, np.float32(0), small)
 
     def looks(self, depth: Float32[np.ndarray, "_h _w"]) -> Looks:
         """A depth image of the size used, with what is least around each pixel."""
-        return Looks(depth, cv2.erode(depth, np.ones((3, 3), np.uint8)))
+        return Looks(depth, _eroded(depth, 3))
 
-    def under(
-        self, mask: Bool[np.ndarray, "h w"], X_cam: Float[np.ndarray, "3 n"]
-    ) -> Bool[np.ndarray, " n"]:
+    def under(self, mask: Bool[np.ndarray, "h w"], X_cam: Float[np.ndarray, "3 n"]) -> Bool[np.ndarray, " n"]:
         """Which points, of pixels used and in the axes of the camera, a mask of the whole image covers."""
         small = self.every(mask)
         x, y = X_cam[:2] / np.maximum(X_cam[2], 1e-3)
@@ -85,6 +100,14 @@ class View:
         row = np.clip(np.rint(row), 0, self.shape[0] - 1).astype(np.intp)
         column = np.clip(np.rint(column), 0, self.shape[1] - 1).astype(np.intp)
         return small[row, column]
+
+
+def _dilated(image: np.ndarray, side: int) -> np.ndarray:
+    return cv2.dilate(image, np.ones((side, side), np.uint8))
+
+
+def _eroded(image: np.ndarray, side: int) -> np.ndarray:
+    return cv2.erode(image, np.ones((side, side), np.uint8))
 
 
 def _distorted(intrinsics: Intrinsics, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -13,8 +13,16 @@ from jaxlie import SE3
 from jaxslam_kernels.camera import Intrinsics
 from jaxslam_kernels.free_space import seen_from
 from jaxslam_kernels.transform import to_world
-from jaxslam_kernels.voxel_grid import VoxelGrid, Voxels, centroids, changed, empty_grid, reduced_cloud, with_cloud
-from jaxslam_kernels.voxel_grid import weighed as _with_evidence
+from jaxslam_kernels.voxel_grid import (
+    VoxelGrid,
+    Voxels,
+    centroids,
+    changed,
+    empty_grid,
+    reduced_cloud,
+    weighed,
+    with_cloud,
+)
 from jaxslam_kernels.voxel_hash import NO_ROW
 from jaxtyping import Array, Bool, Float, Float32, Int, Int32
 
@@ -25,11 +33,13 @@ from jaxslam.xla import IN_ITS_THREAD
 HIT, MISS = np.float32(0.85), np.float32(-0.85)
 """Log-odds of a voxel that a keyframe has a point in: a probability of 0.7, OctoMap's; and of one it sees past. That is
 0.4 in OctoMap, for rays that graze a surface; here it must be clearly behind, and says as much as a point does."""
+_SEEN = np.float32(0.4)
+"""What a surface where a voxel has its points says for it: less than new points do."""
 _GONE = -1.0
 """Points in voxels with less do not go with their keyframe when it is moved."""
 _MOST_PAST = 3
 """Earlier keyframes that see past a new point of which no more count: something may have been put there since."""
-_SAME_SHARE, _SAME_M = np.float32(0.03), np.float32(0.03)
+_SAME_SHARE, _SAME_M = 0.03, 0.03
 """Differences of depth that are none, a share and metres: sensors are a percent or two off at four metres."""
 _CHUNK = 65536
 """Voxels compared with a depth image in one call."""
@@ -43,21 +53,21 @@ class Part(NamedTuple):
     Attributes:
         X_cam: `(3, m)` in units of the layer, int16.
         colour: `(3, m)` uint8.
-        count: `(m,)` float16.
+        counts: `(m,)` float16.
         rows: `(m,)` of the grid; `NO_ROW` of points that have left it.
         T_world_cam: `(7,)` where the keyframe was when they were put there; `None` while they are not in the grid.
     """
 
     X_cam: np.ndarray
     colour: np.ndarray
-    count: np.ndarray
+    counts: np.ndarray
     rows: Int32[np.ndarray, " m"]
     T_world_cam: np.ndarray | None
 
     @property
     def nbytes(self) -> int:
         """What it takes up."""
-        return self.X_cam.nbytes + self.colour.nbytes + self.count.nbytes + self.rows.nbytes
+        return self.X_cam.nbytes + self.colour.nbytes + self.counts.nbytes + self.rows.nbytes
 
 
 class VoxelLayer:
@@ -99,7 +109,9 @@ class VoxelLayer:
         X = np.clip(np.rint(X / self.unit_m), -32767, 32767).astype(np.int16)
         return Part(X, np.rint(colour).astype(np.uint8), count.astype(np.float16), np.full(num, NO_ROW, np.int32), None)
 
-    def put(self, keyframe: int, part: Part, T_world_cam: np.ndarray, past: Int[np.ndarray, " m"] | None = None) -> None:
+    def put(
+        self, keyframe: int, part: Part, T_world_cam: np.ndarray, past: Int[np.ndarray, " m"] | None = None
+    ) -> None:
         """Put the points of a keyframe into the grid.
 
         Args:
@@ -108,7 +120,7 @@ class VoxelLayer:
             T_world_cam: `(7,)` its pose.
             past: `(m,)` how many earlier keyframes see past each.
         """
-        evidence = np.full(len(part.count), HIT)
+        evidence = np.full(len(part.counts), HIT)
         if past is not None:
             evidence += MISS * np.minimum(past, _MOST_PAST)
         pose = T_world_cam.astype(np.float32)
@@ -123,7 +135,7 @@ class VoxelLayer:
             left = part if which is None else _at(part, ~which)
             self.parts[keyframe] = left
             return left
-        evidence = np.full(len(part.count), -HIT)
+        evidence = np.full(len(part.counts), -HIT)
         X, colour, count, evidence = self._padded(part, evidence)
         rows = padded(part.rows, self._part_points, fill=NO_ROW)
         if which is not None:
@@ -138,7 +150,7 @@ class VoxelLayer:
         """Move the points of a keyframe with it, or out of the grid; those found to be gone stay out."""
         part = self.parts[keyframe]
         if part.T_world_cam is not None:
-            odds = np.asarray(self._grid.log_odds)[np.maximum(part.rows, 0)]
+            odds = np.asarray(self._grid.sums)[np.maximum(part.rows, 0), 7]
             stays = (part.rows != NO_ROW) & (odds > _GONE)
             part = _at(self.take_out(keyframe), stays)
             self.parts[keyframe] = part
@@ -150,15 +162,15 @@ class VoxelLayer:
         del self.parts[keyframe]
 
     def look(self, looks: Looks, T_world_cam: np.ndarray, view: View) -> None:
-        """Take in which voxels a keyframe sees past."""
+        """Take in which voxels a frame sees again, and which it sees past."""
         for start in range(0, int(self._grid.table.num), _CHUNK):
             self._look_from(start, looks, T_world_cam, view)
 
     def past(self, part: Part, T_world_cam: np.ndarray, looks: Looks, poses: np.ndarray, view: View) -> np.ndarray:
         """`(m,)` how many of `(k, h, w)` depth images, taken at `(k, 7)` poses, see past the points of a keyframe."""
-        X = self._padded(part, np.zeros(len(part.count), np.float32))[0]
+        X = self._padded(part, np.zeros(len(part.counts), np.float32))[0]
         arrays = T_world_cam.astype(np.float32), looks.depth, looks.least, poses.astype(np.float32), view.intrinsics
-        return np.asarray(_num_past(X, *arrays))[: len(part.count)]
+        return np.asarray(_num_past(X, *arrays))[: len(part.counts)]
 
     def make_room(self) -> None:
         """Forget free voxels when the grid is nearly full, and if that does not help, make voxels larger."""
@@ -172,7 +184,7 @@ class VoxelLayer:
         """Points `(n, 3)`, colours `(n, 3)` and counts `(n,)` of voxels that have some and are not free."""
         num = int(self._grid.table.num)
         voxels = _all_centroids(self._grid, np.float32(self.voxel_m))
-        keep = (np.asarray(voxels.count)[:num] > 0) & (np.asarray(self._grid.log_odds)[:num] > 0)
+        keep = (np.asarray(voxels.counts)[:num] > 0) & (np.asarray(self._grid.sums)[:num, 7] > 0)
         X, colour, count = (np.asarray(array)[..., :num][..., keep] for array in voxels[:3])
         colour = np.clip(np.rint(colour), 0, 255).astype(np.uint8)
         return np.ascontiguousarray(X.T), np.ascontiguousarray(colour.T), count
@@ -194,7 +206,8 @@ class VoxelLayer:
         del self.parts[NO_ROW]
         blank = np.zeros((num_looks, *small.shape), np.float32)
         self.past(part, pose, Looks(blank, blank), np.tile(pose, (num_looks, 1)), small)
-        self._look_from(0, view.looks(np.zeros(view.shape, np.float32)), pose, view)
+        for used in (view, small):
+            self._look_from(0, used.looks(np.zeros(used.shape, np.float32)), pose, used)
         self.shown()
 
     @property
@@ -215,7 +228,7 @@ class VoxelLayer:
         """Points, colours, counts and evidence of a part at the size programs are compiled for."""
         size = self._part_points
         X, colour = (padded(array.astype(np.float32), size, axis=1) for array in (part.X_cam, part.colour))
-        return X * self.unit_m, colour, padded(part.count.astype(np.float32), size), padded(evidence, size)
+        return X * self.unit_m, colour, padded(part.counts.astype(np.float32), size), padded(evidence, size)
 
     def _rebuild(self, factor: int) -> None:
         """The same grid with larger voxels, or as large ones, without those that are free."""
@@ -228,7 +241,7 @@ class VoxelLayer:
 
 
 def _at(part: Part, which: Bool[np.ndarray, " m"]) -> Part:
-    return Part(part.X_cam[:, which], part.colour[:, which], part.count[which], part.rows[which], part.T_world_cam)
+    return Part(part.X_cam[:, which], part.colour[:, which], part.counts[which], part.rows[which], part.T_world_cam)
 
 
 _reduced = jax.jit(
@@ -247,7 +260,14 @@ def _put(
 
 @partial(jax.jit, donate_argnums=0, compiler_options=IN_ITS_THREAD)
 def _taken_out(
-    grid: VoxelGrid, rows: Array, X_cam: Array, colour: Array, count: Array, evidence: Array, pose: Array, voxel_m: Array
+    grid: VoxelGrid,
+    rows: Array,
+    X_cam: Array,
+    colour: Array,
+    count: Array,
+    evidence: Array,
+    pose: Array,
+    voxel_m: Array,
 ) -> VoxelGrid:
     return changed(grid, rows, to_world(SE3(pose), X_cam), colour, -count, evidence, voxel_m)
 
@@ -262,12 +282,15 @@ def _looked(
     intrinsics: Intrinsics,
     voxel_m: Float[Array, ""],
 ) -> VoxelGrid:
-    capacity = len(grid.sums)
-    rows = start + jnp.arange(_CHUNK, dtype=jnp.int32)
-    voxels = centroids(grid, jnp.minimum(rows, capacity - 1), voxel_m)
-    seen = seen_from(voxels.X, SE3(pose), depth, least, intrinsics, same_share=_SAME_SHARE, same_m=_SAME_M)
-    past = seen.past & (voxels.count > 0) & (rows < capacity)
-    return _with_evidence(grid, jnp.where(past, rows, NO_ROW), jnp.full(_CHUNK, MISS))
+    size = min(_CHUNK, len(grid.sums))
+    first = jnp.minimum(start, len(grid.sums) - size)
+    voxels = centroids(grid, first, voxel_m, size=size)
+    seen = seen_from(
+        voxels.X, SE3(pose), depth, least, intrinsics, same_share=jnp.float32(_SAME_SHARE), same_m=jnp.float32(_SAME_M)
+    )
+    counts = (voxels.counts > 0) & (first + jnp.arange(size, dtype=jnp.int32) >= start)
+    evidence = jnp.where(seen.past, MISS, jnp.where(seen.there, _SEEN, 0))
+    return weighed(grid, first, jnp.where(counts, evidence, 0))
 
 
 @partial(jax.jit, compiler_options=IN_ITS_THREAD)
@@ -282,7 +305,15 @@ def _num_past(
     X_world = to_world(SE3(pose), X_cam)
 
     def look(depth: Array, least: Array, other: Array) -> Array:
-        seen = seen_from(X_world, SE3(other), depth, least, intrinsics, same_share=_SAME_SHARE, same_m=_SAME_M)
+        seen = seen_from(
+            X_world,
+            SE3(other),
+            depth,
+            least,
+            intrinsics,
+            same_share=jnp.float32(_SAME_SHARE),
+            same_m=jnp.float32(_SAME_M),
+        )
         return seen.past.astype(jnp.int32)
 
     return jnp.sum(jax.vmap(look)(depths, leasts, poses), axis=0)
@@ -290,13 +321,13 @@ def _num_past(
 
 @jax.jit
 def _all_centroids(grid: VoxelGrid, voxel_m: Float[Array, ""]) -> Voxels:
-    return centroids(grid, jnp.arange(len(grid.sums), dtype=jnp.int32), voxel_m)
+    return centroids(grid, jnp.zeros((), jnp.int32), voxel_m, size=len(grid.sums))
 
 
 @partial(jax.jit, static_argnums=3)
 def _rebuilt(
     grid: VoxelGrid, old_m: Float[Array, ""], new_m: Float[Array, ""], capacity: int
 ) -> tuple[VoxelGrid, Int[Array, " c"]]:
-    voxels = centroids(grid, jnp.arange(capacity, dtype=jnp.int32), old_m)
-    count = jnp.where(grid.log_odds > 0, voxels.count, 0)
+    voxels = centroids(grid, jnp.zeros((), jnp.int32), old_m, size=capacity)
+    count = jnp.where(grid.log_odds > 0, voxels.counts, 0)
     return with_cloud(empty_grid(capacity), voxels.X, voxels.colour, count, grid.log_odds, new_m)

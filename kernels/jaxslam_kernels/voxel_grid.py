@@ -8,6 +8,7 @@ added elsewhere, when the keyframe is moved. Source of the filter: Rusu and Cous
 from typing import NamedTuple, TypeAlias
 
 import jax.numpy as jnp
+from jax import lax
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
@@ -35,13 +36,13 @@ class Voxels(NamedTuple):
     Attributes:
         X: `(3, m)` centroids, metres; 0 where there is no voxel.
         colour: `(3, m)` their mean colours.
-        count: `(m,)` points in each; 0 where there is no voxel.
+        counts: `(m,)` points in each; 0 where there is no voxel.
         num: Voxels that the cloud has; those beyond `m` are left out.
     """
 
     X: Points
     colour: Colours
-    count: Weights
+    counts: Weights
     num: Code
 
 
@@ -85,11 +86,12 @@ def reduced_cloud(X: Points, colour: Colours, mask: Mask, voxel_m: Scalar, *, ca
     row = jnp.where(rows < 0, capacity, rows)
     # Missing points may be NaN, and 0 times NaN would be the gradient.
     offset = jnp.where(usable[None], X - corner, 0)
-    sums = jnp.concatenate([offset, colour, usable[None].astype(X.dtype)])
-    sums = jnp.zeros((7, capacity), X.dtype).at[:, row].add(sums, mode="drop")
-    corners = jnp.zeros((3, capacity), X.dtype).at[:, row].set(corner, mode="drop")
+    figures = jnp.concatenate([offset, colour, usable[None].astype(X.dtype)])
+    sums = jnp.zeros((capacity, 7), X.dtype).at[row].add(figures.T, mode="drop").T
+    some = (sums[6] > 0)[None]
     share = 1 / jnp.maximum(sums[6], 1)[None]
-    return Voxels(corners + sums[:3] * share, sums[3:6] * share, sums[6], table.num + left_out)
+    centroid = jnp.where(some, key_corners(table.keys, voxel_m) + sums[:3] * share, 0)
+    return Voxels(centroid, sums[3:6] * share, sums[6], table.num + left_out)
 
 
 def empty_grid(capacity: int, dtype: DTypeLike = jnp.float32) -> VoxelGrid:
@@ -141,19 +143,25 @@ def changed(
     return grid._replace(sums=_bounded(grid.sums.at[row].add(figures.T, mode="drop"), row))
 
 
-def weighed(grid: VoxelGrid, rows: Rows, evidence: Weights) -> VoxelGrid:
-    """The grid with log-odds added to rows; nothing happens to `NO_ROW`."""
-    row = jnp.where(rows == NO_ROW, len(grid.sums), rows)
-    return grid._replace(sums=_bounded(grid.sums.at[row, 7].add(evidence, mode="drop"), row))
+def weighed(grid: VoxelGrid, start: Code, evidence: Weights) -> VoxelGrid:
+    """The grid with log-odds `(n,)` added to the rows from `start` on; there must be as many."""
+    old = lax.dynamic_slice(grid.sums, (start, jnp.full_like(start, 7)), (len(evidence), 1))
+    new = jnp.clip(old + evidence[:, None], LEAST_LOG_ODDS, MOST_LOG_ODDS)
+    return grid._replace(sums=lax.dynamic_update_slice(grid.sums, new, (start, jnp.full_like(start, 7))))
 
 
-def centroids(grid: VoxelGrid, rows: Rows, voxel_m: Scalar) -> Voxels:
-    """The points in some rows of a grid, whatever their log-odds; one of which nothing is left has a count of 0."""
-    sums, num = grid.sums[rows].T, grid.table.num
-    some = (sums[6] > 0.5) & (rows < num)  # what is taken out again leaves rounding behind
+def centroids(grid: VoxelGrid, start: Code, voxel_m: Scalar, *, size: int) -> Voxels:
+    """The points of `size` rows from `start` on, whatever their log-odds; there must be as many.
+
+    One of which nothing is left has a count of 0.
+    """
+    zero = jnp.zeros_like(start)
+    sums = lax.dynamic_slice(grid.sums, (start, zero), (size, 8)).T
+    keys = lax.dynamic_slice(grid.table.keys, (zero, start), (2, size))
+    some = sums[6] > 0.5  # what is taken out again leaves rounding behind
     share = jnp.where(some, 1 / jnp.where(some, sums[6], 1), 0)[None]
-    X = key_corners(grid.table.keys[:, rows], voxel_m) + sums[:3] * share * voxel_m
-    return Voxels(jnp.where(some[None], X, 0), sums[3:6] * share, jnp.where(some, sums[6], 0), num)
+    X = key_corners(keys, voxel_m) + sums[:3] * share * voxel_m
+    return Voxels(jnp.where(some[None], X, 0), sums[3:6] * share, jnp.where(some, sums[6], 0), grid.table.num)
 
 
 def _bounded(sums: Float[Array, "c 8"], rows: Rows) -> Float[Array, "c 8"]:

@@ -61,9 +61,7 @@ class _Search(NamedTuple):
 def empty_table(capacity: int, points: int = 0) -> HashTable:
     """A table without voxels, at most half full when all rows are given, or so many points have come at once."""
     size = 1 << (2 * max(capacity, points) - 1).bit_length()
-    return HashTable(
-        jnp.full(size, _FREE, jnp.int32), jnp.zeros((2, capacity), jnp.uint32), jnp.zeros((), jnp.int32)
-    )
+    return HashTable(jnp.full(size, _FREE, jnp.int32), jnp.zeros((2, capacity), jnp.uint32), jnp.zeros((), jnp.int32))
 
 
 def voxel_keys(X: Points, voxel_m: Scalar) -> tuple[Keys, Mask]:
@@ -97,7 +95,6 @@ def find_rows(table: HashTable, keys: Keys, mask: Mask) -> tuple[HashTable, Rows
     """
     n, capacity = keys.shape[1], table.keys.shape[1]
     index = jnp.arange(n, dtype=jnp.int32)
-    known = jnp.concatenate([keys, table.keys], axis=1)
 
     def step(search: _Search) -> _Search:
         at = _slot(keys, search.round, len(search.slots))
@@ -105,7 +102,8 @@ def find_rows(table: HashTable, keys: Keys, mask: Mask) -> tuple[HashTable, Rows
         # The first of those that want a slot has it.
         slots = search.slots.at[jnp.where(wants, at, len(search.slots))].max(-2 - index, mode="drop")
         there = slots[at]
-        other = known[:, jnp.clip(jnp.where(there < 0, -2 - there, n + there), 0, n + capacity - 1)]
+        waiting, known = keys[:, jnp.clip(-2 - there, 0, n - 1)], table.keys[:, jnp.clip(there, 0, capacity - 1)]
+        other = jnp.where(there < 0, waiting, known)
         same = search.open & (there < capacity) & jnp.all(other == keys, axis=0)
         found, where = jnp.where(same, there, search.found), jnp.where(same, at, search.at)
         return _Search(slots, found, where, search.open & ~same, search.round + 1)
@@ -125,8 +123,13 @@ def find_rows(table: HashTable, keys: Keys, mask: Mask) -> tuple[HashTable, Rows
 
 
 def _slot(keys: Keys, round: Code, size: int) -> Rows:
-    """The slot that each key looks at in a round; a mixture of multiplications and shifts as in MurmurHash3."""
-    mixed = keys[0] * jnp.uint32(0xCC9E2D51) ^ (keys[1] + round.astype(jnp.uint32)) * jnp.uint32(0x1B873593)
+    """The slot that each key looks at in a round: double hashing, with the mixer of MurmurHash3.
+
+    Neighbours must not share their ways: with the round added to a coordinate, a surface took several times as long.
+    """
+    mixed = keys[0] * jnp.uint32(0xCC9E2D51) ^ keys[1] * jnp.uint32(0x1B873593)
     mixed = (mixed ^ (mixed >> jnp.uint32(16))) * jnp.uint32(0x85EBCA6B)
     mixed = (mixed ^ (mixed >> jnp.uint32(13))) * jnp.uint32(0xC2B2AE35)
-    return ((mixed ^ (mixed >> jnp.uint32(16))) & jnp.uint32(size - 1)).astype(jnp.int32)
+    mixed ^= mixed >> jnp.uint32(16)
+    stride = (mixed >> jnp.uint32(7)) * jnp.uint32(0x9E3779B1) | jnp.uint32(1)  # odd: all slots have their turn
+    return ((mixed + round.astype(jnp.uint32) * stride) & jnp.uint32(size - 1)).astype(jnp.int32)

@@ -16,6 +16,7 @@ import pytest
 from result_files import FILES, MASK_FILES
 
 from jaxslam import Camera, TrackParams, TrackPlan, TrackStatus
+from jaxslam.dense.results import DENSE_FILES
 from jaxslam.semantics.prompted import read_examples
 from jaxslam.xla import cache_dir
 
@@ -63,11 +64,12 @@ def test_blocks_run_in_order(tmp_path: Path) -> None:
     (tmp_path / ".venv").symlink_to(sys.prefix)
     printed = {block.line: _run_block(block, tmp_path) for block in _blocks(README)}
     text = "".join(printed.values())
-    assert len(printed) == 14
+    assert len(printed) == 15
     assert "ATE" in text
     left_behind = {path.name for path in (tmp_path / "results" / "demo").iterdir()}
     assert left_behind == FILES | MASK_FILES
     assert all(f"`{name}`" in README.read_text(encoding="utf-8") for name in left_behind)
+    assert all((tmp_path / "results" / "dense" / name).is_file() for name in DENSE_FILES)
     assert (tmp_path / "ate.png").is_file()
     assert Camera.load(tmp_path / "my_camera.yaml").depth_scale_per_m == 5000
     assert [example.label for example in read_examples(tmp_path / "examples.yaml")] == ["arm", "arm"]

@@ -1,0 +1,254 @@
+"""The dense map of the rendered room: its surface, ghosts, corrections, bounds, key objects, and what a run leaves."""
+
+import functools
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+from small_scene import CONFIG, clip
+
+from jaxslam.config import Config, DenseConfig, load_config
+from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
+from jaxslam.datasets.synthetic.dataset import SyntheticFrame
+from jaxslam.dense.mapping import DenseMapping
+from jaxslam.dense.picture import picture
+from jaxslam.dense.results import DENSE_FILES
+from jaxslam.dense.view import View
+from jaxslam.errors import ConfigError, MapFileError
+from jaxslam.frame_arrays import FrameArrays
+from jaxslam.local_mapping import NewKeyframe, Tracks
+from jaxslam.map import Map, empty_map
+from jaxslam.map_movers import Movers
+from jaxslam.pose import IDENTITY, moved, transform
+from jaxslam.results import RunInfo, write_results
+from jaxslam.semantics import Detections
+from jaxslam.slam import Slam
+
+EVERY = 12
+SMALL = DenseConfig(enabled=True, max_points=150_000, keyframe_points=16_384)
+NO_TRACKS = Tracks(np.zeros(0), np.zeros((2, 0)), np.zeros((3, 0)), np.zeros(0))
+
+
+@functools.cache
+def _room(people: int, frames: int = 10) -> tuple[SyntheticDataset, tuple[SyntheticFrame, ...]]:
+    """Every twelfth frame of the room."""
+    source = SyntheticDataset(SyntheticConfig(width=320, height=240, frames=EVERY * frames, people=people))
+    return source, tuple(source.render(EVERY * index) for index in range(frames))
+
+
+def _mapping(source: SyntheticDataset, config: DenseConfig = SMALL, detector=None) -> DenseMapping:
+    return DenseMapping(source.camera, config, nearest_m=0.3, farthest_m=6.0, deterministic=True, key_detector=detector)
+
+
+def _map(source: SyntheticDataset, poses: list[np.ndarray]) -> Map:
+    """A map that holds nothing but keyframes."""
+    ids = np.arange(len(poses))
+    return empty_map(source.camera)._replace(
+        ids=ids, T_world_cam=np.stack(poses), parent=ids - 1, submap=np.zeros(len(poses), np.int32)
+    )
+
+
+def _hand_over(dense: DenseMapping, index: int, frame: SyntheticFrame, ignore: np.ndarray | None = None) -> None:
+    ignore = np.zeros(frame.depth_m.shape, bool) if ignore is None else ignore
+    arrays = FrameArrays(frame.rgb[..., 0], frame.depth_m, ignore, np.float32(0), np.float32(0))  # pyright: ignore[reportArgumentType]
+    new = NewKeyframe(index, frame.timestamp_ns, arrays, index - 1, IDENTITY, 0, np.zeros(6), NO_TRACKS)
+    dense.keyframe_made(new, frame.rgb, frame.T_world_cam, EVERY * index)
+
+
+def _made(source, frames, config=SMALL, *, masks=False, late=False) -> DenseMapping:
+    """The map of frames where they truly were; with true masks of who moves, at once or late."""
+    dense, poses = _mapping(source, config), []
+    for index, frame in enumerate(frames):
+        who = frame.instance_mask > 0
+        _hand_over(dense, index, frame, who if masks and not late else None)
+        poses.append(frame.T_world_cam)
+        dense.map_made(_map(source, poses), index, 0)
+        if masks and late:
+            dense.remove(Movers(index, who, np.zeros(0, np.int64)), 0)
+    dense.finish()
+    return dense
+
+
+def _surface(source, frames, *, people: bool) -> np.ndarray:
+    """`(n, 3)` the true surface that frames see up to six metres, of what stands still or of who moves."""
+    view, points = View(source.camera, 1, 100.0, 0.1), []
+    for frame in frames:
+        z = frame.exact_depth_m.reshape(1, -1)
+        chosen = ((frame.instance_mask > 0) == people).ravel() & (z[0] < 6) & (frame.depth_m > 0).ravel()
+        points.append(transform(frame.T_world_cam, np.concatenate([view.rays * z, z])[:, chosen].astype(float)).T)
+    return np.concatenate(points)
+
+
+def _ghosts(dense: DenseMapping, source, frames) -> float:
+    """Share of points that are off the true static surface by more than 6 cm, and on that of somebody."""
+    points = dense.cloud().points
+    still, people = (KDTree(_surface(source, frames, people=who)[::3]) for who in (False, True))
+    return float(np.mean((still.query(points)[0] > 0.06) & (people.query(points)[0] < 0.04)))
+
+
+class TestSurface:
+    def test_accuracy_and_coverage(self) -> None:
+        source, frames = _room(people=0)
+        cloud = _made(source, frames).cloud()
+        surface = _surface(source, frames, people=False)
+        assert np.mean(KDTree(surface[::2]).query(cloud.points)[0]) < 0.015
+        assert np.mean(KDTree(cloud.points).query(surface[::37])[0] < 0.03) > 0.9
+        assert len(cloud.points) < 0.25 * sum(np.count_nonzero(frame.depth_m) for frame in frames)
+        assert cloud.points.shape == cloud.colours.shape == (len(cloud.counts), 3)
+
+    def test_colours(self) -> None:
+        """Of a picture in one colour, whatever its depth, every point has it."""
+        source, frames = _room(people=0)
+        red = replace(frames[0], rgb=np.full_like(frames[0].rgb, (200, 30, 10)))
+        cloud = _made(source, [red]).cloud()
+        assert len(cloud.points) > 5000
+        np.testing.assert_array_equal(cloud.colours, np.broadcast_to((200, 30, 10), cloud.colours.shape))
+
+
+class TestGhosts:
+    def test_without_masks_and_carving_people_stay(self) -> None:
+        """What the other tests would see if nothing were done."""
+        source, frames = _room(people=2)
+        assert _ghosts(_made(source, frames, replace(SMALL, carve=False)), source, frames) > 0.02
+
+    @pytest.mark.parametrize("late", [False, True])
+    def test_masks(self, late: bool) -> None:
+        source, frames = _room(people=2)
+        dense = _made(source, frames, replace(SMALL, carve=False), masks=True, late=late)
+        assert _ghosts(dense, source, frames) < 0.005
+
+    def test_carving(self) -> None:
+        """Without any mask: what other keyframes see past is gone."""
+        source, frames = _room(people=2)
+        neither = _ghosts(_made(source, frames, replace(SMALL, carve=False)), source, frames)
+        assert _ghosts(_made(source, frames), source, frames) < 0.5 * neither
+
+
+class TestCorrections:
+    def test_keyframes_that_move_take_their_points_along(self) -> None:
+        """Put in at wrong poses and corrected, the map is that of the right ones."""
+        source, frames = _room(people=0)
+        config = replace(SMALL, carve=False)
+        right = _made(source, frames[:4], config).cloud()
+        rng = np.random.default_rng(0)
+        wrong = [replace(f, T_world_cam=moved(f.T_world_cam, rng.normal(0, 0.1, 6))) for f in frames[:4]]
+        dense = _made(source, wrong, config)
+        assert np.mean(KDTree(right.points).query(dense.cloud().points)[0]) > 0.03
+        dense.map_made(_map(source, [frame.T_world_cam for frame in frames[:4]]), -1, 0)
+        dense.finish()
+        cloud = dense.cloud()
+        assert dense.figures().moved >= 4
+        assert abs(len(cloud.points) - len(right.points)) <= 0.01 * len(right.points)
+        distances = KDTree(right.points).query(cloud.points)[0]
+        assert np.percentile(distances, 99) < 0.002
+
+    def test_another_submap_is_not_shown(self) -> None:
+        source, frames = _room(people=0)
+        dense = _made(source, frames[:3])
+        all_three = len(dense.cloud().points)
+        map = _map(source, [frame.T_world_cam for frame in frames[:3]])
+        dense.map_made(map._replace(submap=np.array([0, 1, 0], np.int32)), -1, 0)
+        dense.finish()
+        assert 0 < len(dense.cloud().points) < all_three
+
+
+class TestBounds:
+    def test_full_grid_gets_larger_voxels(self) -> None:
+        source, frames = _room(people=0)
+        dense = _made(source, frames, replace(SMALL, max_points=12_000))
+        figures, cloud = dense.figures(), dense.cloud()
+        assert figures.coarsened >= 1
+        assert cloud.voxel_m == pytest.approx(0.02 * 2**figures.coarsened)
+        assert 1000 < len(cloud.points) <= 12_000
+        surface = _surface(source, frames, people=False)
+        assert np.mean(KDTree(surface[::2]).query(cloud.points)[0]) < 0.03
+
+    def test_oldest_keyframes_are_forgotten(self) -> None:
+        """Their points stay, and move no more; memory is what it may be."""
+        source, frames = _room(people=0)
+        dense = _made(source, frames, replace(SMALL, memory_mb=1.0, carve=False))
+        whole = _made(source, frames, replace(SMALL, carve=False))
+        assert dense.figures().frozen >= 5
+        assert len(dense.cloud().points) == len(whole.cloud().points)
+        assert dense.figures().working_mb < whole.figures().working_mb
+
+    def test_late_thread_passes_keyframes_over(self) -> None:
+        source, frames = _room(people=0)
+        dense = DenseMapping(source.camera, SMALL, nearest_m=0.3, farthest_m=6.0, deterministic=False)
+        with dense._lock:  # it is held up
+            for index in range(20):
+                _hand_over(dense, index, frames[index % len(frames)])
+                dense.map_made(_map(source, [frames[i % len(frames)].T_world_cam for i in range(index + 1)]), index, 0)
+        dense.finish()
+        dense.worker.close()
+        figures = dense.figures()
+        assert figures.passed_over >= 10
+        assert figures.keyframes + figures.passed_over == 20
+
+    def test_no_depth(self) -> None:
+        source, frames = _room(people=0)
+        blind = replace(frames[0], depth_m=np.full_like(frames[0].depth_m, np.nan))
+        dense = _made(source, [blind])
+        assert len(dense.cloud().points) == 0
+        assert not dense.sees_anything
+        assert picture(dense.cloud(), np.zeros((0, 7))).any()
+
+    def test_nothing_yet(self) -> None:
+        with pytest.raises(MapFileError, match="octree: expected at least one keyframe with depth"):
+            _mapping(_room(people=0)[0]).cells()
+
+
+def test_key_objects_are_dense() -> None:
+    """Inside the box of an object there are more points than voxels, also from a frame before the keyframe."""
+    source, frames = _room(people=0)
+    box = np.array([[120, 90, 200, 160]], np.float32)
+    found = Detections(box, np.ones(1, np.float32), ("book",), None, None)
+    dense = _mapping(source, SMALL, lambda image: found)
+    assert dense.neighbours is not None
+    nothing = np.zeros(frames[0].depth_m.shape, bool)
+    dense.neighbours.see(0, frames[0].rgb, frames[0].depth_m, nothing, frames[0].T_world_cam)
+    _hand_over(dense, 0, frames[0])
+    shown = dense.neighbours.before(4, frames[1].T_world_cam)
+    assert len(shown) == 1
+    dense.map_made(_map(source, [frames[0].T_world_cam]), 0, 0)
+    dense.finish()
+    cloud = dense.cloud()
+    keys, others = cloud.points[cloud.is_key], cloud.points[~cloud.is_key]
+    low, high = keys.min(axis=0), keys.max(axis=0)
+    beside = ((others >= low) & (others <= high)).all(axis=1)
+    assert len(keys) > 1.5 * beside.sum() > 100
+
+
+class TestRun:
+    def test_what_a_run_leaves(self, tmp_path: Path) -> None:
+        recording = clip(frames=40)
+        dense = DenseConfig(enabled=True, max_points=20_000, keyframe_points=4096, pixel_step=1)
+        with Slam(recording.camera, Config(track=CONFIG.track, dense=dense)) as slam:
+            records = slam.run(recording)
+            summary, _ = write_results(tmp_path, slam, records, RunInfo(recording, "default", 1.0))
+            cloud = slam.dense
+        assert cloud is not None
+        assert all((tmp_path / name).is_file() for name in DENSE_FILES)
+        figures = json.loads((tmp_path / "summary.json").read_text())["dense"]
+        assert figures == summary["dense"]
+        assert figures["points"] == len(cloud.points) > 1000
+        assert figures["keyframes"] == len(slam.map.ids)
+        assert figures["ms_per_keyframe"]["median"] > 0
+        assert {"reduce", "put in", "move"} <= set(figures["stage_ms"])
+        header, body = (tmp_path / "map.ply").read_bytes().split(b"end_header\n", 1)
+        assert f"element vertex {len(cloud.points)}".encode() in header
+        assert len(body) == 19 * len(cloud.points)
+        np.testing.assert_array_equal(np.frombuffer(body[:12], "<f4"), cloud.points[0])
+
+    def test_off_by_default(self) -> None:
+        with Slam(clip().camera, CONFIG) as slam:
+            assert slam.dense is None
+            assert slam.dense_mapping is None
+
+    @pytest.mark.parametrize("bad", ["voxel_m=0", "pixel_step=0", "max_points=10", "memory_mb=-1", "colour=true"])
+    def test_settings_are_checked(self, bad: str) -> None:
+        with pytest.raises(ConfigError, match=f"dense.{bad.partition('=')[0]}"):
+            load_config(overrides=[f"dense.{bad}"])
