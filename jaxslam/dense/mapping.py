@@ -170,7 +170,7 @@ class DenseMapping:
         self._on_the_way: dict[int, _Shown] = {}
         self._waiting: deque[_Job] = deque()
         self._map: Map | None = None
-        self._lock = threading.Lock()
+        self._lock, self._waiting_lock = threading.Lock(), threading.Lock()
         self._put = self._passed_over = self._frozen = self._moved = self._measured = 0
         self.worker: Worker[None, None] = make_worker(
             self._next_job, "jaxslam-dense", deterministic=deterministic, latency_frames=0
@@ -293,18 +293,27 @@ class DenseMapping:
         if job is None and self._waiting:
             return  # the newest map is looked at with each job
         if isinstance(job, _Shown):
-            waiting = [other for other in tuple(self._waiting) if isinstance(other, _Shown)]
+            jobs = tuple(self._waiting)
+            waiting = [number for number, other in enumerate(jobs) if isinstance(other, _Shown)]
             if len(waiting) >= _MOST_WAITING:
-                self._waiting.remove(waiting[0])  # its turn does nothing
-                self._passed_over += 1
+                self._pass_over(jobs[waiting[0]])
         self._waiting.append(job)
         self.worker.offer(None, frame)
 
+    def _pass_over(self, job: _Job) -> None:
+        """Take the place of a job that waits, unless its turn has come; then nothing is done in that turn."""
+        with self._waiting_lock:
+            for number, other in enumerate(self._waiting):
+                if other is job:
+                    del self._waiting[number]
+                    self._passed_over += 1
+                    return
+
     def _next_job(self, _: None) -> None:
-        try:
+        with self._waiting_lock:
+            if not self._waiting:
+                return
             job = self._waiting.popleft()
-        except IndexError:
-            return
         with self._lock:
             if isinstance(job, _Shown):
                 self._add(job)

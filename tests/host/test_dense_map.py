@@ -13,7 +13,7 @@ from small_scene import CONFIG, clip
 from jaxslam.config import Config, DenseConfig, load_config
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.datasets.synthetic.dataset import SyntheticFrame
-from jaxslam.dense.mapping import DenseMapping
+from jaxslam.dense.mapping import DenseMapping, _Look
 from jaxslam.dense.picture import picture
 from jaxslam.dense.results import DENSE_FILES
 from jaxslam.dense.view import View
@@ -174,6 +174,20 @@ class TestBounds:
         assert dense.figures().frozen >= 5
         assert len(dense.cloud().points) == len(whole.cloud().points)
         assert dense.figures().working_mb < whole.figures().working_mb
+
+    def test_looks_wait_too(self) -> None:
+        """Looks of frames between keyframes stand before keyframes that are passed over."""
+        source, frames = _room(people=0)
+        dense = DenseMapping(source.camera, SMALL, nearest_m=0.3, farthest_m=6.0, deterministic=False)
+        small = dense._small.every(frames[0].depth_m)
+        with dense._lock:
+            dense._add_job(_Look(small, np.zeros(small.shape, bool), frames[0].T_world_cam), 0)
+            for index in range(12):
+                _hand_over(dense, index, frames[0])
+                dense.map_made(_map(source, [frames[0].T_world_cam] * (index + 1)), index, 0)
+        dense.finish()
+        dense.worker.close()
+        assert dense.figures().passed_over >= 3
 
     def test_late_thread_passes_keyframes_over(self) -> None:
         source, frames = _room(people=0)
