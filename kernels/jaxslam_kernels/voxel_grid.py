@@ -53,8 +53,7 @@ class VoxelGrid(NamedTuple):
         table: Which row a voxel has.
         sums: `(c, 8)` of the ways from its corner, in voxels; of colours; of counts; and last, no sum, how sure it is
             that there is something (log-odds, bounded): a voxel with less than 0 is free. A row lies together, against
-            the custom of kernels, because rows are visited in no order: to keep each figure in an array of its own
-            takes twice as long.
+            the custom of kernels: rows are visited in no order, and each visit is to one place in memory then.
     """
 
     table: HashTable
