@@ -16,14 +16,12 @@ from jaxslam.state import LookedUp, TrackParams, TrackPlan, TrackState
 _DEPTH_GATE_M, _DEPTH_SIGMAS = 0.1, 3.0
 """Of depth that supports a pose hypothesis: metres, and deviations with even votes or of a pair.
 
-With even votes points vote by deviations, and of those that agree the ones within both count for what follows, unless
-they are few: Bonn `crowd` lost two frames in one of five runs for that, with 40 as a few too. Metres in the vote too:
-it loses a frame in two of five, and a frame of noise moves what follows by 7 mm instead of 6. Deviations alone: a
-rendered room with people who sit has 4.1 mm instead of 2.4; metres in the vote alone: 4.1 too. The larger of 0.1 m and
-one deviation for all: `static` has 36 mm instead of 16 in the room xyz.
+With even votes points vote by deviations, and of those that agree the ones within both count for what follows. Metres
+in the vote too: Bonn `crowd` loses a frame in two of five runs, and a frame of noise moves what follows by 7 mm instead
+of 6. Deviations alone: a rendered room with people who sit has 4.1 mm instead of 2.4; metres in the vote alone, or as a
+weight of zero for points that are kept: 4.1 too. The larger of 0.1 m and one deviation for all: `static` has 36 mm
+instead of 16 in the room xyz.
 """
-_ENOUGH_NEAR = 0.25
-"""Of all points: fewer are few."""
 
 
 def coarse_pose(
@@ -48,9 +46,8 @@ def coarse_pose(
     if not plan.even_votes or view.right is not None:
         return result.T_world_cam, result.inliers
     apart_m = to_camera(result.T_world_cam, state.points.X_world)[2] - seen.depth
-    near = result.inliers & ((seen.depth <= 0) | (jnp.abs(apart_m) < _DEPTH_GATE_M))
-    enough = jnp.sum(near) >= _ENOUGH_NEAR * plan.num_points
-    return result.T_world_cam, jnp.where(enough, near, result.inliers)
+    near = (seen.depth <= 0) | (jnp.abs(apart_m) < _DEPTH_GATE_M)
+    return result.T_world_cam, result.inliers & near
 
 
 def refined_pose(

@@ -120,6 +120,8 @@ def match_depth(view: View, uv: Pixels, expected_depth: Weights, mask: Mask, par
     """
     if view.right is None:
         return None
+    if not uv.shape[1]:  # a plan that looks nothing up
+        return jnp.zeros(0, expected_depth.dtype)
     focal_baseline = params.intrinsics.fx * params.baseline_m
     rough = jnp.where(expected_depth > 0, expected_depth, sample_depth(view.depth, uv, reach=0))
     known = mask & (rough > 0)

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from jaxslam import recordings as module
+from jaxslam.camera import Camera
 from jaxslam.datasets import tum
 from jaxslam.errors import DatasetError
 from jaxslam.recordings import find_recording, found_recordings, known_recording, known_recordings, recordings_dir
@@ -68,7 +69,7 @@ class TestCatalogue:
         for name, entry in KNOWN.items():
             if entry.kind == "tum":
                 camera = tum.LOADER.camera(Path(name))
-                assert camera is not None
+                assert isinstance(camera, Camera)
                 assert f"/freiburg{camera.name[-1]}/" in (entry.url or "")
             else:
                 assert name.startswith({"bonn": "rgbd_bonn_", "kitti": "kitti_"}[entry.kind])

@@ -135,6 +135,14 @@ class TestRoom:
         assert [record.status for record in records[1:]] == [TrackStatus.OK] * (len(dataset) - 1)
         assert error_m < 0.002
 
+    def test_without_looking_points_up(self) -> None:
+        """A plan that follows points from keyframe to keyframe alone has none to match."""
+        dataset = _room(0.1, frames=6)
+        config = load_config("static", overrides=("semantics.model=null",))
+        with Slam(dataset.camera, config) as slam:
+            statuses = [slam.track(dataset[index]).status for index in range(len(dataset))]
+        assert statuses[1:] == [TrackStatus.OK] * 5
+
     def test_black_pairs_in_between(self) -> None:
         dataset = _room(0.1, frames=16)
         black = np.zeros((480, 640, 3), np.uint8)
