@@ -5,8 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxslam import Slam, load_config
-from jaxslam.datasets.stream import Subset
-from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset, with_true_masks
+from jaxslam.datasets.synthetic import SceneDetector, SyntheticConfig, SyntheticDataset
 from jaxslam.datasets.synthetic.parked import is_moving
 
 WITHIN = 5
@@ -56,12 +55,13 @@ def verdicts(
     config = load_config(preset, overrides=("semantics.model=scene", "semantics.labels=[person, box]"))
     scene = SyntheticConfig(frames=stop, people=0, parked=1, path=path, seed=seed, **room)  # type: ignore[arg-type]
     data = SyntheticDataset(scene)
-    part, truth = with_true_masks(Subset(data, start, stop), config.semantics)
-    box = [data.render(index).instance_mask > 0 for index in range(start, stop)]
+    detector = SceneDetector(data, labels=config.semantics.labels)
     masked, pose = [], []
-    with Slam(data.camera, config, detector=truth) as slam:
-        for index, shows in enumerate(box):
-            tracked = slam.track(part[index])
+    with Slam(data.camera, config, detector=detector) as slam:
+        for index in range(start, stop):
+            rendered = data.render(index)
+            detector.note(rendered)
+            tracked, shows = slam.track(rendered.measured), rendered.instance_mask > 0
             masked.append(tracked.dynamic_mask[shows].mean() if shows.any() else 0.0)
             pose.append(tracked.T_world_cam)
     time_s = (data.timestamps_ns[start:stop] - data.timestamps_ns[0]) * 1e-9

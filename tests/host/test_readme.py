@@ -64,7 +64,7 @@ def test_blocks_run_in_order(tmp_path: Path) -> None:
     (tmp_path / ".venv").symlink_to(sys.prefix)
     printed = {block.line: _run_block(block, tmp_path) for block in _blocks(README)}
     text = "".join(printed.values())
-    assert len(printed) == 15
+    assert len(printed) == 17
     assert "ATE" in text
     left_behind = {path.name for path in (tmp_path / "results" / "demo").iterdir()}
     assert left_behind == FILES | MASK_FILES
