@@ -65,7 +65,7 @@ def verdicts(
             masked.append(tracked.dynamic_mask[shows].mean() if shows.any() else 0.0)
             pose.append(tracked.T_world_cam)
     time_s = (data.timestamps_ns[start:stop] - data.timestamps_ns[0]) * 1e-9
-    moves = is_moving(time_s - 0.5 / data.fps)  # on the way from the frame before
+    moves = is_moving(np.maximum(time_s - 0.5 / data.fps, 0))  # on the way from the frame before
     true = data.T_world_cam[start:stop, 4:]
     return Verdicts(moves, np.array(masked), _error(np.array(pose)[:, 4:], true))
 
