@@ -166,11 +166,14 @@ def judge_points(
     plan: TrackPlan,
 ) -> Judged:
     """What is said of points and things, given the coarse pose, which most of the points at rest have made."""
-    judged = _by_cues(state, view, seen, regions, coarse, twist, params, plan)
+    verdicts = _verdicts(state, view, seen, regions, coarse, twist, params, plan)
+    judged = _with_regions(verdicts, regions, state.regions.weight, view, seen.agreeing, plan)
+    if verdicts:
+        left = jnp.sum(seen.agreeing & (judged.weights(seen.trust) > 0), dtype=seen.trust.dtype)
+        judged = judged._replace(heard=left >= params.min_inliers)
     if plan.motion is None:
         return judged
-    motion = _motion(state, view, seen, coarse, twist, params)
-    return judged.with_motion(motion, view)
+    return judged.with_motion(_motion(state, view, seen, coarse, twist, params), view)
 
 
 def _motion(
@@ -191,24 +194,6 @@ def _motion(
     measured = MeasuredPoints(X_world, observed.in_camera(), sigma, there)
     background = seen.agreeing.astype(sigma.dtype)
     return judge_motion(measured, seen.thing, background, coarse, state.motion, params.motion)
-
-
-def _by_cues(
-    state: TrackState,
-    view: View,
-    seen: PointsSeen,
-    regions: Regions | None,
-    coarse: SE3,
-    twist: Float[Array, "6"],
-    params: TrackParams,
-    plan: TrackPlan,
-) -> Judged:
-    verdicts = _verdicts(state, view, seen, regions, coarse, twist, params, plan)
-    judged = _with_regions(verdicts, regions, state.regions.weight, view, seen.agreeing, plan)
-    if not verdicts:
-        return judged
-    left = jnp.sum(seen.agreeing & (judged.weights(seen.trust) > 0), dtype=seen.trust.dtype)
-    return judged._replace(heard=left >= params.min_inliers)
 
 
 def _with_regions(

@@ -78,18 +78,24 @@ class MotionState(NamedTuple):
     """What is known of the things in a frame that may move; entry 0 is of thing 1.
 
     Attributes:
-        of_point: `(n,)` number of the thing that each point is on, from 1; 0 for none.
         there: `(n,)` which points are known in the frame.
         verdict: Of this frame alone, `(k,)`; evidence is in units of the limit.
-        at_rest: `(k,)` which are taken to stand still.
         memory: For the next frame.
     """
 
-    of_point: Int[Array, " n"]
     there: Mask
     verdict: RegionVerdict
-    at_rest: Bool[Array, " k"]
     memory: MotionMemory
+
+    @property
+    def of_point(self) -> Int[Array, " n"]:
+        """`(n,)` number of the thing that each point is on, from 1; 0 for none."""
+        return self.memory.of_point
+
+    @property
+    def at_rest(self) -> Bool[Array, " k"]:
+        """`(k,)` which are taken to stand still."""
+        return self.memory.at_rest
 
     def moves(self) -> Bool[Array, " k1"]:
         """`(k + 1,)` by label; false for 0, what cannot move."""
@@ -174,8 +180,7 @@ def judge_motion(
     by_mean = jnp.where(params.as_published, 0, groups.mean / mean_limit)
     known = (groups.number >= params.fewest) & (limit > 0)
     verdict = RegionVerdict(*judge(jnp.maximum(by_share, by_mean), known, params.temperature)[:3])
-    memory = _remembered(verdict, of_point, before, params)
-    return MotionState(of_point, points.there, verdict, memory.at_rest, memory)
+    return MotionState(points.there, verdict, _remembered(verdict, of_point, before, params))
 
 
 def _remembered(
