@@ -210,7 +210,7 @@ class ClusterCueConfig(Checked):
     num_regions: Annotated[int, Range(at_least=2, at_most=128)] = 24
     """Surfaces into which the depth image is divided by K-means,"""
     step_px: Annotated[int, Range(at_least=1, at_most=32)] = 4
-    """of which one pixel in so many is looked at, in rows and in columns,"""
+    """of which one pixel in so many is looked at, in rows and in columns (of a pair in twice as many),"""
     num_steps: Annotated[int, Range(at_least=1, at_most=50)] = 2
     """in so many steps a frame."""
     recover_frames: Annotated[int, Range(at_least=1, at_most=1000)] = 15

@@ -8,11 +8,12 @@ import jax
 import numpy as np
 from jaxslam_kernels.camera import to_pixels
 from jaxslam_kernels.depth_image import believable, sample_depth
-from jaxslam_kernels.types import DepthImage, Pixels, Scalar, Weights
+from jaxslam_kernels.image import build_pyramid
+from jaxslam_kernels.types import Pixels, Weights
 from jaxtyping import Array, Bool, Float, Float32, UInt8
 
 from jaxslam.frame_arrays import FrameArrays
-from jaxslam.observe import observe
+from jaxslam.observe import RIGHT_LEVELS, View, match_depth, observe
 from jaxslam.padding import padded
 from jaxslam.state import TrackParams
 
@@ -101,7 +102,7 @@ def features_of(
     patches = extract(np.asarray(frame.image), np.asarray(frame.ignore), plan)
     num = len(patches.octave)
     fixed_size = padded(patches.seen_uv, plan.num_features, axis=1)  # compiled once
-    uv, depth = jax.device_get(_ideal(fixed_size, twist.astype(np.float32), frame.depth, frame.depth_delay_s, params))
+    uv, depth = jax.device_get(_ideal(fixed_size, twist.astype(np.float32), frame, params))
     return Features(patches.seen_uv, uv[:, :num], depth[:num], *patches[1:])
 
 
@@ -222,9 +223,14 @@ def _no_patches() -> Patches:
 
 @jax.jit
 def _ideal(
-    seen_uv: Pixels, twist: Float[Array, "6"], depth: DepthImage, depth_delay_s: Scalar, params: TrackParams
+    seen_uv: Pixels, twist: Float[Array, "6"], frame: FrameArrays, params: TrackParams
 ) -> tuple[Pixels, Weights]:
-    """Pixels of the ideal camera, and depth."""
-    believed = believable(depth, params.min_depth_m, params.max_depth_m)
-    seen = observe(seen_uv, sample_depth(believed, seen_uv), twist, believed, depth_delay_s, params)
+    """Pixels of the ideal camera, and depth; of a pair by matching."""
+    believed = believable(frame.depth, params.min_depth_m, params.max_depth_m)
+    rough, matched = sample_depth(believed, seen_uv), None
+    if frame.right is not None:
+        pyramid = build_pyramid(frame.image, num_levels=RIGHT_LEVELS, dtype=seen_uv.dtype)
+        view = View(frame, pyramid, believed, frame.dt_s).with_right()
+        matched = match_depth(view, seen_uv, rough, rough > 0, params, known_point=False)
+    seen = observe(seen_uv, rough, twist, believed, frame.depth_delay_s, params, matched=matched)
     return to_pixels(params.intrinsics, seen.xy), seen.depth

@@ -65,10 +65,17 @@ class FrameMemory:
         self._ignore, self._nothing = (aligned_array((height, width), np.bool_) for _ in range(2))
         self._nothing[:] = False
 
-    def hold(self, frame: Frame, dt_s: float) -> FrameArrays:
-        """The arrays of a frame, as of `frame_arrays`, until the next one is held."""
+    def hold(self, frame: Frame, dt_s: float, *, depth_follows: bool = False) -> FrameArrays:
+        """The arrays of a frame, as of `frame_arrays`, until the next one is held.
+
+        Args:
+            frame: The frame.
+            dt_s: Seconds since the frame before.
+            depth_follows: Whether its depth is given to `hold_depth`, before anything looks at it.
+        """
         to_grey(frame.image, out=self._image)
-        np.copyto(self._depth, _depth(frame))
+        if not depth_follows:
+            np.copyto(self._depth, _depth(frame))
         right = None if self._right is None or frame.right is None else to_grey(frame.right, out=self._right)
         ignore = self._nothing
         if frame.dynamic_mask is not None:
@@ -78,6 +85,10 @@ class FrameMemory:
             self._movable[:] = 0
         arrays: Any = (self._image, self._depth, ignore, *_times(frame, dt_s, np.float32), right, self._movable)
         return FrameArrays(*arrays)
+
+    def hold_depth(self, depth_m: np.ndarray) -> None:
+        """Depth `(h, w)` of the frame held, metres."""
+        np.copyto(self._depth, depth_m)
 
     def with_movable(self, arrays: FrameArrays, labels: np.ndarray) -> FrameArrays:
         """The arrays held, with the numbers `(h, w)` of things that may move."""

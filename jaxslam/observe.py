@@ -7,7 +7,7 @@ from jaxlie import SE3
 from jaxslam_kernels.camera import distort, normalise, to_pixels
 from jaxslam_kernels.depth_image import believable, sample_depth
 from jaxslam_kernels.disparity import row_disparities
-from jaxslam_kernels.image import Pyramid
+from jaxslam_kernels.image import Pyramid, build_pyramid
 from jaxslam_kernels.rolling_shutter import as_if_at_once, image_velocity, row_time
 from jaxslam_kernels.transform import to_camera
 from jaxslam_kernels.types import DepthImage, Mask, Pixels, Points, Scalar, Weights
@@ -15,6 +15,11 @@ from jaxtyping import Array, Bool, Float
 
 from jaxslam.frame_arrays import FrameArrays
 from jaxslam.state import TrackParams
+
+RIGHT_LEVELS = 2
+"""Of the pyramid of the right image: where matching begins is known to a few pixels."""
+_EXPECTED_PX = 1.0
+"""A match so close to where the map has a point is that point."""
 
 
 class View(NamedTuple):
@@ -36,6 +41,13 @@ class View(NamedTuple):
     elapsed_s: Scalar
     right: Pyramid | None = None
     matched: Weights | None = None
+
+    def with_right(self) -> "View":
+        """The same frame with the right image of its pair, if it is one."""
+        if self.frame.right is None:
+            return self
+        dtype, border = self.pyramid.levels[0].dtype, self.pyramid.border
+        return self._replace(right=build_pyramid(self.frame.right, num_levels=RIGHT_LEVELS, border=border, dtype=dtype))
 
     def without(self, pixels: Bool[Array, "h w"]) -> "View":
         """The same frame with these pixels to be ignored too."""
@@ -105,7 +117,9 @@ def observe_points(
     return observe(uv, expected, twist, view.depth, view.frame.depth_delay_s, params, matched=matched)
 
 
-def match_depth(view: View, uv: Pixels, expected_depth: Weights, mask: Mask, params: TrackParams) -> Weights | None:
+def match_depth(
+    view: View, uv: Pixels, expected_depth: Weights, mask: Mask, params: TrackParams, *, known_point: bool = True
+) -> Weights | None:
     """Depth of pixels of the left image of a pair by matching them in the right one; `None` without a pair.
 
     Args:
@@ -114,6 +128,8 @@ def match_depth(view: View, uv: Pixels, expected_depth: Weights, mask: Mask, par
         expected_depth: `(n,)` metres, where matching begins; where it is not positive, the frame's own rough depth.
         mask: `(n,)` which to match.
         params: Camera, and the depths to be believed.
+        known_point: Whether `expected_depth` is that of points of the map, static: where it is confirmed, a match needs
+            no way back. Else it is rough depth of this very pair, which may be wrong in the same way.
 
     Returns:
         `(n,)` metres, 0 where there is no match.
@@ -127,7 +143,8 @@ def match_depth(view: View, uv: Pixels, expected_depth: Weights, mask: Mask, par
     known = mask & (rough > 0)
     left = Pyramid(view.pyramid.levels[: len(view.right.levels)], view.pyramid.border)
     guess = focal_baseline / jnp.where(known, rough, 1)
-    match = row_disparities(left, view.right, uv, guess, known)
+    expected_px = _EXPECTED_PX if known_point else 0.0
+    match = row_disparities(left, view.right, uv, guess, known, expected_px=expected_px)
     depth = focal_baseline / jnp.where(match.found, match.disparity, 1)
     return believable(jnp.where(match.found, depth, 0), params.min_depth_m, params.max_depth_m)
 

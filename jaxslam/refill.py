@@ -77,7 +77,7 @@ def refill(
     candidate = order[jnp.clip(rank, 0, order.shape[0] - 1)]
     new = ~points.valid & (rank < room)
     uv, rough, *chosen = (jnp.take(array, candidate, axis=-1) for array in (uv, rough, *seen))
-    seen, matched = Observed(*chosen), match_depth(view, uv, rough, new, params)
+    seen, matched = Observed(*chosen), match_depth(view, uv, rough, new, params, known_point=False)
     if matched is not None:
         seen, new = seen._replace(depth=matched), new & (matched > 0)
     X_world = to_world(T_world_cam, seen.in_camera())

@@ -79,10 +79,11 @@ class Slam:
         config: Settings in effect.
         dense_mapping: What makes the dense map; `None` without `dense.enabled`.
         compile_s: Seconds that compiling took.
-        times: Of the stages of every frame: `match pair` of a stereo camera, `take over` what mapping has done, `flow`,
-            `wait for mask`, `pose`, `match with map`, `hand over` to mapping and the detector; and of the jobs beside
-            them: `masks`, `detector`, `mapping`, `places`, `dense` and its parts. In a deterministic run those are
-            parts of stages: `masks` in `flow` and `hand over`, the others in `hand over` or `take over`.
+        times: Of the stages of every frame: `take over` what mapping has done, `flow`, `wait for mask`, `pose`,
+            `match with map`, `hand over` to mapping and the detector; and of the jobs beside them: `match pair` of a
+            stereo camera, `masks`, `detector`, `mapping`, `places`, `dense` and its parts. In a deterministic run those
+            are parts of stages: `match pair` in `flow`, `masks` there and in `hand over`, the others in `hand over` or
+            `take over`.
     """
 
     def __init__(
@@ -124,7 +125,7 @@ class Slam:
         # ORB-SLAM's local mapping does not accept keyframes either while it is busy.
         patient = max(_PATIENT_S, self.config.track.keyframe_weak_after_s)
         self._patient_params = self._params._replace(keyframe_weak_after_s=jnp.float32(patient))
-        self._plan = with_cues(track_plan(self.config.track), self.config.dynamics)
+        self._plan = with_cues(track_plan(self.config.track), self.config.dynamics, pairs=camera.is_stereo)
         self._detector = detector or detector_of(self.config.semantics)
         self._key_detector = key_detector or key_detector_of(self.config)
         self._rough_depth = RoughDepth(camera) if camera.is_stereo else None
@@ -207,15 +208,14 @@ class Slam:
         check_frame(frame, self.camera.width, self.camera.height, self._last_ns, pair=self.camera.is_stereo)
         self.warm_up()
         began, watch = time.perf_counter(), self.times.stopwatch()
-        if self._rough_depth is not None:
-            frame = self._rough_depth.with_depth(frame)
-            watch.ends("match pair")
         self._state, correction = self._back.update(self._state, self._frame)
         dt_s = 1 / self.camera.fps if self._last_ns is None else (frame.timestamp_ns - self._last_ns) * 1e-9
-        arrays = self._memory.hold(frame, dt_s)
+        arrays = self._memory.hold(frame, dt_s, depth_follows=frame.depth_m is None)
         watch.ends("take over")
-        # Neither needs the other, and on two cores masks are ready before flow is.
-        self._beside.offer(partial(self._mask_of, frame, arrays, correction), self._frame)
+        # Neither needs the other, and on two cores masks are ready before flow is; so is the rough depth of a pair.
+        if frame.depth_m is None:
+            self._beside.offer(("match pair", partial(self._match_pair, frame)), self._frame)
+        self._beside.offer(("masks", partial(self._mask_of, frame, arrays, correction)), self._frame)
         followed = _follow_points(self._state, arrays, self._params, self._plan)
         watch.ends("flow")
         mask: FrameMask = self._beside.drain()[-1]
@@ -364,10 +364,11 @@ class Slam:
                 times=self.times,
             )
         )
-        self._beside: Worker[Callable[[], Any], Any] = make_worker(
-            self.times.timed("masks", lambda job: job()),
+        self._beside: Worker[tuple[str, Callable[[], Any]], Any] = make_worker(
+            self._do_beside,
             "jaxslam-masks",
-            deterministic=run.in_turn or self._masks is None,  # nothing to do beside flow then
+            # Without either there is nothing to do beside flow.
+            deterministic=run.in_turn or (self._masks is None and self._rough_depth is None),
             latency_frames=0,
             urgent=True,
         )
@@ -410,6 +411,21 @@ class Slam:
             error = unfit
         _log.warning("frame at %d ns rejected: %s", timestamp_ns, error)
         return Rejected(timestamp_ns, error)
+
+    def _do_beside(self, job: tuple[str, Callable[[], Any]]) -> Any:
+        """A job of a stage, with the time it takes."""
+        stage, work = job
+        watch = self.times.stopwatch()
+        try:
+            return work()
+        finally:
+            watch.ends(stage)
+
+    def _match_pair(self, frame: Frame) -> None:
+        """Rough depth of a pair into the arrays held."""
+        assert self._rough_depth is not None
+        assert frame.right is not None
+        self._memory.hold_depth(self._rough_depth.of(frame.image, frame.right))
 
     def _mask_of(self, frame: Frame, arrays: FrameArrays, correction: np.ndarray) -> FrameMask:
         """What of a frame is to be left out because it may move."""
@@ -493,7 +509,7 @@ class Slam:
             self._lost_s += dt_s
             self._last_pose = compose(tracked.correction, self._last_pose)
             if self._masks is not None:
-                self._beside.offer(partial(self._masks.lost, self._frame), self._frame)
+                self._beside.offer(("masks", partial(self._masks.lost, self._frame)), self._frame)
             if self.config.run.on_loss == "predict":
                 ahead_s = min(self._lost_s, _PREDICTED_S)
                 tracked = replace(tracked, T_world_cam=moved(self._last_pose, self._last_twist * ahead_s))
@@ -501,7 +517,8 @@ class Slam:
         if self._masks is not None:
             pose = moved(tracked.T_world_cam, tracked.twist * depth_delay_s)
             when = self._frame, tracked.timestamp_ns * 1e-9
-            self._beside.offer(partial(self._masks.tracked, *when, pose, _turn(tracked.twist)), self._frame)
+            moved_on = partial(self._masks.tracked, *when, pose, _turn(tracked.twist))
+            self._beside.offer(("masks", moved_on), self._frame)
         self._unrecognised, self._lost_s = 0, 0.0
         self._last_pose, self._last_twist = tracked.T_world_cam, tracked.twist
         self._back.localize(tracked.T_world_cam, self._frame)

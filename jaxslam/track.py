@@ -48,8 +48,6 @@ DEFAULT_PLAN = TrackPlan()
 _MAX_PREDICTION_S = 0.1
 """A constant velocity says nothing about longer gaps."""
 _MAX_FUSED = 4
-_RIGHT_LEVELS = 2
-"""Of the pyramid of the right image: where matching begins is known to a few pixels."""
 _UNKNOWN_VARIANCE = 1e2
 _LOOK_EVERY = 3
 """Frames from one search for points on things that have too few to the next."""
@@ -254,10 +252,7 @@ def _background(state: TrackState, there: Mask, thing: Int[Array, " n"], params:
 
 def _matched(view: View, state: TrackState, uv: Pixels, found: Mask, predicted: SE3, params: TrackParams) -> View:
     """The frame with the right image of a pair, and the depth of the points followed by it; without one as it was."""
-    if view.frame.right is None:
-        return view
-    dtype, border = state.twist.dtype, view.pyramid.border
-    view = view._replace(right=build_pyramid(view.frame.right, num_levels=_RIGHT_LEVELS, border=border, dtype=dtype))
+    view = view.with_right()
     expected = to_camera(predicted, state.points.X_world)[2]
     return view._replace(matched=match_depth(view, uv, expected, found, params))
 

@@ -37,10 +37,14 @@ _KNOWN = {
 }
 
 
-def with_cues(plan: TrackPlan, config: DynamicsConfig) -> TrackPlan:
-    """The plan with the cues of the settings, and regions if one of them needs those."""
+def with_cues(plan: TrackPlan, config: DynamicsConfig, *, pairs: bool = False) -> TrackPlan:
+    """The plan with the cues of the settings, and regions if one of them needs those.
+
+    The depth of pairs is found at half the size, and so are its regions.
+    """
     chosen, clusters = [_KNOWN[name] for name in config.cues], config.clusters
-    regions = RegionPlan(clusters.num_regions, clusters.step_px, clusters.num_steps, clusters.recover_frames)
+    step_px = 2 * clusters.step_px if pairs else clusters.step_px
+    regions = RegionPlan(clusters.num_regions, step_px, clusters.num_steps, clusters.recover_frames)
     needed = config.even_votes or any(known.needs_regions for known in chosen)
     return plan._replace(
         cues=tuple(known.cue(config) for known in chosen),

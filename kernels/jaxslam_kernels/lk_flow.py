@@ -12,6 +12,7 @@ from jaxslam_kernels._patches import Window
 from jaxslam_kernels.image import Pyramid
 from jaxslam_kernels.implicit import Found, implicit_positions
 from jaxslam_kernels.lk_search import FlowPlan, LevelPlan, difference, look, make_template, mean_absolute, search
+from jaxslam_kernels.row_search import search_rows
 from jaxslam_kernels.types import Mask, Pixels, Scalar
 
 __all__ = ["Flow", "FlowPlan", "FlowStatus", "LevelPlan", "lk_flow", "lk_flow_forward_backward"]
@@ -159,7 +160,7 @@ class _End(NamedTuple):
 
 
 def _solve(inputs: _Inputs, *, plan: FlowPlan) -> Found:
-    end = search(*inputs, plan=plan)
+    end = (search_rows if plan.along_rows else search)(*inputs, plan=plan)
     tracked = inputs.usable & (end.texture > inputs.min_texture) & (end.last_step < plan.finest.accepted**2)
     tracked &= _inside(end.position, inputs.current)
     return Found(end.position, tracked, _End(end.residual, end.texture, end.last_step))

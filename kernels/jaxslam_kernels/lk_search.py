@@ -223,7 +223,7 @@ def iterate(search: Search, template: Template, level: Float[Array, "h w"], bord
     return lax.while_loop(going, body, start)[0]
 
 
-def _move_inside(position: Pixels, flow: Pixels, level: Float[Array, "h w"], border: int, window: Window) -> Pixels:
+def move_inside(position: Pixels, flow: Pixels, level: Float[Array, "h w"], border: int, window: Window) -> Pixels:
     """The nearest positions whose windows, there and at `position + flow`, lie in the image.
 
     A coarse level gives no more than a guess to the next, and that of a neighbour with a whole window is better than
@@ -256,8 +256,8 @@ def _search_chunk(
         window = Window(level_plan.window)
         start = points / 2**level
         if level > 0:
-            start = _move_inside(start, flow, previous.levels[level], border, window)
-        template = make_template(previous.levels[level], start, border, window, once, plan.along_rows)
+            start = move_inside(start, flow, previous.levels[level], border, window)
+        template = make_template(previous.levels[level], start, border, window, once)
         active = usable & (template.texture > min_texture)
         search = Search(start + flow, jnp.zeros_like(points[0]), active)
         search = iterate(search, template, current.levels[level], border, level_plan)
@@ -273,21 +273,34 @@ def _search_chunk(
     return Solution(search.position, search.last_step, residual, template.texture)
 
 
-def in_chunks(function: Callable[..., Any], arrays: tuple[Array, ...], chunk: int) -> Any:
-    """Apply a function of arrays whose last axis is points to `chunk` points after the other."""
-    n = arrays[0].shape[-1]
+def in_chunks(function: Callable[..., Any], arrays: tuple[Array, ...], wanted: Mask, chunk: int) -> Any:
+    """Apply a function of arrays whose last axis is points to the wanted points, `chunk` after the other.
+
+    Wanted points come first, and chunks without any are left out: a slot without a point costs nothing. What the
+    function gives for other points is not to be used; it may be zeros.
+    """
+    n = wanted.shape[0]
     if n <= chunk:
         return function(*arrays)
     count = -(-n // chunk)
+    order = jnp.argsort(~wanted, stable=True)
+    place = jnp.zeros_like(order).at[order].set(jnp.arange(n, dtype=order.dtype), unique_indices=True)
 
     def split(array: Array) -> Array:
-        padded = jnp.pad(array, [(0, 0)] * (array.ndim - 1) + [(0, count * chunk - n)])
+        sorted = jnp.take(array, order, axis=-1)
+        padded = jnp.pad(sorted, [(0, 0)] * (array.ndim - 1) + [(0, count * chunk - n)])
         return jnp.moveaxis(padded.reshape(*array.shape[:-1], count, chunk), -2, 0)
 
     def join(array: Array) -> Array:
-        return jnp.moveaxis(array, 0, -2).reshape(*array.shape[1:-1], count * chunk)[..., :n]
+        joined = jnp.moveaxis(array, 0, -2).reshape(*array.shape[1:-1], count * chunk)
+        return jnp.take(joined, place, axis=-1)
 
-    return jax.tree.map(join, lax.map(lambda chunked: function(*chunked), tuple(map(split, arrays))))
+    def one(chunked: tuple[Array, ...]) -> Any:
+        shapes = jax.eval_shape(function, *chunked[:-1])
+        nothing = lambda: jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+        return lax.cond(jnp.any(chunked[-1]), lambda: function(*chunked[:-1]), nothing)
+
+    return jax.tree.map(join, lax.map(one, tuple(map(split, (*arrays, wanted)))))
 
 
 def search(
@@ -309,6 +322,6 @@ def search(
     @jax.custom_batching.sequential_vmap
     def search_all(previous, current, points, guess, usable, min_texture):
         chunk = partial(_search_chunk, previous=previous, current=current, plan=plan, min_texture=min_texture)
-        return in_chunks(chunk, (points, guess, usable), plan.chunk)
+        return in_chunks(chunk, (points, guess, usable), usable, plan.chunk)
 
     return search_all(previous, current, points, guess, usable, min_texture)

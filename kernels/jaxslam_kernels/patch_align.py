@@ -198,9 +198,11 @@ def _solve(inputs: _Inputs, *, plan: LevelPlan, border: int, chunk: int) -> Foun
         run = lambda picture, centre, warp, guess, mask: search_chunk(
             inputs._replace(picture=picture, centre=centre, warp=warp, guess=guess, mask=mask)
         )
-        return in_chunks(run, (inputs.picture, inputs.centre, inputs.warp, inputs.guess, inputs.mask), chunk)
+        each = (inputs.picture, inputs.centre, inputs.warp, inputs.guess, inputs.mask)
+        return in_chunks(run, each, inputs.mask, chunk)
 
-    return search_all(inputs)
+    found = search_all(inputs)
+    return found._replace(measures=jnp.where(inputs.mask, found.measures, -1))
 
 
 def _explain(position: Pixels, inputs: _Inputs, *, plan: LevelPlan, border: int) -> tuple[Pixels, Weights]:

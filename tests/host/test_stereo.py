@@ -14,6 +14,7 @@ from jaxslam.datasets.kitti import KittiDataset
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset, write_tum
 from jaxslam.errors import CameraError, DatasetError, FrameError
 from jaxslam.evaluation import evaluate
+from jaxslam.features import features_of
 from jaxslam.frame_arrays import FrameMemory, frame_arrays
 from jaxslam.slam import track_params
 from jaxslam.stereo import RoughDepth
@@ -84,9 +85,22 @@ class TestRoughDepth:
         with pytest.raises(CameraError, match=message):
             RoughDepth(dataclasses.replace(PAIR, **change))
 
-    def test_a_frame_with_depth_stays(self) -> None:
-        frame = Frame(0, GREY, METRES, right=GREY)
-        assert RoughDepth(PAIR).with_depth(frame) is frame
+    def test_features_are_matched(self) -> None:
+        """Depth of features is matched, not read from the rough one: half the error, or less."""
+        *pair, true = stereo_motorcycle()
+        left, right = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in pair)
+        camera = Camera("motorcycle", left.shape[1], left.shape[0], 995.0, 995.0, 311.0, 254.0, baseline_m=0.193)
+        rough = RoughDepth(camera).of(left, right)
+        arrays = frame_arrays(Frame(0, left, rough, right=right), 0.1)
+        features = features_of(arrays, np.zeros(6, np.float32), track_params(camera, _settings().track))
+        column, row = features.seen_uv.round().astype(int)
+        known = np.isfinite(true[row, column]) & (features.depth > 0) & (rough[row, column] > 0)
+        errors = [
+            np.abs(995.0 * 0.193 / depth[known] - true[row, column][known])
+            for depth in (features.depth, rough[row, column])
+        ]
+        assert known.sum() > 300
+        assert np.median(errors[0]) < 0.5 * np.median(errors[1])
 
     def test_nothing_to_see(self) -> None:
         assert not RoughDepth(PAIR).of(GREY, GREY).any()

@@ -23,10 +23,10 @@ SHIFT_PX = 6.3
 EXACT = ROW_PLAN._replace(finest=LevelPlan(13, 200, 1e-12))
 
 
-def _run(plan=ROW_PLAN):
+def _run(plan=ROW_PLAN, **options):
     def disparities(left, right, points, guess, mask):
         left, right = (build_pyramid(image, num_levels=2) for image in (left, right))
-        return row_disparities(left, right, points, guess, mask, plan=plan)
+        return row_disparities(left, right, points, guess, mask, plan=plan, **options)
 
     return disparities
 
@@ -116,6 +116,18 @@ class TestMatchesReference:
         wrong = np.abs(found.disparity - _truth(points)) > 1
         assert not np.any(np.asarray(found.found) & covered & ~wrong)
         assert np.mean(np.asarray(found.found)[covered]) < 0.3
+
+    def test_what_was_expected_needs_no_way_back(self):
+        """One way only near the guess: the same disparities, and whatever is further off still has to come back."""
+        left, right, points, guess, mask = _pair()
+        right[40:90, 50:110] = picture(WIDTH, HEIGHT)[::-1, ::-1][40:90, 50:110]
+        both, one = (
+            jax.jit(_run(expected_px=expected_px))(left, right, points, guess, mask) for expected_px in (0.0, 1.0)
+        )
+        returned, found = np.asarray(both.found), np.asarray(one.found)
+        assert np.all(found[returned])
+        np.testing.assert_array_equal(one.disparity[returned], both.disparity[returned])
+        assert np.all(np.abs(one.disparity - guess)[found & ~returned] < 1)
 
 
 class TestGradient:
