@@ -10,7 +10,7 @@ from collections import deque
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, UInt8
 
 from jaxslam.dense.view import View
 from jaxslam.masks.box_mask import add_box
@@ -97,7 +97,7 @@ def object_boxes(found: Detections, depth: Float32[np.ndarray, "_h _w"], view: V
 
 def points_inside(
     boxes: Float32[np.ndarray, "k 2 3"], frame: Neighbour, view: View
-) -> tuple[Float32[np.ndarray, "3 n"], Float32[np.ndarray, "3 n"]]:
+) -> tuple[Float32[np.ndarray, "3 n"], UInt8[np.ndarray, "3 n"]]:
     """Points of a frame inside boxes, in the axes of the keyframe, with their colours.
 
     Args:
@@ -105,11 +105,9 @@ def points_inside(
         frame: Seen from there.
         view: All pixels of its image.
     """
-    depth = view.depth(frame.depth, frame.ignore).ravel()
-    seen = np.flatnonzero(depth)
-    z = depth[seen]
-    X = transform(frame.pose, np.concatenate([view.rays[:, seen] * z, z[None]])).astype(np.float32)
-    inside = np.zeros(len(seen), bool)
+    X, colours = view.cloud(view.depth(frame.depth, frame.ignore), frame.image)
+    X = transform(frame.pose, X).astype(np.float32)
+    inside = np.zeros(X.shape[1], bool)
     for low, high in boxes:
         inside |= (np.abs(X - 0.5 * (low + high)[:, None]) < 0.5 * (high - low)[:, None]).all(axis=0)
-    return X[:, inside], view.colours(frame.image)[:, seen[inside]]
+    return X[:, inside], colours[:, inside]

@@ -9,6 +9,7 @@ import threading
 from collections import deque
 from typing import NamedTuple, TypeAlias
 
+import cv2
 import numpy as np
 
 from jaxslam.camera import Camera
@@ -42,8 +43,9 @@ _LEAST_MOVE_VOXELS = 0.25
 """A keyframe that moves a point by less, two metres away, stays where it is."""
 _AT_M = 2.0
 _LOOK_EVERY = 5
-"""Frames, of which one has its look at what is not there any more: with keyframes alone, twice as many ghosts stay."""
-_NUM_LOOKS = 6
+"""Frames, of which one has its look at what is not there any more: with keyframes alone, twice as many ghosts stay.
+A keyframe of a camera that measures depth has none of its own besides."""
+_NUM_LOOKS = 4
 """Earlier keyframes that new points are compared with,"""
 _NEAR_M, _NEAR_RAD = 1.5, 0.6
 """of those so near, and turned by so little."""
@@ -155,13 +157,15 @@ class DenseMapping:
         """
         self._config, self._farthest_m, self._times = config, farthest_m, times or StageTimes()
         self._view = View(camera, config.pixel_step, farthest_m, nearest_m)
-        self._small = View(camera, 2 * config.pixel_step, farthest_m, nearest_m)
+        self._small = self._view.halved()
         voxel_m = config.voxel_m or farthest_m / _VOXELS_DEEP
         self._first_voxel_m, self._cell_m = voxel_m, config.cell_m or _CELL_VOXELS * voxel_m
-        self._layer = VoxelLayer(config.max_points, config.keyframe_points, voxel_m, farthest_m)
+        most = self._view.rays.shape[1]
+        self._layer = VoxelLayer(config.max_points, config.keyframe_points, most, voxel_m, farthest_m)
         self._keys: VoxelLayer | None = None
         if key_detector is not None:
-            self._keys = VoxelLayer(config.key_points, config.keyframe_points, _KEY_SHARE * voxel_m, farthest_m)
+            fine_m = _KEY_SHARE * voxel_m
+            self._keys = VoxelLayer(config.key_points, config.keyframe_points, _KEY_POINTS, fine_m, farthest_m)
             self._whole = View(camera, 1, farthest_m, nearest_m)
         self._stereo = DenseDepth(camera) if camera.is_stereo else None
         self._key_detector = key_detector
@@ -179,9 +183,8 @@ class DenseMapping:
     def compile(self) -> None:
         """Compile all that is needed."""
         with self._lock:
-            self._layer.compile(self._view, self._small, _NUM_LOOKS, self._view.rays.shape[1])
-            if self._keys is not None:
-                self._keys.compile(self._view, self._small, _NUM_LOOKS, _KEY_POINTS)
+            for layer in self._layers():
+                layer.compile(self._view, self._small, _NUM_LOOKS)
 
     def keyframe_made(self, new: NewKeyframe, image: np.ndarray, pose: np.ndarray, frame: int) -> None:
         """Take a keyframe; it is put in when it is in the map.
@@ -211,8 +214,8 @@ class DenseMapping:
         depth, ignore, pose = np.asarray(arrays.depth), np.asarray(arrays.ignore), pose_of(output)
         if self.neighbours is not None:
             self.neighbours.see(frame, image, depth, ignore, pose)
-        wanted = self._config.carve and frame % _LOOK_EVERY == 0 and not bool(output.keyframe)
-        # Rough depth of a pair would see past what is there.
+        wanted = self._config.carve and frame % _LOOK_EVERY == 0
+        # Rough depth of a pair would see past what is there: keyframes, which are matched again, look instead.
         if wanted and arrays.right is None and len(self._waiting) < _MOST_WAITING:
             pose = moved(pose, np.asarray(output.twist) * float(arrays.depth_delay_s))
             seen = _Look(self._small.every(depth).copy(), self._small.every(ignore).copy(), pose)
@@ -331,18 +334,20 @@ class DenseMapping:
             watch.ends("dense: match pair")
         total = self._times.stopwatch()
         depth = self._view.depth(whole, shown.ignore)
-        z = depth.reshape(1, -1)
-        part = self._layer.reduce(np.concatenate([self._view.rays * z, z]), self._view.colours(shown.image), z[0] > 0)
+        part = self._layer.reduce(*self._view.cloud(depth, shown.image))
         watch.ends("dense: reduce")
-        self._kept[shown.keyframe] = _Kept(self._packed(whole, shown.ignore), shown.T_cam_depth)
+        self._kept[shown.keyframe] = _Kept(self._packed(depth), shown.T_cam_depth)
         wanted = self._wanted()
-        self._put_in(self._layer, shown.keyframe, part, depth, wanted, watch)
+        if shown.pair is not None and self._config.carve and (pose := wanted[shown.keyframe]) is not None:
+            self._layer.look(self._view.looks(depth), pose, self._view)
+            watch.ends("dense: carve")
+        self._put_in(self._layer, shown.keyframe, part, wanted, watch)
         self._put += 1
-        self._measured += self._num_believed(whole, shown.ignore)
         self._correct(self._config.corrections, wanted)
         self._bound()
         watch.ends("dense: move")
         total.ends("dense")
+        self._measured += self._num_believed(whole, shown.ignore)
         if self._keys is not None and wanted[shown.keyframe] is not None:
             self._add_keys(self._keys, shown, whole, depth, wanted, watch)
 
@@ -351,18 +356,15 @@ class DenseMapping:
         layer: VoxelLayer,
         keyframe: int,
         part: Part,
-        depth: np.ndarray,
         wanted: dict[int, np.ndarray | None],
         watch: Stopwatch,
     ) -> None:
-        """Put the points of a keyframe into a layer, and take out of it what the keyframe sees past."""
+        """Put the points of a keyframe into a layer."""
         pose, past = wanted[keyframe], None
         if pose is None:
             layer.parts[keyframe] = part
             return
         if self._config.carve:
-            layer.look(self._view.looks(depth), pose, self._view)
-            watch.ends("dense: carve")
             past = self._num_past(layer, keyframe, part, wanted)
             watch.ends("dense: compare")
         layer.put(keyframe, part, pose, past)
@@ -379,8 +381,8 @@ class DenseMapping:
 
     def _num_believed(self, depth: np.ndarray, ignore: np.ndarray) -> int:
         """Pixels of a whole depth image that a map without voxels would hold."""
-        with np.errstate(invalid="ignore"):
-            return int(np.count_nonzero((depth > 0) & (depth <= self._farthest_m) & ~ignore))
+        good = cv2.inRange(depth, np.array([1e-6]), np.array([self._farthest_m])).view(bool)
+        return int(np.count_nonzero(good & ~ignore))
 
     def _add_keys(
         self,
@@ -401,7 +403,7 @@ class DenseMapping:
         parts = [points_inside(boxes, frame, self._whole) for frame in (own, *shown.neighbours)]
         X, colours = (np.concatenate(column, axis=1) for column in zip(*parts, strict=True))
         self._measured += X.shape[1] - parts[0][0].shape[1]
-        self._put_in(keys, shown.keyframe, keys.reduce(*_sampled(X, colours)), depth, wanted, self._times.stopwatch())
+        self._put_in(keys, shown.keyframe, keys.reduce(*_sampled(X, colours)), wanted, self._times.stopwatch())
         watch.ends("dense: key objects")
 
     def _num_past(
@@ -485,9 +487,9 @@ class DenseMapping:
     def _layers(self) -> list[VoxelLayer]:
         return [self._layer] if self._keys is None else [self._layer, self._keys]
 
-    def _packed(self, depth: np.ndarray, ignore: np.ndarray) -> np.ndarray:
-        """What is kept of a depth image, in 65,535 steps up to the farthest depth."""
-        small = self._small.depth(depth, ignore)
+    def _packed(self, depth: np.ndarray) -> np.ndarray:
+        """What is kept of a depth image of the pixels used, in 65,535 steps up to the farthest depth."""
+        small = self._small.of_finer(depth)
         return np.rint(small * np.float32(_DEPTH_COUNTS / self._farthest_m)).astype(np.uint16)
 
     def _unpacked(self, kept: _Kept) -> np.ndarray:
@@ -514,11 +516,9 @@ def _poses(map: Map, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return compose(map.T_world_cam[row], T_at_keyframe), map.submap[row]
 
 
-def _sampled(X: np.ndarray, colours: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points, evenly thinned out if there are too many, padded to the size that programs are compiled for; a mask."""
-    if X.shape[1] > _KEY_POINTS:
-        chosen = np.linspace(0, X.shape[1] - 1, _KEY_POINTS).astype(np.int64)
-        X, colours = X[:, chosen], colours[:, chosen]
-    mask = np.arange(_KEY_POINTS) < X.shape[1]
-    more = ((0, 0), (0, _KEY_POINTS - X.shape[1]))
-    return np.pad(X, more), np.pad(colours, more), mask
+def _sampled(X: np.ndarray, colours: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points, evenly thinned out if there are too many."""
+    if X.shape[1] <= _KEY_POINTS:
+        return X, colours
+    chosen = np.linspace(0, X.shape[1] - 1, _KEY_POINTS).astype(np.int64)
+    return X[:, chosen], colours[:, chosen]

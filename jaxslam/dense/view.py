@@ -1,12 +1,13 @@
 """What the dense map sees of a keyframe: depth at a smaller size, cleaned, and the rays of its pixels."""
 
+import math
 from typing import NamedTuple
 
 import cv2
 import jax
 import numpy as np
 from jaxslam_kernels.camera import Intrinsics, normalise
-from jaxtyping import Bool, Float, Float32, Shaped
+from jaxtyping import Bool, Float, Float32, Shaped, UInt8
 
 from jaxslam.camera import Camera
 from jaxslam.masks.reduced import Raster, Reduced
@@ -14,6 +15,7 @@ from jaxslam.masks.reduced import Raster, Reduced
 _EDGE_SHARE, _EDGE_M = 0.025, 0.04
 """Depth that differs by more around a pixel, a share for each pixel of the step and metres, is that of an outline:
 there a sensor mixes near and far."""
+_THREE = np.ones((3, 3), np.uint8)
 
 
 class Looks(NamedTuple):
@@ -36,27 +38,58 @@ class View:
         shape: Rows and columns of them.
         intrinsics: Of the camera in these pixels.
         rays: `(2, h w)` where the ray of each meets the plane one metre ahead.
+        borders: `(2, 2)` left and top, right and bottom of all that any pixel may see, in that plane.
+        farthest_m: Farthest depth believed.
     """
 
     def __init__(self, camera: Camera, step: int, farthest_m: float, nearest_m: float) -> None:
         """Use one pixel in so many, and depth within bounds."""
-        self._reduced = Reduced(Raster.of(camera), max(8, camera.width // step))
-        self.step, self._bounds_m = self._reduced.step, (nearest_m, farthest_m)
-        self.shape = self._reduced.raster.shape
-        self.intrinsics: Intrinsics = self._reduced.raster.intrinsics
+        reduced = Reduced(Raster.of(camera), max(8, camera.width // step))
+        self._begin((reduced,), farthest_m, nearest_m)
+
+    def _begin(self, reduced: tuple[Reduced, ...], farthest_m: float, nearest_m: float) -> None:
+        """Use the pixels that are left when images are made smaller, one time after the other."""
+        self._reduced, self._bounds_m = reduced, (nearest_m, farthest_m)
+        self.step = math.prod(once.step for once in reduced)
+        self.shape, intrinsics = reduced[-1].raster
+        self.intrinsics: Intrinsics = intrinsics
         v, u = np.mgrid[: self.shape[0], : self.shape[1]].astype(np.float32)
         self.rays: Float32[np.ndarray, "2 n"] = np.array(
             jax.jit(normalise)(self.intrinsics, np.stack([u.ravel(), v.ravel()]))
         )
+        pixel = 1 / np.array([self.intrinsics.fx, self.intrinsics.fy], np.float32)
+        self.borders = np.stack([self.rays.min(axis=1) - pixel, self.rays.max(axis=1) + pixel])
+        self.farthest_m = farthest_m
 
-    def every(self, image: Shaped[np.ndarray, "h w"]) -> Shaped[np.ndarray, "_h _w"]:
+    def halved(self) -> "View":
+        """The view of every second of these pixels."""
+        half = View.__new__(View)
+        last = Reduced(self._reduced[-1].raster, max(8, self.shape[1] // 2))
+        half._begin((*self._reduced, last), self.farthest_m, self._bounds_m[0])
+        return half
+
+    def every(self, image: Shaped[np.ndarray, "*colours h w"]) -> Shaped[np.ndarray, "*colours _h _w"]:
         """The pixels of a larger image that are used; a view of them."""
-        return self._reduced.every(image)
+        for once in self._reduced:
+            image = once.every(image)
+        return image
 
-    def colours(self, image: np.ndarray) -> Float32[np.ndarray, "3 n"]:
+    def of_finer(self, image: Shaped[np.ndarray, "h w"]) -> Shaped[np.ndarray, "_h _w"]:
+        """The pixels used of an image of the view that this one was halved from."""
+        return self._reduced[-1].every(image)
+
+    def colours(self, image: np.ndarray) -> UInt8[np.ndarray, "3 n"]:
         """Colours of the pixels used, of an RGB or a grey image."""
         small = self.every(np.moveaxis(image, -1, 0)) if image.ndim == 3 else self.every(image)[None]
-        return np.broadcast_to(small, (3, *self.shape)).reshape(3, -1).astype(np.float32)
+        return np.broadcast_to(small, (3, *self.shape)).reshape(3, -1)
+
+    def cloud(
+        self, depth: Float32[np.ndarray, "_h _w"], image: np.ndarray
+    ) -> tuple[Float32[np.ndarray, "3 n"], UInt8[np.ndarray, "3 n"]]:
+        """Points where there is depth, in the axes of the camera, with their colours."""
+        seen = np.flatnonzero(depth)
+        z = depth.ravel()[seen]
+        return np.concatenate([self.rays[:, seen] * z, z[None]]), self.colours(image)[:, seen]
 
     def depth(self, depth: Float[np.ndarray, "h w"], ignore: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "_h _w"]:
         """Depth to be believed at the pixels used: within bounds, not ignored, not at an outline; else 0.
@@ -71,24 +104,25 @@ class View:
     ) -> Float32[np.ndarray, "_h _w"]:
         """The same of an image that has the pixels used only."""
         nearest_m, farthest_m = self._bounds_m
-        with np.errstate(invalid="ignore"):
-            good = (small >= nearest_m) & (small <= farthest_m) & ~ignore
-        small = np.where(good, small, np.float32(0)).astype(np.float32, copy=False)
+        small = np.ascontiguousarray(small, np.float32)
+        good = cv2.inRange(small, np.array([nearest_m]), np.array([farthest_m])).view(bool) & ~ignore
+        small = np.where(good, small, np.float32(0))
         least, most = np.where(good, small, np.float32(2 * farthest_m)), small
         limit = _EDGE_SHARE * self.step * small + _EDGE_M
-        outline = _dilated(most, 3) - _eroded(least, 3) >= limit
+        most, least = _dilated(most), _eroded(least)
+        outline = most - least >= limit
         # On a plane the inverse of depth is even: its mean is that of the plane.
         inverse = np.where(good, 1 / np.maximum(small, np.float32(nearest_m)), np.float32(0))
         count, total = (
             cv2.boxFilter(array, -1, (5, 5), normalize=False) for array in (good.astype(np.float32), inverse)
         )
-        smooth = (_dilated(most, 5) - _eroded(least, 5) < limit) & good
+        smooth = (_dilated(most) - _eroded(least) < limit) & good  # once more: five by five
         small = np.where(smooth, count / np.maximum(total, np.float32(1e-6)), small)
         return np.where(outline, np.float32(0), small)
 
     def looks(self, depth: Float32[np.ndarray, "_h _w"]) -> Looks:
         """A depth image of the size used, with what is least around each pixel."""
-        return Looks(depth, _eroded(depth, 3))
+        return Looks(depth, _eroded(depth))
 
     def under(self, mask: Bool[np.ndarray, "h w"], X_cam: Float[np.ndarray, "3 n"]) -> Bool[np.ndarray, " n"]:
         """Which points, of pixels used and in the axes of the camera, a mask of the whole image covers."""
@@ -102,12 +136,14 @@ class View:
         return small[row, column]
 
 
-def _dilated(image: np.ndarray, side: int) -> np.ndarray:
-    return cv2.dilate(image, np.ones((side, side), np.uint8))
+def _dilated(image: np.ndarray) -> np.ndarray:
+    """The most of each pixel and the eight around it."""
+    return cv2.dilate(image, _THREE)
 
 
-def _eroded(image: np.ndarray, side: int) -> np.ndarray:
-    return cv2.erode(image, np.ones((side, side), np.uint8))
+def _eroded(image: np.ndarray) -> np.ndarray:
+    """The least."""
+    return cv2.erode(image, _THREE)
 
 
 def _distorted(intrinsics: Intrinsics, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
