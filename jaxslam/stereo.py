@@ -17,7 +17,7 @@ _UNIT = 16
 class DenseDepth:
     """Depth of pairs by semi-global matching at half the size: slower than `RoughDepth`, denser and smoother.
 
-    On a pair of KITTI (1226x370) it takes some 30 ms; at the full size 130.
+    On a pair of KITTI (1226x370) it takes 20 ms on one core; matching alone, at the full size, 118.
     """
 
     def __init__(self, camera: Camera) -> None:
