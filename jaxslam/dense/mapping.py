@@ -17,15 +17,16 @@ from jaxslam.config import DenseConfig
 from jaxslam.dense.cloud import DenseCloud
 from jaxslam.dense.key_regions import Neighbour, Neighbours, object_boxes, points_inside
 from jaxslam.dense.occupancy import Occupancy, occupancy
+from jaxslam.dense.places import distance, poses_of
 from jaxslam.dense.view import Looks, View
 from jaxslam.dense.voxel_layer import Part, VoxelLayer
 from jaxslam.errors import MapFileError
 from jaxslam.frame_arrays import FrameArrays
 from jaxslam.local_mapping import NewKeyframe
-from jaxslam.map import NONE, Map, has, rows
+from jaxslam.map import NONE, Map, has
 from jaxslam.map_link import pose_of
 from jaxslam.map_movers import Movers
-from jaxslam.pose import IDENTITY, angle, between, compose, inverse, moved
+from jaxslam.pose import IDENTITY, angle, between, compose, moved
 from jaxslam.semantics import Detector
 from jaxslam.stage_times import StageTimes, Stopwatch
 from jaxslam.state import TrackOutput
@@ -41,7 +42,6 @@ _KEY_SHARE = 0.25
 """Side of the voxels of key objects, in others."""
 _LEAST_MOVE_VOXELS = 0.25
 """A keyframe that moves a point by less, two metres away, stays where it is."""
-_AT_M = 2.0
 _LOOK_EVERY = 5
 """Frames, of which one has its look at what is not there any more: with keyframes alone, twice as many ghosts stay.
 A keyframe of a camera that measures depth has none of its own besides."""
@@ -444,9 +444,9 @@ class DenseMapping:
 
     def _correct(self, at_most: int, wanted: dict[int, np.ndarray | None]) -> int:
         """Move the points of keyframes that have moved by most; gives how many were."""
-        moves = [(_distance(self._layer.parts[id].T_world_cam, pose), -id) for id, pose in wanted.items()]
+        moves = [(distance(self._layer.parts[id].T_world_cam, pose), -id) for id, pose in wanted.items()]
         least = _LEAST_MOVE_VOXELS * self._layer.voxel_m
-        chosen = [-id for distance, id in sorted(moves, reverse=True)[:at_most] if distance > least]
+        chosen = [-id for way, id in sorted(moves, reverse=True)[:at_most] if way > least]
         for id in chosen:
             for layer in self._layers():
                 if id in layer.parts:
@@ -464,7 +464,7 @@ class DenseMapping:
             return wanted
         numbers, counts = np.unique(map.submap, return_counts=True)
         ids = ids[has(map.ids, ids) | np.isin(ids, map.culled.ids)]
-        poses, submaps = _poses(map, ids)
+        poses, submaps = poses_of(map, ids)
         shown = submaps == numbers[np.argmax(counts)]
         poses = compose(poses, np.stack([self._kept[id].T_cam_depth for id in ids.tolist()]))
         wanted.update(zip(ids[shown].tolist(), poses[shown], strict=True))
@@ -494,26 +494,6 @@ class DenseMapping:
 
     def _unpacked(self, kept: _Kept) -> np.ndarray:
         return kept.depth.astype(np.float32) * np.float32(self._farthest_m / _DEPTH_COUNTS)
-
-
-def _distance(now: np.ndarray | None, wanted: np.ndarray | None) -> float:
-    """How far a point two metres away goes from one pose to the other; infinite into or out of the map."""
-    if now is None or wanted is None:
-        return 0.0 if now is wanted else float("inf")
-    change = compose(inverse(now), wanted)
-    return float(np.linalg.norm(change[4:]) + _AT_M * angle(change))
-
-
-def _poses(map: Map, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """`(n, 7)` poses and `(n,)` submaps of keyframes, also of those that were culled; as `Map.pose` of each."""
-    order, at = np.argsort(map.culled.ids), ids.copy()
-    T_at_keyframe = np.tile(IDENTITY, (len(ids), 1))
-    while (gone := ~has(map.ids, at)).any():
-        row = order[rows(map.culled.ids[order], at[gone])]
-        T_at_keyframe[gone] = compose(map.culled.T_anchor_keyframe[row], T_at_keyframe[gone])
-        at[gone] = map.culled.anchor[row]
-    row = rows(map.ids, at)
-    return compose(map.T_world_cam[row], T_at_keyframe), map.submap[row]
 
 
 def _sampled(X: np.ndarray, colours: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
