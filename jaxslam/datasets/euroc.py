@@ -4,7 +4,7 @@ Source: Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016.
 """
 
 import csv
-import functools
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from jaxslam.camera import Camera
-from jaxslam.datasets.image_file import check_size, read_grey
+from jaxslam.datasets.image_file import read_grey
+from jaxslam.datasets.image_pairs import ImagePairs, check_present, check_stereo, moved
 from jaxslam.datasets.protocol import Fit, Loader, Unmatched
 from jaxslam.errors import CameraError, DatasetError, TrajectoryError
-from jaxslam.frame import Frame
 from jaxslam.pose import between, compose
 from jaxslam.rectification import RectifiedPair
 from jaxslam.rig import Rig
@@ -28,7 +28,7 @@ _LIST, _SENSOR, _TRUTH = "data.csv", "sensor.yaml", Path("state_groundtruth_esti
 _POSE_COLUMNS = 8
 
 
-class EurocDataset:
+class EurocDataset(ImagePairs):
     """A folder such as `MH_01_easy`, or the `mav0` in it; pairs are rectified as they are decoded.
 
     A pair is two images of exactly the same time. The ground truth of EuRoC is of the body (the IMU); here it is of
@@ -48,10 +48,8 @@ class EurocDataset:
             DatasetError: If a list is missing or malformed, a listed image is missing, or nothing matches.
             CameraError: If the camera is no stereo pair, or `T_BS` of `cam0` is missing or malformed.
         """
-        if not isinstance(camera, RectifiedPair) and not camera.is_stereo:
-            raise CameraError(f"camera '{camera.name}': baseline_m: expected metres for a stereo pair, got none")
-        self._pair = camera if isinstance(camera, RectifiedPair) else None
-        self.camera = camera.camera if isinstance(camera, RectifiedPair) else camera
+        self._taken_with(camera)
+        check_stereo(self.camera)
         self._root = _mav(folder)
         self.name = _name(self._root)
         left, right = (_listed(self._root / which) for which in _CAMERAS)
@@ -63,42 +61,18 @@ class EurocDataset:
         self.timestamps_ns = np.array(common, np.int64)
         self.unmatched = Unmatched(len(left) - len(common), len(right) - len(common))
         self._files = [(left[stamp], right[stamp]) for stamp in common]
-        missing = [file for pair in self._files for file in pair if not file.is_file()]
-        if missing:
-            raise DatasetError(f"{missing[0]}: listed but missing, one of {len(missing)} such images")
+        check_present(self._files)
         self._T_body_camera = _T_body_left(self._root)
         if self._pair is not None:
             self._T_body_camera = compose(self._T_body_camera, self._pair.T_left_camera)
 
-    @property
-    def ground_truth(self) -> Trajectory | None:
-        """Poses of the rectified left camera, read when first asked for; `TrajectoryError` if malformed."""
-        return self._ground_truth
-
-    @functools.cached_property
-    def _ground_truth(self) -> Trajectory | None:
+    def _truth(self) -> Trajectory | None:
         path = self._root / _TRUTH
-        return _moved(_read_truth(path), self._T_body_camera) if path.is_file() else None
+        return moved(_read_truth(path), self._T_body_camera) if path.is_file() else None
 
-    def __len__(self) -> int:
-        return len(self._files)
-
-    def __getitem__(self, index: int) -> Frame:
-        """Decode and rectify one pair.
-
-        Raises:
-            IndexError: If there is no such frame.
-            DatasetError: If an image is unreadable, or of another size than the camera's.
-        """
-        left, right = (read_grey(file) for file in self._files[index])
-        for file, image in zip(self._files[index], (left, right), strict=True):
-            check_size(file, image, self.camera)
-        stamp = int(self.timestamps_ns[index])
-        return Frame(stamp, left, right=right) if self._pair is None else self._pair.of(stamp, left, right)
-
-
-def _moved(bodies: Trajectory, T_body_camera: np.ndarray) -> Trajectory:
-    return Trajectory(bodies.timestamps_ns, compose(bodies.T_world_cam, T_body_camera[None]))
+    @property
+    def _readers(self) -> tuple[Callable[[Path], np.ndarray], Callable[[Path], np.ndarray]]:
+        return read_grey, read_grey
 
 
 def _mav(folder: Path) -> Path:

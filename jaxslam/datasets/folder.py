@@ -1,6 +1,6 @@
 """Images of one's own in two folders, `left` and `right` or `rgb` and `depth`, and a camera file."""
 
-import functools
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -8,11 +8,10 @@ import numpy as np
 
 from jaxslam.camera import Camera
 from jaxslam.datasets.file_names import IMAGES, files_in, times_of
-from jaxslam.datasets.image_file import check_size, read_color, read_depth, read_depth_metres
+from jaxslam.datasets.image_file import read_color, read_depth, read_depth_metres
+from jaxslam.datasets.image_pairs import ImagePairs, check_stereo, moved
 from jaxslam.datasets.protocol import Fit, Loader
 from jaxslam.errors import CameraError, DatasetError
-from jaxslam.frame import Frame
-from jaxslam.pose import compose
 from jaxslam.rectification import RectifiedPair
 from jaxslam.trajectory import Trajectory, read_tum
 
@@ -29,7 +28,7 @@ class _Layout(NamedTuple):
     pair: bool
 
 
-class FolderDataset:
+class FolderDataset(ImagePairs):
     """Two folders of images, the n-th of one with the n-th of the other, sorted by name.
 
     `left` and `right` hold a stereo pair; `rgb` (or `color`, `image`) and `depth` colour and depth, as counts in .png
@@ -51,9 +50,8 @@ class FolderDataset:
             CameraError: If the camera is not of the kind that the folders need.
         """
         layout = _layout(folder)
-        self._pair = camera if isinstance(camera, RectifiedPair) else None
-        self.camera = camera.camera if isinstance(camera, RectifiedPair) else camera
-        self.name, self._folder, self._is_pair = folder.name, folder, layout.pair
+        self._taken_with(camera)
+        self.name, self._folder = folder.name, folder
         first = files_in(layout.first, IMAGES)
         second = files_in(layout.second, IMAGES) if layout.pair else _depth_files(layout.second)
         _check_camera(self.camera, folder, layout, second[0].suffix)
@@ -64,42 +62,17 @@ class FolderDataset:
         self._files = list(zip(first, second, strict=True))
         self.timestamps_ns = times_of(first, folder / _TIMES, self.camera.fps)
 
-    @property
-    def ground_truth(self) -> Trajectory | None:
-        """The poses of `groundtruth.txt`, read when first asked for; `TrajectoryError` if malformed.
-
-        In the file they are of the camera as it is; here of the rectified one, if the pair is rectified.
-        """
-        return self._ground_truth
-
-    @functools.cached_property
-    def _ground_truth(self) -> Trajectory | None:
+    def _truth(self) -> Trajectory | None:
+        """The poses of `groundtruth.txt`; in the file they are of the camera as it is, before it is rectified."""
         path = self._folder / _GROUND_TRUTH
         if not path.is_file():
             return None
         truth = read_tum(path)
-        if self._pair is None:
-            return truth
-        return Trajectory(truth.timestamps_ns, compose(truth.T_world_cam, self._pair.T_left_camera[None]))
+        return truth if self._pair is None else moved(truth, self._pair.T_left_camera)
 
-    def __len__(self) -> int:
-        return len(self._files)
-
-    def __getitem__(self, index: int) -> Frame:
-        """Decode one frame.
-
-        Raises:
-            IndexError: If there is no such frame.
-            DatasetError: If an image is unreadable, or of another size than the camera's.
-        """
-        first, second = self._files[index]
-        stamp, image = int(self.timestamps_ns[index]), read_color(first)
-        other = read_color(second) if self._is_pair else self._depth(second)
-        check_size(first, image, self.camera)
-        check_size(second, other, self.camera)
-        if not self._is_pair:
-            return Frame(stamp, image, other)
-        return Frame(stamp, image, right=other) if self._pair is None else self._pair.of(stamp, image, other)
+    @property
+    def _readers(self) -> tuple[Callable[[Path], np.ndarray], Callable[[Path], np.ndarray]]:
+        return read_color, read_color if self.camera.is_stereo else self._depth
 
     def _depth(self, path: Path) -> np.ndarray:
         if path.suffix == _METRES:
@@ -130,9 +103,8 @@ def _depth_files(folder: Path) -> list[Path]:
 
 
 def _check_camera(camera: Camera, folder: Path, layout: _Layout, suffix: str) -> None:
-    if layout.pair and not camera.is_stereo:
-        raise CameraError(f"camera '{camera.name}': baseline_m: expected metres for a stereo pair, got none")
     if layout.pair:
+        check_stereo(camera)
         return
     if camera.is_stereo:
         raise CameraError(f"camera '{camera.name}': expected one with depth for {folder}, got a stereo pair")

@@ -3,18 +3,17 @@
 Source: Geiger, Lenz and Urtasun, "Are we ready for Autonomous Driving? The KITTI Vision Benchmark Suite", CVPR 2012.
 """
 
-import functools
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from jaxslam.camera import Camera
-from jaxslam.datasets.image_file import check_size, read_color, read_grey
+from jaxslam.datasets.image_file import read_color, read_grey
+from jaxslam.datasets.image_pairs import ImagePairs, check_stereo, moved
 from jaxslam.datasets.protocol import Fit, Loader
 from jaxslam.errors import CameraError, DatasetError, TrajectoryError
-from jaxslam.frame import Frame
-from jaxslam.pose import compose
 from jaxslam.trajectory import Trajectory, read_kitti, read_times
 
 _CALIBRATION, _TIMES = "calib.txt", "times.txt"
@@ -33,7 +32,7 @@ _PAIRS = (_Pair("image_0", "image_1", ("P0", "P1"), True), _Pair("image_2", "ima
 """Grey comes first: it is sharper, and colour is not needed."""
 
 
-class KittiDataset:
+class KittiDataset(ImagePairs):
     """A folder such as `sequences/06`, with poses in `poses/06.txt` two folders up if they are public.
 
     Poses are those of the left camera that is used; KITTI's are of the left grey one, 6 cm beside the one for colour.
@@ -51,9 +50,8 @@ class KittiDataset:
             DatasetError: If times are missing or malformed, or images do not go with them.
             CameraError: If the camera is no stereo pair.
         """
-        if not camera.is_stereo:
-            raise CameraError(f"camera '{camera.name}': baseline_m: expected metres for a stereo pair, got none")
-        self._pair = _pair(folder)
+        check_stereo(camera)
+        self._sides = _pair(folder)
         self.name, self.camera, self._folder = _name(folder), camera, folder
         try:
             self.timestamps_ns = read_times(folder / _TIMES)
@@ -62,8 +60,8 @@ class KittiDataset:
         late = np.flatnonzero(np.diff(self.timestamps_ns) <= 0)
         if late.size:
             raise DatasetError(f"{folder / _TIMES}: expected times that increase, frame {late[0] + 1} does not")
-        left, right = (sorted((folder / side).glob("*.png")) for side in (self._pair.left, self._pair.right))
-        for side, files in ((self._pair.left, left), (self._pair.right, right)):
+        left, right = (sorted((folder / side).glob("*.png")) for side in (self._sides.left, self._sides.right))
+        for side, files in ((self._sides.left, left), (self._sides.right, right)):
             if len(files) != len(self.timestamps_ns):
                 expected = f"one image a line of {_TIMES}, {len(self.timestamps_ns)}"
                 raise DatasetError(f"{folder / side}: expected {expected}, got {len(files)}")
@@ -72,35 +70,17 @@ class KittiDataset:
             raise DatasetError(f"{unlike[1]}: expected the partner of {unlike[0].name}")
         self._files = list(zip(left, right, strict=True))
 
-    @property
-    def ground_truth(self) -> Trajectory | None:
-        """The poses, read when first asked for; `TrajectoryError` if malformed, `None` if there are none."""
-        return self._ground_truth
-
-    @functools.cached_property
-    def _ground_truth(self) -> Trajectory | None:
+    def _truth(self) -> Trajectory | None:
         path = self._folder.parent.parent / "poses" / f"{self._folder.name}.txt"
         if not path.is_file():
             return None
         truth = read_kitti(path, self._folder / _TIMES)
-        offset = _offset(_projections(self._folder)[self._pair.projections[0]])
-        return Trajectory(truth.timestamps_ns, compose(truth.T_world_cam, np.array([[1.0, 0, 0, 0, *offset]])))
+        offset = _offset(_projections(self._folder)[self._sides.projections[0]])
+        return moved(truth, np.array([1.0, 0, 0, 0, *offset]))
 
-    def __len__(self) -> int:
-        return len(self._files)
-
-    def __getitem__(self, index: int) -> Frame:
-        """Decode one pair.
-
-        Raises:
-            IndexError: If there is no such frame.
-            DatasetError: If an image is unreadable, or of another size than the camera's.
-        """
-        read = read_grey if self._pair.grey else read_color
-        images = [read(file) for file in self._files[index]]
-        for file, image in zip(self._files[index], images, strict=True):
-            check_size(file, image, self.camera)
-        return Frame(int(self.timestamps_ns[index]), images[0], right=images[1])
+    @property
+    def _readers(self) -> tuple[Callable[[Path], np.ndarray], Callable[[Path], np.ndarray]]:
+        return (read_grey, read_grey) if self._sides.grey else (read_color, read_color)
 
 
 def _name(folder: Path) -> str:

@@ -5,17 +5,17 @@ tools: 640x480, fx = fy = 320, cx = 320, cy = 240, 0.25 m between left and right
 assumed, which only speeds of the motion model and errors a second depend on.
 """
 
-import functools
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from jaxslam.camera import Camera
 from jaxslam.datasets.file_names import files_in
-from jaxslam.datasets.image_file import check_size, read_color, read_depth_metres
+from jaxslam.datasets.image_file import read_color, read_depth_metres
+from jaxslam.datasets.image_pairs import ImagePairs
 from jaxslam.datasets.protocol import Fit, Loader
 from jaxslam.errors import CameraError, DatasetError, TrajectoryError
-from jaxslam.frame import Frame
 from jaxslam.rotation import matrices, quaternions
 from jaxslam.trajectory import Trajectory
 
@@ -27,7 +27,7 @@ _CAMERA_FROM_NED = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
 """x forward, y right, z down become x right, y down, z forward."""
 
 
-class TartanAirDataset:
+class TartanAirDataset(ImagePairs):
     """A folder such as `P001`: frames with depth if there is `depth_left`, otherwise stereo pairs.
 
     For stereo where there is depth, give a camera with `baseline_m` and no `depth_scale_per_m`; `tartanair_stereo` as
@@ -46,43 +46,23 @@ class TartanAirDataset:
             DatasetError: If images are missing, or numbers of images differ.
         """
         self.name, self.camera, self._folder = folder.name, camera, folder
-        self._is_pair = camera.is_stereo
-        first, other = folder / _LEFT, folder / (_RIGHT if self._is_pair else _DEPTH)
+        first, other = folder / _LEFT, folder / (_RIGHT if camera.is_stereo else _DEPTH)
         for needed in (first, other):
             if not needed.is_dir():
                 raise DatasetError(f"{needed}: expected a folder of images, got none")
-        left, second = files_in(first, (".png",)), files_in(other, (".png",) if self._is_pair else (".npy",))
+        left, second = files_in(first, (".png",)), files_in(other, (".png",) if camera.is_stereo else (".npy",))
         if len(left) != len(second):
             raise DatasetError(f"{other}: expected as many files as in {_LEFT}, {len(left)}, got {len(second)}")
         self._files = list(zip(left, second, strict=True))
         self.timestamps_ns = np.round(np.arange(len(left)) * (1e9 / camera.fps)).astype(np.int64)
 
-    @property
-    def ground_truth(self) -> Trajectory | None:
-        """The poses of `pose_left.txt` in axes of OpenCV, read when first asked for; `TrajectoryError` if malformed."""
-        return self._ground_truth
-
-    @functools.cached_property
-    def _ground_truth(self) -> Trajectory | None:
+    def _truth(self) -> Trajectory | None:
         path = self._folder / _POSES
         return _read_poses(path, self.timestamps_ns) if path.is_file() else None
 
-    def __len__(self) -> int:
-        return len(self._files)
-
-    def __getitem__(self, index: int) -> Frame:
-        """Decode one frame.
-
-        Raises:
-            IndexError: If there is no such frame.
-            DatasetError: If an image is unreadable, or of another size than the camera's.
-        """
-        first, second = self._files[index]
-        image, other = read_color(first), (read_color if self._is_pair else _read_depth)(second)
-        check_size(first, image, self.camera)
-        check_size(second, other, self.camera)
-        stamp = int(self.timestamps_ns[index])
-        return Frame(stamp, image, right=other) if self._is_pair else Frame(stamp, image, other)
+    @property
+    def _readers(self) -> tuple[Callable[[Path], np.ndarray], Callable[[Path], np.ndarray]]:
+        return read_color, read_color if self.camera.is_stereo else _read_depth
 
 
 def _read_depth(path: Path) -> np.ndarray:

@@ -5,13 +5,15 @@ Source: Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IR
 
 import functools
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from jaxslam.camera import Camera
 from jaxslam.datasets.file_list import FileList, read_file_list
-from jaxslam.datasets.image_file import check_size, read_color, read_depth
+from jaxslam.datasets.image_file import read_color, read_depth
+from jaxslam.datasets.image_pairs import ImagePairs, check_present
 from jaxslam.datasets.protocol import Fit, Loader, Unmatched
 from jaxslam.errors import CameraError, DatasetError
 from jaxslam.frame import Frame
@@ -24,7 +26,7 @@ _COLOR_LIST, _DEPTH_LIST, _GROUND_TRUTH = "rgb.txt", "depth.txt", "groundtruth.t
 _NAME = re.compile(r"rgbd_dataset_freiburg([123])_")
 
 
-class TumDataset:
+class TumDataset(ImagePairs):
     """A recording whose colour and depth images are listed apart and matched by time, one to one.
 
     A frame has the time of its colour image, and says that of its depth.
@@ -57,34 +59,19 @@ class TumDataset:
         self._folder = folder
         self._depth_scale_per_m = camera.depth_scale_per_m
         self._files = [(color.files[i], depth.files[j]) for i, j in zip(color_index, depth_index, strict=True)]
-        _check_present(self._files)
+        check_present(self._files)
 
-    @property
-    def ground_truth(self) -> Trajectory | None:
-        """The poses of `groundtruth.txt`, read when first asked for; `TrajectoryError` if malformed."""
-        return self._ground_truth
-
-    @functools.cached_property
-    def _ground_truth(self) -> Trajectory | None:
+    def _truth(self) -> Trajectory | None:
         path = self._folder / _GROUND_TRUTH
         return read_tum(path) if path.is_file() else None
 
-    def __len__(self) -> int:
-        return len(self._files)
+    @property
+    def _readers(self) -> tuple[Callable[[Path], np.ndarray], Callable[[Path], np.ndarray]]:
+        return read_color, functools.partial(read_depth, scale_per_m=self._depth_scale_per_m)
 
-    def __getitem__(self, index: int) -> Frame:
-        """Decode one frame.
-
-        Raises:
-            IndexError: If there is no such frame.
-            DatasetError: If an image is unreadable, or the two images or the camera differ in size.
-        """
-        color_file, depth_file = self._files[index]
-        image, depth_m = read_color(color_file), read_depth(depth_file, self._depth_scale_per_m)
-        check_size(color_file, image, self.camera)
-        check_size(depth_file, depth_m, self.camera)
+    def _frame(self, index: int, first: np.ndarray, second: np.ndarray) -> Frame:
         depth_time = int(self._depth_timestamps_ns[index])
-        return Frame(int(self.timestamps_ns[index]), image, depth_m, depth_timestamp_ns=depth_time)
+        return Frame(int(self.timestamps_ns[index]), first, second, depth_timestamp_ns=depth_time)
 
 
 def has_layout(folder: Path) -> bool:
@@ -106,12 +93,6 @@ def _match(color: FileList, depth: FileList) -> tuple[np.ndarray, np.ndarray]:
 def _span(images: FileList) -> str:
     first, last = images.timestamps_ns[[0, -1]] / 1e9
     return f"{first:.3f} to {last:.3f} s"
-
-
-def _check_present(files: list[tuple[Path, Path]]) -> None:
-    missing = [file for pair in files for file in pair if not file.is_file()]
-    if missing:
-        raise DatasetError(f"{missing[0]}: listed but missing, one of {len(missing)} such images")
 
 
 def _fit(folder: Path) -> Fit:

@@ -10,11 +10,11 @@ from typing import Protocol
 import numpy as np
 
 from jaxslam.datasets.synthetic.body import TRUNK, below, body, bone
+from jaxslam.datasets.synthetic.crate import Crate
 from jaxslam.datasets.synthetic.parked import ParkedBox
 from jaxslam.datasets.synthetic.rigid import transform
 from jaxslam.datasets.synthetic.seated import SeatedPerson
-from jaxslam.datasets.synthetic.solids import Solid, box
-from jaxslam.datasets.synthetic.texture import Material
+from jaxslam.datasets.synthetic.solids import Solid
 from jaxslam.rotation import axis_rotation
 
 
@@ -158,26 +158,14 @@ def _still(time_s: np.ndarray, place: tuple[float, float, float]) -> np.ndarray:
     return np.broadcast_to(transform(np.eye(3), np.array(place)), (len(time_s), 4, 4))
 
 
-class CarriedBox:
+class CarriedBox(Crate):
     """A textured box carried about at the height of a chest, turning as it goes: a mover no detector knows."""
-
-    label = "box"
 
     def __init__(self, lane: Lane, start: float, rng: np.random.Generator) -> None:
         self._lane = lane
         self._start = start
-        half = rng.uniform((0.16, 0.20, 0.18), (0.22, 0.32, 0.34))
-        look = Material(
-            (0.50, 0.40, 0.26),
-            (0.72, 0.58, 0.40),
-            dark=tuple(rng.uniform(0.0, 0.4, 3)),
-            noise_per_m=5.0,
-            stretch=2.0,
-            noise=0.6,
-            patch_m=0.22,
-            patch_density=0.6,
-        )
-        self.solids = [box((half[0], half[1], half[2]), look, rng)]
+        half_m = rng.uniform((0.16, 0.20, 0.18), (0.22, 0.32, 0.34))
+        super().__init__(half_m, ((0.50, 0.40, 0.26), (0.72, 0.58, 0.40)), rng)
 
     def root(self, time_s: np.ndarray) -> np.ndarray:
         """Poses of the centre of the box: `(t, 7)`, wxyz_xyz."""
@@ -185,7 +173,3 @@ class CarriedBox:
         height = 1.1 + 0.18 * np.sin(0.7 * time_s + 2.0 * self._start)
         turn = 0.5 * np.sin(0.45 * time_s + self._start)
         return np.concatenate([axis_rotation(2, turn), position, height[:, None]], axis=1)
-
-    def parts(self, time_s: np.ndarray) -> np.ndarray:
-        """The box lies along the axes of its frame: `(t, 1, 4, 4)` identities."""
-        return np.broadcast_to(np.eye(4), (len(time_s), 1, 4, 4))

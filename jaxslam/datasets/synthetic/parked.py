@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from jaxslam.datasets.synthetic.solids import Solid, box
-from jaxslam.datasets.synthetic.texture import Material
+from jaxslam.datasets.synthetic.crate import Crate
 from jaxslam.rotation import axis_rotation
 
 MOST_PARKED = 2
@@ -16,10 +15,8 @@ _CENTRES, _SEMI_AXES = ((-0.5, 0.0), (1.5, 0.9)), (0.14, 0.5)
 _TABLE = 720
 
 
-class ParkedBox:
+class ParkedBox(Crate):
     """A large box on the floor, such as a crate on rollers."""
-
-    label = "box"
 
     def __init__(self, place: int, seed: int) -> None:
         """The box in one of `MOST_PARKED` places; the seed chooses where it begins, which way it goes and its size."""
@@ -27,19 +24,8 @@ class ParkedBox:
         self._centre = np.array(_CENTRES[place])
         start, self._turn = rng.uniform(0.0, 2.0 * np.pi, 2)
         self._sense = rng.choice((-1.0, 1.0))
-        half = rng.uniform((0.14, 0.16, 0.40), (0.20, 0.22, 0.55))
-        self._height = float(half[2])
-        look = Material(
-            (0.30, 0.34, 0.42),
-            (0.55, 0.58, 0.62),
-            dark=tuple(rng.uniform(0.0, 0.4, 3)),
-            noise_per_m=5.0,
-            stretch=2.0,
-            noise=0.6,
-            patch_m=0.22,
-            patch_density=0.6,
-        )
-        self.solids: list[Solid] = [box((half[0], half[1], half[2]), look, rng)]
+        half_m = rng.uniform((0.14, 0.16, 0.40), (0.20, 0.22, 0.55))
+        super().__init__(half_m, ((0.30, 0.34, 0.42), (0.55, 0.58, 0.62)), rng)
         self._angles, self._ways = _by_way()
         self._start_m = float(np.interp(start, self._angles, self._ways))
 
@@ -48,12 +34,8 @@ class ParkedBox:
         way = way_m(time_s)
         angle = np.interp((self._start_m + self._sense * way) % self._ways[-1], self._ways, self._angles)
         position = self._centre + np.stack([_SEMI_AXES[0] * np.cos(angle), _SEMI_AXES[1] * np.sin(angle)], axis=-1)
-        height = np.full((len(way), 1), self._height)
+        height = np.full((len(way), 1), self.half_m[2])
         return np.concatenate([axis_rotation(2, self._turn + 0.4 * self._sense * way), position, height], axis=1)
-
-    def parts(self, time_s: np.ndarray) -> np.ndarray:
-        """The box lies along the axes of its frame: `(t, 1, 4, 4)` identities."""
-        return np.broadcast_to(np.eye(4), (len(time_s), 1, 4, 4))
 
 
 def is_moving(time_s: np.ndarray) -> np.ndarray:
