@@ -24,6 +24,7 @@ from jaxslam.semantics.prompted import (
 SCENE = "scene"
 """The model that is no network: the truth of a rendered room, see `jaxslam.datasets.synthetic.with_true_masks`."""
 
+_BY_DEPTH = "masks are made by depth"
 _log = logging.getLogger(__name__)
 
 
@@ -97,7 +98,7 @@ def _segmenter_of(config: SemanticsConfig) -> PromptSegmenter | None:
         if named[given] is not None:
             raise ConfigError(f"semantics.{missing}: expected what belongs to semantics.{given}, got null")
         return None
-    encoder, decoder = (_found(name, "masks are made by depth") for name in named.values() if name is not None)
+    encoder, decoder = (_found(name, _BY_DEPTH) for name in named.values() if name is not None)
     if encoder is None or decoder is None:
         return None
     return load_segmenter(encoder, decoder, num_threads=config.threads)
@@ -112,6 +113,17 @@ def model_file(config: SemanticsConfig) -> Path | None:
     if config.model is None or config.model == SCENE:
         return None
     return _found(config.model, "no network finds what moves, geometry alone decides")
+
+
+def network_files(config: SemanticsConfig) -> dict[str, Path | None]:
+    """The files of all networks that the settings name, by setting; `None` for one that is known but not here.
+
+    Raises:
+        ModelError: If a file is named that is not there.
+    """
+    found = {} if config.model in (None, SCENE) else {"model": model_file(config)}
+    prompt = {"prompt_encoder": config.prompt_encoder, "prompt_decoder": config.prompt_decoder}
+    return found | {key: _found(name, _BY_DEPTH) for key, name in prompt.items() if name is not None}
 
 
 def _found(name: str, otherwise: str) -> Path | None:

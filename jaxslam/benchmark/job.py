@@ -22,12 +22,12 @@ import cv2
 import numpy as np
 
 from jaxslam.benchmark.suite import Sequence as Clip
-from jaxslam.config import Config, load_config, to_yaml
+from jaxslam.config import Config, SemanticsConfig, load_config, to_yaml
 from jaxslam.datasets import Dataset, Subset, open_dataset
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset, with_true_masks
 from jaxslam.datasets.synthetic.sensor import SensorConfig
 from jaxslam.datasets.synthetic.stored import StoredRoom
-from jaxslam.detector_choice import model_file
+from jaxslam.detector_choice import network_files
 from jaxslam.download import sha256_of
 from jaxslam.errors import BenchmarkError, JaxSlamError
 from jaxslam.files import write_atomically
@@ -36,7 +36,7 @@ from jaxslam.recordings import find_recording
 from jaxslam.results import RunInfo, write_results
 from jaxslam.run_pictures import RunPictures
 from jaxslam.slam import Slam
-from jaxslam.xla import prefer_one_thread
+from jaxslam.xla import enable_compile_cache, prefer_one_thread
 
 RESULT = "result.json"
 """The last file of a run to be written: where it is, the run is done."""
@@ -183,6 +183,7 @@ def run_here(folder: Path, root: Path | None, rooms: Path | None) -> None:
         JaxSlamError: If its recording is not there or not fit to be tracked, or a file cannot be written.
     """
     prefer_one_thread()
+    enable_compile_cache()
     job = Job.of_json((folder / _JOB).read_text())
     whole, recording = opened(job.clip, root, rooms)
     dataset, truth = with_true_masks(whole, job.config.semantics)
@@ -206,10 +207,19 @@ def run_here(folder: Path, root: Path | None, rooms: Path | None) -> None:
         **ratios,
         "data_sha256": None if recording is None else _fingerprint(recording),
         "model": job.config.semantics.model,
-        "model_sha256": None if (model := model_file(job.config.semantics)) is None else sha256_of(model),
+        "networks_sha256": networks_sha256(job.config.semantics),
         "config": dataclasses.asdict(job.config),
     }
     write_atomically(folder / RESULT, (json.dumps(result, indent=2) + "\n").encode(), BenchmarkError)
+
+
+def networks_sha256(config: SemanticsConfig) -> dict[str, str | None]:
+    """Hashes of the networks of a run by the settings that name them; `None` for one that is not on this machine.
+
+    Raises:
+        ModelError: If a file is named that is not there.
+    """
+    return {setting: path and sha256_of(path) for setting, path in network_files(config).items()}
 
 
 def flow_time_ms(dataset: Dataset) -> float:

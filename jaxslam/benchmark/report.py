@@ -7,7 +7,6 @@ from typing import Any
 from jaxslam.benchmark.published import Figure, Verdict, load_published, published_for, verdict
 from jaxslam.benchmark.rows import ACCURACY, RUNNING, Column, by_sequence, cell, columns_of, rows_of
 from jaxslam.benchmark.suite import Suite
-from jaxslam.detector_choice import SCENE
 
 _INLINE = (
     " In deterministic runs mapping and the detector are done within the frame, which takes so much longer; with"
@@ -72,7 +71,7 @@ def without_network(results: Sequence[Mapping[str, Any]]) -> list[str]:
     """Runs that had to do without the network of their settings, a line a network."""
     lacking: dict[str, list[str]] = {}
     for result in results:
-        if result["status"] == "done" and result["model"] not in (None, SCENE) and result["model_sha256"] is None:
+        if result["status"] == "done" and ("model", None) in result["networks_sha256"].items():
             lacking.setdefault(result["model"], []).append(result["label"])
     return [
         f"{', '.join(dict.fromkeys(labels))}: without a network, because {model} was not on the machine; depth alone"

@@ -79,6 +79,17 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "out"
 
 
+@pytest.fixture
+def mine(out: Path, tmp_path: Path) -> Path:
+    """A copy of them; what is the same in another suite is taken from here with `--resume`."""
+    return Path(shutil.copytree(out, tmp_path / "out"))
+
+
+def times_of(files: list[Path]) -> dict[Path, int]:
+    """When they were written."""
+    return {path: path.stat().st_mtime_ns for path in files}
+
+
 class TestResults:
     def test_of_every_run(self, out: Path) -> None:
         assert {path.name for path in out.iterdir()} == {"results.json", "report.md", "report.html", "room"}
@@ -95,6 +106,7 @@ class TestResults:
             assert 0 < run["ate_rmse_m"] < 0.1
             assert run["flow_ratio_median"] == pytest.approx(run["track_ms"]["median"] / run["flow_ms"], rel=1e-2)
             assert {"cpu", "cores", "threads", "versions", "commit", "peak_rss_mb", "seed"} <= set(run)
+            assert run["networks_sha256"] == {}
 
     def test_report(self, out: Path) -> None:
         text = (out / "report.md").read_text()
@@ -149,10 +161,9 @@ class TestResults:
 
 
 class TestRates:
-    def test_errors_over_the_rate(self, out: Path, tmp_path: Path) -> None:
+    def test_errors_over_the_rate(self, out: Path, mine: Path) -> None:
         """Of a room that is there at two rates, one line a preset, through the medians of its runs."""
-        shutil.copytree(out, tmp_path / "out")
-        shutil.copytree(out / "room", tmp_path / "out" / "room_15_hz")
+        shutil.copytree(out / "room", mine / "room_15_hz")
         results = json.loads((out / "results.json").read_text())
         slow = [{**run, "sequence": "room_15_hz", "rate_hz": 15.0, "ate_rmse_m": 0.05} for run in results]
         figure = plot_rates({"room": [*results, *slow]})
@@ -163,38 +174,40 @@ class TestRates:
             np.testing.assert_allclose(points, [[15.0, 0.05], [30.0, np.median(ates)]], rtol=1e-3)
         room = SyntheticConfig(frames=8, people=1, width=160, height=120)
         suite = Suite("rates", "", (Sequence("room", room=room), Sequence("room_15_hz", room=room, every=2)))
-        page = html_report(suite, [*results, *slow], {}, tmp_path / "out")
+        page = html_report(suite, [*results, *slow], {}, mine)
         assert "Error over the rate of frames" in page
         assert "Error over the rate of frames" not in (out / "report.html").read_text()
 
 
 class TestGoingOn:
     def test_nothing_twice(self, out: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        files = sorted(out.rglob("result.json"))
-        before = [path.stat().st_mtime_ns for path in files]
+        before = times_of(sorted(out.rglob("result.json")))
         kept = (out / "results.json").read_text()
         main(["bench", suite_file(out.parent), "--out", str(out), "--resume"])
-        assert [path.stat().st_mtime_ns for path in files] == before
+        assert times_of(sorted(out.rglob("result.json"))) == before
         assert (out / "results.json").read_text() == kept
         assert "4 runs, 0 failed" in capsys.readouterr().out
 
     def test_not_by_mistake(self, out: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert "--resume goes on" in fails(capsys, suite_file(out.parent), "--out", str(out))
 
-    def test_other_settings_are_other_runs(self, out: Path, tmp_path: Path) -> None:
-        command = ["bench", suite_file(tmp_path), "--out", str(tmp_path / "out"), "--runs", "1", "--presets", "default"]
-        config = tmp_path / "out/room/default/0/config.yaml"
-        main(command)
+    def test_other_settings_are_other_runs(self, mine: Path, tmp_path: Path) -> None:
+        """Those alone that differ are run again."""
+        config = mine / "room/default/0/config.yaml"
         assert "probation_frames: 8" in config.read_text()
         config.write_text(config.read_text().replace("probation_frames: 8", "probation_frames: 9"))
-        main([*command, "--resume"])
+        before = times_of(sorted(mine.rglob("result.json")))
+        main(["bench", suite_file(tmp_path), "--out", str(mine), "--resume"])
         assert "probation_frames: 8" in config.read_text()
+        now = times_of(sorted(mine.rglob("result.json")))
+        assert [path for path in now if now[path] != before[path]] == [config.parent / "result.json"]
 
     def test_killed_in_the_middle(self, tmp_path: Path) -> None:
-        """No run that was finished is repeated, and none is lost."""
-        suite, folder = suite_file(tmp_path), tmp_path / "out"
+        """No run that was finished is repeated, and none is lost: one at work then, one not begun."""
+        suite, folder = suite_file(tmp_path, SUITE.replace("runs: 2", "runs: 3")), tmp_path / "out"
         program = "from jaxslam.cli import main; main()"
-        command = [sys.executable, "-c", program, "bench", suite, "--out", str(folder)]
+        chosen = ["--out", str(folder), "--presets", "static"]
+        command = [sys.executable, "-c", program, "bench", suite, *chosen]
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         until = time.monotonic() + 120
         while not (done := sorted(folder.rglob("result.json"))) and time.monotonic() < until:
@@ -203,35 +216,34 @@ class TestGoingOn:
         process.wait()
         assert done
         done = sorted(folder.rglob("result.json"))
-        assert len(done) < 4
-        before = {path: path.stat().st_mtime_ns for path in done}
-        main(["bench", suite, "--out", str(folder), "--resume"])
-        assert {path: path.stat().st_mtime_ns for path in done} == before
-        assert len(json.loads((folder / "results.json").read_text())) == 4
+        assert len(done) < 3
+        before = times_of(done)
+        main(["bench", suite, *chosen, "--resume"])
+        assert times_of(done) == before
+        assert len(json.loads((folder / "results.json").read_text())) == 3
         assert not (folder / ".rooms").exists()
 
 
 class TestTrouble:
-    def test_run_that_crashes(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def test_run_that_crashes(self, mine: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         """It is a row that says so; the others are there."""
         text = SUITE.replace("runs: 2", "runs: 1") + "  - recording: broken\n    camera: tum_fr1\n"
         (tmp_path / "data" / "broken").mkdir(parents=True)
         (tmp_path / "data" / "broken" / "rgb.txt").write_text("nonsense\n")
-        folder = tmp_path / "out"
-        error = fails(capsys, suite_file(tmp_path, text), "--out", str(folder), "--root", str(tmp_path / "data"))
-        assert "2 of 4 runs failed" in error
-        results = json.loads((folder / "results.json").read_text())
+        options = ["--out", str(mine), "--root", str(tmp_path / "data"), "--resume"]
+        assert "2 of 4 runs failed" in fails(capsys, suite_file(tmp_path, text), *options)
+        results = json.loads((mine / "results.json").read_text())
         assert [run["status"] for run in results] == ["done", "done", "failed", "failed"]
         assert results[-1]["problem"].startswith("ended with 1: error: ")
-        report = (folder / "report.md").read_text()
+        report = (mine / "report.md").read_text()
         assert "1 runs failed: ended with 1" in report
         assert "| static | 0 of 1 |" in report
 
-    def test_recording_that_is_not_there(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        text = SUITE.replace("runs: 2", "runs: 1") + "  - recording: rgbd_bonn_nowhere\n"
-        main(["bench", suite_file(tmp_path, text), "--out", str(tmp_path / "out"), "--presets", "default"])
-        assert "jaxslam data get rgbd_bonn_nowhere" in (tmp_path / "out" / "report.md").read_text()
-        assert "rgbd_bonn_nowhere" in (tmp_path / "out" / "report.html").read_text()
+    def test_recording_that_is_not_there(self, mine: Path, tmp_path: Path) -> None:
+        suite = suite_file(tmp_path, SUITE + "  - recording: rgbd_bonn_nowhere\n")
+        main(["bench", suite, "--out", str(mine), "--resume"])
+        assert "jaxslam data get rgbd_bonn_nowhere" in (mine / "report.md").read_text()
+        assert "rgbd_bonn_nowhere" in (mine / "report.html").read_text()
 
     def test_kitti(self, tmp_path: Path, data_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
         """What is there of it is run, with the development kit's figures; the other ten are named."""
@@ -268,9 +280,10 @@ class TestTrouble:
 
 
 @pytest.fixture(scope="module")
-def command(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
-    """Of a gate whose baseline is what one preset, run once, shows now."""
+def command(out: Path, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """Of a gate whose baseline is what one preset, run once, shows now: the run of the small suite."""
     folder = tmp_path_factory.mktemp("gate")
+    shutil.copytree(out / "room/default/0", folder / "out/room/default/0")
     command = ["bench", "gate", "--baseline", str(folder / "baseline.json"), "--out", str(folder / "out"), "--resume"]
     chosen = ["--presets", "default", "--runs", "1", "--of", suite_file(folder)]
     main([*command, *chosen, "--update", "as it is now"])
@@ -351,10 +364,12 @@ class TestPublished:
         assert not protocols(suite, [{"sequence": "mine"}])
 
     def test_without_a_network(self) -> None:
-        run = {"status": "done", "model": "yolox-nano", "model_sha256": None, "label": "ngd"}
-        (line,) = without_network([run, run, {**run, "label": "default"}, {**run, "model_sha256": "0" * 64}])
+        run = {"status": "done", "model": "yolox-nano", "networks_sha256": {"model": None}, "label": "ngd"}
+        (line,) = without_network(
+            [run, run, {**run, "label": "default"}, {**run, "networks_sha256": {"model": "0" * 64}}]
+        )
         assert line.startswith("ngd, default: without a network, because yolox-nano was not")
-        assert not without_network([{**run, "model": None}, {**run, "model": "scene"}, {"status": "failed"}])
+        assert not without_network([{**run, "networks_sha256": {}}, {"status": "failed"}])
 
     def test_nothing_about_parts_and_rooms(self) -> None:
         assert not self.lines(Sequence("crowd", "rgbd_bonn_crowd", stop=220), (0.02, 0.03))

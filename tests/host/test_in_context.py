@@ -16,10 +16,12 @@ from command_line import failing
 from tiny_models import Thing
 from tiny_segmenters import SURE
 
+from jaxslam.benchmark.job import networks_sha256
 from jaxslam.cli import main
 from jaxslam.config import SemanticsConfig, load_config
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
-from jaxslam.detector_choice import detector_of
+from jaxslam.detector_choice import SCENE, detector_of
+from jaxslam.download import sha256_of
 from jaxslam.dynamic_masks import DynamicMasks, MaskSource
 from jaxslam.errors import ConfigError, FrameError, JaxSlamError, ModelError
 from jaxslam.frame import to_grey
@@ -385,6 +387,22 @@ class TestSettings:
         with caplog.at_level(logging.WARNING):
             assert isinstance(detector_of(settings), OnnxDetector)
         assert "masks are made by depth: mobilesam-encoder is not on this machine" in caplog.text
+        assert networks_sha256(settings) == {
+            "model": sha256_of(yolox),
+            "prompt_encoder": None,
+            "prompt_decoder": None,
+        }
+
+    def test_hashes_of_all(self, pair: dict[str, Any], yolox: str) -> None:
+        """For results: of the network that finds things and of those that are prompted, whatever is asked for."""
+        hashes = {setting: sha256_of(path) for setting, path in pair.items()}
+        assert len(hashes) == len(set(hashes.values())) == 2
+        assert networks_sha256(SemanticsConfig(model=None, **pair)) == hashes
+        assert networks_sha256(SemanticsConfig(model=yolox, **pair)) == {"model": sha256_of(yolox), **hashes}
+        assert networks_sha256(SemanticsConfig(model=SCENE)) == {}
+        pair["prompt_decoder"] = "nowhere.onnx"
+        with pytest.raises(ModelError, match="nowhere"):
+            networks_sha256(SemanticsConfig(model=yolox, **pair))
 
     def test_mask_of_a_frame(self, pair: dict[str, Any], yolox: str) -> None:
         """What the tracker leaves out is the box of the network in front, by the mask that is prompted for."""
