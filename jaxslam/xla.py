@@ -12,22 +12,26 @@ def cache_dir() -> Path:
     return Path(platformdirs.user_cache_dir("jaxslam", appauthor=False)) / "xla"
 
 
+_LEAST_COMPILE, _LEAST_COMPILE_OF_JAX_S = "jax_persistent_cache_min_compile_time_secs", 1.0
 _LEAST_COMPILE_S = 0.05
-"""Programs that take less are compiled anew. With 0.5 some 25 of a run's 40 were, every time."""
+"""Programs that take less are compiled anew, unless the user chose otherwise. With 0.5 some 25 of a run's 40 were,
+every time; with JAX's own limit, a second, even more."""
 
 
 def enable_compile_cache() -> Path:
     """Keep compiled code between processes, so that only the first start on a machine waits for the compiler.
 
+    `Slam` does it when it begins; what is compiled before, such as the renderer of rooms, is kept if this comes first.
+
     Returns:
         The folder: the user's own where one was chosen in JAX's settings, else `cache_dir()`.
     """
     chosen: str | None = jax.config.values["jax_compilation_cache_dir"]
-    if chosen:
-        return Path(chosen)
-    folder = cache_dir()
+    folder = Path(chosen) if chosen else cache_dir()
     jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", _LEAST_COMPILE_S)
+    least_s: float = jax.config.values[_LEAST_COMPILE]
+    if least_s == _LEAST_COMPILE_OF_JAX_S:
+        jax.config.update(_LEAST_COMPILE, _LEAST_COMPILE_S)
     return folder
 
 
