@@ -10,8 +10,35 @@ import pytest
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
+_FOR_ALL = (
+    "jax_compilation_cache_dir",
+    "jax_persistent_cache_min_compile_time_secs",
+    "jax_numpy_dtype_promotion",
+    "jax_numpy_rank_promotion",
+)
 
-_LONGEST = ("test_readme", "test_pose_graph", "test_bench_command", "test_notebooks", "test_cluster")
+
+def pytest_sessionstart() -> None:
+    """Every program is compiled once for all processes: those of pytest, and those that tests start.
+
+    These are strict too: a program that was traced with other rules has parts of other names, and is another one.
+    """
+    from jaxslam.xla import enable_compile_cache  # noqa: PLC0415 - what is imported before this gets no type checks
+
+    enable_compile_cache()
+    for name in _FOR_ALL:
+        os.environ[name.upper()] = str(jax.config.values[name])
+
+
+_LONGEST = (
+    "test_readme",
+    "test_bench_command",
+    "test_pose_graph",
+    "test_notebooks",
+    "test_back_end",
+    "test_cues_in_tracker",
+    "test_cluster",
+)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

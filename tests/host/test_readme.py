@@ -1,7 +1,8 @@
 """README and CONTRIBUTING say what is true: every block runs, in order, in one folder; every table is complete.
 
-Everything runs in processes of its own, as for a reader. `.venv` is the environment of the tests, so of the two
-set-up lines only what follows `pip install` runs here: `test_wheel` installs, `.ci/run` runs the second line itself.
+Everything runs in processes of its own, as for a reader, but with JAX's strict rules, as all tests. `.venv` is the
+environment of the tests, so of the two set-up lines only what follows `pip install` runs here: `test_wheel` installs,
+`.ci/run` runs the second line itself.
 """
 
 import os
@@ -18,7 +19,6 @@ from result_files import FILES, MASK_FILES
 from jaxslam import Camera, TrackParams, TrackPlan, TrackStatus
 from jaxslam.dense.results import DENSE_FILES
 from jaxslam.semantics.prompted import read_examples
-from jaxslam.xla import cache_dir
 
 ROOT = Path(__file__).resolve().parents[2]
 README = ROOT / "README.md"
@@ -39,7 +39,7 @@ def _blocks(path: Path) -> list[_Block]:
 
 
 def _run(arguments: list[str], folder: Path, what: str) -> str:
-    environment = os.environ | {"NO_COLOR": "1", "JAX_COMPILATION_CACHE_DIR": str(cache_dir())}
+    environment = os.environ | {"NO_COLOR": "1"}
     done = subprocess.run(arguments, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, f"{what} failed:\n{done.stdout}\n{done.stderr}"
     return done.stdout

@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 
 from jaxslam.camera import known_cameras
-from jaxslam.xla import cache_dir
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -45,7 +44,6 @@ def environment(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _run(arguments: list[str | Path], folder: str | Path) -> str:
     variables = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
-    variables |= {"JAX_COMPILATION_CACHE_DIR": str(cache_dir())}
     done = subprocess.run(
         list(map(str, arguments)), cwd=folder, env=variables, capture_output=True, text=True, check=False
     )
