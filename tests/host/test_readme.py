@@ -1,8 +1,8 @@
 """README and CONTRIBUTING say what is true: every block runs, in order, in one folder; every table is complete.
 
-Everything runs in processes of its own, as for a reader, but with JAX's strict rules, as all tests. `.venv` is the
-environment of the tests, so of the two set-up lines only what follows `pip install` runs here: `test_wheel` installs,
-`.ci/run` runs the second line itself.
+Everything runs in processes of its own, as for a reader; commands with JAX's strict rules, as all tests, and Python as
+JAX comes. `.venv` is the environment of the tests, so of the two set-up lines only what follows `pip install` runs
+here: `test_wheel` installs, `.ci/run` runs the second line itself.
 """
 
 import os
@@ -10,7 +10,9 @@ import re
 import shlex
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 import pytest
@@ -38,8 +40,8 @@ def _blocks(path: Path) -> list[_Block]:
     return [_Block(match[1], match[2], text.count("\n", 0, match.start()) + 2) for match in _FENCED.finditer(text)]
 
 
-def _run(arguments: list[str], folder: Path, what: str) -> str:
-    environment = os.environ | {"NO_COLOR": "1"}
+def _run(arguments: list[str], folder: Path, what: str, rules: Mapping[str, str] = MappingProxyType({})) -> str:
+    environment = os.environ | {"NO_COLOR": "1"} | dict(rules)
     done = subprocess.run(arguments, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, f"{what} failed:\n{done.stdout}\n{done.stderr}"
     return done.stdout
@@ -52,7 +54,8 @@ def _run_block(block: _Block, folder: Path) -> str:
         (folder / name).write_text(block.text)
         return ""
     if block.language == "python":
-        return _run([sys.executable, "-W", "error", "-c", block.text], folder, what)
+        as_they_come = {"JAX_NUMPY_DTYPE_PROMOTION": "standard", "JAX_NUMPY_RANK_PROMOTION": "allow"}
+        return _run([sys.executable, "-W", "error", "-c", block.text], folder, what, as_they_come)
     assert block.language == "bash", f"{what}: no way to run a block in '{block.language}'"
     command = _SET_UP.sub("", block.text)
     return (

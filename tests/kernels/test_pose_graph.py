@@ -197,6 +197,20 @@ def posegraph_case(request):
     return request.param
 
 
+def _value(values, inputs, loss):
+    return _summary(_optimise(inputs._replace(edges=inputs.edges._replace(**values)), loss))
+
+
+def _forward(values, direction, inputs, loss):
+    return jax.jvp(lambda v: _value(v, inputs, loss), (values,), (direction,))[1]
+
+
+# Here, so that graphs of one size are compiled once.
+_compiled_value = _compile(_value, static_argnames="loss")
+_compiled_forward = _compile(_forward, static_argnames="loss")
+_compiled_gradient = _compile(jax.grad(_value), static_argnames="loss")
+
+
 class TestGradient:
     @pytest.mark.parametrize("sim3", [False, True])
     @pytest.mark.parametrize("loss", ["squared", "cauchy"])
@@ -217,17 +231,14 @@ class TestGradient:
             rng = np.random.default_rng(0)
             direction = jax.tree.map(lambda x: 0.1 * jnp.asarray(rng.normal(size=x.shape)), differentiable)
 
-            def f(values):
-                return _summary(_optimise(inputs._replace(edges=inputs.edges._replace(**values)), loss))
+            def value(h):
+                there = jax.tree.map(lambda x, v: x + h * v, differentiable, direction)
+                return float(_compiled_value(there, inputs, loss))
 
-            def along(h):
-                return jax.tree.map(lambda x, v: x + h * v, differentiable, direction)
-
-            value = _compile(f)
             h = 1e-4
-            difference = (float(value(along(h))) - float(value(along(-h)))) / (2 * h)
-            forward = _compile(lambda v: jax.jvp(f, (differentiable,), (v,))[1])(direction)
-            gradient = _compile(jax.grad(f))(differentiable)
+            difference = (value(h) - value(-h)) / (2 * h)
+            forward = _compiled_forward(differentiable, direction, inputs, loss)
+            gradient = _compiled_gradient(differentiable, inputs, loss)
             reverse = sum(jnp.vdot(g, v) for g, v in zip(*map(jax.tree.leaves, (gradient, direction)), strict=True))
         np.testing.assert_allclose(forward, difference, rtol=2e-5, atol=1e-7)
         np.testing.assert_allclose(reverse, forward, rtol=1e-7, atol=1e-9)
