@@ -120,7 +120,7 @@ class Slam:
                 f" got {map.camera.width}x{map.camera.height}"
             )
         self._start_map, self._localize_only = map, localize_only
-        params = track_params(camera, self.config.track)._replace(restart_after=jnp.float32(_NEVER))
+        params = track_params(camera, _with_dense(self.config))._replace(restart_after=jnp.float32(_NEVER))
         self._params = with_cue_params(params, self.config.dynamics)
         # ORB-SLAM's local mapping does not accept keyframes either while it is busy.
         patient = max(_PATIENT_S, self.config.track.keyframe_weak_after_s)
@@ -542,6 +542,13 @@ def _no_old_garbage() -> Iterator[None]:
 def _turn(twist: np.ndarray) -> float:
     """Angular speed, rad/s."""
     return float(np.linalg.norm(twist[3:]))
+
+
+def _with_dense(config: Config) -> TrackConfig:
+    """The tracker's settings, with keyframes often enough for a dense map if there is to be one."""
+    if not config.dense.enabled:
+        return config.track
+    return replace(config.track, keyframe_below=max(config.track.keyframe_below, config.dense.keyframe_below))
 
 
 def track_plan(config: TrackConfig) -> TrackPlan:

@@ -109,6 +109,20 @@ class TestSurface:
         assert len(cloud.points) < 0.25 * sum(np.count_nonzero(frame.depth_m) for frame in frames)
         assert cloud.points.shape == cloud.colours.shape == (len(cloud.counts), 3)
 
+    def test_of_a_run(self) -> None:
+        """The same of all that a tracked camera has seen, where it was tracked: keyframes come often enough."""
+        source = SyntheticDataset(SyntheticConfig(width=320, height=240, frames=60, people=0))
+        config = load_config("default", overrides=["semantics.model=null", "dense.enabled=true"])
+        with Slam(source.camera, config) as slam:
+            slam.run(source)
+            cloud = slam.dense
+        assert cloud is not None
+        frames = [source.render(index) for index in range(0, 60, 6)]
+        surface = _surface(source, frames, people=False)
+        points = transform(frames[0].T_world_cam, cloud.points.T.astype(float)).T
+        assert np.mean(KDTree(surface[::2]).query(points)[0]) < 0.015
+        assert np.mean(KDTree(points).query(surface[::37])[0] < 0.03) > 0.9
+
     def test_colours(self) -> None:
         """Of a picture in one colour, whatever its depth, every point has it."""
         source, frames = _room(people=0)
