@@ -12,7 +12,7 @@ from jaxslam_kernels._patches import Window
 from jaxslam_kernels.image import Pyramid
 from jaxslam_kernels.implicit import Found, implicit_positions
 from jaxslam_kernels.lk_search import FlowPlan, LevelPlan, difference, look, make_template, mean_absolute, search
-from jaxslam_kernels.row_search import search_rows
+from jaxslam_kernels.row_search import MORE_BORDER, search_rows
 from jaxslam_kernels.types import Mask, Pixels, Scalar
 
 __all__ = ["Flow", "FlowPlan", "FlowStatus", "LevelPlan", "lk_flow", "lk_flow_forward_backward"]
@@ -76,7 +76,8 @@ def lk_flow(
     that towards greater ones.
 
     Args:
-        previous: Pyramid of the image the points are in; its border at least half the largest window plus 6.
+        previous: Pyramid of the image the points are in; its border at least half the largest window plus 6,
+            or plus 9 with a plan along rows.
         current: Pyramid of the image they are searched in, of the same sizes.
         points: `(2, n)` pixel coordinates in the previous image.
         guess: `(2, n)` where to start the search in the current image; `points` if not given. With a plan along rows,
@@ -184,7 +185,7 @@ def _check(previous: Pyramid, current: Pyramid, plan: FlowPlan) -> None:
     if sizes[0] != sizes[1] or previous.border != current.border:
         raise ValueError(f"pyramids of the same levels and border expected, got levels of {sizes[0]} and {sizes[1]}")
     used = [plan.level(level, len(sizes[0])) for level in range(len(sizes[0]))]
-    needed = max(Window(level.window).border for level in used)
+    needed = max(Window(level.window).border for level in used) + (MORE_BORDER if plan.along_rows else 0)
     if previous.border < needed:
         raise ValueError(f"border: at least {needed} pixels needed by this plan, got {previous.border}")
 

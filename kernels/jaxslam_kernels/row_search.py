@@ -34,6 +34,8 @@ from jaxslam_kernels.types import Mask, Pixels, Scalar, Weights
 _REACH, _NEXT_REACH = 6, 3
 """Whole columns on either side of the guess that are looked at: on the coarsest level as far as a window of 11 is
 drawn; the guess it gives to the next is good to a pixel or two."""
+MORE_BORDER = _REACH - 3
+"""Padding that images need beyond `Window.border`, for windows around all these columns."""
 
 
 class _Slopes(NamedTuple):

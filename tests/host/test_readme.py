@@ -16,6 +16,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import pytest
+import readers_jax
 from result_files import FILES, MASK_FILES
 
 from jaxslam import Camera, TrackParams, TrackPlan, TrackStatus
@@ -54,8 +55,7 @@ def _run_block(block: _Block, folder: Path) -> str:
         (folder / name).write_text(block.text)
         return ""
     if block.language == "python":
-        as_they_come = {"JAX_NUMPY_DTYPE_PROMOTION": "standard", "JAX_NUMPY_RANK_PROMOTION": "allow"}
-        return _run([sys.executable, "-W", "error", "-c", block.text], folder, what, as_they_come)
+        return _run([sys.executable, "-W", "error", "-c", block.text], folder, what, readers_jax.ENVIRONMENT)
     assert block.language == "bash", f"{what}: no way to run a block in '{block.language}'"
     command = _SET_UP.sub("", block.text)
     return (

@@ -199,6 +199,11 @@ class TestDegenerate:
             assert not np.any(found.disparity)
             assert all_finite((gradient, found))
 
+    def test_narrow_border(self):
+        wide = ROW_PLAN._replace(finest=LevelPlan(17, 8, 0.02))
+        with pytest.raises(ValueError, match="border: at least 17 pixels needed by this plan, got 16"):
+            jax.eval_shape(_run(wide), *_pair())
+
     def test_stripes_along_the_rows(self):
         """What has texture across its row only is not matched."""
         _, _, points, guess, mask = _pair()

@@ -1,0 +1,3 @@
+"""JAX as it comes, for Python that readers write: README and notebooks. Tests themselves run with its strict rules."""
+
+ENVIRONMENT = {"JAX_NUMPY_DTYPE_PROMOTION": "standard", "JAX_NUMPY_RANK_PROMOTION": "allow"}
