@@ -339,7 +339,7 @@ class DenseMapping:
         self._kept[shown.keyframe] = _Kept(self._packed(depth), shown.T_cam_depth)
         wanted = self._wanted()
         if shown.pair is not None and self._config.carve and (pose := wanted[shown.keyframe]) is not None:
-            self._layer.look(self._view.looks(depth), pose, self._view)
+            self._see_past(depth, pose, self._view)
             watch.ends("dense: carve")
         self._put_in(self._layer, shown.keyframe, part, wanted, watch)
         self._put += 1
@@ -374,10 +374,14 @@ class DenseMapping:
     def _look(self, seen: _Look) -> None:
         """Take in what a frame between keyframes sees past."""
         watch = self._times.stopwatch()
-        looks = self._small.looks(self._small.cleaned(seen.depth, seen.ignore))
-        for layer in self._layers():
-            layer.look(looks, seen.T_world_cam, self._small)
+        self._see_past(self._small.cleaned(seen.depth, seen.ignore), seen.T_world_cam, self._small)
         watch.ends("dense: look")
+
+    def _see_past(self, depth: np.ndarray, pose: np.ndarray, view: View) -> None:
+        """Take in which voxels of all layers a depth image sees again, and which it sees past."""
+        looks = view.looks(depth)
+        for layer in self._layers():
+            layer.look(looks, pose, view)
 
     def _num_believed(self, depth: np.ndarray, ignore: np.ndarray) -> int:
         """Pixels of a whole depth image that a map without voxels would hold."""

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxslam_kernels.image import Pyramid
-from jaxslam_kernels.lk_flow import lk_flow
+from jaxslam_kernels.lk_flow import lk_flow_forward_backward
 from jaxslam_kernels.lk_search import FlowPlan, LevelPlan
 from jaxslam_kernels.types import Mask, Pixels, Scalar, Weights
 
@@ -59,8 +59,7 @@ def row_disparities(
         points: `(2, n)` pixels in the left image.
         guess: `(n,)` about what the disparity is, to twice as many pixels as the coarsest level is smaller.
         mask: `(n,)` which points to match; all if not given.
-        max_return_px: How far from the point the way back may end; the left-right check of stereo matching (`lk_flow`
-            back again).
+        max_return_px: How far from the point the way back may end; the left-right check of stereo matching.
         expected_px: A match within so many pixels of its guess is taken without a way back, for guesses that come from
             elsewhere than these images.
         least: Smallest disparity that is one, pixels: smaller ones are those of points too far to tell.
@@ -71,12 +70,18 @@ def row_disparities(
         Disparities, finite whatever the images hold.
     """
     shift = jnp.where(jnp.isfinite(guess), guess, 0)
-    aside = lax.stop_gradient(jnp.stack([shift, jnp.zeros_like(shift)]))
-    there = lk_flow(left, right, points, points - aside, mask, plan=plan, min_texture=min_texture)
-    arrived = lax.stop_gradient(there.points)
-    expected = jnp.abs(points[0] - arrived[0] - shift) < expected_px
-    back = lk_flow(right, left, arrived, arrived + aside, there.ok & ~expected, plan=plan, min_texture=min_texture)
-    returned = back.ok & (jnp.abs(back.points[0] - points[0]) < max_return_px)
-    disparity = points[0] - there.points[0]
-    found = there.ok & (expected | returned) & (disparity > least)
-    return Disparities(jnp.where(found, disparity, 0), found, there.residual)
+    start = points - jnp.stack([shift, jnp.zeros_like(shift)])
+    flow = lk_flow_forward_backward(
+        left,
+        right,
+        points,
+        lax.stop_gradient(start),
+        mask,
+        max_return_px=max_return_px,
+        expected_px=expected_px,
+        plan=plan,
+        min_texture=min_texture,
+    )
+    disparity = points[0] - flow.points[0]
+    found = flow.ok & (disparity > least)
+    return Disparities(jnp.where(found, disparity, 0), found, flow.residual)

@@ -12,7 +12,7 @@ from jaxslam_kernels._patches import Window
 from jaxslam_kernels.image import Pyramid
 from jaxslam_kernels.implicit import Found, implicit_positions
 from jaxslam_kernels.lk_search import FlowPlan, LevelPlan, difference, look, make_template, mean_absolute, search
-from jaxslam_kernels.row_search import MORE_BORDER, search_rows
+from jaxslam_kernels.row_search import MORE_BORDER, settle_in_rows
 from jaxslam_kernels.types import Mask, Pixels, Scalar
 
 __all__ = ["Flow", "FlowPlan", "FlowStatus", "LevelPlan", "lk_flow", "lk_flow_forward_backward"]
@@ -127,21 +127,25 @@ def lk_flow_forward_backward(
     mask: Mask | None = None,
     *,
     max_return_px: Scalar | float = 1.0,
+    expected_px: Scalar | float = 0.0,
     plan: FlowPlan = DEFAULT_PLAN,
     min_texture: Scalar | float = 1.0,
 ) -> Flow:
     """`lk_flow`, and back again: a point that does not return to within `max_return_px` is `INCONSISTENT`.
 
     Source: Kalal, Mikolajczyk, Matas, Forward-Backward Error, ICPR 2010. The way back starts from the forward result
-    moved by the reversed guess, so that it does not know where it should arrive. Arguments as for `lk_flow`.
+    moved by the reversed guess, so that it does not know where it should arrive. A point found within `expected_px` of
+    its guess is taken without a way back. Other arguments as for `lk_flow`.
     """
     forward = lk_flow(previous, current, points, guess, mask, plan=plan, min_texture=min_texture)
     moved = jnp.zeros_like(points) if guess is None else points - guess
     arrived = lax.stop_gradient(forward.points)
-    back = lk_flow(current, previous, arrived, arrived + moved, forward.ok, plan=plan, min_texture=min_texture)
+    off = jnp.sum(jnp.square(arrived - points + moved), axis=0)
+    unsure = forward.ok & ~(off < jnp.square(expected_px))
+    back = lk_flow(current, previous, arrived, arrived + moved, unsure, plan=plan, min_texture=min_texture)
     distance = jnp.sum(jnp.square(back.points - points), axis=0)
     returned = back.ok & (distance < max_return_px**2)
-    status = jnp.where(forward.ok & ~returned, FlowStatus.INCONSISTENT, forward.status)
+    status = jnp.where(unsure & ~returned, FlowStatus.INCONSISTENT, forward.status)
     return forward._replace(status=status)
 
 
@@ -161,7 +165,8 @@ class _End(NamedTuple):
 
 
 def _solve(inputs: _Inputs, *, plan: FlowPlan) -> Found:
-    end = (search_rows if plan.along_rows else search)(*inputs, plan=plan)
+    how = {"settle": settle_in_rows} if plan.along_rows else {}
+    end = search(*inputs, plan=plan, **how)
     tracked = inputs.usable & (end.texture > inputs.min_texture) & (end.last_step < plan.finest.accepted**2)
     tracked &= _inside(end.position, inputs.current)
     return Found(end.position, tracked, _End(end.residual, end.texture, end.last_step))

@@ -223,7 +223,7 @@ def iterate(search: Search, template: Template, level: Float[Array, "h w"], bord
     return lax.while_loop(going, body, start)[0]
 
 
-def move_inside(position: Pixels, flow: Pixels, level: Float[Array, "h w"], border: int, window: Window) -> Pixels:
+def _move_inside(position: Pixels, flow: Pixels, level: Float[Array, "h w"], border: int, window: Window) -> Pixels:
     """The nearest positions whose windows, there and at `position + flow`, lie in the image.
 
     A coarse level gives no more than a guess to the next, and that of a neighbour with a whole window is better than
@@ -246,6 +246,7 @@ def _search_chunk(
     current: Pyramid,
     plan: FlowPlan,
     min_texture: Scalar,
+    settle: Callable[..., Search],
 ) -> Solution:
     """Search one chunk of finite points, from the coarsest level to the finest."""
     num_levels, border = len(previous.levels), previous.border
@@ -256,11 +257,12 @@ def _search_chunk(
         window = Window(level_plan.window)
         start = points / 2**level
         if level > 0:
-            start = move_inside(start, flow, previous.levels[level], border, window)
-        template = make_template(previous.levels[level], start, border, window, once)
+            start = _move_inside(start, flow, previous.levels[level], border, window)
+        template = make_template(previous.levels[level], start, border, window, once, plan.along_rows)
         active = usable & (template.texture > min_texture)
         search = Search(start + flow, jnp.zeros_like(points[0]), active)
-        search = iterate(search, template, current.levels[level], border, level_plan)
+        coarsest = level == num_levels - 1
+        search = settle(search, template, current.levels[level], border, level_plan, once=once, coarsest=coarsest)
         return search, template, search.position - start
 
     flow = (guess - points) / 2**num_levels
@@ -287,8 +289,7 @@ def in_chunks(function: Callable[..., Any], arrays: tuple[Array, ...], wanted: M
     place = jnp.zeros_like(order).at[order].set(jnp.arange(n, dtype=order.dtype), unique_indices=True)
 
     def split(array: Array) -> Array:
-        sorted = jnp.take(array, order, axis=-1)
-        padded = jnp.pad(sorted, [(0, 0)] * (array.ndim - 1) + [(0, count * chunk - n)])
+        padded = jnp.pad(jnp.take(array, order, axis=-1), [(0, 0)] * (array.ndim - 1) + [(0, count * chunk - n)])
         return jnp.moveaxis(padded.reshape(*array.shape[:-1], count, chunk), -2, 0)
 
     def join(array: Array) -> Array:
@@ -296,11 +297,15 @@ def in_chunks(function: Callable[..., Any], arrays: tuple[Array, ...], wanted: M
         return jnp.take(joined, place, axis=-1)
 
     def one(chunked: tuple[Array, ...]) -> Any:
-        shapes = jax.eval_shape(function, *chunked[:-1])
-        nothing = lambda: jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-        return lax.cond(jnp.any(chunked[-1]), lambda: function(*chunked[:-1]), nothing)
+        return patches.at_once(partial(function, *chunked[:-1]), jnp.any(chunked[-1]))
 
     return jax.tree.map(join, lax.map(one, tuple(map(split, (*arrays, wanted)))))
+
+
+def _settle(
+    search: Search, template: Template, level: Float[Array, "h w"], border: int, plan: LevelPlan, **_: Any
+) -> Search:
+    return iterate(search, template, level, border, plan)
 
 
 def search(
@@ -312,8 +317,9 @@ def search(
     min_texture: Scalar,
     *,
     plan: FlowPlan,
+    settle: Callable[..., Search] = _settle,
 ) -> Solution:
-    """Search all points; not differentiable, `lk_flow` is.
+    """Search all points; not differentiable, `lk_flow` is. `settle` finds them on one level, from where it begins.
 
     Under `vmap` the batch is worked off one after the other: chunks fill the vector units already, a batch would only
     wait for its slowest member, and `patches.at_once` would no longer hold.
@@ -321,7 +327,8 @@ def search(
 
     @jax.custom_batching.sequential_vmap
     def search_all(previous, current, points, guess, usable, min_texture):
-        chunk = partial(_search_chunk, previous=previous, current=current, plan=plan, min_texture=min_texture)
+        fixed = {"previous": previous, "current": current, "plan": plan, "min_texture": min_texture, "settle": settle}
+        chunk = partial(_search_chunk, **fixed)
         return in_chunks(chunk, (points, guess, usable), usable, plan.chunk)
 
     return search_all(previous, current, points, guess, usable, min_texture)
