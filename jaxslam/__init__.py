@@ -25,8 +25,6 @@ from jaxslam.rectification import RectifiedPair as RectifiedPair
 from jaxslam.rig import Lens as Lens
 from jaxslam.rig import Rig as Rig
 from jaxslam.slam import Slam as Slam
-from jaxslam.slam import track_params as track_params
-from jaxslam.slam import track_plan as track_plan
 from jaxslam.state import TrackOutput as TrackOutput
 from jaxslam.state import TrackParams as TrackParams
 from jaxslam.state import TrackPlan as TrackPlan
@@ -36,6 +34,8 @@ from jaxslam.track import follow_points as follow_points
 from jaxslam.track import init_state as init_state
 from jaxslam.track import track_followed as track_followed
 from jaxslam.track import track_step as track_step
+from jaxslam.track_settings import track_params as track_params
+from jaxslam.track_settings import track_plan as track_plan
 from jaxslam.tracked import Tracked as Tracked
 from jaxslam.trajectory import Trajectory as Trajectory
 from jaxslam.xla import prefer_one_thread as prefer_one_thread

@@ -144,9 +144,8 @@ class BackEnd:
             times: Where to keep how long the jobs of the threads take.
         """
         self._times = times or StageTimes()
-        occlusion = config.dynamics.occlusion
         self._params, self._track_plan = params, plan
-        self._plan = mapping_plan(config.mapping, config.track, occlusion)
+        self._plan = mapping_plan(camera, config)
         self._camera, self._config, self._localize_only = camera, config, localize_only
         start = empty_map(camera) if map is None else map
         self._mapping = LocalMapping(camera, params, self._plan, start)
@@ -158,6 +157,7 @@ class BackEnd:
         self._dense = dense
         self._link = MapLink(plan, start)
         most = config.mapping.num_features + self._num_tracks
+        occlusion = config.dynamics.occlusion
         self._states = PointStates(occlusion, params, start, most) if occlusion.enabled else None
         self._states_in_map = 0  # number of the changes that the newest map has
         self._arrived: Map | None = None

@@ -174,7 +174,8 @@ def _observations(map: Map, window: _Window, size: int, plan: AdjustPlan) -> Obs
     weight = seen.weight * map.points.weight[at]
     if plan.occluded_weight != 1:
         weight = weight * state_weights(map.points.state[at], plan.occluded_weight)
-    precision = np.concatenate([focal / seen.sigma_px, np.where(seen.depth > 0, 1 / sigma_depth, 0)[None, :]])
+    of_depth = np.divide(1, sigma_depth, out=np.zeros_like(sigma_depth), where=seen.depth > 0)
+    precision = np.concatenate([focal / seen.sigma_px, of_depth[None, :]])
     fit: Any = lambda array, dtype: padded(array.astype(dtype), room, axis=-1, fill=0)
     valid: Any = np.arange(room) < len(row)
     return Observations(

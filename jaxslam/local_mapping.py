@@ -17,7 +17,7 @@ from jaxslam_kernels.types import Pixels, Weights
 from jaxtyping import Array, Float
 
 from jaxslam.camera import Camera
-from jaxslam.config import MappingConfig, OcclusionConfig, TrackConfig
+from jaxslam.config import Config
 from jaxslam.culling import CONFIRM_WITHIN, without_redundant, without_unconfirmed
 from jaxslam.features import FeaturePlan, Features, features_of
 from jaxslam.frame_arrays import FrameArrays
@@ -35,6 +35,7 @@ from jaxslam.observe import observe
 from jaxslam.point_states import StateChanges, with_changes
 from jaxslam.pose import compose, transform
 from jaxslam.state import TrackParams
+from jaxslam.track_settings import depth_noise
 
 _PART_KEYFRAMES = 30
 """Keyframes that mapping looks at and changes at all, for a new one."""
@@ -107,21 +108,21 @@ class MappingPlan(NamedTuple):
     search_px: float = 3.0
 
 
-def mapping_plan(config: MappingConfig, track: TrackConfig, occlusion: OcclusionConfig | None = None) -> MappingPlan:
+def mapping_plan(camera: Camera, config: Config) -> MappingPlan:
     """The settings of local mapping; depth is measured as well as in tracking."""
-    occluded_weight = occlusion.weight if occlusion is not None and occlusion.enabled else 1.0
+    mapping, occlusion, noise = config.mapping, config.dynamics.occlusion, depth_noise(camera, config.track)
     return MappingPlan(
-        features=FeaturePlan(**{name: getattr(config, name) for name in FeaturePlan._fields}),
+        features=FeaturePlan(**{name: getattr(mapping, name) for name in FeaturePlan._fields}),
         adjust=AdjustPlan(
-            window=config.window,
-            max_steps=config.max_steps,
-            loss_scale=track.loss_scale,
-            depth_sigma_m=track.depth_sigma_m,
-            depth_sigma_per_m2=track.depth_sigma_per_m2,
-            occluded_weight=occluded_weight,
+            window=mapping.window,
+            max_steps=mapping.max_steps,
+            loss_scale=config.track.loss_scale,
+            depth_sigma_m=noise.sigma_m,
+            depth_sigma_per_m2=noise.sigma_per_m2,
+            occluded_weight=occlusion.weight if occlusion.enabled else 1.0,
         ),
-        track_sigma_px=config.track_sigma_px,
-        search_px=config.search_px,
+        track_sigma_px=mapping.track_sigma_px,
+        search_px=mapping.search_px,
     )
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxslam.back_end import BackEnd, Placed
 from jaxslam.camera import Camera
-from jaxslam.config import Config, TrackConfig
+from jaxslam.config import Config
 from jaxslam.datasets import Dataset, prefetch
 from jaxslam.datasets.realtime import in_real_time
 from jaxslam.dense.cloud import DenseCloud
@@ -38,6 +38,7 @@ from jaxslam.stage_times import StageTimes
 from jaxslam.state import TrackOutput, TrackParams, TrackPlan, TrackReason, TrackState, TrackStatus
 from jaxslam.stereo import RoughDepth
 from jaxslam.track import Followed, follow_points, init_state, track_followed
+from jaxslam.track_settings import track_params, track_plan, with_dense_keyframes
 from jaxslam.tracked import FrameRecord, Rejected, Tracked, tracked_of
 from jaxslam.trajectory import PathLike, Trajectory
 from jaxslam.worker import Worker, make_worker
@@ -120,7 +121,7 @@ class Slam:
                 f" got {map.camera.width}x{map.camera.height}"
             )
         self._start_map, self._localize_only = map, localize_only
-        params = track_params(camera, _with_dense(self.config))._replace(restart_after=jnp.float32(_NEVER))
+        params = track_params(camera, with_dense_keyframes(self.config))._replace(restart_after=jnp.float32(_NEVER))
         self._params = with_cue_params(params, self.config.dynamics)
         # ORB-SLAM's local mapping does not accept keyframes either while it is busy.
         patient = max(_PATIENT_S, self.config.track.keyframe_weak_after_s)
@@ -542,40 +543,6 @@ def _no_old_garbage() -> Iterator[None]:
 def _turn(twist: np.ndarray) -> float:
     """Angular speed, rad/s."""
     return float(np.linalg.norm(twist[3:]))
-
-
-def _with_dense(config: Config) -> TrackConfig:
-    """The tracker's settings, with keyframes often enough for a dense map if there is to be one."""
-    if not config.dense.enabled:
-        return config.track
-    return replace(config.track, keyframe_below=max(config.track.keyframe_below, config.dense.keyframe_below))
-
-
-def track_plan(config: TrackConfig) -> TrackPlan:
-    """The static part of the tracker's settings."""
-    return TrackPlan(**{name: getattr(config, name) for name in TrackPlan._fields if hasattr(config, name)})
-
-
-def track_params(camera: Camera, config: TrackConfig, dtype: type[np.floating] = np.float32) -> TrackParams:
-    """The traced part of the tracker's settings, with the camera; `track_step` takes it."""
-    of_camera = {"readout_s": camera.readout_s, "baseline_m": camera.baseline_m if camera.is_stereo else 0.0}
-    traced = (name for name in TrackParams._fields if name not in ("intrinsics", "cues", "motion", *of_camera))
-    settings = {name: getattr(config, name) for name in traced} | of_camera | _of_pair(camera, config)
-    arrays: dict[str, Any] = {name: jnp.asarray(value, dtype) for name, value in settings.items()}
-    return TrackParams(intrinsics=camera.intrinsics(dtype), **arrays)
-
-
-def _of_pair(camera: Camera, config: TrackConfig) -> dict[str, float]:
-    """Settings that a stereo pair has instead of those of a camera that measures depth."""
-    if camera.baseline_m is None or not camera.is_stereo:
-        return {}
-    farthest_m = camera.far_depth_m or config.far_baselines * camera.baseline_m
-    return {
-        "depth_sigma_m": 0.0,
-        "depth_sigma_per_m2": config.disparity_sigma_px / (camera.fx * camera.baseline_m),
-        "max_depth_m": farthest_m,
-        "max_speed_m_per_s": max(config.max_speed_m_per_s, farthest_m),
-    }
 
 
 class _Tolerant:

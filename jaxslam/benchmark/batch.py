@@ -16,9 +16,9 @@ from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.evaluation import evaluate
 from jaxslam.frame_arrays import FrameArrays, stack_frames
 from jaxslam.results import peak_rss_mb
-from jaxslam.slam import track_params, track_plan
 from jaxslam.state import TrackParams, TrackPlan, TrackStatus
 from jaxslam.track import init_state, track_step
+from jaxslam.track_settings import track_params, track_plan
 from jaxslam.trajectory import Trajectory
 from jaxslam.xla import threads
 

@@ -19,7 +19,8 @@ from jaxslam.config import Config
 from jaxslam.datasets import open_dataset
 from jaxslam.local_mapping import LocalMapping, NewKeyframe, mapping_plan
 from jaxslam.map import NONE, Map
-from jaxslam.slam import Slam, track_params
+from jaxslam.slam import Slam
+from jaxslam.track_settings import track_params
 
 pytestmark = pytest.mark.benchmark
 
@@ -68,7 +69,7 @@ def repeated(jobs: list[NewKeyframe], number: int) -> NewKeyframe:
 
 
 def fresh(slam: Slam, jobs: list[NewKeyframe]) -> LocalMapping:
-    plan = mapping_plan(slam.config.mapping, slam.config.track)
+    plan = mapping_plan(slam.camera, slam.config)
     mapping = LocalMapping(slam.camera, track_params(slam.camera, slam.config.track), plan)
     mapping.compile(jobs[0].frame, len(jobs[0].tracks.id))
     return mapping

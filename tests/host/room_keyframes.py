@@ -11,7 +11,7 @@ from jaxslam.local_mapping import LocalMapping, MappingPlan, NewKeyframe, Tracks
 from jaxslam.map import NONE, Map
 from jaxslam.pose import between, moved, to_local, transform
 
-PLAN: MappingPlan = mapping_plan(Config().mapping, Config().track)
+PLAN: MappingPlan = mapping_plan(room().camera, Config())
 STEP = 24
 """Pictures between two keyframes: 9 degrees of a round of the room."""
 _NOISE_PX = 0.2

@@ -12,8 +12,8 @@ from jaxslam.frame import Frame
 from jaxslam.frame_arrays import frame_arrays
 from jaxslam.map import NONE, Keyframe, Map, empty_map
 from jaxslam.map_edit import with_keyframe
-from jaxslam.slam import track_params
 from jaxslam.state import TrackParams
+from jaxslam.track_settings import track_params
 
 STILL = np.zeros(6)
 FRAMES = 960

@@ -12,9 +12,10 @@ from jaxslam.config import Config, TrackConfig
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.frame import Frame
 from jaxslam.frame_arrays import FrameArrays, stack_frames
-from jaxslam.slam import Slam, track_params, track_plan
+from jaxslam.slam import Slam
 from jaxslam.state import TrackParams, TrackState
 from jaxslam.track import init_state
+from jaxslam.track_settings import track_params, track_plan
 from jaxslam.trajectory import Trajectory
 
 WIDTH, HEIGHT = 160, 120

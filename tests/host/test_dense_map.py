@@ -4,25 +4,27 @@ import functools
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial import KDTree
 from small_scene import CONFIG, clip
+from true_surface import accuracy, true_surface
 
 from jaxslam.config import Config, DenseConfig, load_config
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.datasets.synthetic.dataset import SyntheticFrame
-from jaxslam.dense.mapping import DenseMapping, _Look
+from jaxslam.dense.mapping import DenseMapping
 from jaxslam.dense.picture import picture
 from jaxslam.dense.results import DENSE_FILES
-from jaxslam.dense.view import View
 from jaxslam.errors import ConfigError, MapFileError
 from jaxslam.frame_arrays import FrameArrays
 from jaxslam.local_mapping import NewKeyframe, Tracks
 from jaxslam.map import Map, empty_map
 from jaxslam.map_movers import Movers
-from jaxslam.pose import IDENTITY, moved, transform
+from jaxslam.pose import IDENTITY, moved
 from jaxslam.results import RunInfo, write_results
 from jaxslam.semantics import Detections
 from jaxslam.slam import Slam
@@ -51,17 +53,24 @@ def _map(source: SyntheticDataset, poses: list[np.ndarray]) -> Map:
     )
 
 
-def _hand_over(dense: DenseMapping, index: int, frame: SyntheticFrame, ignore: np.ndarray | None = None) -> None:
+def _arrays(frame: SyntheticFrame, ignore: np.ndarray | None = None) -> FrameArrays:
     ignore = np.zeros(frame.depth_m.shape, bool) if ignore is None else ignore
-    arrays = FrameArrays(frame.rgb[..., 0], frame.depth_m, ignore, np.float32(0), np.float32(0))  # pyright: ignore[reportArgumentType]
-    new = NewKeyframe(index, frame.timestamp_ns, arrays, index - 1, IDENTITY, 0, np.zeros(6), NO_TRACKS)
+    return FrameArrays(frame.rgb[..., 0], frame.depth_m, ignore, np.float32(0), np.float32(0))  # pyright: ignore[reportArgumentType]
+
+
+def _tracked_at(pose: np.ndarray) -> Any:
+    """Of a `TrackOutput`, what a dense map needs."""
+    return SimpleNamespace(T_world_cam=SimpleNamespace(wxyz_xyz=pose), twist=np.zeros(6))
+
+
+def _hand_over(dense: DenseMapping, index: int, frame: SyntheticFrame, ignore: np.ndarray | None = None) -> None:
+    new = NewKeyframe(index, frame.timestamp_ns, _arrays(frame, ignore), index - 1, IDENTITY, 0, np.zeros(6), NO_TRACKS)
     dense.keyframe_made(new, frame.rgb, frame.T_world_cam, EVERY * index)
 
 
 def _look(dense: DenseMapping, frame: SyntheticFrame) -> None:
     """A look as of a frame between keyframes."""
-    small = dense._small.every(frame.depth_m)
-    dense._add_job(_Look(small, np.zeros(small.shape, bool), frame.T_world_cam), 0)
+    dense.frame_tracked(0, frame.rgb, _arrays(frame), _tracked_at(frame.T_world_cam))
 
 
 def _made(source, frames, config=SMALL, *, masks=False, late=False) -> DenseMapping:
@@ -80,22 +89,12 @@ def _made(source, frames, config=SMALL, *, masks=False, late=False) -> DenseMapp
     return dense
 
 
-def _surface(source, frames, *, people: bool) -> np.ndarray:
-    """`(n, 3)` the true surface that frames see up to six metres, of what stands still or of who moves."""
-    view, points = View(source.camera, 1, 100.0, 0.1), []
-    for frame in frames:
-        z = frame.exact_depth_m.reshape(1, -1)
-        chosen = ((frame.instance_mask > 0) == people).ravel() & (z[0] < 6) & (frame.depth_m > 0).ravel()
-        points.append(transform(frame.T_world_cam, np.concatenate([view.rays * z, z])[:, chosen].astype(float)).T)
-    return np.concatenate(points)
-
-
 def _ghosts(dense: DenseMapping, source, frames) -> float:
     """Share of points that were put there because of a person: on the true surface of one in some frame, within 4 cm,
     and off all that stands still by more than 6 cm. A wall that somebody has stood before is none.
     """
     points = dense.cloud().points
-    still, people = (KDTree(_surface(source, frames, people=who)[::3]) for who in (False, True))
+    still, people = (KDTree(true_surface(source, frames, people=who)[::3]) for who in (False, True))
     return float(np.mean((still.query(points)[0] > 0.06) & (people.query(points)[0] < 0.04)))
 
 
@@ -103,7 +102,7 @@ class TestSurface:
     def test_accuracy_and_coverage(self) -> None:
         source, frames = _room(people=0)
         cloud = _made(source, frames).cloud()
-        surface = _surface(source, frames, people=False)
+        surface = true_surface(source, frames, people=False)
         assert np.mean(KDTree(surface[::2]).query(cloud.points)[0]) < 0.015
         assert np.mean(KDTree(cloud.points).query(surface[::37])[0] < 0.03) > 0.9
         assert len(cloud.points) < 0.25 * sum(np.count_nonzero(frame.depth_m) for frame in frames)
@@ -117,11 +116,9 @@ class TestSurface:
             slam.run(source)
             cloud = slam.dense
         assert cloud is not None
-        frames = [source.render(index) for index in range(0, 60, 6)]
-        surface = _surface(source, frames, people=False)
-        points = transform(frames[0].T_world_cam, cloud.points.T.astype(float)).T
-        assert np.mean(KDTree(surface[::2]).query(points)[0]) < 0.015
-        assert np.mean(KDTree(points).query(surface[::37])[0] < 0.03) > 0.9
+        found = accuracy(cloud.points, source)
+        assert found.mean_m < 0.015
+        assert found.coverage > 0.9
 
     def test_colours(self) -> None:
         """Of a picture in one colour, whatever its depth, every point has it."""
@@ -194,7 +191,7 @@ class TestBounds:
         assert figures.coarsened >= 1
         assert cloud.voxel_m == pytest.approx(0.02 * 2**figures.coarsened)
         assert 1000 < len(cloud.points) <= 12_000
-        surface = _surface(source, frames, people=False)
+        surface = true_surface(source, frames, people=False)
         assert np.mean(KDTree(surface[::2]).query(cloud.points)[0]) < 0.03
 
     def test_oldest_keyframes_are_forgotten(self) -> None:
@@ -210,9 +207,8 @@ class TestBounds:
         """Looks of frames between keyframes stand before keyframes that are passed over."""
         source, frames = _room(people=0)
         dense = DenseMapping(source.camera, SMALL, nearest_m=0.3, farthest_m=6.0, deterministic=False)
-        small = dense._small.every(frames[0].depth_m)
         with dense._lock:
-            dense._add_job(_Look(small, np.zeros(small.shape, bool), frames[0].T_world_cam), 0)
+            _look(dense, frames[0])
             for index in range(12):
                 _hand_over(dense, index, frames[0])
                 dense.map_made(_map(source, [frames[0].T_world_cam] * (index + 1)), index, 0)
@@ -252,12 +248,8 @@ def test_key_objects_are_dense() -> None:
     box = np.array([[120, 90, 200, 160]], np.float32)
     found = Detections(box, np.ones(1, np.float32), ("book",), None, None)
     dense = _mapping(source, SMALL, lambda image: found)
-    assert dense.neighbours is not None
-    nothing = np.zeros(frames[0].depth_m.shape, bool)
-    dense.neighbours.see(0, frames[0].rgb, frames[0].depth_m, nothing, frames[0].T_world_cam)
+    dense.frame_tracked(0, frames[0].rgb, _arrays(frames[0]), _tracked_at(frames[0].T_world_cam))
     _hand_over(dense, 0, frames[0])
-    shown = dense.neighbours.before(4, frames[1].T_world_cam)
-    assert len(shown) == 1
     dense.map_made(_map(source, [frames[0].T_world_cam]), 0, 0)
     dense.finish()
     cloud = dense.cloud()

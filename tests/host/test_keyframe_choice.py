@@ -10,9 +10,9 @@ from jaxlie import SE3
 from jaxslam import load_config
 from jaxslam.camera import Camera
 from jaxslam.keyframe_choice import Candidate, keyframe_reason
-from jaxslam.slam import track_params, track_plan
 from jaxslam.state import KeyframeReason
 from jaxslam.track import init_state
+from jaxslam.track_settings import track_params, track_plan
 
 N = 64
 CAMERA = Camera("test", 64, 48, 50.0, 50.0, 31.5, 23.5, depth_scale_per_m=5000.0)

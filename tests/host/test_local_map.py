@@ -19,13 +19,14 @@ from jaxslam.local_map import keyframes_in_view, local_keyframes, match_local_ma
 from jaxslam.local_mapping import mapping_plan
 from jaxslam.map import Map, empty_map, sightings_at
 from jaxslam.pose import IDENTITY, angle, between, compose, inverse, moved
-from jaxslam.slam import Slam, track_params
+from jaxslam.slam import Slam
 from jaxslam.state import TrackReason, TrackStatus
+from jaxslam.track_settings import track_params
 from jaxslam.tracked import Tracked
 
 CONFIG = Config(track=TRACK)
 ALWAYS_WEAK = replace(CONFIG, track=replace(TRACK, weak_inliers=10_000))
-PLAN = mapping_plan(CONFIG.mapping, TRACK).features
+PLAN = mapping_plan(room().camera, CONFIG).features
 NUM_FRAMES, LATER = 60, 50
 
 

@@ -23,8 +23,8 @@ from jaxslam.dynamics.motion_state import (
 from jaxslam.frame import Frame
 from jaxslam.frame_arrays import frame_arrays
 from jaxslam.masks.objects import ObjectFinder, object_labels
-from jaxslam.slam import track_params, track_plan
 from jaxslam.track import init_state, track_step
+from jaxslam.track_settings import track_params, track_plan
 
 CAMERA = Camera("test", 320, 240, 260.0, 260.0, 159.5, 119.5, depth_scale_per_m=5000.0)
 CONFIG = load_config("usd")

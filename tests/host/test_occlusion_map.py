@@ -20,7 +20,7 @@ from test_local_adjustment import exact_map
 from wall_map import POINTS, at, seen_from
 
 from jaxslam.camera import Camera
-from jaxslam.config import Config, OcclusionConfig, TrackConfig, load_config
+from jaxslam.config import Config, DynamicsConfig, OcclusionConfig, TrackConfig, load_config
 from jaxslam.datasets.synthetic import SceneDetector, SyntheticConfig, SyntheticDataset
 from jaxslam.dynamics.occlusion import PointState, state_weights
 from jaxslam.errors import MapFileError
@@ -41,8 +41,9 @@ from jaxslam.new_points import new_points
 from jaxslam.point_states import PointStates, StateChanges, occluded_shares, with_changes
 from jaxslam.pose import IDENTITY, between, to_local
 from jaxslam.results import RunInfo, write_results
-from jaxslam.slam import Slam, track_params
+from jaxslam.slam import Slam
 from jaxslam.state import TrackStatus
+from jaxslam.track_settings import track_params
 from jaxslam.tracked import Tracked
 
 STATIC, BLOCKED, OCCLUDED = (int(state) for state in PointState)
@@ -445,7 +446,7 @@ class TestAdjustment:
         assert same(first._replace(points=first.points._replace(state=second.points.state)), second)
 
     def test_settings(self) -> None:
-        mapping, track = Config().mapping, Config().track
+        plan = lambda dynamics: mapping_plan(CAMERA, Config(dynamics=dynamics))
         weights = {
             OcclusionConfig(): 1.0,
             OcclusionConfig(enabled=True): 3.0,
@@ -453,8 +454,8 @@ class TestAdjustment:
             OcclusionConfig(weight=1.5): 1.0,
         }
         for occlusion, expected in weights.items():
-            assert mapping_plan(mapping, track, occlusion).adjust.occluded_weight == expected
-        assert mapping_plan(mapping, track).adjust.occluded_weight == 1
+            assert plan(DynamicsConfig(occlusion=occlusion)).adjust.occluded_weight == expected
+        assert plan(DynamicsConfig()).adjust.occluded_weight == 1
         assert state_weights(np.array([STATIC, BLOCKED, OCCLUDED]), 3.0).tolist() == [1, 1, 3]
 
 

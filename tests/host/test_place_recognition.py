@@ -21,7 +21,7 @@ from jaxslam.map_edit import with_keyframe, without_keyframe
 from jaxslam.place_index import PlaceIndex
 from jaxslam.place_recognition import Recognition, recognise, verify
 from jaxslam.pose import angle, between
-from jaxslam.slam import track_params
+from jaxslam.track_settings import track_params
 
 ROUND = range(0, FRAMES, 120)
 

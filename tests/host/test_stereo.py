@@ -16,8 +16,9 @@ from jaxslam.errors import CameraError, DatasetError, FrameError
 from jaxslam.evaluation import evaluate
 from jaxslam.features import features_of
 from jaxslam.frame_arrays import FrameMemory, frame_arrays
-from jaxslam.slam import track_params
+from jaxslam.local_mapping import mapping_plan
 from jaxslam.stereo import RoughDepth
+from jaxslam.track_settings import track_params
 
 WIDTH, HEIGHT = 320, 240
 PAIR = Camera("pair", WIDTH, HEIGHT, 300.0, 300.0, 159.5, 119.5, baseline_m=0.2)
@@ -113,6 +114,13 @@ class TestSettings:
         assert params.depth_sigma_per_m2 == pytest.approx(0.6 / 60)
         assert params.depth_sigma_m == 0
         assert params.max_depth_m == pytest.approx(15)
+
+    def test_mapping_takes_the_same(self) -> None:
+        """The map of a pair is adjusted with the noise of its disparity, not with that of a sensor of depth."""
+        adjust = mapping_plan(PAIR, _settings(disparity_sigma_px=0.25)).adjust
+        assert (adjust.depth_sigma_m, adjust.depth_sigma_per_m2) == (0.0, 0.25 / 60)
+        measured = mapping_plan(DEPTH, _settings()).adjust
+        assert (measured.depth_sigma_m, measured.depth_sigma_per_m2) == (0.005, 0.007)
 
     def test_far_depth_of_the_camera_file(self) -> None:
         assert track_params(dataclasses.replace(PAIR, far_depth_m=7.0), _settings().track).max_depth_m == 7

@@ -72,6 +72,11 @@ def test_imports_from_anywhere(environment: Path) -> None:
     assert cameras == known_cameras()
 
 
+def test_is_a_module_too(environment: Path) -> None:
+    python, command = environment / "bin" / "python", environment / "bin" / "jaxslam"
+    assert _run([python, "-m", "jaxslam", "models", "list"], "/") == _run([command, "models", "list"], "/")
+
+
 def test_demo_runs_in_another_folder(environment: Path, tmp_path: Path) -> None:
     printed = _run([environment / "bin" / "jaxslam", "demo", "--frames", "12", "--out", tmp_path / "out"], tmp_path)
     assert "12 of 12" in printed

@@ -28,8 +28,8 @@ from jaxslam.map import NONE, Keyframe, Map, MapPoints, Sightings, empty_map
 from jaxslam.map_edit import with_keyframe, with_points, with_sightings
 from jaxslam.point_states import PointStates
 from jaxslam.pose import between, to_local, transform
-from jaxslam.slam import track_params
 from jaxslam.state import TrackPlan
+from jaxslam.track_settings import track_params
 
 _FLOW_POINTS = 1000
 _SETTLING_STEPS = 20

@@ -1,0 +1,125 @@
+"""The dense map of a crowd: what a keyframe takes on one core, how few points, and how many of them are people.
+
+`pytest -m benchmark -n 0 tests/benchmarks/test_bench_dense.py -s`
+"""
+
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from host.true_surface import accuracy
+
+from jaxslam import Slam, load_config, open_dataset
+from jaxslam.benchmark.timing import pinned_to_one_core
+from jaxslam.datasets import Dataset
+from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
+from jaxslam.datasets.synthetic.camera_path import CameraPathKind
+from jaxslam.frame import to_grey
+from jaxslam.pose import inverse, transform
+from jaxslam.semantics import load_detector
+from jaxslam.trajectory import Trajectory
+
+pytestmark = pytest.mark.benchmark
+
+RUNS = 5
+EVERY, FIRST = 10, 7
+"""Frames that ghosts are looked for in. None has a look at what is not there any more, as every fifth frame does."""
+AT_DEPTH_M, AT_DEPTH_SHARE = 0.03, 0.03
+LK_RATIO = 20 / 14.7
+"""20 ms a keyframe, where OpenCV's flow of 1000 points takes 14.7."""
+
+
+def test_of_a_crowd(data_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    dataset = open_dataset(data_dir / "bonn/rgbd_bonn_crowd")
+    networks = [
+        Path(os.environ.get("JAXSLAM_MODELS") or "nowhere", name)
+        for name in ("yolox_nano.onnx", "deeplabv3_mobilenetv2_voc.onnx")
+    ]
+    if not all(network.is_file() for network in networks):
+        pytest.skip("JAXSLAM_MODELS is not set, or does not hold the networks")
+    finds, segments = networks
+    ratios, shares, ghosts = [], [], []
+    for seed in range(RUNS):
+        settings = ["dense.enabled=true", f"semantics.model={finds}", f"run.seed={seed}"]
+        with Slam(dataset.camera, load_config(overrides=settings)) as slam, pinned_to_one_core():
+            slam.run(dataset)
+            lk_ms = _opencv_flow_ms(dataset)
+            cloud, ms, made = slam.dense, slam.times.ms["dense"], slam.dense_mapping.figures()
+            ghost = _ghosts(cloud.points, dataset, slam.trajectory, segments)
+        ratios.append(np.median(ms) / lk_ms)
+        shares.append(len(cloud.points) / made.measured)
+        ghosts.append(ghost)
+        with capsys.disabled():
+            print(
+                f"\nseed {seed}: {made.keyframes} keyframes, median {np.median(ms):.1f} ms, p95"
+                f" {np.percentile(ms, 95):.1f} ms on one core, OpenCV's flow of 1000 points {lk_ms:.1f} ms;"
+                f" {len(cloud.points)} of {made.measured} points, {100 * shares[-1]:.1f} %, {cloud.megabytes:.1f} MB;"
+                f" ghosts {100 * ghost:.3f} %",
+                flush=True,
+            )
+    assert np.median(ratios) <= LK_RATIO
+    assert max(shares) <= 0.25
+    assert max(ghosts) < 0.005
+
+
+@pytest.mark.parametrize("path", ["xyz", "rpy", "halfsphere"])
+def test_of_a_rendered_room(capsys: pytest.CaptureFixture[str], path: CameraPathKind) -> None:
+    """How near the points are to the true surface, and how much of it is covered, where the camera was tracked."""
+    found = []
+    for seed in range(RUNS):
+        source = SyntheticDataset(SyntheticConfig(frames=60, people=0, path=path, seed=seed))
+        with Slam(source.camera, load_config(overrides=["dense.enabled=true", "semantics.model=null"])) as slam:
+            slam.run(source)
+            assert slam.dense is not None
+            found.append(accuracy(slam.dense.points, source))
+    with capsys.disabled():
+        each = ", ".join(f"{100 * mean_m:.2f} cm {100 * coverage:.1f} %" for mean_m, coverage in found)
+        print(f"\n{path}: mean distance from the surface and coverage, by seed: {each}")
+    assert np.median([mean_m for mean_m, _ in found]) <= 0.015
+    assert np.median([coverage for _, coverage in found]) >= 0.9
+
+
+def _opencv_flow_ms(dataset: Dataset) -> float:
+    """OpenCV's flow of 1000 points between frames of the recording."""
+    times = []
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.03)
+    for index in range(0, 200, 10):
+        before, after = (to_grey(dataset[i].image) for i in (index, index + 1))
+        points = cv2.goodFeaturesToTrack(before, 1000, 0.001, 7)
+        for _ in range(3):
+            began = cv2.getTickCount()
+            cv2.calcOpticalFlowPyrLK(
+                before, after, points, points.copy(), winSize=(21, 21), maxLevel=3, criteria=criteria
+            )
+            times.append(1e3 * (cv2.getTickCount() - began) / cv2.getTickFrequency())
+    return float(np.median(times))
+
+
+def _ghosts(points: np.ndarray, dataset: Dataset, path: Trajectory, segments: Path) -> float:
+    """Share of points that are there because of a person.
+
+    Where one is seen, at its depth, it is more often within a mask of people than outside.
+    """
+    person, camera = load_detector(segments, labels=("person",)), dataset.camera
+    inside, outside = np.zeros(len(points), int), np.zeros(len(points), int)
+    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    for index in range(FIRST, len(dataset), EVERY):
+        row = np.searchsorted(path.timestamps_ns, dataset.timestamps_ns[index])
+        if path.timestamps_ns[min(row, len(path) - 1)] != dataset.timestamps_ns[index]:
+            continue  # it was lost
+        frame, mask = dataset[index], person(dataset[index].image).class_mask
+        X = transform(inverse(path.T_world_cam[row]), points.T.astype(float))
+        ahead = np.flatnonzero(X[2] > 0.1)
+        pixels, _ = cv2.projectPoints(X[:, ahead].T, np.zeros(3), np.zeros(3), K, np.array(camera.distortion))
+        column, line = np.rint(pixels[:, 0].T).astype(int)
+        there = (column >= 0) & (column < camera.width) & (line >= 0) & (line < camera.height)
+        # Far out of the picture, distortion may lead back into it.
+        there &= (np.abs(X[0, ahead]) < X[2, ahead]) & (np.abs(X[1, ahead]) < X[2, ahead])
+        ahead, column, line = ahead[there], column[there], line[there]
+        z = X[2, ahead]
+        seen = np.abs(frame.depth_m[line, column] - z) < AT_DEPTH_M + AT_DEPTH_SHARE * z
+        inside[ahead[seen & mask[line, column]]] += 1
+        outside[ahead[seen & ~mask[line, column]]] += 1
+    return float(np.mean(inside > outside))
