@@ -46,7 +46,10 @@ def test_of_a_crowd(data_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
         with Slam(dataset.camera, load_config(overrides=settings)) as slam, pinned_to_one_core():
             slam.run(dataset)
             lk_ms = _opencv_flow_ms(dataset)
-            cloud, ms, made = slam.dense, slam.times.ms["dense"], slam.dense_mapping.figures()
+            cloud, ms = slam.dense, slam.times.ms["dense"]
+            assert cloud is not None
+            assert slam.dense_mapping is not None
+            made = slam.dense_mapping.figures()
             ghost = _ghosts(cloud.points, dataset, slam.trajectory, segments)
         ratios.append(np.median(ms) / lk_ms)
         shares.append(len(cloud.points) / made.measured)
@@ -109,7 +112,10 @@ def _ghosts(points: np.ndarray, dataset: Dataset, path: Trajectory, segments: Pa
         row = np.searchsorted(path.timestamps_ns, dataset.timestamps_ns[index])
         if path.timestamps_ns[min(row, len(path) - 1)] != dataset.timestamps_ns[index]:
             continue  # it was lost
-        frame, mask = dataset[index], person(dataset[index].image).class_mask
+        frame = dataset[index]
+        depth_m, mask = frame.depth_m, person(frame.image).class_mask
+        assert depth_m is not None
+        assert mask is not None
         X = transform(inverse(path.T_world_cam[row]), points.T.astype(float))
         ahead = np.flatnonzero(X[2] > 0.1)
         pixels, _ = cv2.projectPoints(X[:, ahead].T, np.zeros(3), np.zeros(3), K, np.array(camera.distortion))
@@ -119,7 +125,7 @@ def _ghosts(points: np.ndarray, dataset: Dataset, path: Trajectory, segments: Pa
         there &= (np.abs(X[0, ahead]) < X[2, ahead]) & (np.abs(X[1, ahead]) < X[2, ahead])
         ahead, column, line = ahead[there], column[there], line[there]
         z = X[2, ahead]
-        seen = np.abs(frame.depth_m[line, column] - z) < AT_DEPTH_M + AT_DEPTH_SHARE * z
+        seen = np.abs(depth_m[line, column] - z) < AT_DEPTH_M + AT_DEPTH_SHARE * z
         inside[ahead[seen & mask[line, column]]] += 1
         outside[ahead[seen & ~mask[line, column]]] += 1
     return float(np.mean(inside > outside))

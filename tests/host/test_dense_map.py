@@ -247,10 +247,10 @@ def test_key_objects_are_dense() -> None:
     source, frames = _room(people=0)
     box = np.array([[120, 90, 200, 160]], np.float32)
     found = Detections(box, np.ones(1, np.float32), ("book",), None, None)
-    dense = _mapping(source, SMALL, lambda image: found)
+    dense = _mapping(source, replace(SMALL, key_window=EVERY), lambda image: found)
     dense.frame_tracked(0, frames[0].rgb, _arrays(frames[0]), _tracked_at(frames[0].T_world_cam))
-    _hand_over(dense, 0, frames[0])
-    dense.map_made(_map(source, [frames[0].T_world_cam]), 0, 0)
+    _hand_over(dense, 1, frames[1])
+    dense.map_made(_map(source, [frame.T_world_cam for frame in frames[:2]]), 1, 0)
     dense.finish()
     cloud = dense.cloud()
     keys, others = cloud.points[cloud.is_key], cloud.points[~cloud.is_key]
