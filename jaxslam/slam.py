@@ -20,6 +20,7 @@ from jaxslam.config import Config
 from jaxslam.datasets import Dataset, prefetch
 from jaxslam.datasets.realtime import in_real_time
 from jaxslam.dense.cloud import DenseCloud
+from jaxslam.dense.dense_map import DenseMap
 from jaxslam.dense.mapping import DenseMapping
 from jaxslam.detector_choice import detector_of, key_detector_of
 from jaxslam.dynamic_masks import DynamicMasks, FrameMask, MaskSource
@@ -387,15 +388,15 @@ class Slam:
         """What makes the dense map, if the settings ask for one and the map may grow."""
         if not self.config.dense.enabled or self._localize_only:
             return None
-        return DenseMapping(
+        dense_map = DenseMap(
             self.camera,
             self.config.dense,
             nearest_m=float(self._params.min_depth_m),
             farthest_m=float(self._params.max_depth_m),
-            deterministic=self.config.run.in_turn,
             key_detector=self._key_detector,
             times=self.times,
         )
+        return DenseMapping(dense_map, self.config.dense, deterministic=self.config.run.in_turn)
 
     def _fresh_state(self) -> TrackState:
         return _new_state(self.camera.height, self.camera.width, self._plan, seed=self.config.run.seed)

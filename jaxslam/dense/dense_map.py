@@ -102,6 +102,7 @@ class DenseMap:
 
     Attributes:
         sparse: Where keyframes are; to be replaced when they have moved.
+        has_keys: Whether key objects are kept at full density.
     """
 
     def __init__(
@@ -137,6 +138,7 @@ class DenseMap:
             fine_m = _KEY_SHARE * voxel_m
             self._keys = VoxelLayer(config.key_points, config.keyframe_points, _KEY_POINTS, fine_m, farthest_m)
             self._whole = View(camera, 1, farthest_m, nearest_m)
+        self.has_keys = key_detector is not None
         self._layers = [self._layer] if self._keys is None else [self._layer, self._keys]
         self._stereo = DenseDepth(camera) if camera.is_stereo else None
         self._key_detector = key_detector
@@ -170,7 +172,7 @@ class DenseMap:
             watch.ends("dense: carve")
         self._put_in(self._layer, shown.keyframe, part, poses, watch)
         self._put += 1
-        self._move_most_moved(poses)
+        self._move(poses, self._config.corrections)
         self._bound()
         watch.ends("dense: move")
         total.ends("dense")
@@ -196,7 +198,7 @@ class DenseMap:
 
     def correct(self) -> None:
         """Move the points of some keyframes that have moved, those that have moved by most."""
-        self._move_most_moved(self._kept.poses(self.sparse))
+        self._move(self._kept.poses(self.sparse), self._config.corrections)
 
     def correct_all(self) -> None:
         """Move the points of all keyframes to where the sparse map has them."""
@@ -211,13 +213,16 @@ class DenseMap:
         is_key = np.arange(len(points)) >= len(shown[0][0])
         return DenseCloud(points, colours, counts, is_key, self._layer.voxel_m)
 
-    def cells(self) -> Occupancy:
-        """What is occupied and free, by all keyframes that are kept.
+    def depths(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Depth of the keyframes that are kept, and where it was taken, for `cells`."""
+        return self._kept.shown(self._kept.poses(self.sparse))
+
+    def cells(self, depths: list[np.ndarray], poses: list[np.ndarray]) -> Occupancy:
+        """What is occupied and free, by depth images and their poses; from any thread.
 
         Raises:
             MapFileError: If there is none yet.
         """
-        depths, poses = self._kept.shown(self._kept.poses(self.sparse))
         if not depths:
             raise MapFileError("octree: expected at least one keyframe with depth in the dense map, got none")
         return occupancy(depths, np.stack(poses), self._small.rays, self._cell_m)
@@ -279,9 +284,6 @@ class DenseMap:
         self._measured += X.shape[1] - parts[0][0].shape[1]
         self._put_in(keys, shown.keyframe, keys.reduce(*_sampled(X, colours)), poses, self._times.stopwatch())
         watch.ends("dense: key objects")
-
-    def _move_most_moved(self, poses: Poses) -> None:
-        self._move(poses, self._config.corrections)
 
     def _move(self, poses: Poses, at_most: int) -> int:
         """Move the points of keyframes that have moved by most; gives how many were."""

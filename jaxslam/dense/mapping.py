@@ -10,7 +10,6 @@ from typing import TypeAlias
 
 import numpy as np
 
-from jaxslam.camera import Camera
 from jaxslam.config import DenseConfig
 from jaxslam.dense.cloud import DenseCloud
 from jaxslam.dense.dense_map import DenseFigures, DenseMap, Look, Shown
@@ -22,8 +21,6 @@ from jaxslam.map import NONE, Map
 from jaxslam.map_link import pose_of
 from jaxslam.map_movers import Movers
 from jaxslam.pose import IDENTITY, moved
-from jaxslam.semantics import Detector
-from jaxslam.stage_times import StageTimes
 from jaxslam.state import TrackOutput
 from jaxslam.worker import Worker, make_worker
 
@@ -43,33 +40,16 @@ class DenseMapping:
     All but `cloud`, `cells` and `figures` is called from the tracker's thread.
     """
 
-    def __init__(
-        self,
-        camera: Camera,
-        config: DenseConfig,
-        *,
-        nearest_m: float,
-        farthest_m: float,
-        deterministic: bool,
-        key_detector: Detector | None = None,
-        times: StageTimes | None = None,
-    ) -> None:
-        """Begin empty.
+    def __init__(self, map: DenseMap, config: DenseConfig, *, deterministic: bool) -> None:
+        """Begin.
 
         Args:
-            camera: That takes the frames.
-            config: Settings.
-            nearest_m: Nearest depth believed.
-            farthest_m: Farthest.
+            map: Empty; from now on nobody else's.
+            config: Settings that it was made with.
             deterministic: Work in turn; else in a thread.
-            key_detector: Finds key objects.
-            times: Where to keep how long it takes.
         """
-        self._carves = config.carve
-        self._map = DenseMap(
-            camera, config, nearest_m=nearest_m, farthest_m=farthest_m, key_detector=key_detector, times=times
-        )
-        self._neighbours = None if key_detector is None else Neighbours(config.key_window, config.key_frames)
+        self._map, self._carves = map, config.carve
+        self._neighbours = Neighbours(config.key_window, config.key_frames) if map.has_keys else None
         self._on_the_way: dict[int, Shown] = {}
         self._waiting: deque[_Job] = deque()
         self._lock, self._waiting_lock = threading.Lock(), threading.Lock()
@@ -153,7 +133,8 @@ class DenseMapping:
             MapFileError: If there is none yet.
         """
         with self._lock:
-            return self._map.cells()
+            depths, poses = self._map.depths()
+        return self._map.cells(depths, poses)
 
     @property
     def sees_anything(self) -> bool:

@@ -12,11 +12,11 @@ import pytest
 from host.true_surface import accuracy
 
 from jaxslam import Slam, load_config, open_dataset
+from jaxslam.benchmark.job import flow_time_ms
 from jaxslam.benchmark.timing import pinned_to_one_core
 from jaxslam.datasets import Dataset
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.datasets.synthetic.camera_path import CameraPathKind
-from jaxslam.frame import to_grey
 from jaxslam.pose import inverse, transform
 from jaxslam.semantics import load_detector
 from jaxslam.trajectory import Trajectory
@@ -40,17 +40,18 @@ def test_of_a_crowd(data_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
     if not all(network.is_file() for network in networks):
         pytest.skip("JAXSLAM_MODELS is not set, or does not hold the networks")
     finds, segments = networks
+    people = _people(dataset, segments)
     ratios, shares, ghosts = [], [], []
     for seed in range(RUNS):
         settings = ["dense.enabled=true", f"semantics.model={finds}", f"run.seed={seed}"]
         with Slam(dataset.camera, load_config(overrides=settings)) as slam, pinned_to_one_core():
             slam.run(dataset)
-            lk_ms = _opencv_flow_ms(dataset)
+            lk_ms = flow_time_ms(dataset)
             cloud, ms = slam.dense, slam.times.ms["dense"]
             assert cloud is not None
             assert slam.dense_mapping is not None
             made = slam.dense_mapping.figures()
-            ghost = _ghosts(cloud.points, dataset, slam.trajectory, segments)
+            ghost = _ghosts(cloud.points, dataset, slam.trajectory, people)
         ratios.append(np.median(ms) / lk_ms)
         shares.append(len(cloud.points) / made.measured)
         ghosts.append(ghost)
@@ -84,38 +85,29 @@ def test_of_a_rendered_room(capsys: pytest.CaptureFixture[str], path: CameraPath
     assert np.median([coverage for _, coverage in found]) >= 0.9
 
 
-def _opencv_flow_ms(dataset: Dataset) -> float:
-    """OpenCV's flow of 1000 points between frames of the recording."""
-    times = []
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.03)
-    for index in range(0, 200, 10):
-        before, after = (to_grey(dataset[i].image) for i in (index, index + 1))
-        points = cv2.goodFeaturesToTrack(before, 1000, 0.001, 7)
-        for _ in range(3):
-            began = cv2.getTickCount()
-            cv2.calcOpticalFlowPyrLK(
-                before, after, points, points.copy(), winSize=(21, 21), maxLevel=3, criteria=criteria
-            )
-            times.append(1e3 * (cv2.getTickCount() - began) / cv2.getTickFrequency())
-    return float(np.median(times))
+def _people(dataset: Dataset, segments: Path) -> dict[int, np.ndarray]:
+    """Masks of people in frames that ghosts are looked for in."""
+    person, masks = load_detector(segments, labels=("person",)), {}
+    for index in range(FIRST, len(dataset), EVERY):
+        masks[index] = person(dataset[index].image).class_mask
+        assert masks[index] is not None
+    return masks
 
 
-def _ghosts(points: np.ndarray, dataset: Dataset, path: Trajectory, segments: Path) -> float:
+def _ghosts(points: np.ndarray, dataset: Dataset, path: Trajectory, people: dict[int, np.ndarray]) -> float:
     """Share of points that are there because of a person.
 
     Where one is seen, at its depth, it is more often within a mask of people than outside.
     """
-    person, camera = load_detector(segments, labels=("person",)), dataset.camera
+    camera = dataset.camera
     inside, outside = np.zeros(len(points), int), np.zeros(len(points), int)
     K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-    for index in range(FIRST, len(dataset), EVERY):
+    for index, mask in people.items():
         row = np.searchsorted(path.timestamps_ns, dataset.timestamps_ns[index])
         if path.timestamps_ns[min(row, len(path) - 1)] != dataset.timestamps_ns[index]:
             continue  # it was lost
-        frame = dataset[index]
-        depth_m, mask = frame.depth_m, person(frame.image).class_mask
+        depth_m = dataset[index].depth_m
         assert depth_m is not None
-        assert mask is not None
         X = transform(inverse(path.T_world_cam[row]), points.T.astype(float))
         ahead = np.flatnonzero(X[2] > 0.1)
         pixels, _ = cv2.projectPoints(X[:, ahead].T, np.zeros(3), np.zeros(3), K, np.array(camera.distortion))

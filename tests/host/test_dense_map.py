@@ -16,6 +16,7 @@ from true_surface import accuracy, true_surface
 from jaxslam.config import Config, DenseConfig, load_config
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.datasets.synthetic.dataset import SyntheticFrame
+from jaxslam.dense.dense_map import DenseMap
 from jaxslam.dense.mapping import DenseMapping
 from jaxslam.dense.picture import picture
 from jaxslam.dense.results import DENSE_FILES
@@ -41,8 +42,11 @@ def _room(people: int, frames: int = 10) -> tuple[SyntheticDataset, tuple[Synthe
     return source, tuple(source.render(EVERY * index) for index in range(frames))
 
 
-def _mapping(source: SyntheticDataset, config: DenseConfig = SMALL, detector=None) -> DenseMapping:
-    return DenseMapping(source.camera, config, nearest_m=0.3, farthest_m=6.0, deterministic=True, key_detector=detector)
+def _mapping(
+    source: SyntheticDataset, config: DenseConfig = SMALL, detector=None, *, deterministic: bool = True
+) -> DenseMapping:
+    dense_map = DenseMap(source.camera, config, nearest_m=0.3, farthest_m=6.0, key_detector=detector)
+    return DenseMapping(dense_map, config, deterministic=deterministic)
 
 
 def _map(source: SyntheticDataset, poses: list[np.ndarray]) -> Map:
@@ -206,7 +210,7 @@ class TestBounds:
     def test_looks_wait_too(self) -> None:
         """Looks of frames between keyframes stand before keyframes that are passed over."""
         source, frames = _room(people=0)
-        dense = DenseMapping(source.camera, SMALL, nearest_m=0.3, farthest_m=6.0, deterministic=False)
+        dense = _mapping(source, deterministic=False)
         with dense._lock:
             _look(dense, frames[0])
             for index in range(12):
@@ -218,7 +222,7 @@ class TestBounds:
 
     def test_late_thread_passes_keyframes_over(self) -> None:
         source, frames = _room(people=0)
-        dense = DenseMapping(source.camera, SMALL, nearest_m=0.3, farthest_m=6.0, deterministic=False)
+        dense = _mapping(source, deterministic=False)
         with dense._lock:  # it is held up
             for index in range(20):
                 _hand_over(dense, index, frames[index % len(frames)])
