@@ -3,6 +3,8 @@
 All sixteen scenes, in full size: `tests/benchmarks/test_bench_dynamic_scenes.py`.
 """
 
+from statistics import median
+
 import pytest
 from dynamic_scenes import errors, scene
 
@@ -11,6 +13,10 @@ from jaxslam.datasets.synthetic.camera_path import CameraPathKind
 
 FRAMES, WIDTH, HEIGHT = 60, 320, 240
 OVERRIDES = ("track.cell_px=12",)  # for a small image
+ROOMS = 3
+"""How much people harm is a matter of where they happen to walk: `static` errs by 18, 157 and 245 mm in those of
+`halfsphere`, and the tracker itself by 2 to 4 mm in so small an image, by 4.2 or less than 3.5 as the CPU rounds. No
+single room shows it."""
 LATE_RATIO, STATIC_RATIO = 1.3, 5.0
 SCENES: list[tuple[CameraPathKind, int]] = [("xyz", 2), ("rpy", 3), ("halfsphere", 1)]
 """Some of those where `static` fails."""
@@ -18,9 +24,13 @@ SCENES: list[tuple[CameraPathKind, int]] = [("xyz", 2), ("rpy", 3), ("halfsphere
 
 @pytest.mark.parametrize(("path", "people"), SCENES)
 def test_late_masks_are_as_good(path: CameraPathKind, people: int) -> None:
-    found = errors(
-        scene(SyntheticConfig(frames=FRAMES, width=WIDTH, height=HEIGHT, path=path, people=people)), OVERRIDES
-    )
-    print(found)
-    assert found.late_ratio <= LATE_RATIO
-    assert found.static_ratio >= STATIC_RATIO
+    found = [
+        errors(
+            scene(SyntheticConfig(frames=FRAMES, width=WIDTH, height=HEIGHT, path=path, people=people, seed=room)),
+            OVERRIDES,
+        )
+        for room in range(ROOMS)
+    ]
+    print(*found, sep="\n")
+    assert max(room.late_ratio for room in found) <= LATE_RATIO
+    assert median(room.static_ratio for room in found) >= STATIC_RATIO
