@@ -13,7 +13,7 @@ from jaxslam.errors import ConfigError, FrameError
 from jaxslam.frame_arrays import FrameArrays
 from jaxslam.state import TrackParams, TrackPlan, TrackState
 from jaxslam.track import DEFAULT_PLAN, init_state, track_step
-from jaxslam.xla import IN_ITS_THREAD
+from jaxslam.xla import IN_ITS_THREAD, SOON_COMPILED
 
 
 class TrackedClips(NamedTuple):
@@ -112,7 +112,7 @@ def _new_states(
 
 
 # In its thread: for a batch as fast as without, and programs in several threads do not wait for each other's parts.
-@partial(jax.jit, static_argnames="plan", donate_argnums=0, compiler_options=IN_ITS_THREAD)
+@partial(jax.jit, static_argnames="plan", donate_argnums=0, compiler_options=SOON_COMPILED | IN_ITS_THREAD)
 def _step(
     states: TrackState, frames: FrameArrays, params: TrackParams, plan: TrackPlan
 ) -> tuple[TrackState, tuple[Array, Array]]:

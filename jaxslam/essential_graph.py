@@ -3,6 +3,7 @@
 Source: Mur-Artal and Tardos, "ORB-SLAM2", 2017, section III-C, for the edges: tree, strong covisibility, loops.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -14,6 +15,7 @@ from jaxslam_kernels.pose_graph_cost import PoseGraphEdges
 from jaxslam.map import NONE, Map, has, rows, visibility
 from jaxslam.padding import padded
 from jaxslam.pose import IDENTITY, angle, between
+from jaxslam.xla import SOON_COMPILED
 
 _STRONG = 100
 """Points in common from which covisible keyframes are tied (ORB-SLAM's essential graph)."""
@@ -122,7 +124,7 @@ def _solved(graph: _Graph, poses: np.ndarray, fixed: np.ndarray) -> Any:
     return solved._replace(chi2=solved.chi2[:num_edges])
 
 
-@jax.jit
+@partial(jax.jit, compiler_options=SOON_COMPILED)
 def _optimise(T_world_cam: SE3, edges: PoseGraphEdges, fixed: Any, mask: Any, rank: Any) -> Any:
     return optimise_pose_graph(T_world_cam, edges, fixed, mask=mask, rank=rank, loss="squared", max_steps=30)
 

@@ -7,6 +7,7 @@ see `jaxslam_kernels.segments`.
 
 import math
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -27,6 +28,7 @@ from jaxslam_kernels.segments import KITTI_LENGTHS_M, KITTI_STEP, SegmentErrors,
 from jaxslam.errors import TrajectoryError, nearest
 from jaxslam.rotation import matrices
 from jaxslam.trajectory import Trajectory, associate
+from jaxslam.xla import SOON_COMPILED
 
 _NAMES: dict[AlignmentKind, str] = {
     "none": "without alignment",
@@ -243,7 +245,7 @@ def _errors(estimate: Trajectory, truth: np.ndarray, align: AlignmentKind, delta
         return jax.tree.map(np.asarray, errors)
 
 
-@jax.jit
+@partial(jax.jit, compiler_options=SOON_COMPILED)
 def _padded_errors(P: jax.Array, Q: jax.Array, mask: jax.Array, later: jax.Array, scaled: jax.Array) -> _Errors:
     """All alignments at once: one compilation serves them all."""
     x, y, weights = P[:, 4:].T, Q[:, 4:].T, mask.astype(P.dtype)

@@ -1,5 +1,6 @@
 """The pose of an image from points found among its features, if enough of them agree on one."""
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -15,6 +16,7 @@ from jaxslam.features import FeaturePlan, Features
 from jaxslam.observe import depth_sigma
 from jaxslam.padding import padded
 from jaxslam.state import TrackParams
+from jaxslam.xla import SOON_COMPILED
 
 MIN_INLIERS = 30
 """Fewest features that agree in the end."""
@@ -158,7 +160,7 @@ def _cells(uv: np.ndarray, params: TrackParams) -> int:
     return np.unique(np.floor((uv - centre) / (_CELL * focal)), axis=1).shape[1]
 
 
-@jax.jit
+@partial(jax.jit, compiler_options=SOON_COMPILED)
 def _refined(T_origin_cam: SE3, matches: Matches, params: TrackParams) -> PoseRefinement:
     return refine_pose(
         T_origin_cam,

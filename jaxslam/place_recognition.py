@@ -1,6 +1,7 @@
 """Recognising a place: where an image was taken, relative to a keyframe that shows the same place."""
 
 from collections.abc import Set
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -17,6 +18,7 @@ from jaxslam.matching import hamming_pairs, match_by_projection, match_descripto
 from jaxslam.place_index import PlaceIndex
 from jaxslam.pose import IDENTITY, to_local
 from jaxslam.state import TrackParams
+from jaxslam.xla import SOON_COMPILED
 
 MIN_AGREEING = 12
 """Fewest matches of descriptors alone that agree on a pose."""
@@ -149,7 +151,7 @@ def _matches(
     return matches_of(X, source.depth[then], features, now, plan, capacity=capacity)
 
 
-@jax.jit
+@partial(jax.jit, compiler_options=SOON_COMPILED)
 def _agreed(key: Key[Array, ""], matches: Matches, params: TrackParams) -> PnpResult:
     return ransac_pnp(
         key,

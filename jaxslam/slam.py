@@ -43,7 +43,7 @@ from jaxslam.track_settings import track_params, track_plan, with_dense_keyframe
 from jaxslam.tracked import FrameRecord, Rejected, Tracked, tracked_of
 from jaxslam.trajectory import PathLike, Trajectory
 from jaxslam.worker import Worker, make_worker
-from jaxslam.xla import IN_ITS_THREAD, enable_compile_cache
+from jaxslam.xla import IN_ITS_THREAD, SOON_COMPILED, enable_compile_cache
 
 _log = logging.getLogger(__name__)
 
@@ -62,7 +62,7 @@ _new_state = jax.jit(init_state, static_argnames=("height", "width", "plan"))
 _follow_points = jax.jit(follow_points, static_argnames="plan", compiler_options=IN_ITS_THREAD)
 
 
-@partial(jax.jit, static_argnames="plan", donate_argnums=0)
+@partial(jax.jit, static_argnames="plan", donate_argnums=0, compiler_options=SOON_COMPILED)
 def _track_followed(
     state: TrackState, frame: FrameArrays, followed: Followed, params: TrackParams, plan: TrackPlan
 ) -> tuple[TrackState, TrackOutput]:

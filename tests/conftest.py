@@ -18,6 +18,19 @@ _FOR_ALL = (
 )
 
 
+_OLDER_GENERATOR = "--xla_cpu_use_fusion_emitters=false"
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Tests compile more than they compute: XLA's older generator of code, which the tracker is compiled by, for all.
+
+    Half of the time is for compiling even so. Benchmarks have kernels as users have them.
+    """
+    flags = os.environ.get("XLA_FLAGS", "")
+    if config.option.markexpr == "not benchmark" and _OLDER_GENERATOR not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} {_OLDER_GENERATOR}".strip()
+
+
 def pytest_sessionstart() -> None:
     """Every program is compiled once for all processes: those of pytest, and those that tests start.
 
