@@ -215,7 +215,9 @@ def test_too_little_to_be_certain(round_map, monkeypatch):
 
 def test_compiles_once(round_map, monkeypatch):
     for module, name in ((place_recognition, "_agreed"), (feature_pose, "_refined")):
-        monkeypatch.setattr(module, name, jax.jit(eqx.debug.assert_max_traces(getattr(module, name), max_traces=1)))
+        monkeypatch.setattr(
+            module, name, jax.jit(eqx.debug.assert_max_traces(getattr(module, name).__wrapped__, max_traces=1))
+        )
     found = [verify(round_map.keyframes[0], features(index), params()) for index in (0, 10)]
     assert all(found)
 
