@@ -38,6 +38,7 @@ def pytest_sessionstart() -> None:
     """
     from jaxslam.xla import enable_compile_cache  # noqa: PLC0415 - what is imported before this gets no type checks
 
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # a small one is loaded in a tenth of its time
     enable_compile_cache()
     for name in _FOR_ALL:
         os.environ[name.upper()] = str(jax.config.values[name])

@@ -18,6 +18,18 @@ WARM_UP = 10
 CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.03)
 
 
+def flow_ms(before: np.ndarray, after: np.ndarray, corners: np.ndarray) -> float:
+    """Milliseconds that OpenCV takes to follow corners from one grey image to the next, with both pyramids."""
+    at = time.perf_counter()
+    cv2.calcOpticalFlowPyrLK(before, after, corners, corners.copy(), winSize=(21, 21), maxLevel=3, criteria=CRITERIA)
+    return 1e3 * (time.perf_counter() - at)
+
+
+def corners_of(image: np.ndarray) -> np.ndarray:
+    """A thousand corners to follow, of a colour or grey image."""
+    return cv2.goodFeaturesToTrack(to_grey(image), 1000, 0.001, 7)
+
+
 class Run(NamedTuple):
     """One live run: milliseconds of every frame, ours and OpenCV's, which frames were kept, and the error."""
 
@@ -52,8 +64,7 @@ def part_of(folder: Path, frames: range, rate_hz: float = 30.0) -> Recording:
     """Some frames of a recording."""
     dataset = open_dataset(folder)
     read = [dataset[index] for index in frames]
-    corners = [cv2.goodFeaturesToTrack(to_grey(frame.image), 1000, 0.001, 7) for frame in read]
-    return Recording(dataset, read, corners, rate_hz)
+    return Recording(dataset, read, [corners_of(frame.image) for frame in read], rate_hz)
 
 
 def live_run(recording: Recording, model: Path | None = None, detector: Detector | None = None) -> Run:
@@ -72,9 +83,7 @@ def live_run(recording: Recording, model: Path | None = None, detector: Detector
             time.sleep(max(0.0, began + index / rate_hz - time.perf_counter()))
             old = corners[max(index - 1, 0)]
             tracked = slam.track(frames[index]) if index % 2 else None
-            at = time.perf_counter()
-            cv2.calcOpticalFlowPyrLK(before, after, old, old.copy(), winSize=(21, 21), maxLevel=3, criteria=CRITERIA)
-            theirs.append(1e3 * (time.perf_counter() - at))
+            theirs.append(flow_ms(before, after, old))
             tracked = tracked or slam.track(frames[index])
             assert not tracked.detector_error
             ours.append(tracked.track_ms)
