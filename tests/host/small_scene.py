@@ -30,8 +30,6 @@ TRACK = TrackConfig(
 )
 CONFIG = Config(track=TRACK)
 PLAN = track_plan(TRACK)
-QUICK_COMPILE: dict[str, str | bool] = {"xla_backend_optimization_level": "0"}
-"""Options of `jax.jit` for what runs a few times only: half the time to compile, the same arithmetic."""
 
 
 class Clip:

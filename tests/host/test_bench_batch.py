@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from command_line import failing
 from PIL import Image
-from small_scene import HEIGHT, QUICK_COMPILE, TRACK, WIDTH
+from quick_compile import quick_compile
+from small_scene import HEIGHT, TRACK, WIDTH
 
 import jaxslam.batch as track_batch
 from jaxslam.batch import TrackedClips, track_clips
@@ -34,8 +35,8 @@ FILES = {"batch.json", "batch.md", "batch.png"}
 @pytest.fixture(scope="module", autouse=True)
 def small_programs() -> Iterator[None]:
     """Compiling is what these tests cost; all of them use the programs that the command makes, of two clips and one."""
-    together = jax.jit(inspect.unwrap(track_batch._step), static_argnames="plan", compiler_options=QUICK_COMPILE)
-    by_itself = jax.jit(track_step, static_argnames="plan", compiler_options=QUICK_COMPILE)
+    together = quick_compile(inspect.unwrap(track_batch._step), static_argnames="plan")
+    by_itself = quick_compile(track_step, static_argnames="plan")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(track_batch, "_step", together)
         patch.setattr(batch, "_step_alone", by_itself)

@@ -5,7 +5,6 @@ import io
 import json
 import os
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 from command_line import failing
 from PIL import Image
+from quick_compile import quick_compile
 
 from jaxslam.benchmark.kernels import case as case_module
 from jaxslam.benchmark.kernels.cases import CASES, chosen
@@ -32,9 +32,6 @@ SMALL = (
     "cue_occlusion",
 )  # fmt: skip
 """What else is compared here, once and at its smallest size."""
-
-# Compiling is what these tests cost; the code LLVM leaves as it is runs as correctly.
-_compile = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +93,7 @@ def test_results_agree(name: str) -> None:
     if (absent := case.missing()) is not None:
         pytest.skip(f"{absent} is not installed")
     problem = case.problem(case.sizes[0])
-    program = _compile(problem.ours) if problem.compile is None else problem.ours
+    program = quick_compile(problem.ours) if problem.compile is None else problem.ours
     ours, theirs = program(*problem.arguments), problem.theirs(*problem.prepare())
     assert problem.difference(ours, theirs) <= case.limit
     other = jax.tree.map(lambda x: 1.1 * x + 1 if np.issubdtype(x.dtype, np.floating) else x, ours)

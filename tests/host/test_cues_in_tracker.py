@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_scene import PLAN, QUICK_COMPILE, TRACK, WIDTH, at, clip, new_state, params, stacked
+from quick_compile import quick_compile
+from small_scene import PLAN, TRACK, WIDTH, at, clip, new_state, params, stacked
 
 from jaxslam.config import Config, DynamicsConfig, load_config
 from jaxslam.dynamics.cue import Scene, Verdict, judge
@@ -19,7 +20,7 @@ from jaxslam.state import TrackOutput, TrackPlan, TrackState, TrackStatus
 from jaxslam.track import track_step
 
 FRAMES = 6
-_step = jax.jit(track_step, static_argnames="plan", compiler_options=QUICK_COMPILE)
+_step = quick_compile(track_step, static_argnames="plan")
 
 
 def left_of(scene: Scene, limit_px: Any) -> Verdict:
@@ -117,7 +118,7 @@ class TestSettings:
             frames, state = stacked(clip(1).frames[:FRAMES], np.float64, np.float64), new_state(np.float64, np.float64)
             given = with_cue_params(params(np.float64), config, np.float64)
             (chosen,) = given.cues
-            step = jax.jit(track_step, static_argnames="plan", compiler_options=QUICK_COMPILE)
+            step = quick_compile(track_step, static_argnames="plan")
             for index in range(FRAMES - 1):
                 state, _ = step(state, at(frames, index), given, plan=plan)
 
@@ -126,8 +127,8 @@ class TestSettings:
                 return track_step(state, at(frames, FRAMES - 1), changed, plan)[1].T_world_cam.translation()[2]
 
             at_m, step_m = jnp.asarray(0.02), 1e-4  # with 1e-5 the refinement stops a step earlier on one side
-            slope = float(jax.jit(jax.grad(ahead), compiler_options=QUICK_COMPILE)(at_m))
-            value = jax.jit(ahead, compiler_options=QUICK_COMPILE)
+            slope = float(quick_compile(jax.grad(ahead))(at_m))
+            value = quick_compile(ahead)
             difference = float(value(at_m + step_m) - value(at_m - step_m)) / (2 * step_m)
         assert abs(slope) > 0
         assert slope == pytest.approx(difference, rel=1e-3)

@@ -10,7 +10,7 @@ import pytest
 from cue_scenes import MOTIONS, N, check_finite, moves, scene
 from jaxslam_kernels.camera import project, undistort_pixels
 from jaxslam_kernels.transform import to_camera
-from small_scene import QUICK_COMPILE
+from quick_compile import quick_compile
 
 from jaxslam.dynamics.cue import Scene
 from jaxslam.dynamics.epipolar import EpipolarParams, make_epipolar_cue
@@ -120,7 +120,7 @@ class TestCue:
             found = small(given._replace(uv=uv), params(temperature=0.4)._replace(limit_px=limit_px))
             return jnp.sum(found.weight * jnp.linspace(1, 2, N))
 
-        at = jax.jit(jax.value_and_grad(total, argnums=(0, 1)), compiler_options=QUICK_COMPILE)
+        at = quick_compile(jax.value_and_grad(total, argnums=(0, 1)))
         limit_px, step = jnp.array(1.0), 1e-6
         _, (by_limit, by_uv) = at(limit_px, given.uv)
         assert np.isfinite(by_uv).all()

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from jax import lax
 from jaxtyping import Array
-from small_scene import PLAN, QUICK_COMPILE, Clip, at, clip, new_state, params, stacked, truth_from_start
+from quick_compile import quick_compile
+from small_scene import PLAN, Clip, at, clip, new_state, params, stacked, truth_from_start
 
 from jaxslam.frame_arrays import FrameArrays
 from jaxslam.state import TrackState
@@ -72,7 +73,7 @@ def problem() -> Iterator[Problem]:
 def _problem(recording: Clip) -> Problem:
     frames = stacked(recording.frames[: BEFORE + STEPS], np.float64, np.float64)
     given = params(np.float64)._replace(readout_s=jnp.asarray(0.005))
-    step = jax.jit(track_step, static_argnums=3, compiler_options=QUICK_COMPILE)
+    step = quick_compile(track_step, static_argnums=3)
     state = new_state(np.float64, np.float64)
     for index in range(BEFORE):
         state, _ = step(state, at(frames, index), given, EXACT)
@@ -109,10 +110,9 @@ def _problem(recording: Clip) -> Problem:
         readout_s=given.readout_s,
         image=jnp.zeros(()),
     )
-    compiled = lambda function: jax.jit(function, compiler_options=QUICK_COMPILE)
-    gradient = compiled(jax.grad(loss))(inputs)
-    forward = compiled(lambda direction: jax.jvp(loss, (inputs,), (direction,))[1])
-    return Problem(inputs, gradient, compiled(loss), forward, state.points.valid)
+    gradient = quick_compile(jax.grad(loss))(inputs)
+    forward = quick_compile(lambda direction: jax.jvp(loss, (inputs,), (direction,))[1])
+    return Problem(inputs, gradient, quick_compile(loss), forward, state.points.valid)
 
 
 class TestGradient:

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
-from small_scene import HEIGHT, PLAN, QUICK_COMPILE, TRACK, WIDTH, at, clip, new_state, params, stacked
+from quick_compile import quick_compile
+from small_scene import HEIGHT, PLAN, TRACK, WIDTH, at, clip, new_state, params, stacked
 
 from jaxslam.config import Config, DynamicsConfig, SemanticsConfig, load_config
 from jaxslam.frame_arrays import FrameArrays
@@ -37,7 +38,7 @@ class Counted:
 
     def __init__(self) -> None:
         self.traces = 0
-        self.step: Step = jax.jit(self._trace, compiler_options=QUICK_COMPILE)
+        self.step: Step = quick_compile(self._trace)
 
     def _trace(self, state: TrackState, frame: FrameArrays, params: TrackParams) -> tuple[TrackState, TrackOutput]:
         self.traces += 1
@@ -130,9 +131,8 @@ class TestCompiled:
 
     def test_scan_equals_loop(self, counted: Counted, frames: FrameArrays) -> None:
         _, outputs = track(counted.step, frames)
-        scan = jax.jit(
-            lambda state, frames, given: lax.scan(lambda s, f: track_step(s, f, given, PLAN), state, frames),
-            compiler_options=QUICK_COMPILE,
+        scan = quick_compile(
+            lambda state, frames, given: lax.scan(lambda s, f: track_step(s, f, given, PLAN), state, frames)
         )
         state, scanned = scan(new_state(), frames, params())
         assert described(state) == described(new_state())
@@ -140,9 +140,7 @@ class TestCompiled:
 
     def test_vmap_equals_loop(self, counted: Counted, frames: FrameArrays) -> None:
         """Two recordings side by side, one of them a frame ahead."""
-        batched = jax.jit(
-            jax.vmap(lambda s, f, p: track_step(s, f, p, PLAN), in_axes=(0, 0, None)), compiler_options=QUICK_COMPILE
-        )
+        batched = quick_compile(jax.vmap(lambda s, f, p: track_step(s, f, p, PLAN), in_axes=(0, 0, None)))
         both = lambda *trees: jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
         singles, states = [new_state(), new_state()], both(new_state(), new_state())
         for index in range(5):
@@ -164,7 +162,7 @@ ALONE = PLAN._replace(num_sources=0, new_points="keyframes")
 
 @pytest.fixture(scope="module")
 def step() -> Step:
-    return jax.jit(lambda s, f, p: track_step(s, f, p, ALONE), compiler_options=QUICK_COMPILE)
+    return quick_compile(lambda s, f, p: track_step(s, f, p, ALONE))
 
 
 class TestFollowingAlone:

@@ -38,9 +38,6 @@ def flow_of(method, num_levels, plan=DEFAULT_PLAN):
     return assert_max_traces(run, max_traces=1)
 
 
-# Compiling is what these tests cost; the code LLVM leaves as it is runs as correctly.
-quick_compile = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
-
 track = jax.jit(flow_of(lk_flow, 2))
 
 

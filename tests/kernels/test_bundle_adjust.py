@@ -15,6 +15,7 @@ from jaxslam_kernels.bundle_cost import Observations, observe
 from jaxslam_kernels.camera import make_intrinsics
 from jaxslam_kernels.pose_cost import UNKNOWN_CHI2
 from jaxslam_kernels.robust import Loss
+from quick_compile import quick_compile
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -24,9 +25,6 @@ K, N = 4, 25
 SPARE = 5  # slots without an observation
 FOCAL, CENTRE = 500.0, np.array([[320.0], [240.0]])
 SIGMA_PX, SIGMA_DEPTH = 1.3, 0.03
-
-# Compiling is what these tests cost; the code LLVM leaves as it is runs as correctly.
-_compile = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 
 
 class Inputs(NamedTuple):
@@ -151,7 +149,7 @@ def _differentiate(inputs: Inputs, links: Links, direction: Inputs):
 
 
 # Compiled once for float32 and once for float64, whatever changes from call to call.
-_differentiated = _compile(eqx.debug.assert_max_traces(_differentiate, max_traces=2))
+_differentiated = quick_compile(eqx.debug.assert_max_traces(_differentiate, max_traces=2))
 
 
 def _arrays(tree: Any, dtype=None) -> Any:
@@ -226,7 +224,7 @@ class TestReference:
             start = window.inputs._replace(poses=poses, X_world=X_world, scale=np.array(4.0))
             window = window._replace(inputs=start)
         with jax.enable_x64(True):
-            adjust = _compile(partial(_adjust, loss=loss))
+            adjust = quick_compile(partial(_adjust, loss=loss))
             result = jax.tree.map(np.asarray, adjust(_arrays(window.inputs), _arrays(window.links)))
         poses, X_world, cost = _scipy_optimum(window, loss)
         assert BundleStatus(int(result.status)) == BundleStatus.OK
@@ -377,7 +375,7 @@ def test_vmap_equals_loop():
     counts = {w.links.valid.size for w in windows}
     assert len(counts) == 1
     with jax.enable_x64(True):
-        batched = _compile(jax.vmap(_adjust))(_arrays(batch.inputs), _arrays(batch.links))
+        batched = quick_compile(jax.vmap(_adjust))(_arrays(batch.inputs), _arrays(batch.links))
         for k, window in enumerate(windows):
             looped, *_ = _run(window.inputs, window.links)
             assert _pose_errors(batched.poses[k], looped.poses) < 1e-8
@@ -508,7 +506,7 @@ class TestDegenerate:
 
     def test_steps_run_out(self):
         window = make_window(22)
-        result = _compile(partial(_adjust, max_steps=1))(_arrays(window.inputs), _arrays(window.links))
+        result = quick_compile(partial(_adjust, max_steps=1))(_arrays(window.inputs), _arrays(window.links))
         assert BundleStatus(int(result.status)) == BundleStatus.NOT_CONVERGED
         assert result.num_steps == 1
         assert result.cost < result.initial_cost

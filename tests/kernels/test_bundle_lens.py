@@ -11,6 +11,7 @@ import pytest
 from jaxslam_kernels.bundle_adjust import BundleAdjustment, BundleStatus, bundle_adjust
 from jaxslam_kernels.bundle_cost import Observations
 from jaxslam_kernels.robust import Loss
+from quick_compile import quick_compile
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -20,9 +21,6 @@ K, N = 4, 25
 M = K * N
 CAMERA, POINT = np.divmod(np.arange(M), N)
 FIXED_POSES, FIXED_POINTS, FIXED_LENSES = np.arange(K) == 0, np.arange(N) < 6, np.arange(K) == 3
-
-# Compiling is what these tests cost; the code LLVM leaves as it is runs as correctly.
-_compile = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 
 
 class Inputs(NamedTuple):
@@ -110,7 +108,7 @@ def _differentiate(inputs: Inputs, direction: Inputs):
 
 
 # Compiled once for float32 and once for float64, whatever changes from call to call.
-_differentiated = _compile(eqx.debug.assert_max_traces(_differentiate, max_traces=2))
+_differentiated = quick_compile(eqx.debug.assert_max_traces(_differentiate, max_traces=2))
 
 
 def _arrays(tree: Any) -> Any:
@@ -158,7 +156,7 @@ class TestReference:
     def test_matches_reference(self, loss):
         inputs = make_scene(1).inputs
         with jax.enable_x64(True):
-            result = jax.tree.map(np.asarray, _compile(partial(_adjust, loss=loss))(_arrays(inputs)))
+            result = jax.tree.map(np.asarray, quick_compile(partial(_adjust, loss=loss))(_arrays(inputs)))
         poses, X_world, lenses, cost = _scipy_optimum(inputs, loss)
         assert result.status == BundleStatus.OK
         assert result.cost == pytest.approx(cost, rel=1e-9)
@@ -192,7 +190,7 @@ class TestReference:
         ideal = inputs._replace(uv=inputs.uv / 500.0)
         with jax.enable_x64(True):
             ours, theirs = _arrays(inputs), _arrays(ideal)
-            result = _compile(partial(_adjust, fixed_lenses=jnp.ones(K, bool)))(ours)
+            result = quick_compile(partial(_adjust, fixed_lenses=jnp.ones(K, bool)))(ours)
             observations = Observations(
                 camera=jnp.asarray(CAMERA, jnp.int32),
                 point=jnp.asarray(POINT, jnp.int32),
@@ -203,7 +201,7 @@ class TestReference:
                 valid=jnp.ones(M, bool),
             )
             fixed: Any = {"fixed_poses": jnp.asarray(FIXED_POSES), "fixed_points": jnp.asarray(FIXED_POINTS)}
-            plain = _compile(partial(bundle_adjust, tolerance=0.0, max_steps=200, **fixed))
+            plain = quick_compile(partial(bundle_adjust, tolerance=0.0, max_steps=200, **fixed))
             expected = plain(theirs.poses, theirs.X_world, observations)
         assert expected.lenses is None
         np.testing.assert_allclose(result.cost, expected.cost, rtol=1e-10)
@@ -220,7 +218,7 @@ class TestReference:
         uv[1, CAMERA == 1] *= -1.0
         inputs = scene.inputs._replace(poses=turned, lenses=scene.true_lenses, uv=uv)
         with jax.enable_x64(True):
-            result = _compile(partial(_adjust, loss="squared", two_sided=two_sided))(_arrays(inputs))
+            result = quick_compile(partial(_adjust, loss="squared", two_sided=two_sided))(_arrays(inputs))
         assert bool(np.asarray(result.used)[CAMERA == 1].all()) == two_sided
         if two_sided:
             assert result.status == BundleStatus.OK
@@ -267,7 +265,7 @@ def test_gradient():
 def test_vmap_equals_loop():
     several = [make_scene(seed).inputs for seed in (10, 11)]
     with jax.enable_x64(True):
-        batched = _compile(jax.vmap(_adjust))(_arrays(jax.tree.map(lambda *x: np.stack(x), *several)))
+        batched = quick_compile(jax.vmap(_adjust))(_arrays(jax.tree.map(lambda *x: np.stack(x), *several)))
         for i, inputs in enumerate(several):
             alone, *_ = _run(inputs)
             assert _pose_errors(batched.poses[i], alone.poses) < 1e-7

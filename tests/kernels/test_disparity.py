@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from jaxslam_kernels.disparity import ROW_PLAN, Disparities, row_disparities
 from jaxslam_kernels.image import build_pyramid
 from jaxslam_kernels.lk_search import LevelPlan
-from kernels.flow_cases import all_finite, quick_compile
+from kernels.flow_cases import all_finite
+from quick_compile import quick_compile
 from skimage.data import stereo_motorcycle
 
 from jaxslam.benchmark.kernels.known_warps import corners, picture

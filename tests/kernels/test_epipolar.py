@@ -1,6 +1,5 @@
 """Epipolar distances, seven points and robust fundamental matrices against OpenCV and known poses."""
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import cv2
@@ -22,6 +21,7 @@ from jaxslam_kernels.epipolar import (
 )
 from jaxslam_kernels.fundamental import FundamentalResult, FundamentalStatus, ransac_fundamental
 from jaxslam_kernels.transform import moved, to_camera, to_world
+from quick_compile import quick_compile
 
 from jaxslam.benchmark.kernels.two_views import KINDS, TwoViewScene, make_two_views
 
@@ -29,9 +29,7 @@ N = 150
 seeded = given(seed=st.integers(0, 2**32 - 1))
 few_examples = settings(max_examples=6, deadline=None, derandomize=True)
 
-# Compiling is what these tests cost; the code LLVM leaves as it is runs as correctly.
-_compile = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
-_seven, _distances, _sampson = map(_compile, (seven_point, epipolar_distances, sampson_distances))
+_seven, _distances, _sampson = map(quick_compile, (seven_point, epipolar_distances, sampson_distances))
 
 
 def _homogeneous(uv: np.ndarray) -> np.ndarray:
@@ -265,7 +263,7 @@ def _differentiate(key: jax.Array, inputs: Inputs, direction: Inputs):
 
 
 # Compiled once for float32 and once for float64, whatever changes from call to call.
-_differentiated = _compile(eqx.debug.assert_max_traces(_differentiate, max_traces=2))
+_differentiated = quick_compile(eqx.debug.assert_max_traces(_differentiate, max_traces=2))
 
 
 def _run(seed: int, inputs: Inputs, direction: Inputs | None = None):
@@ -343,9 +341,9 @@ class TestRansac:
         keys = jax.random.split(jax.random.key(0), 2)
         with jax.enable_x64(True):
             batch = jax.tree.map(lambda *x: jnp.stack(x), *map(_inputs, scenes))
-            batched = _compile(jax.vmap(_solve))(keys, batch)
+            batched = quick_compile(jax.vmap(_solve))(keys, batch)
             for k, scene in enumerate(scenes):
-                one = jax.tree.map(np.asarray, _compile(_solve)(keys[k], _inputs(scene)))
+                one = jax.tree.map(np.asarray, quick_compile(_solve)(keys[k], _inputs(scene)))
                 np.testing.assert_allclose(batched.F[k], one.F, atol=1e-7)
                 np.testing.assert_array_equal(batched.inliers[k], one.inliers)
                 assert batched.status[k] == one.status
@@ -375,7 +373,7 @@ class TestRansac:
                 key, before, after, weights=weights, threshold_px=threshold, initial=initial, **few
             )
 
-        compiled = _compile(solve)
+        compiled = quick_compile(solve)
         shares: dict[str, list[float]] = {"true": [], "zero": [], "NaN": []}
         for seed in range(10):
             scene = make_two_views(seed, N, outliers=0.6)
@@ -393,7 +391,7 @@ class TestRansac:
         scene, other = (make_two_views(seed, N, outliers=0.3) for seed in (3, 4))
         plain, *_ = _run(0, _inputs(scene))
         before, after, weights, threshold = _inputs(scene)
-        tried = _compile(ransac_fundamental)(
+        tried = quick_compile(ransac_fundamental)(
             jax.random.key(0), before, after, weights=weights, threshold_px=threshold, initial=jnp.asarray(other.F)
         )
         np.testing.assert_array_equal(tried.inliers, plain.inliers)

@@ -10,15 +10,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from jaxslam_kernels.kmeans import KMeans, _draw, kmeans
+from quick_compile import quick_compile
 from scipy.spatial.transform import Rotation
 from sklearn.cluster import KMeans as Reference
 
 N, K = 60, 4
 SEEDS = st.integers(0, 2**32 - 1)
 
-# Compiling is what these tests cost; the code LLVM leaves as it is runs as correctly.
-_QUICK: Any = {"compiler_options": {"xla_backend_optimization_level": 0}}
-_kmeans = jax.jit(kmeans, static_argnames=("num_clusters", "num_steps"), **_QUICK)
+_kmeans = quick_compile(kmeans, static_argnames=("num_clusters", "num_steps"))
 
 
 @pytest.fixture
@@ -214,13 +213,12 @@ def _loss_at_labels(points, mask, before, label, kept):
     return _weighted(KMeans(label, centers, cost, label))
 
 
-_value_and_gradient: Any = jax.jit(jax.value_and_grad(_loss), static_argnums=4, **_QUICK)
-_jvp: Any = jax.jit(
+_value_and_gradient: Any = quick_compile(jax.value_and_grad(_loss), static_argnums=4)
+_jvp: Any = quick_compile(
     lambda points, direction, key, mask, initial, steps: jax.jvp(
         lambda p: _loss(p, key, mask, initial, steps), (points,), (direction,)
     ),
     static_argnums=5,
-    **_QUICK,
 )
 _SPARSE = np.concatenate([_begin(_blobs(), K - 1), np.full((3, 1), 50.0)], axis=1)
 
@@ -271,9 +269,9 @@ def test_vmap_equals_loop(warm):
     initial = np.stack([_begin(one) for one in points])
     start = {"initial": initial, "usable": usable} if warm else {}
     run = lambda key, points, mask, start: kmeans(key, points, mask, num_clusters=K, num_steps=3, **start)
-    batched = jax.jit(jax.vmap(run), **_QUICK)(keys, points, masks, start)
+    batched = quick_compile(jax.vmap(run))(keys, points, masks, start)
     for k in range(3):
-        one = jax.jit(run, **_QUICK)(keys[k], points[k], masks[k], jax.tree.map(lambda a, k=k: a[k], start))
+        one = quick_compile(run)(keys[k], points[k], masks[k], jax.tree.map(lambda a, k=k: a[k], start))
         np.testing.assert_array_equal(batched.label[k], one.label)
         np.testing.assert_array_equal(batched.counts[k], one.counts)
         np.testing.assert_allclose(batched.centers[k], one.centers, rtol=1e-5, atol=1e-5)

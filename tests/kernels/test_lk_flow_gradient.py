@@ -15,12 +15,12 @@ from kernels.flow_cases import (
     flow_of,
     image_pair,
     one_of_each,
-    quick_compile,
     random_weights,
     weighted_sum,
     with_gradient,
     within,
 )
+from quick_compile import quick_compile
 
 from jaxslam.benchmark.kernels.known_warps import corners, picture, warp
 

@@ -18,6 +18,7 @@ from jaxslam_kernels.p3p import p3p
 from jaxslam_kernels.pnp import PnpResult, draw_samples, ransac_pnp, score_poses
 from jaxslam_kernels.pose_cost import pose_cost, pose_problem
 from jaxslam_kernels.pose_refine import PoseStatus
+from quick_compile import quick_compile
 from scipy.spatial.transform import Rotation
 
 from jaxslam.benchmark.kernels.posed_scene import (
@@ -36,10 +37,8 @@ THRESHOLD_PX = 3.0
 seeded = given(seed=st.integers(0, 2**32 - 1))
 few_examples = settings(max_examples=6, deadline=None, derandomize=True)
 
-# Compiling is what these tests cost; the code LLVM leaves as it is runs as correctly.
-_compile = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
-_p3p, _align = _compile(p3p), _compile(absolute_orientation)
-_draw = _compile(draw_samples, static_argnums=2)
+_p3p, _align = quick_compile(p3p), quick_compile(absolute_orientation)
+_draw = quick_compile(draw_samples, static_argnums=2)
 
 
 def _triples(seed: int, h: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -137,7 +136,7 @@ class TestAbsoluteOrientation:
                 R, t, _ = absolute_orientation(source, target)
                 return jnp.sum(jnp.sin(R)) + jnp.sum(jnp.square(t))
 
-            @_compile
+            @quick_compile
             def values(pair, direction, h):
                 after, before = (f(*jax.tree.map(lambda x, d, k=k: x + k * d, pair, direction)) for k in (h, -h))
                 _, forward = jax.jvp(f, pair, direction)
@@ -155,7 +154,9 @@ class TestAbsoluteOrientation:
         target = target.at[1, 1, 2].set(jnp.nan)
         R, t, valid = _align(source, target)
         np.testing.assert_array_equal(valid, [False, False, False, True])
-        gradients = _compile(jax.grad(lambda *a: sum(x.sum() for x in absolute_orientation(*a)[:2]), argnums=(0, 1)))
+        gradients = quick_compile(
+            jax.grad(lambda *a: sum(x.sum() for x in absolute_orientation(*a)[:2]), argnums=(0, 1))
+        )
         assert all(np.isfinite(x).all() for x in (R, t, *gradients(source, target)))
 
 
@@ -229,7 +230,7 @@ def _differentiate(key: jax.Array, initial: SE3, inputs: Inputs, direction: Inpu
 
 
 # Compiled once for float32 and once, with a direction, for float64, whatever changes from call to call.
-_differentiated = _compile(eqx.debug.assert_max_traces(_differentiate, max_traces=2))
+_differentiated = quick_compile(eqx.debug.assert_max_traces(_differentiate, max_traces=2))
 
 
 def _run(seed: int, inputs: Inputs, initial: SE3 | None = None, direction: Inputs | None = None):
@@ -306,7 +307,7 @@ class TestRansac:
         T_cam_world = np.concatenate([R_world_cam.T, -(R_world_cam.T @ scene.pose[4:, None])], axis=1)
         behind = np.diag([1.0, -1.0, -1.0]) @ T_cam_world
 
-        @_compile
+        @quick_compile
         def evaluate(X_world, uv, depth, sigma, poses):
             problem = pose_problem(X_world, uv, camera(), None, depth, 1.0, sigma, 3.0, None)
             return (
@@ -362,7 +363,7 @@ class TestRansac:
         keys = jax.random.split(jax.random.key(0), 2)
         batch = jax.tree.map(lambda *x: jnp.stack(x), *(_inputs(s) for s in scenes))
         initial = SE3(jnp.stack([pose_of(s.initial).wxyz_xyz for s in scenes]))
-        batched = _compile(jax.vmap(_solve))(keys, initial, batch)
+        batched = quick_compile(jax.vmap(_solve))(keys, initial, batch)
         for k, scene in enumerate(scenes):
             one, *_ = _differentiated(keys[k], pose_of(scene.initial), _inputs(scene), None)
             assert max(pose_error(batched.T_world_cam.wxyz_xyz[k], one.T_world_cam.wxyz_xyz)) < 1e-4

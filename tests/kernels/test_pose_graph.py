@@ -35,13 +35,11 @@ from jaxslam_kernels.pose_graph_cost import (
 from jaxslam_kernels.pose_graph_sparse import solve_on_host
 from jaxslam_kernels.robust import Loss
 from kernels.pose_graph_cases import isotropic, move, read_g2o, scipy_optimum
+from quick_compile import quick_compile
 
 from jaxslam.benchmark.kernels.loop_graph import Graph, between, loop_graph
 
 GROUP = 4  # small, so that the loop does not fit into the band and iterations are needed
-
-# Compiling is what these tests cost; the code LLVM leaves as it is runs as correctly.
-_compile = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 
 
 class Inputs(NamedTuple):
@@ -106,8 +104,8 @@ def _differentiate(inputs: Inputs, loss: Loss):
     return result, floats
 
 
-_differentiated = _compile(_differentiate, static_argnums=1)
-_optimised = _compile(_optimise, static_argnums=(1, 2, 3))
+_differentiated = quick_compile(_differentiate, static_argnums=1)
+_optimised = quick_compile(_optimise, static_argnums=(1, 2, 3))
 
 
 def _largest_difference(a: Any, b: Any) -> float:
@@ -206,9 +204,9 @@ def _forward(values, direction, inputs, loss):
 
 
 # Here, so that graphs of one size are compiled once.
-_compiled_value = _compile(_value, static_argnames="loss")
-_compiled_forward = _compile(_forward, static_argnames="loss")
-_compiled_gradient = _compile(jax.grad(_value), static_argnames="loss")
+_compiled_value = quick_compile(_value, static_argnames="loss")
+_compiled_forward = quick_compile(_forward, static_argnames="loss")
+_compiled_gradient = quick_compile(jax.grad(_value), static_argnames="loss")
 
 
 class TestGradient:
@@ -248,7 +246,7 @@ class TestGradient:
 def test_vmap_equals_loop():
     several = [_inputs(loop_graph(seed, 10)) for seed in range(3)]
     batch = jax.tree.map(lambda *x: jnp.stack(x), *several)
-    together = _compile(jax.vmap(_optimise))(batch)
+    together = quick_compile(jax.vmap(_optimise))(batch)
     for i, inputs in enumerate(several):
         alone = _optimised(inputs, "squared")
         assert int(alone.status) == int(together.status[i]) == PoseGraphStatus.OK
@@ -264,7 +262,7 @@ def test_single_trace():
             SE3(inputs.poses), inputs.edges, inputs.fixed, mask=mask, rank=rank, loss_scale=loss_scale, group_size=GROUP
         )
 
-    once = _compile(eqx.debug.assert_max_traces(solve, max_traces=1))
+    once = quick_compile(eqx.debug.assert_max_traces(solve, max_traces=1))
     for seed in range(3):
         graph = loop_graph(seed, 10)
         inputs = _inputs(graph)
@@ -415,7 +413,7 @@ class TestHostElimination:
                     edges = inputs.edges._replace(information=information, T_source_target=SE3(measured))
                     return _summary(_optimise(inputs._replace(edges=edges), "cauchy", 50, way))
 
-                by = _compile(jax.grad(f, argnums=(0, 1)))
+                by = quick_compile(jax.grad(f, argnums=(0, 1)))
                 return by(inputs.edges.information, inputs.edges.T_source_target.wxyz_xyz)
 
             for band, host in zip(gradient("band"), gradient("host"), strict=True):
@@ -425,7 +423,7 @@ class TestHostElimination:
     def test_vmap_equals_loop(self):
         several = [_inputs(loop_graph(seed, 10)) for seed in range(2)]
         batch = jax.tree.map(lambda *x: jnp.stack(x), *several)
-        together = _compile(jax.vmap(partial(_optimise, elimination="host")))(batch)
+        together = quick_compile(jax.vmap(partial(_optimise, elimination="host")))(batch)
         for i, inputs in enumerate(several):
             alone = _optimised(inputs, "squared", 50, "host")
             assert _largest_difference(together.T_world_cam.wxyz_xyz[i], alone.T_world_cam.wxyz_xyz) < 1e-4
@@ -551,7 +549,7 @@ class TestInvariance:
             order = rng.permutation(len(graph.source))
             edges = jax.tree.map(lambda x: x[order], inputs.edges)
             rank = jnp.asarray(rng.permutation(10))
-            ordered = _compile(
+            ordered = quick_compile(
                 lambda edges, rank: optimise_pose_graph(
                     SE3(inputs.poses), edges, inputs.fixed, rank=rank, group_size=GROUP
                 )

@@ -17,6 +17,7 @@ from jaxslam_kernels.camera import Intrinsics
 from jaxslam_kernels.pose_cost import PosePrior, pose_cost, pose_problem, retract
 from jaxslam_kernels.pose_refine import UNKNOWN_VARIANCE, PoseRefinement, PoseStatus, refine_pose, solve_pose
 from jaxslam_kernels.robust import Loss
+from quick_compile import quick_compile
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -34,9 +35,6 @@ from jaxslam.benchmark.kernels.posed_scene import (
 N = 60
 SIGMA_PX = 1.3
 PRIOR_INFORMATION = np.diag([400.0, 900.0, 400.0, 2500.0, 2500.0, 1600.0]) + 50.0
-
-# Compiling is what these tests cost; the code LLVM leaves as it is runs as correctly.
-_compile = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 
 
 class Inputs(NamedTuple):
@@ -118,7 +116,7 @@ def _differentiate(T: SE3, inputs: Inputs, direction: Inputs | None):
 
 
 # Compiled once for float32 and once, with a direction, for float64, whatever changes from call to call.
-_differentiated = _compile(eqx.debug.assert_max_traces(_differentiate, max_traces=2))
+_differentiated = quick_compile(eqx.debug.assert_max_traces(_differentiate, max_traces=2))
 
 
 def _run(T: SE3, inputs: Inputs, direction: Inputs | None = None):
@@ -200,7 +198,7 @@ class TestReference:
                 problem = pose_problem(*inputs[:3], *inputs[3:8], prior=None)
                 return solve_pose(T, problem, loss, 200)
 
-            optimum, report = jax.tree.map(np.asarray, _compile(solve)(pose_of(scene.initial), inputs))
+            optimum, report = jax.tree.map(np.asarray, quick_compile(solve)(pose_of(scene.initial), inputs))
         distance, angle = pose_error(optimum.wxyz_xyz, _scipy_optimum(scene, inputs, loss, with_prior=False))
         assert report.converged
         assert distance < 1e-6
@@ -303,7 +301,7 @@ class TestGradient:
 
                 return lax.scan(step, T, length=40)[0].wxyz_xyz
 
-            jvp = _compile(lambda i, d: jax.jvp(unrolled, (i,), (d,)))
+            jvp = quick_compile(lambda i, d: jax.jvp(unrolled, (i,), (d,)))
             expected, expected_change = map(np.asarray, jvp(inputs, direction))
             result, _, (_, change) = _run(T, inputs, direction)
         np.testing.assert_allclose(result.T_world_cam.wxyz_xyz, expected, atol=1e-8)
@@ -324,7 +322,7 @@ class TestGradient:
                 return lax.scan(lambda T, i: (_refine(T, i).T_world_cam, None), T, moved)[0].wxyz_xyz[4:].sum()
 
             shifts = np.array([0.0, 0.5])
-            through = np.asarray(_compile(jax.vmap(jax.grad(chain)))(jnp.asarray(shifts)))
+            through = np.asarray(quick_compile(jax.vmap(jax.grad(chain)))(jnp.asarray(shifts)))
             along_uv = jax.tree.map(jnp.zeros_like, last)._replace(uv=jnp.ones_like(last.uv))
             changes = [_run(T, last._replace(uv=last.uv + shift), along_uv)[2][1][4:].sum() for shift in shifts]
         np.testing.assert_allclose(through, changes, rtol=1e-6)
@@ -347,7 +345,7 @@ def test_vmap_equals_loop():
     scenes = [make_scene(seed, N) for seed in (10, 11, 12)]
     poses = [pose_of(s.initial) for s in scenes]
     batch = jax.tree.map(lambda *x: jnp.stack(x), *(_inputs(s) for s in scenes))
-    batched = _compile(jax.vmap(_refine))(SE3(jnp.stack([T.wxyz_xyz for T in poses])), batch)
+    batched = quick_compile(jax.vmap(_refine))(SE3(jnp.stack([T.wxyz_xyz for T in poses])), batch)
     for k, (T, scene) in enumerate(zip(poses, scenes, strict=True)):
         looped, *_ = _run(T, _inputs(scene))
         one = jax.tree.map(lambda x, k=k: x[k], batched)
@@ -460,7 +458,7 @@ class TestDegenerate:
     def test_steps_run_out(self):
         scene = make_scene(22, N)
         X_world, uv, _, _ = scene.arrays()
-        result = _compile(partial(refine_pose, max_steps=2))(pose_of(scene.initial), X_world, uv, camera())
+        result = quick_compile(partial(refine_pose, max_steps=2))(pose_of(scene.initial), X_world, uv, camera())
         assert PoseStatus(int(result.status)) == PoseStatus.NOT_CONVERGED
         before, after = pose_error(scene.initial, scene.pose), pose_error(result.T_world_cam.wxyz_xyz, scene.pose)
         assert after < before
