@@ -60,7 +60,7 @@ class TrackConfig(Checked):
     """Standard deviation of the disparity of a stereo pair, pixels; it stands for the noise of depth there.
 
     As that of a point, as in ORB-SLAM2. A match by itself is better, but rectification is not: on a road of KITTI, with
-    0.5, the tracker turned by 0.006 degrees a frame about its axis, which essential matrices of its pictures do not.
+    0.5, the tracker turned by 0.005 degrees a frame about its axis, by essential matrices of its pictures by -0.001.
     """
     far_baselines: Annotated[float, Positive] = 75.0
     """Farthest depth believed of a stereo pair whose camera file does not say, in baselines (ORB-SLAM's `ThDepth`)."""

@@ -99,7 +99,8 @@ class _FlowBeside:
 
     def __call__(self, frame: Frame | None, _: object) -> None:
         if frame is not None and self._last is not None and self._frames % FLOW_EVERY == 0:
-            self.ms.append(flow_ms(to_grey(self._last), to_grey(frame.image), corners_of(self._last)))
+            before = to_grey(self._last)
+            self.ms.append(flow_ms(before, to_grey(frame.image), corners_of(before)))
         self._frames, self._last = self._frames + 1, None if frame is None else frame.image
 
 

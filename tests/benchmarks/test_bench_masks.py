@@ -6,11 +6,11 @@
 from functools import partial
 from typing import NamedTuple
 
-import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from benchmarks.live import corners_of, opencv_flow
 from jaxlie import SE3
 from jaxslam_kernels.camera import make_intrinsics
 from jaxslam_kernels.depth_change import depth_change
@@ -32,7 +32,6 @@ EARLIER = (5, 10, 15)
 """So many frames before are the depth images compared with."""
 STEP = 4
 """Of whose pixels and rows every so many are used: 160 x 120."""
-CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.03)
 
 _pyramid = jax.jit(partial(build_pyramid, num_levels=PYRAMID_LEVELS))
 
@@ -59,11 +58,9 @@ def views(dataset) -> tuple[View, View]:
 def opencv(views):
     """What everything is compared with: flow of 1000 points, both pyramids included."""
     before, now = (view.grey for view in views)
-    corners = cv2.goodFeaturesToTrack(before, 1000, 0.001, 7)
+    corners = corners_of(before)
     assert len(corners) == 1000
-    return lambda: cv2.calcOpticalFlowPyrLK(
-        before, now, corners, corners.copy(), winSize=(21, 21), maxLevel=3, criteria=CRITERIA
-    )
+    return lambda: opencv_flow(before, now, corners)
 
 
 def _carry(reduced: Reduced, before: Pyramid, origin: Origin, now: View) -> np.ndarray:

@@ -2,9 +2,9 @@
 
 import itertools
 
-import cv2
 import jax
 import pytest
+from benchmarks.live import corners_of, opencv_flow
 
 from jaxslam import Slam, frame_arrays, open_dataset, track_params, track_plan, track_step
 from jaxslam.benchmark.timing import compare
@@ -14,7 +14,6 @@ from jaxslam.frame import to_grey
 pytestmark = pytest.mark.benchmark
 
 FIRST, ROUNDS, WARM_UP = 60, 60, 5
-CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.03)
 
 
 def test_step_is_not_slower_than_opencv_flow(data_dir, capsys):
@@ -30,7 +29,7 @@ def test_step_is_not_slower_than_opencv_flow(data_dir, capsys):
     frames = [dataset[index] for index in range(FIRST - 1, FIRST + ROUNDS + WARM_UP)]
     arrays = iter([frame_arrays(frame, 1 / 30) for frame in frames[1:]])
     grey = [to_grey(frame.image) for frame in frames]
-    pairs = iter([(a, b, cv2.goodFeaturesToTrack(a, 1000, 0.001, 7)) for a, b in itertools.pairwise(grey)])
+    pairs = iter([(a, b, corners_of(a)) for a, b in itertools.pairwise(grey)])
 
     def ours():
         nonlocal state
@@ -41,9 +40,7 @@ def test_step_is_not_slower_than_opencv_flow(data_dir, capsys):
     def theirs():
         before, after, corners = next(pairs)
         assert len(corners) == 1000
-        cv2.calcOpticalFlowPyrLK(
-            before, after, corners, corners.copy(), winSize=(21, 21), maxLevel=3, criteria=CRITERIA
-        )
+        opencv_flow(before, after, corners)
 
     result = compare(ours, theirs, rounds=ROUNDS, warm_up=WARM_UP)
     with capsys.disabled():

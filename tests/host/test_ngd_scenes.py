@@ -15,8 +15,7 @@ FRAMES, WIDTH, HEIGHT = 60, 320, 240
 OVERRIDES = ("track.cell_px=12",)  # for a small image
 ROOMS = 3
 """How much people harm is a matter of where they happen to walk: `static` errs by 18, 157 and 245 mm in those of
-`halfsphere`, and the tracker itself by 2 to 4 mm in so small an image, by 4.2 or less than 3.5 as the CPU rounds. No
-single room shows it."""
+`halfsphere`, and the tracker by 2 to 4 mm without people in so small an image. No single room shows it."""
 LATE_RATIO, STATIC_RATIO = 1.3, 5.0
 SCENES: list[tuple[CameraPathKind, int]] = [("xyz", 2), ("rpy", 3), ("halfsphere", 1)]
 """Some of those where `static` fails."""
