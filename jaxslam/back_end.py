@@ -37,10 +37,11 @@ from jaxslam.semantics import Detector
 from jaxslam.stage_times import StageTimes
 from jaxslam.state import TrackOutput, TrackParams, TrackPlan, TrackReason, TrackState, TrackStatus
 from jaxslam.state_edit import relocated
+from jaxslam.trace_cache import traced_once
 from jaxslam.track import init_state
 from jaxslam.worker import Worker, close_all, make_worker
 
-_relocated = jax.jit(relocated, donate_argnums=0)
+_relocated = jax.jit(traced_once(relocated), donate_argnums=0)
 
 _RECALL_EVERY = 10
 """Frames after which a tracker that only localises gets other keyframes."""

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int
 from jaxslam.errors import ConfigError, FrameError
 from jaxslam.frame_arrays import FrameArrays
 from jaxslam.state import TrackParams, TrackPlan, TrackState
+from jaxslam.trace_cache import traced_once
 from jaxslam.track import DEFAULT_PLAN, init_state, track_step
 from jaxslam.xla import IN_ITS_THREAD, SOON_COMPILED
 
@@ -104,6 +105,7 @@ def _track(batch: _Batch, size: int, plan: TrackPlan, first: int) -> TrackedClip
 
 
 @partial(jax.jit, static_argnums=(1, 2, 3, 4, 5))
+@traced_once
 def _new_states(
     seeds: Int[Array, " clips"], height: int, width: int, plan: TrackPlan, image_dtype: np.dtype, dtype: np.dtype
 ) -> TrackState:
@@ -113,6 +115,7 @@ def _new_states(
 
 # In its thread: for a batch as fast as without, and programs in several threads do not wait for each other's parts.
 @partial(jax.jit, static_argnames="plan", donate_argnums=0, compiler_options=SOON_COMPILED | IN_ITS_THREAD)
+@traced_once
 def _step(
     states: TrackState, frames: FrameArrays, params: TrackParams, plan: TrackPlan
 ) -> tuple[TrackState, tuple[Array, Array]]:

@@ -23,6 +23,7 @@ from jaxslam.masks.surfaces import SurfaceMemory
 from jaxslam.semantic_thread import Found, Seen, SemanticThread
 from jaxslam.semantics import Detector
 from jaxslam.stage_times import StageTimes
+from jaxslam.trace_cache import traced_once
 from jaxslam.xla import IN_ITS_THREAD
 
 _MOST_FRAMES = 30
@@ -33,7 +34,7 @@ _TRUSTED_FRAMES = 5
 WIDTH_PX = 320
 """Masks are made at about so many columns: one of a third of the image is carried on in 1.5 ms, at 640 in 5.4."""
 
-_pyramid = jax.jit(partial(build_pyramid, num_levels=PYRAMID_LEVELS), compiler_options=IN_ITS_THREAD)
+_pyramid = jax.jit(traced_once(partial(build_pyramid, num_levels=PYRAMID_LEVELS)), compiler_options=IN_ITS_THREAD)
 
 
 class MaskSource(enum.IntEnum):

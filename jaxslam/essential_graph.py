@@ -15,6 +15,7 @@ from jaxslam_kernels.pose_graph_cost import PoseGraphEdges
 from jaxslam.map import NONE, Map, has, rows, visibility
 from jaxslam.padding import padded
 from jaxslam.pose import IDENTITY, angle, between
+from jaxslam.trace_cache import traced_once
 from jaxslam.xla import SOON_COMPILED
 
 _STRONG = 100
@@ -125,6 +126,7 @@ def _solved(graph: _Graph, poses: np.ndarray, fixed: np.ndarray) -> Any:
 
 
 @partial(jax.jit, compiler_options=SOON_COMPILED)
+@traced_once
 def _optimise(T_world_cam: SE3, edges: PoseGraphEdges, fixed: Any, mask: Any, rank: Any) -> Any:
     return optimise_pose_graph(T_world_cam, edges, fixed, mask=mask, rank=rank, loss="squared", max_steps=30)
 

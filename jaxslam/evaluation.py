@@ -27,6 +27,7 @@ from jaxslam_kernels.segments import KITTI_LENGTHS_M, KITTI_STEP, SegmentErrors,
 
 from jaxslam.errors import TrajectoryError, nearest
 from jaxslam.rotation import matrices
+from jaxslam.trace_cache import traced_once
 from jaxslam.trajectory import Trajectory, associate
 from jaxslam.xla import SOON_COMPILED
 
@@ -246,6 +247,7 @@ def _errors(estimate: Trajectory, truth: np.ndarray, align: AlignmentKind, delta
 
 
 @partial(jax.jit, compiler_options=SOON_COMPILED)
+@traced_once
 def _padded_errors(P: jax.Array, Q: jax.Array, mask: jax.Array, later: jax.Array, scaled: jax.Array) -> _Errors:
     """All alignments at once: one compilation serves them all."""
     x, y, weights = P[:, 4:].T, Q[:, 4:].T, mask.astype(P.dtype)

@@ -16,6 +16,7 @@ from jaxslam.features import FeaturePlan, Features
 from jaxslam.observe import depth_sigma
 from jaxslam.padding import padded
 from jaxslam.state import TrackParams
+from jaxslam.trace_cache import traced_once
 from jaxslam.xla import SOON_COMPILED
 
 MIN_INLIERS = 30
@@ -161,6 +162,7 @@ def _cells(uv: np.ndarray, params: TrackParams) -> int:
 
 
 @partial(jax.jit, compiler_options=SOON_COMPILED)
+@traced_once
 def _refined(T_origin_cam: SE3, matches: Matches, params: TrackParams) -> PoseRefinement:
     return refine_pose(
         T_origin_cam,

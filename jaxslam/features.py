@@ -16,6 +16,7 @@ from jaxslam.frame_arrays import FrameArrays
 from jaxslam.observe import RIGHT_LEVELS, View, match_depth, observe
 from jaxslam.padding import padded
 from jaxslam.state import TrackParams
+from jaxslam.trace_cache import traced_once
 
 DESCRIPTOR_BYTES = 32
 _PATCH_PX = 31
@@ -222,6 +223,7 @@ def _no_patches() -> Patches:
 
 
 @jax.jit
+@traced_once
 def _ideal(
     seen_uv: Pixels, twist: Float[Array, "6"], frame: FrameArrays, params: TrackParams
 ) -> tuple[Pixels, Weights]:

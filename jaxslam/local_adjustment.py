@@ -15,6 +15,7 @@ from jaxslam.map import NONE, Map, Sightings, covisible, has, rows, sightings_at
 from jaxslam.map_edit import moved, without_sightings
 from jaxslam.padding import padded
 from jaxslam.pose import between, compose, inverse, rotate, to_local, transform
+from jaxslam.trace_cache import traced_once
 from jaxslam.xla import SOON_COMPILED
 
 _NUM_FIXED = 4
@@ -191,6 +192,7 @@ def _observations(map: Map, window: _Window, size: int, plan: AdjustPlan) -> Obs
 
 
 @partial(jax.jit, static_argnames="max_steps", compiler_options=SOON_COMPILED)
+@traced_once
 def _adjust(
     poses: Float[Array, "k 7"],
     X: Float[Array, "3 n"],

@@ -35,6 +35,7 @@ from jaxslam.observe import observe
 from jaxslam.point_states import StateChanges, with_changes
 from jaxslam.pose import compose, transform
 from jaxslam.state import TrackParams
+from jaxslam.trace_cache import traced_once
 from jaxslam.track_settings import depth_noise
 
 _PART_KEYFRAMES = 30
@@ -309,6 +310,7 @@ def with_new_keyframe(map: Map, new: NewKeyframe, features: Features) -> Map:
 
 
 @jax.jit
+@traced_once
 def _ideal(
     seen_uv: Pixels, expected_depth: Weights, twist: Float[Array, "6"], frame: FrameArrays, params: TrackParams
 ) -> tuple[Pixels, Weights]:

@@ -17,13 +17,14 @@ from jaxslam.pose import IDENTITY, angle, between, compose, inverse, to_local, t
 from jaxslam.recall import Recalled
 from jaxslam.state import TrackOutput, TrackPlan, TrackState, TrackStatus
 from jaxslam.state_edit import carried, forgotten, recalled
+from jaxslam.trace_cache import traced_once
 
 _LEAST_MOVE_M, _LEAST_TURN = 1e-6, 1e-6
 """A correction below both is none."""
 
-_carried = jax.jit(carried, donate_argnums=0)
-_recalled = jax.jit(recalled, donate_argnums=0)
-_forgotten = jax.jit(forgotten, donate_argnums=0)
+_carried = jax.jit(traced_once(carried), donate_argnums=0)
+_recalled = jax.jit(traced_once(recalled), donate_argnums=0)
+_forgotten = jax.jit(traced_once(forgotten), donate_argnums=0)
 _AT_ONCE = 1024
 """Points forgotten in one call."""
 

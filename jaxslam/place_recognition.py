@@ -18,6 +18,7 @@ from jaxslam.matching import hamming_pairs, match_by_projection, match_descripto
 from jaxslam.place_index import PlaceIndex
 from jaxslam.pose import IDENTITY, to_local
 from jaxslam.state import TrackParams
+from jaxslam.trace_cache import traced_once
 from jaxslam.xla import SOON_COMPILED
 
 MIN_AGREEING = 12
@@ -152,6 +153,7 @@ def _matches(
 
 
 @partial(jax.jit, compiler_options=SOON_COMPILED)
+@traced_once
 def _agreed(key: Key[Array, ""], matches: Matches, params: TrackParams) -> PnpResult:
     return ransac_pnp(
         key,

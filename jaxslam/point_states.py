@@ -29,6 +29,7 @@ from jaxslam.observe import depth_sigma, observe, predict_pixels
 from jaxslam.padding import padded
 from jaxslam.pose import IDENTITY, to_local
 from jaxslam.state import TrackParams
+from jaxslam.trace_cache import traced_once
 from jaxslam.xla import IN_ITS_THREAD
 
 _DEPTH_SIGMAS, _DEPTH_SHARE = 4.2, 0.02
@@ -220,6 +221,7 @@ def occluded_shares(map: Map) -> Float64[np.ndarray, " k"]:
 
 
 @partial(jax.jit, static_argnames="guard", compiler_options=IN_ITS_THREAD)
+@traced_once
 def _after_frame(
     columns: _Columns,
     T_keyframe_cam: Float[Array, "7"],

@@ -38,6 +38,7 @@ from jaxslam.semantics import Detector
 from jaxslam.stage_times import StageTimes
 from jaxslam.state import TrackOutput, TrackParams, TrackPlan, TrackReason, TrackState, TrackStatus
 from jaxslam.stereo import RoughDepth
+from jaxslam.trace_cache import traced_once
 from jaxslam.track import Followed, follow_points, init_state, track_followed
 from jaxslam.track_settings import track_params, track_plan, with_dense_keyframes
 from jaxslam.tracked import FrameRecord, Rejected, Tracked, tracked_of
@@ -55,14 +56,15 @@ of the camera there was one every tenth of a second, and the threads held each o
 _PREDICTED_S = 1.0
 """Longest time for which a constant velocity is believed."""
 
-_new_state = jax.jit(init_state, static_argnames=("height", "width", "plan"))
+_new_state = jax.jit(traced_once(init_state), static_argnames=("height", "width", "plan"))
 """One program instead of some fifty."""
 
 
-_follow_points = jax.jit(follow_points, static_argnames="plan", compiler_options=IN_ITS_THREAD)
+_follow_points = jax.jit(traced_once(follow_points), static_argnames="plan", compiler_options=IN_ITS_THREAD)
 
 
 @partial(jax.jit, static_argnames="plan", donate_argnums=0, compiler_options=SOON_COMPILED)
+@traced_once
 def _track_followed(
     state: TrackState, frame: FrameArrays, followed: Followed, params: TrackParams, plan: TrackPlan
 ) -> tuple[TrackState, TrackOutput]:

@@ -17,6 +17,7 @@ from jaxslam.evaluation import evaluate
 from jaxslam.frame_arrays import FrameArrays, stack_frames
 from jaxslam.results import peak_rss_mb
 from jaxslam.state import TrackParams, TrackPlan, TrackStatus
+from jaxslam.trace_cache import traced_once
 from jaxslam.track import init_state, track_step
 from jaxslam.track_settings import track_params, track_plan
 from jaxslam.trajectory import Trajectory
@@ -173,8 +174,8 @@ def _batch(clips: Sequence[FrameArrays], task: Task, way: Way) -> TrackedClips:
     return track_clips(clips, task.params, task.plan, at_once=way.at_once, threads=way.threads)
 
 
-_new_state = jax.jit(init_state, static_argnames=("height", "width", "plan"))
-_step_alone = jax.jit(track_step, static_argnames="plan", donate_argnames="state")
+_new_state = jax.jit(traced_once(init_state), static_argnames=("height", "width", "plan"))
+_step_alone = jax.jit(traced_once(track_step), static_argnames="plan", donate_argnames="state")
 
 
 def loop(clips: Iterable[FrameArrays], task: Task) -> TrackedClips:

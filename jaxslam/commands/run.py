@@ -214,7 +214,7 @@ def track(
 ) -> dict[str, Any]:
     """Track with a progress bar, write the results, and print them unless `quiet`; gives the summary."""
     began = time.perf_counter()
-    with console.status("Compiling the tracker (some 20 s at the first start on a machine, then 2) ..."):
+    with console.status("Compiling the tracker (some 20 s at the first start on a machine, then 1) ..."):
         slam.warm_up()
     if not quiet:
         console.print(f"Tracker ready after {slam.compile_s:.1f} s.")

@@ -31,6 +31,7 @@ from jaxslam_kernels.voxel_grid import (
 from jaxslam_kernels.voxel_hash import NO_ROW
 from jaxtyping import Array, Float, Float16, Float32, Int, Int16, Int32, UInt8
 
+from jaxslam.trace_cache import traced_once
 from jaxslam.xla import IN_ITS_THREAD
 
 ROWS = 1024
@@ -78,6 +79,7 @@ def cloud_size(points: int) -> int:
 
 
 @partial(jax.jit, static_argnames="capacity", compiler_options=IN_ITS_THREAD)
+@traced_once
 def reduced(
     X_cam: Float32[Array, "3 n"],
     colour: UInt8[Array, "3 n"],
@@ -95,6 +97,7 @@ def reduced(
 
 
 @partial(jax.jit, donate_argnums=0, compiler_options=IN_ITS_THREAD)
+@traced_once
 def put(
     grid: VoxelGrid, cloud: Cloud, evidence: Float[Array, " m"], pose: Float[Array, "7"], voxel_m: Float[Array, ""]
 ) -> tuple[VoxelGrid, Int[Array, " m"]]:
@@ -111,6 +114,7 @@ def put(
 
 
 @partial(jax.jit, donate_argnums=0, compiler_options=IN_ITS_THREAD)
+@traced_once
 def taken_out(
     grid: VoxelGrid,
     rows: Int[Array, " m"],
@@ -130,6 +134,7 @@ def taken_out(
 
 
 @partial(jax.jit, donate_argnums=0, compiler_options=IN_ITS_THREAD)
+@traced_once
 def looked(
     grid: VoxelGrid,
     blocks: Int[Array, " b"],
@@ -156,6 +161,7 @@ def looked(
 
 
 @partial(jax.jit, compiler_options=IN_ITS_THREAD)
+@traced_once
 def num_past(
     cloud: Cloud,
     pose: Float[Array, "7"],
@@ -176,12 +182,14 @@ def num_past(
 
 
 @jax.jit
+@traced_once
 def all_centroids(grid: VoxelGrid, voxel_m: Float[Array, ""]) -> Voxels:
     """The points of all rows."""
     return centroids(grid, jnp.zeros((), jnp.int32), voxel_m, size=len(grid.sums))
 
 
 @partial(jax.jit, static_argnums=3)
+@traced_once
 def rebuilt(
     grid: VoxelGrid, old_m: Float[Array, ""], new_m: Float[Array, ""], capacity: int
 ) -> tuple[VoxelGrid, Int[Array, " c"], Points]:

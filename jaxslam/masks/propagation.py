@@ -26,6 +26,7 @@ from jaxtyping import Array, Bool, Float, Float32, Int, Int32, UInt8
 
 from jaxslam.aligned import aligned_array
 from jaxslam.masks.sampling import sample_mask
+from jaxslam.trace_cache import traced_once
 from jaxslam.xla import IN_ITS_THREAD
 
 CAPACITY = 128
@@ -129,6 +130,7 @@ def follow(
 
 
 @jax.jit
+@traced_once
 def as_objects(uv: Pixels, ok: Mask, depth: Float[Array, "h w"], spacing: Float[Array, ""]) -> Followed:
     """Points with depth that lie close together, taken for one object.
 
@@ -253,10 +255,11 @@ def _flow(before: Pyramid, now: Pyramid, uv: Pixels, ok: Mask) -> tuple[Pixels, 
     return flow.points, flow.ok
 
 
-_follow_between = jax.jit(_flow, compiler_options=IN_ITS_THREAD)
+_follow_between = jax.jit(traced_once(_flow), compiler_options=IN_ITS_THREAD)
 
 
 @partial(jax.jit, compiler_options=IN_ITS_THREAD)
+@traced_once
 def _follow_last(
     before: Pyramid,
     grey: UInt8[Array, "h w"],

@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float
 from jaxslam.aligned import aligned_array
 from jaxslam.masks.reduced import Raster, Reduced
 from jaxslam.pose import between, compose
+from jaxslam.trace_cache import traced_once
 from jaxslam.xla import IN_ITS_THREAD
 
 _COARSE_WIDTH = 160
@@ -197,6 +198,7 @@ def newcomers(seen: Surfaces, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray,
 
 
 @partial(jax.jit, compiler_options=IN_ITS_THREAD)
+@traced_once
 def _compared(
     depth: Float[Array, "h w"],
     depths_then: Float[Array, "k h w"],

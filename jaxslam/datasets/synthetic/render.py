@@ -25,6 +25,7 @@ from jaxslam.datasets.synthetic.raycast import (
 from jaxslam.datasets.synthetic.shading import SUN, Hits, shade
 from jaxslam.datasets.synthetic.solids import Solid
 from jaxslam.datasets.synthetic.texture import N_WORDS
+from jaxslam.trace_cache import traced_once
 
 _CAPACITY_STEP = 64
 
@@ -119,6 +120,7 @@ def _capacity(count: int) -> int:
 
 
 @partial(jax.jit, static_argnames=("height", "width"))
+@traced_once
 def render(scene: Scene, view: View, *, height: int, width: int) -> Rendering:
     """Cast one ray a pixel.
 

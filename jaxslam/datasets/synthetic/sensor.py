@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, UInt, UInt8
 
 from jaxslam.checked import Checked, Range
 from jaxslam.datasets.synthetic.shading import unpack_colour
+from jaxslam.trace_cache import traced_once
 
 
 @dataclass(frozen=True)
@@ -95,6 +96,7 @@ def sensor_params(config: SensorConfig) -> SensorParams:
 
 
 @jax.jit
+@traced_once
 def measure(
     exposures: tuple[UInt[Array, "h w"], ...],
     depth_m: Float[Array, "h w"],
