@@ -7,7 +7,6 @@ but their queues and the index of places, which has a lock.
 
 import threading
 from collections.abc import Callable, Iterable
-from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
@@ -38,7 +37,6 @@ from jaxslam.stage_times import StageTimes
 from jaxslam.state import TrackOutput, TrackParams, TrackPlan, TrackReason, TrackState, TrackStatus
 from jaxslam.state_edit import relocated
 from jaxslam.trace_cache import traced_once
-from jaxslam.track import init_state
 from jaxslam.worker import Worker, close_all, make_worker
 
 _relocated = jax.jit(traced_once(relocated), donate_argnums=0)
@@ -202,13 +200,13 @@ class BackEnd:
         """Whether keyframes wait that mapping has not begun with; never on the schedule of a deterministic run."""
         return not self._config.run.in_turn and self._link.num_on_the_way > _MOST_ON_THE_WAY
 
-    def compile(self, frame: FrameArrays) -> None:
-        """Compile all that is needed while frames of this kind come."""
+    def compile(self, frame: FrameArrays, state: TrackState) -> None:
+        """Compile all that is needed while frames of this kind come, with a state that is not needed any more."""
         self._mapping.compile(frame, self._num_tracks)
         if self._states is not None:
             self._states.compile(frame)
         compile_recognition(self._params, self._plan.features)
-        self._compile_edits(*frame.image.shape)
+        self._compile_edits(state)
         if self._dense is not None:
             self._dense.compile()
         if not self._config.run.in_turn:
@@ -404,12 +402,9 @@ class BackEnd:
             return None
         return Placed(Hung(about.keyframe, found.T_origin_cam), len(found.agree), found.covariance)
 
-    def _compile_edits(self, height: int, width: int) -> None:
-        """Compile the changes to the tracker's state, on one that holds nothing."""
-        shapes: Any = jax.eval_shape(partial(init_state, height, width, self._track_plan))
-        nothing = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes._replace(key=None))
-        state = _relocated(nothing._replace(key=jax.random.key(0)), np.asarray(IDENTITY, np.float32))
-        state = self._link.compile(state)
+    def _compile_edits(self, state: TrackState) -> None:
+        """Compile the changes to the tracker's state."""
+        state = self._link.compile(_relocated(state, np.asarray(IDENTITY, np.float32)))
         if self._semantics is not None:
             state = self._link.forgotten(state, np.zeros(1, np.int64))
         jax.block_until_ready(state)

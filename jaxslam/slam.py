@@ -182,7 +182,7 @@ class Slam:
             nothing = self._memory.hold(Frame(0, black, np.zeros(shape, np.float32), right=pair), 0.0)
             # In two threads: 5.9 s instead of 7.4 from the cache, 31 instead of 34 without one.
             with ThreadPoolExecutor(1, thread_name_prefix="jaxslam-compile") as beside:
-                back_end = beside.submit(self._back.compile, nothing)
+                back_end = beside.submit(self._back.compile, nothing, self._fresh_state())
                 state = self._fresh_state()
                 followed = _follow_points(state, nothing, self._params, self._plan)
                 jax.block_until_ready(_track_followed(state, nothing, followed, self._params, self._plan))
@@ -401,7 +401,9 @@ class Slam:
         return DenseMapping(dense_map, self.config.dense, deterministic=self.config.run.in_turn)
 
     def _fresh_state(self) -> TrackState:
-        return _new_state(self.camera.height, self.camera.width, self._plan, seed=self.config.run.seed)
+        state = _new_state(self.camera.height, self.camera.width, self._plan, seed=self.config.run.seed)
+        # Committed from the beginning, as after any `traced_once`: else all is compiled again when the first one is.
+        return jax.device_put(state, *state.twist.devices())
 
     def _tracked_or_rejected(self, timestamp_ns: int, frame: Frame | JaxSlamError | None) -> Tracked | Rejected:
         if frame is None:
@@ -498,12 +500,11 @@ class Slam:
         else:
             return lost, None
         output = self._advance(arrays, _follow_points(self._state, arrays, self._params, self._plan))
-        if int(output.status) == TrackStatus.STARTED:
-            return output, placed
-        self._state = self._state._replace(lost_frames=jnp.zeros((), jnp.int32))  # not to start by itself
+        if int(output.status) != TrackStatus.STARTED:
+            self._state = self._state._replace(lost_frames=jnp.zeros((), jnp.int32))  # not to start by itself
         if placed is None:
             return output, None
-        # Nothing here has a depth from which to go on, but what the map shows is a pose all the same.
+        # If nothing here has a depth from which to go on, what the map shows is a pose all the same.
         covariance = placed.covariance.astype(np.float32)
         return output._replace(status=TrackStatus.RELOCALISED, reason=TrackReason.NONE, covariance=covariance), placed
 

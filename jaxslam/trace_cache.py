@@ -50,6 +50,8 @@ def traced_once(function: Callable[P, R]) -> Callable[P, R]:
     every time. It cannot be differentiated.
 
     The same trace is compiled whether it was found or made, so that a first start gives the same digits as a later one.
+    What a program from the disk gives is committed to its device, as by `jax.device_put(x, device)`; and a program that
+    was compiled for arguments which are not is compiled again for some that are.
 
     Args:
         function: Of jaxslam, pure, of arrays in pytrees and of static arguments.
@@ -101,18 +103,19 @@ def _traced(function: Callable[..., Any], leaves: list[Any], tree: Any, dynamic:
 
 def _key_of(value: Any) -> str | None:
     """Text that says what a static value is; `None` if it cannot be told."""
-    if value is None or isinstance(value, bool | int | float | str | np.dtype | Enum):
+    if isinstance(value, Enum):
+        return f"{type(value).__module__}.{value!r}"
+    is_number_type = isinstance(value, type) and value.__module__ in {"numpy", "jax.numpy"}
+    if value is None or is_number_type or isinstance(value, bool | int | float | str | np.dtype):
         return repr(value)
-    if isinstance(value, type):
-        return f"{value.__module__}.{value.__qualname__}"
     if isinstance(value, tuple | list):
-        return _key_of_parts(type(value).__qualname__, value)
+        return _key_of_parts(f"{type(value).__module__}.{type(value).__qualname__}", value)
     if isinstance(value, functools.partial):
         return _key_of_parts("partial", (value.func, value.args, tuple(sorted(value.keywords.items()))))
     if inspect.isfunction(value):
-        value = inspect.unwrap(value)
-        if value.__module__.partition(".")[0] in _PACKAGES:
-            name = f"{value.__module__}.{value.__qualname__}:{value.__code__.co_firstlineno}"
+        module = value.__globals__["__name__"]  # not `__module__`, which `functools.wraps` copies to a user's function
+        if module.partition(".")[0] in _PACKAGES:
+            name = f"{module}.{value.__qualname__}:{value.__code__.co_firstlineno}"
             held = [cell.cell_contents for cell in value.__closure__ or ()]
             return _key_of_parts(name, (held, value.__defaults__, tuple((value.__kwdefaults__ or {}).items())))
     return None

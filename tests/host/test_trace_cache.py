@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from enum import Enum
 from pathlib import Path
+from types import FunctionType
 from typing import Any, NamedTuple
 
 import jax
@@ -64,23 +65,29 @@ def make_function(number: int) -> Callable[..., int]:
     return of_jaxslam(lambda: number)
 
 
-def of_jaxslam(function: Callable[..., Any]) -> Callable[..., Any]:
+def of_jaxslam(function: Any) -> Callable[..., Any]:
     """The function, as if it were of the package."""
-    function.__module__ = "jaxslam.something"
-    return function
+    names = globals() | {"__name__": "jaxslam.something"}
+    ours = FunctionType(function.__code__, names, function.__name__, function.__defaults__, function.__closure__)
+    return functools.update_wrapper(ours, function)
 
 
 def outside() -> None:
     """A function of a user."""
 
 
-of_jaxslam(program)
+@functools.wraps(trace_cache.traced_once)
+def around_ours() -> None:
+    """A function of a user, which says it was one of jaxslam."""
+
+
+_program = of_jaxslam(program)
 _TWICE = Plan(2.0)
 
 
 def called(a: Any = (1.0, 2.0), plan: Plan = _TWICE) -> Given:
     """The program as the next process would call it: with nothing in memory."""
-    jitted = jax.jit(traced_once(program), static_argnames="plan", donate_argnums=0)
+    jitted = jax.jit(traced_once(_program), static_argnames="plan", donate_argnums=0)
     turn = SO3.from_z_radians(jnp.float32(0.3))
     return jitted(jnp.array(a, jnp.float32), turn, jax.random.key(7), plan=plan)
 
@@ -122,20 +129,22 @@ class TestFound:
     def test_arguments_are_given_away(self) -> None:
         for _ in range(2):
             a = jnp.array([1.0, 2.0], jnp.float32)
-            jitted = jax.jit(traced_once(program), static_argnames="plan", donate_argnums=0)
+            jitted = jax.jit(traced_once(_program), static_argnames="plan", donate_argnums=0)
             jitted(a, SO3.identity(), jax.random.key(0), plan=Plan())
             assert a.is_deleted()
 
-    def test_in_a_transformation(self) -> None:
-        """`vmap` comes before it is jitted, as in a batch."""
-        turn, key = SO3.from_z_radians(jnp.float32(0.3)), jax.random.key(7)
-        several = jax.vmap(lambda b: program(b, turn, key, plan=Plan()).total)
+    def test_of_a_batch(self, folder: Path) -> None:
+        def several(a: jax.Array) -> jax.Array:
+            turn, key = SO3.from_z_radians(a[0, 0]), jax.random.key(7)
+            return jax.vmap(lambda one: program(one, turn, key, plan=Plan()).total)(a)
+
         a = jnp.arange(6, dtype=jnp.float32).reshape(3, 2)
         for _ in range(2):
-            np.testing.assert_array_equal(jax.jit(traced_once(of_jaxslam(several)))(a)[2], several(a)[2])
+            np.testing.assert_array_equal(jax.jit(traced_once(of_jaxslam(several)))(a), jax.jit(several)(a))
+        assert len(kept(folder)) == 1
 
     def test_without_jit_it_is_the_function(self, folder: Path) -> None:
-        result = traced_once(program)(jnp.ones(2), SO3.identity(), jax.random.key(0), plan=Plan())
+        result = traced_once(_program)(jnp.ones(2), SO3.identity(), jax.random.key(0), plan=Plan())
         assert isinstance(result, Given)
         assert not kept(folder)
 
@@ -183,7 +192,9 @@ class TestOther:
         assert len(kept(folder)) == 2
 
     @pytest.mark.parametrize(
-        "unknown", [outside, functools.partial(outside), np.ones], ids=["function", "partial", "numpy"]
+        "unknown",
+        [outside, around_ours, functools.partial(outside), np.ones, Plan],
+        ids=["function", "around_ours", "partial", "numpy", "class"],
     )
     def test_function_of_a_user_is_not_kept(self, folder: Path, unknown: Any) -> None:
         for _ in range(2):
@@ -193,7 +204,11 @@ class TestOther:
 
     def test_partial_of_ours_is_kept(self, folder: Path) -> None:
         for number in (1, 2, 1):
-            called(plan=Plan(functions=(functools.partial(make_function(0), number, name=np.dtype(np.float32)),)))
+            called(
+                plan=Plan(
+                    functions=(functools.partial(make_function(0), number, name=np.dtype(np.float32), kind=np.float32),)
+                )
+            )
         assert len(traces) == len(kept(folder)) == 2
 
     @pytest.mark.parametrize("setting", [FOLDER, "jax_enable_compilation_cache"])
