@@ -49,6 +49,11 @@ wait there behind those of other programs: beside optical flow, 0.3 ms of work f
 the machine for itself is faster with the pool: the second part of the tracker's step takes 2.5 ms, and 3.3 without.
 """
 
+MUCH_COMPUTED: dict[str, bool | str] = {"xla_cpu_use_fusion_emitters": True}
+"""Options of `jax.jit` for a program that computes much for every pixel: XLA's newer generator of code, whatever
+`XLA_FLAGS` says. With the older one a frame of a room takes 111 ms instead of 63 (640x480, one thread, AMD EPYC).
+"""
+
 
 def prefer_one_thread() -> None:
     """Compute in the calling thread, unless `NPROC` in the environment says otherwise; before the first array.

@@ -32,12 +32,13 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_sessionstart() -> None:
-    """Every program is compiled once for all processes: those of pytest, and those that tests start.
+    """One thread for each worker, and every program compiled once for all processes: pytest's, and those tests start.
 
     These are strict too: a program that was traced with other rules has parts of other names, and is another one.
     """
-    from jaxslam.xla import enable_compile_cache  # noqa: PLC0415 - what is imported before this gets no type checks
+    from jaxslam.xla import enable_compile_cache, prefer_one_thread  # noqa: PLC0415 - before it there are no type checks
 
+    prefer_one_thread()
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # a small one is loaded in a tenth of its time
     enable_compile_cache()
     for name in _FOR_ALL:

@@ -18,9 +18,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
+from jaxslam.benchmark.opencv_flow import flow_time_ms
 from jaxslam.benchmark.suite import Sequence as Clip
 from jaxslam.config import Config, SemanticsConfig, load_config, to_yaml
 from jaxslam.datasets import Dataset, Subset, open_dataset
@@ -31,7 +31,6 @@ from jaxslam.detector_choice import network_files
 from jaxslam.download import sha256_of
 from jaxslam.errors import BenchmarkError, JaxSlamError
 from jaxslam.files import write_atomically
-from jaxslam.frame import to_grey
 from jaxslam.recordings import find_recording
 from jaxslam.results import RunInfo, write_results
 from jaxslam.run_pictures import RunPictures
@@ -41,8 +40,6 @@ from jaxslam.xla import enable_compile_cache, prefer_one_thread
 RESULT = "result.json"
 """The last file of a run to be written: where it is, the run is done."""
 _JOB = "job.json"
-_FLOW_PAIRS, _FLOW_CALLS = 8, 3
-_FLOW_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.03)
 _MOST_HASHED_BYTES = 5_000_000
 _LAST_WORDS = 400
 
@@ -220,33 +217,6 @@ def networks_sha256(config: SemanticsConfig) -> dict[str, str | None]:
         ModelError: If a file is named that is not there.
     """
     return {setting: path and sha256_of(path) for setting, path in network_files(config).items()}
-
-
-def flow_time_ms(dataset: Dataset) -> float:
-    """What a frame costs on this machine, whatever is done with it: OpenCV's optical flow of 1000 corners.
-
-    The median over pairs of frames all over the recording, in one thread, with both pyramids.
-    """
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        first = np.linspace(0, max(len(dataset) - 2, 0), _FLOW_PAIRS).astype(int)
-        return float(np.median([_flow_of_pair_ms(dataset, int(index)) for index in np.unique(first)]))
-    finally:
-        cv2.setNumThreads(before)
-
-
-def _flow_of_pair_ms(dataset: Dataset, index: int) -> float:
-    a, b = (to_grey(dataset[min(i, len(dataset) - 1)].image) for i in (index, index + 1))
-    corners = cv2.goodFeaturesToTrack(a, 1000, 0.001, 7)
-    if corners is None:
-        corners = np.random.default_rng(index).uniform(0, min(a.shape), (1000, 1, 2)).astype(np.float32)
-    taken: list[float] = []
-    for _ in range(_FLOW_CALLS):
-        began = time.perf_counter()
-        cv2.calcOpticalFlowPyrLK(a, b, corners, corners.copy(), winSize=(21, 21), maxLevel=3, criteria=_FLOW_CRITERIA)
-        taken.append(1e3 * (time.perf_counter() - began))
-    return float(np.median(taken))
 
 
 def _rate_hz(dataset: Dataset) -> float:

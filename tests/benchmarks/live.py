@@ -5,34 +5,16 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import pytest
 
 from jaxslam import Slam, evaluate, load_config, open_dataset
+from jaxslam.benchmark.opencv_flow import corners_of, flow_ms
 from jaxslam.datasets import Dataset
 from jaxslam.frame import Frame, to_grey
 from jaxslam.semantics import Detector
 
 WARM_UP = 10
-CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.03)
-
-
-def opencv_flow(before: np.ndarray, after: np.ndarray, corners: np.ndarray) -> None:
-    """Let OpenCV follow corners from one grey image to the next, with both pyramids."""
-    cv2.calcOpticalFlowPyrLK(before, after, corners, corners.copy(), winSize=(21, 21), maxLevel=3, criteria=CRITERIA)
-
-
-def flow_ms(before: np.ndarray, after: np.ndarray, corners: np.ndarray) -> float:
-    """Milliseconds that it takes."""
-    at = time.perf_counter()
-    opencv_flow(before, after, corners)
-    return 1e3 * (time.perf_counter() - at)
-
-
-def corners_of(image: np.ndarray) -> np.ndarray:
-    """A thousand corners to follow, of a colour or grey image."""
-    return cv2.goodFeaturesToTrack(to_grey(image), 1000, 0.001, 7)
 
 
 class Run(NamedTuple):

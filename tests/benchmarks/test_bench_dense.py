@@ -9,10 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from benchmarks.live import corners_of, flow_ms
 from host.true_surface import accuracy
 
 from jaxslam import Slam, load_config, open_dataset
+from jaxslam.benchmark.opencv_flow import corners_of, flow_ms
 from jaxslam.benchmark.timing import pinned_to_one_core
 from jaxslam.datasets import Dataset
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset

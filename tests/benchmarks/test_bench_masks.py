@@ -10,12 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from benchmarks.live import corners_of, opencv_flow
 from jaxlie import SE3
 from jaxslam_kernels.camera import make_intrinsics
 from jaxslam_kernels.depth_change import depth_change
 from jaxslam_kernels.image import Pyramid, build_pyramid
 
+from jaxslam.benchmark.opencv_flow import corners_of, opencv_flow
 from jaxslam.benchmark.timing import Comparison, compare, compile_seconds
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.dynamic_masks import WIDTH_PX

@@ -4,9 +4,9 @@ import itertools
 
 import jax
 import pytest
-from benchmarks.live import corners_of, opencv_flow
 
 from jaxslam import Slam, frame_arrays, open_dataset, track_params, track_plan, track_step
+from jaxslam.benchmark.opencv_flow import corners_of, opencv_flow
 from jaxslam.benchmark.timing import compare
 from jaxslam.config import Config, TrackConfig
 from jaxslam.frame import to_grey

@@ -8,7 +8,7 @@ import numpy as np
 from jaxslam_kernels.camera import back_project
 
 from jaxslam.benchmark.kernels.case import Case, Problem
-from jaxslam.benchmark.kernels.image_cases import moving_corners, opencv_flow
+from jaxslam.benchmark.kernels.image_cases import moving_corners
 from jaxslam.benchmark.kernels.room_views import (
     RoomViews,
     back_projected,
@@ -17,6 +17,7 @@ from jaxslam.benchmark.kernels.room_views import (
     projected,
     room_views,
 )
+from jaxslam.benchmark.opencv_flow import NUM_CORNERS, opencv_flow
 from jaxslam.config import DynamicsConfig, OcclusionConfig, TrackConfig
 from jaxslam.dynamics.cue import Scene, combined
 from jaxslam.dynamics.known import with_cue_params, with_cues
@@ -31,13 +32,12 @@ from jaxslam.pose import between, to_local, transform
 from jaxslam.state import TrackPlan
 from jaxslam.track_settings import track_params
 
-_FLOW_POINTS = 1000
 _SETTLING_STEPS = 20
 
 
 def _flow() -> Callable[[], np.ndarray]:
     """OpenCV's optical flow of a frame, the unit in which the time of a cue is given."""
-    previous, current, points = moving_corners(_FLOW_POINTS)
+    previous, current, points = moving_corners(NUM_CORNERS)
     rows = np.ascontiguousarray(points.T)
     return lambda: opencv_flow(previous, current, rows)
 
@@ -151,7 +151,7 @@ def _no_features() -> Features:
     return Features(nowhere, nowhere, none, np.zeros(0, np.uint8), none, no_descriptor)
 
 
-_REFERENCE = f"cv2.calcOpticalFlowPyrLK of {_FLOW_POINTS} corners"
+_REFERENCE = f"cv2.calcOpticalFlowPyrLK of {NUM_CORNERS} corners"
 _RATIO = (
     "not the same work: the ratio is what the cue adds to a frame, beside the optical flow of 640x480 pixels, pyramids"
     " included"

@@ -13,9 +13,9 @@ from jaxslam_kernels.lk_flow import lk_flow
 
 from jaxslam.benchmark.kernels.case import Case, Problem
 from jaxslam.benchmark.kernels.known_warps import corners, picture, warp
+from jaxslam.benchmark.opencv_flow import LEVELS, WINDOW_PX, opencv_flow
 
-_WINDOW, _LEVELS, _BORDER, _CELLS_A_ROW = 21, 4, 16, 32
-_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.03)
+_BORDER, _CELLS_A_ROW = 16, 32
 _BATCH_POINTS, _SHIFT_PX = 256, 10.0
 
 
@@ -42,9 +42,9 @@ def _pyramid(num_pixels: int) -> Problem:
         return max(float(np.abs(a - b).max()) for a, b in zip(inside, theirs[1], strict=True))
 
     return Problem(
-        lambda image: build_pyramid(image, num_levels=_LEVELS, border=_BORDER).levels,
+        lambda image: build_pyramid(image, num_levels=LEVELS, border=_BORDER).levels,
         (image,),
-        lambda: cv2.buildOpticalFlowPyramid(image, (_WINDOW, _WINDOW), _LEVELS - 1, withDerivatives=False),
+        lambda: cv2.buildOpticalFlowPyramid(image, (WINDOW_PX, WINDOW_PX), LEVELS - 1, withDerivatives=False),
         difference,
     )
 
@@ -81,13 +81,6 @@ def moving_corners(num_points: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     """Two pictures of 640x480, and corners `(2, num_points)` of the first, which move 10 px to the second."""
     previous, current, _ = warp(picture(640, 480), _SHIFT_PX, 2)
     return previous, current, corners(previous, num_points)
-
-
-def opencv_flow(previous: np.ndarray, current: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Positions `(n, 2)` of points `(n, 2)`."""
-    return cv2.calcOpticalFlowPyrLK(
-        previous, current, points, points.copy(), winSize=(_WINDOW, _WINDOW), maxLevel=_LEVELS - 1, criteria=_CRITERIA
-    )[0]
 
 
 def _median_distance(ours: Any, theirs: Any) -> float:

@@ -26,6 +26,7 @@ from jaxslam.datasets.synthetic.shading import SUN, Hits, shade
 from jaxslam.datasets.synthetic.solids import Solid
 from jaxslam.datasets.synthetic.texture import N_WORDS
 from jaxslam.trace_cache import traced_once
+from jaxslam.xla import MUCH_COMPUTED
 
 _CAPACITY_STEP = 64
 
@@ -119,7 +120,7 @@ def _capacity(count: int) -> int:
     return _CAPACITY_STEP * -(-max(count, 1) // _CAPACITY_STEP)
 
 
-@partial(jax.jit, static_argnames=("height", "width"))
+@partial(jax.jit, static_argnames=("height", "width"), compiler_options=MUCH_COMPUTED)
 @traced_once
 def render(scene: Scene, view: View, *, height: int, width: int) -> Rendering:
     """Cast one ray a pixel.

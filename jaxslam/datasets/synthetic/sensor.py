@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, NamedTuple
 
 import jax
@@ -12,6 +13,7 @@ from jaxtyping import Array, Bool, Float, UInt, UInt8
 from jaxslam.checked import Checked, Range
 from jaxslam.datasets.synthetic.shading import unpack_colour
 from jaxslam.trace_cache import traced_once
+from jaxslam.xla import MUCH_COMPUTED
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,7 @@ def sensor_params(config: SensorConfig) -> SensorParams:
     )
 
 
-@jax.jit
+@partial(jax.jit, compiler_options=MUCH_COMPUTED)
 @traced_once
 def measure(
     exposures: tuple[UInt[Array, "h w"], ...],
