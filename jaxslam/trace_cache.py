@@ -18,6 +18,7 @@ from importlib import metadata, util
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar, cast
 
+import equinox as eqx
 import jax
 import numpy as np
 from jax import export
@@ -59,22 +60,20 @@ def traced_once(function: Callable[P, R]) -> Callable[P, R]:
 
     @functools.wraps(function)
     def traced(*args: P.args, **kwargs: P.kwargs) -> R:
-        leaves, tree = jax.tree.flatten((args, kwargs))
-        dynamic = [isinstance(leaf, Tracer) for leaf in leaves]
-        static = [leaf for leaf, is_array in zip(leaves, dynamic, strict=True) if not is_array]
-        known = _key_of((function, *static))
-        if known is None or not any(dynamic):
+        arrays, static = eqx.partition((args, kwargs), lambda leaf: isinstance(leaf, Tracer))
+        leaves, tree = jax.tree.flatten(arrays)
+        known = _key_of((function, *jax.tree.leaves(static)))
+        if known is None or not leaves:
             return function(*args, **kwargs)
-        arrays = [leaf for leaf, is_array in zip(leaves, dynamic, strict=True) if is_array]
-        kinds = [(aval.dtype, aval.shape, aval.weak_type) for aval in map(jax.typeof, arrays)]
-        file = _file(f"{known} {tree} {dynamic} {kinds}")
+        shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=x.weak_type) for x in map(jax.typeof, leaves)]
+        file = _file(f"{known} {jax.tree.structure((args, kwargs))} {tree} {shapes}")
         kept = None if file is None else _read(file)
         if kept is None:
-            kept = _traced(function, leaves, tree, dynamic)
+            kept = _traced(function, shapes, tree, static)
             if file is not None:
                 _write(file, kept)
         program, skeleton = kept
-        return jax.tree.unflatten(jax.tree.structure(skeleton), export.deserialize(program).call(*arrays))
+        return jax.tree.unflatten(jax.tree.structure(skeleton), export.deserialize(program).call(*leaves))
 
     return traced
 
@@ -83,21 +82,16 @@ _Kept = tuple[bytearray, Any]
 """A program of arrays in a row, and what it gives: numbers in a pytree."""
 
 
-def _traced(function: Callable[..., Any], leaves: list[Any], tree: Any, dynamic: list[bool]) -> _Kept:
+def _traced(function: Callable[..., Any], shapes: list[jax.ShapeDtypeStruct], tree: Any, static: Any) -> _Kept:
     skeleton = None
 
-    def flat(*arrays: Any) -> list[Any]:
+    def flat(*leaves: Any) -> list[Any]:
         nonlocal skeleton
-        rest = iter(arrays)
-        args, kwargs = jax.tree.unflatten(
-            tree, [next(rest) if is_array else leaf for leaf, is_array in zip(leaves, dynamic, strict=True)]
-        )
+        args, kwargs = eqx.combine(jax.tree.unflatten(tree, leaves), static)
         given, structure = jax.tree.flatten(function(*args, **kwargs))
         skeleton = jax.tree.unflatten(structure, range(len(given)))
         return given
 
-    arrays = [leaf for leaf, is_array in zip(leaves, dynamic, strict=True) if is_array]
-    shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=x.weak_type) for x in map(jax.typeof, arrays)]
     return export.export(jax.jit(flat))(*shapes).serialize(), skeleton
 
 

@@ -131,15 +131,13 @@ def tracked_of(
     num_matched: int,
     mask: FrameMask,
     occluded_share: float | None = None,
-    *,
-    relocalised: bool,
 ) -> Tracked:
     """The result of a frame, from what the compiled step said of it."""
     return Tracked(
         timestamp_ns=timestamp_ns,
         T_world_cam=np.asarray(output.T_world_cam.wxyz_xyz, np.float64),
         covariance=np.asarray(output.covariance),
-        status=TrackStatus.RELOCALISED if relocalised else TrackStatus(int(output.status)),
+        status=TrackStatus(int(output.status)),
         reason=TrackReason(int(output.reason)).text,
         twist=np.asarray(output.twist, np.float64),
         num_inliers=int(output.num_inliers),
