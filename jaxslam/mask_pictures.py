@@ -13,6 +13,7 @@ from jaxslam.files import write_atomically
 from jaxslam.frame import Frame
 from jaxslam.tint import GREEN, ORANGE, PURPLE, SKY_BLUE, VERMILION, Rgb, tint
 from jaxslam.tracked import Rejected, Tracked
+from jaxslam.visualize import PNG_LEVEL
 
 MASK_RGB: dict[MaskSource, Rgb] = {
     MaskSource.NONE: (120, 120, 120),
@@ -125,7 +126,7 @@ def _sheet(pictures: Sequence[np.ndarray]) -> bytes:
     tiles = [*pictures, *blank]
     lines = [np.concatenate(tiles[row * columns : (row + 1) * columns], axis=1) for row in range(rows)]
     file = io.BytesIO()
-    Image.fromarray(np.concatenate(lines)).save(file, "PNG")
+    Image.fromarray(np.concatenate(lines)).save(file, "PNG", compress_level=PNG_LEVEL)
     return file.getvalue()
 
 

@@ -137,6 +137,7 @@ class Slam:
         self._memory = FrameMemory(camera.height, camera.width, pairs=camera.is_stereo, movable=motion is not None)
         self._objects = None if motion is None else ObjectFinder(camera, motion.num_objects)
         self._ready = False
+        enable_compile_cache()
         self._begin()
 
     @classmethod
@@ -174,7 +175,6 @@ class Slam:
     def warm_up(self) -> float:
         """Compile all that is needed, or load it from the cache of an earlier run; gives the seconds it took, once."""
         if not self._ready:
-            enable_compile_cache()
             began = time.perf_counter()
             shape = (self.camera.height, self.camera.width)
             black = np.zeros(shape, np.uint8)

@@ -21,6 +21,8 @@ import numpy as np
 from jaxslam.benchmark.rows import by_sequence, row_name, rows_of
 from jaxslam.errors import BenchmarkError
 from jaxslam.files import write_atomically
+from jaxslam.results import machine
+from jaxslam.xla import usable_cores
 
 _WORSE_ATE, _WORSE_TIME = 0.02, 0.2
 """Shares by which the median error, and the time of the median frame, may be greater."""
@@ -102,9 +104,9 @@ def make_baseline(
     failed = [result for result in results if result["status"] != "done"]
     if failed or not results:
         raise BenchmarkError(f"baseline: expected runs that all ended well, got {len(failed)} of {len(results)} failed")
-    machine, versions = _machine(results), _versions(results)
+    figures = _figures_of(results, "median")
     return Baseline(
-        suite, tuple(presets), runs, reason, machine, versions, _noise_of(results), _figures_of(results, "median")
+        suite, tuple(presets), runs, reason, _machine(results), _versions(results), _noise_of(results), figures
     )
 
 
@@ -113,6 +115,11 @@ def differences(baseline: Baseline, results: Sequence[Mapping[str, Any]]) -> str
     ours = _machine(results), _versions(results)
     theirs = baseline.machine, baseline.versions
     return "; ".join(f"{now}, not {before}" for now, before in zip(ours, theirs, strict=True) if now != before)
+
+
+def runs_at_once(baseline: Baseline) -> int:
+    """How many runs this machine has room for: one where times will be compared, else one on each core."""
+    return 1 if _name(machine()) == baseline.machine else usable_cores()
 
 
 def complaints(baseline: Baseline, results: Sequence[Mapping[str, Any]]) -> list[Complaint]:
@@ -219,8 +226,11 @@ def _noise_of(results: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 
 
 def _machine(results: Sequence[Mapping[str, Any]]) -> str:
-    done = (result for result in results if result["status"] == "done")
-    return "; ".join(sorted({f"{run['cpu']} ({run['vectors']}), {run['cores']} cores" for run in done}))
+    return "; ".join(sorted({_name(result) for result in results if result["status"] == "done"}))
+
+
+def _name(machine: Mapping[str, Any]) -> str:
+    return f"{machine['cpu']} ({machine['vectors']}), {machine['cores']} cores"
 
 
 def _versions(results: Sequence[Mapping[str, Any]]) -> str:

@@ -37,8 +37,8 @@ class RunsOfSuite:
     """Presets, instead of the suite's."""
     runs: int | None = None
     """How often to run each, instead of as often as the suite says."""
-    workers: int = 1
-    """Runs at the same time on this machine; times are only worth something with 1."""
+    workers: int | None = None
+    """Runs at the same time on this machine; times are only worth something with 1, which it is if not given."""
     executor: str = _LOCAL
     """Where to run: local, or dask://HOST:PORT, the scheduler of a Dask cluster. Its workers have recordings and --root
     on their own machines, and run as many at a time as they have threads: `dask worker --nthreads 1` for times."""
@@ -84,24 +84,29 @@ class RunsOfSuite:
         )
         return results
 
+    @property
+    def runs_here(self) -> bool:
+        """Whether runs are on this machine, not on those of a cluster."""
+        return self.executor == _LOCAL
+
     def _root(self, suite: str) -> Path | None:
         """Where recordings are looked for first: the suite itself, if it is a folder of them."""
         root = self.root
         if root is None and suite not in suites() and Path(suite).is_dir():
             root = Path(suite)
-        if root is not None and self.executor != _LOCAL:
+        if root is not None and not self.runs_here:
             return root.absolute()  # on other machines, which are asked
         if root is not None and not root.is_dir():
             raise BenchmarkError(f"--root: expected a folder, got '{root}'")
         return root
 
     def _executor(self, root: Path | None) -> AbstractContextManager[Executor]:
-        if self.executor == _LOCAL:
-            return local(self.workers, root)
+        if self.runs_here:
+            return local(self.workers or 1, root)
         match = _DASK.fullmatch(self.executor)
         if match is None:
             raise BenchmarkError(f"--executor: expected local or dask://HOST:PORT, got '{self.executor}'")
-        if self.workers != 1:
+        if self.workers is not None:
             raise BenchmarkError(
                 "--workers: is for this machine; a Dask cluster runs as many as its workers have threads"
             )

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from jaxslam.benchmark.gate import complaints, differences, load_baseline, make_baseline, save_baseline
+from jaxslam.benchmark.gate import complaints, differences, load_baseline, make_baseline, runs_at_once, save_baseline
 from jaxslam.commands.bench import RunsOfSuite
 from jaxslam.commands.console import console
 from jaxslam.errors import BenchmarkError
@@ -37,6 +37,8 @@ class Gate(RunsOfSuite):
         presets, runs = (self.presets, self.runs) if before is None else (before.presets, before.runs)
         out = self.out or _OUT
         options = replace(self, presets=self.presets or presets, runs=self.runs or runs, out=out)
+        if before is not None and self.update is None and self.runs_here:
+            options = replace(options, workers=self.workers or runs_at_once(before))
         results = options.results(suite)
         if self.update is not None:
             ran = tuple(dict.fromkeys(result["preset"] for result in results))

@@ -8,8 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jaxslam.benchmark.gate import Baseline, complaints, differences, load_baseline, make_baseline, save_baseline
+from jaxslam.benchmark.gate import (
+    Baseline,
+    complaints,
+    differences,
+    load_baseline,
+    make_baseline,
+    runs_at_once,
+    save_baseline,
+)
 from jaxslam.errors import BenchmarkError
+from jaxslam.results import machine
+from jaxslam.xla import usable_cores
 
 LABELS = ("static", "default")
 
@@ -99,6 +109,11 @@ class TestComplaints:
     def test_times_are_those_of_a_machine(self) -> None:
         assert not complaints(baseline(), results(time=2.0, cpu="another"))
         assert complaints(baseline(), results(time=2.0, jaxlib="2"))
+
+    def test_runs_at_once_where_times_do_not_count(self) -> None:
+        here = make_baseline("smoke", LABELS, 2, "first", [{**run, **machine()} for run in results()])
+        assert runs_at_once(here) == 1
+        assert runs_at_once(baseline()) == usable_cores()
 
     def test_differences_are_told(self) -> None:
         assert differences(baseline(), results()) == ""

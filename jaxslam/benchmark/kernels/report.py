@@ -1,17 +1,16 @@
 """What comparisons of kernels have shown: a table in Markdown, a picture with both axes logarithmic, slopes."""
 
-import io
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from jaxslam.benchmark.kernels.case import Case
 from jaxslam.benchmark.report import table
+from jaxslam.visualize import png
 
 COLUMNS = ("kernel", "size", "on", "ours, ms", "p95", "theirs, ms", "p95", "ratio", "difference", "compile, s")
 _COLUMNS_OF_PLOTS, _WIDTH_IN, _HEIGHT_IN, _DPI = 3, 13.0, 3.4, 110
@@ -83,10 +82,8 @@ def picture(cases: Sequence[Case], rows: Rows) -> bytes:
         _plot(axes, case, [row for row in rows if row["kernel"] == case.name])
     for axes in plots[len(cases) :]:
         axes.set_axis_off()
-    file = io.BytesIO()
     figure.set_dpi(_DPI)
-    FigureCanvasAgg(figure).print_png(file)
-    return file.getvalue()
+    return png(figure)
 
 
 def _plot(axes: Axes, case: Case, rows: Rows) -> None:
