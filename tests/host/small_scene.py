@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 
 import jax
@@ -28,6 +29,12 @@ TRACK = TrackConfig(
     num_hypotheses=32,
     cell_px=10,
 )
+SETTINGS = [
+    f"track.{field.name}={getattr(TRACK, field.name)}"
+    for field in fields(TRACK)
+    if getattr(TRACK, field.name) != field.default
+]
+"""The same for the command line: no other small tracker need be compiled."""
 CONFIG = Config(track=TRACK)
 PLAN = track_plan(TRACK)
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import failing
+from small_scene import SETTINGS
 
 from jaxslam.benchmark.page import html_report
 from jaxslam.benchmark.plots import plot_rates
@@ -23,14 +24,14 @@ from jaxslam.datasets.synthetic import SyntheticConfig
 
 fails = failing("bench")
 
-SUITE = """
+SUITE = f"""
 about: a small room
 presets: [static, default]
 runs: 2
-set: [semantics.model=null, track.num_points=128, mapping.num_features=200]
+set: [semantics.model=null, {", ".join(SETTINGS)}]
 sequences:
   - name: room
-    room: {frames: 8, people: 1, width: 160, height: 120}
+    room: {{frames: 8, people: 1, width: 160, height: 120}}
 """
 COLUMNS = ("preset", "runs", "tracked, %", "ATE, m", "from - to")
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from small_scene import SETTINGS
 
 from jaxslam.cli import main
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset, write_tum
@@ -22,14 +23,14 @@ from jaxslam.errors import BenchmarkError
 distributed = pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
 psutil = pytest.importorskip("psutil", reason="comes with distributed")
 
-SUITE = """
+SUITE = f"""
 about: a small room, rendered and recorded
 presets: [static]
 runs: 2
-set: [semantics.model=null, track.num_points=128, mapping.num_features=200]
+set: [semantics.model=null, {", ".join(SETTINGS)}]
 sequences:
   - name: room
-    room: {frames: 8, people: 1, width: 160, height: 120}
+    room: {{frames: 8, people: 1, width: 160, height: 120}}
 """
 RECORDINGS = "sequences:\n  - recording: recorded_room\n  - recording: room_nobody_has"
 PATIENCE_S = 120.0

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+from small_scene import HEIGHT, SETTINGS, WIDTH
 
 from jaxslam.cli import main
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset, write_tum
@@ -14,13 +15,13 @@ FRAMES = 8
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recordings") / "room"
-    write_tum(SyntheticDataset(SyntheticConfig(width=320, height=240, frames=FRAMES, people=0)), folder)
+    write_tum(SyntheticDataset(SyntheticConfig(width=WIDTH, height=HEIGHT, frames=FRAMES, people=0)), folder)
     return folder
 
 
 def test_a_table(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Two presets, twice each: every run has its folder, every preset its row."""
-    chosen = ["--presets", "static", "ngd", "--runs", "2", "--set", "track.num_points=128", "track.cell_px=16"]
+    chosen = ["--presets", "static", "ngd", "--runs", "2", "--set", *SETTINGS]
     main(["compare", str(recording), "--out", str(tmp_path), *chosen])
     rows = json.loads((tmp_path / "comparison.json").read_text())
     assert [row["preset"] for row in rows] == ["static", "ngd"]

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import failing
+from small_scene import SETTINGS
 from tiny_recording import CAMERA, write_recording
 
 from jaxslam.benchmark.report import without_network
@@ -21,15 +22,15 @@ from jaxslam.masks.box_mask import mask_of_detections
 
 ROOM = SyntheticConfig(width=96, height=72, frames=6, people=1, boxes=1, seated=1)
 TRUTH = SemanticsConfig(model=SCENE, labels=("person", "box"))
-SUITE = """
+SUITE = f"""
 presets: [static]
-set: [track.num_points=128, mapping.num_features=200, semantics.latency_frames=0, semantics.dilate_px=0]
+set: [{", ".join(SETTINGS)}, semantics.latency_frames=0, semantics.dilate_px=0]
 variants:
   blind: [semantics.model=scene, "semantics.labels=[person]"]
   true-masks: [semantics.model=scene, "semantics.labels=[person, box]"]
 sequences:
   - name: room
-    room: {frames: 6, people: 0, boxes: 1, width: 320, height: 240}
+    room: {{frames: 6, people: 0, boxes: 1, width: 160, height: 120}}
 """
 
 fails = failing()
