@@ -210,10 +210,12 @@ def test_what_the_caller_masks_is_left_out_in_any_case() -> None:
             assert slam.track(frame).dynamic_mask[mask].all()
 
 
-@pytest.mark.parametrize("seed", [0, 7])
-def test_a_box_that_is_pushed(seed: int) -> None:
-    """It stands, is pushed, and stands again: known within five frames, and the pose is good all the while."""
-    found = verdicts(seed, start=110, stop=330)
+def test_a_box_that_is_pushed() -> None:
+    """It stands, is pushed, and stands again: known within five frames, and the pose is good all the while.
+
+    In twenty rooms, from the beginning to the end: `tests/benchmarks/test_bench_parked.py`.
+    """
+    found = verdicts(0, start=110, stop=330)
     assert len(found.changes()) == 2
     after = [found.known_after(change) for change in found.changes()]
     assert all(frames is not None and frames <= WITHIN for frames in after), after

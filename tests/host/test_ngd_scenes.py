@@ -17,7 +17,7 @@ ROOMS = 3
 """How much people harm is a matter of where they happen to walk: `static` errs by 18, 157 and 245 mm in those of
 `halfsphere`, and the tracker by 2 to 4 mm without people in so small an image. No single room shows it."""
 LATE_RATIO, STATIC_RATIO = 1.3, 5.0
-SCENES: list[tuple[CameraPathKind, int]] = [("xyz", 2), ("rpy", 3), ("halfsphere", 1)]
+SCENES: list[tuple[CameraPathKind, int]] = [("xyz", 2), ("halfsphere", 1)]
 """Some of those where `static` fails."""
 
 

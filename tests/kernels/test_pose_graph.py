@@ -210,8 +210,7 @@ _compiled_gradient = quick_compile(jax.grad(_value), static_argnames="loss")
 
 
 class TestGradient:
-    @pytest.mark.parametrize("sim3", [False, True])
-    @pytest.mark.parametrize("loss", ["squared", "cauchy"])
+    @pytest.mark.parametrize(("sim3", "loss"), [(False, "squared"), (True, "cauchy")])
     def test_gradient(self, sim3, loss):
         """Forward, reverse and central differences agree, for measured poses, scales, weights and information."""
         self._check(loop_graph(4, 9, sim3=sim3), sim3, loss)
