@@ -317,7 +317,8 @@ class DenseConfig(Checked):
     """Points of one keyframe at most; voxels of one that has more are larger."""
     keyframe_below: Annotated[float, Share] = 0.9
     """A keyframe is made when no kept one shows more than this share of its points, if that is more than the tracker's
-    own `track.keyframe_below`: what is seen in between is in no map."""
+    own `track.keyframe_below`, and when all together show less than this share of the picture: what is seen in between
+    is in no map."""
     memory_mb: Annotated[float, Positive] = 256.0
     """Of what is kept of keyframes, to move their points with them, megabytes. Beyond it, the oldest are forgotten:
     their points stay where they are then."""

@@ -22,6 +22,7 @@ from jaxslam.datasets.realtime import in_real_time
 from jaxslam.dense.cloud import DenseCloud
 from jaxslam.dense.dense_map import DenseMap
 from jaxslam.dense.mapping import DenseMapping
+from jaxslam.dense.seen_area import SeenArea
 from jaxslam.detector_choice import detector_of, key_detector_of
 from jaxslam.dynamic_masks import DynamicMasks, FrameMask, MaskSource
 from jaxslam.dynamics.known import with_cue_params, with_cues
@@ -53,6 +54,8 @@ _NEVER = 1e6
 _PATIENT_S = 0.5
 """Seconds from one keyframe to the next for want of points, while mapping is behind. With the preset `ngd` at the rate
 of the camera there was one every tenth of a second, and the threads held each other up."""
+_ALL_IS_NEW = 2.0
+"""More than the whole of a keyframe's points: a frame that shows them all is kept too."""
 _PREDICTED_S = 1.0
 """Longest time for which a constant velocity is believed."""
 
@@ -129,6 +132,7 @@ class Slam:
         # ORB-SLAM's local mapping does not accept keyframes either while it is busy.
         patient = max(_PATIENT_S, self.config.track.keyframe_weak_after_s)
         self._patient_params = self._params._replace(keyframe_weak_after_s=jnp.float32(patient))
+        self._eager_params = self._params._replace(keyframe_below=jnp.float32(_ALL_IS_NEW))
         self._plan = with_cues(track_plan(self.config.track), self.config.dynamics, pairs=camera.is_stereo)
         self._detector = detector or detector_of(self.config.semantics)
         self._key_detector = key_detector or key_detector_of(self.config)
@@ -396,7 +400,8 @@ class Slam:
             key_detector=self._key_detector,
             times=self.times,
         )
-        return DenseMapping(dense_map, self.config.dense, deterministic=self.config.run.in_turn)
+        seen = SeenArea(self.camera, float(self._params.min_depth_m), float(self._params.max_depth_m))
+        return DenseMapping(dense_map, seen, self.config.dense, deterministic=self.config.run.in_turn)
 
     def _fresh_state(self) -> TrackState:
         state = _new_state(self.camera.height, self.camera.width, self._plan, seed=self.config.run.seed)
@@ -457,7 +462,11 @@ class Slam:
         return self._memory.ignoring(arrays, objects.rest if given is None else objects.rest | given)
 
     def _advance(self, arrays: FrameArrays, followed: Followed) -> TrackOutput:
-        params = self._patient_params if self._back.is_behind else self._params
+        params = self._params
+        if self._back.is_behind:
+            params = self._patient_params
+        elif self.dense_mapping is not None and self.dense_mapping.wants_keyframe:
+            params = self._eager_params
         self._state, output = _track_followed(self._state, arrays, followed, params, self._plan)
         return jax.tree.map(np.asarray, output)  # as `device_get`, in a tenth of its time
 

@@ -146,7 +146,10 @@ class _Local:
     def run(self, jobs: Sequence[Job], out: Path) -> Iterator[tuple[Job, dict[str, Any]]]:
         rooms = out / _ROOMS
         shutil.rmtree(rooms, ignore_errors=True)  # of a suite that was killed
-        waiting = {self.pool.submit(run_in_process, job, out, self.root, rooms): job for job in jobs}
+        # Every preset before the next seed: processes that compile the same at the same time each do all of it.
+        place = {name: number for number, name in enumerate(dict.fromkeys(job.clip.name for job in jobs))}
+        in_turn = sorted(jobs, key=lambda job: (place[job.clip.name], job.seed))
+        waiting = {self.pool.submit(run_in_process, job, out, self.root, rooms): job for job in in_turn}
         runs_left = Counter(job.clip.name for job in jobs)
         try:
             for future in as_completed(waiting):

@@ -15,6 +15,7 @@ from jaxslam.dense.cloud import DenseCloud
 from jaxslam.dense.dense_map import DenseFigures, DenseMap, Look, Shown
 from jaxslam.dense.key_regions import Neighbours
 from jaxslam.dense.occupancy import Occupancy
+from jaxslam.dense.seen_area import SeenArea
 from jaxslam.frame_arrays import FrameArrays
 from jaxslam.local_mapping import NewKeyframe
 from jaxslam.map import NONE, Map
@@ -27,8 +28,8 @@ from jaxslam.worker import Worker, make_worker
 _MOST_WAITING = 8
 """Keyframes that wait: 2.5 MB each at 640x480, and more than two seconds of a tracker that makes three a second."""
 _LOOK_EVERY = 5
-"""Frames, of which one has its look at what is not there any more: with keyframes alone, twice as many ghosts stay.
-A keyframe of a camera that measures depth has none of its own besides."""
+"""Frames, of which one has its look at what is not there any more, and at what is new: with keyframes alone, twice as
+many ghosts stay. A keyframe of a camera that measures depth has none of its own besides."""
 
 _Job: TypeAlias = Shown | Look | Movers | None
 """`None`: look at the newest map."""
@@ -38,17 +39,22 @@ class DenseMapping:
     """Makes the dense map of keyframes that are in the map.
 
     All but `cloud`, `cells` and `figures` is called from the tracker's thread.
+
+    Attributes:
+        wants_keyframe: Whether much is in the picture that no keyframe shows.
     """
 
-    def __init__(self, map: DenseMap, config: DenseConfig, *, deterministic: bool) -> None:
+    def __init__(self, map: DenseMap, seen: SeenArea, config: DenseConfig, *, deterministic: bool) -> None:
         """Begin.
 
         Args:
             map: Empty; from now on nobody else's.
+            seen: Without keyframes; nobody else's either.
             config: Settings that it was made with.
             deterministic: Work in turn; else in a thread.
         """
         self._map, self._carves = map, config.carve
+        self._seen, self._least_seen, self.wants_keyframe = seen, config.keyframe_below, False
         self._neighbours = Neighbours(config.key_window, config.key_frames) if map.has_keys else None
         self._on_the_way: dict[int, Shown] = {}
         self._waiting: deque[_Job] = deque()
@@ -73,6 +79,8 @@ class DenseMapping:
             frame: Its number.
         """
         arrays = new.frame
+        self._seen.add(pose)
+        self.wants_keyframe = False
         self._on_the_way[new.id] = Shown(
             keyframe=new.id,
             image=image.copy(),
@@ -91,9 +99,11 @@ class DenseMapping:
         depth, ignore, pose = np.asarray(arrays.depth), np.asarray(arrays.ignore), pose_of(output)
         if self._neighbours is not None:
             self._neighbours.see(frame, image, depth, ignore, pose)
-        wanted = self._carves and frame % _LOOK_EVERY == 0
+        if frame % _LOOK_EVERY:
+            return
+        self.wants_keyframe = self._seen.share(depth, ignore, pose) < self._least_seen
         # Rough depth of a pair would see past what is there: keyframes, which are matched again, look instead.
-        if wanted and arrays.right is None and len(self._waiting) < _MOST_WAITING:
+        if self._carves and arrays.right is None and len(self._waiting) < _MOST_WAITING:
             pose = moved(pose, np.asarray(output.twist) * float(arrays.depth_delay_s))
             self._add_job(self._map.look_of(depth, ignore, pose), frame)
 

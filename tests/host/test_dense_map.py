@@ -15,11 +15,13 @@ from true_surface import accuracy, true_surface
 
 from jaxslam.config import Config, DenseConfig, load_config
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
+from jaxslam.datasets.synthetic.camera_path import CameraPathKind
 from jaxslam.datasets.synthetic.dataset import SyntheticFrame
 from jaxslam.dense.dense_map import DenseMap
 from jaxslam.dense.mapping import DenseMapping
 from jaxslam.dense.picture import picture
 from jaxslam.dense.results import DENSE_FILES
+from jaxslam.dense.seen_area import SeenArea
 from jaxslam.errors import ConfigError, MapFileError
 from jaxslam.frame_arrays import FrameArrays
 from jaxslam.local_mapping import NewKeyframe, Tracks
@@ -46,7 +48,8 @@ def _mapping(
     source: SyntheticDataset, config: DenseConfig = SMALL, detector=None, *, deterministic: bool = True
 ) -> DenseMapping:
     dense_map = DenseMap(source.camera, config, nearest_m=0.3, farthest_m=6.0, key_detector=detector)
-    return DenseMapping(dense_map, config, deterministic=deterministic)
+    seen = SeenArea(source.camera, nearest_m=0.3, farthest_m=6.0)
+    return DenseMapping(dense_map, seen, config, deterministic=deterministic)
 
 
 def _map(source: SyntheticDataset, poses: list[np.ndarray]) -> Map:
@@ -112,9 +115,13 @@ class TestSurface:
         assert len(cloud.points) < 0.25 * sum(np.count_nonzero(frame.depth_m) for frame in frames)
         assert cloud.points.shape == cloud.colours.shape == (len(cloud.counts), 3)
 
-    def test_of_a_run(self) -> None:
-        """The same of all that a tracked camera has seen, where it was tracked: keyframes come often enough."""
-        source = SyntheticDataset(SyntheticConfig(width=320, height=240, frames=60, people=0))
+    @pytest.mark.parametrize(("path", "seed"), [("xyz", 0), ("halfsphere", 1)])
+    def test_of_a_run(self, path: CameraPathKind, seed: int) -> None:
+        """The same of all that a tracked camera has seen, where it was tracked: keyframes come often enough.
+
+        The second camera draws back, and its first keyframe has all points for long.
+        """
+        source = SyntheticDataset(SyntheticConfig(width=320, height=240, frames=60, people=0, path=path, seed=seed))
         config = load_config("default", overrides=["semantics.model=null", "dense.enabled=true"])
         with Slam(source.camera, config) as slam:
             slam.run(source)
