@@ -2,7 +2,7 @@
 
 The tracker counts points: while it sees all those of its keyframes, it makes no other one, however much has come into
 the picture beside them. A camera that draws back sees twice as much and has no new keyframe, and the dense map nothing
-of it: of a room that was backed away from for two seconds it had 84 % instead of 98 %.
+of it: of a room that was backed away from for two seconds it had 84 % instead of 99 %.
 """
 
 from collections import deque
