@@ -102,6 +102,9 @@ def _stand(cloud: DenseCloud, T_world_cam: np.ndarray) -> _Stand:
     points = cloud.points if len(cloud.points) else np.zeros((1, 3))
     local = points @ axes.T
     low, high = np.percentile(local, [2, 98], axis=0)
+    if len(T_world_cam):  # of a road, the beginning of the path is before all that was seen from it
+        path = T_world_cam[:, 4:] @ axes.T
+        low, high = np.minimum(low, path.min(axis=0)), np.maximum(high, path.max(axis=0))
     extent_m = float(max(0.5 * (high - low)[[0, 2]].max(), 0.5))
     return _Stand(axes, 0.5 * (low + high) @ axes, extent_m)
 

@@ -17,6 +17,7 @@ from jaxslam.config import Config, DenseConfig, load_config
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.datasets.synthetic.camera_path import CameraPathKind
 from jaxslam.datasets.synthetic.dataset import SyntheticFrame
+from jaxslam.dense.cloud import DenseCloud
 from jaxslam.dense.dense_map import DenseMap
 from jaxslam.dense.mapping import DenseMapping
 from jaxslam.dense.picture import picture
@@ -251,6 +252,20 @@ class TestBounds:
     def test_nothing_yet(self) -> None:
         with pytest.raises(MapFileError, match="octree: expected at least one keyframe with depth"):
             _mapping(_room(people=0)[0]).cells()
+
+
+def test_the_whole_path_is_in_the_picture() -> None:
+    """Of a road, which is seen from 8 m ahead on only."""
+    points = np.random.default_rng(0).uniform([-3, -1, 8], [3, 1, 60], (2000, 3)).astype(np.float32)
+    grey, once = np.full((2000, 3), 90, np.uint8), np.ones(2000, np.int32)
+    poses = np.tile(IDENTITY, (30, 1))
+    poses[:, 6] = np.linspace(0, 40, 30)
+    drawn = picture(DenseCloud(points, grey, once, np.zeros(2000, bool), 0.1), poses)
+    is_path = (drawn == (255, 160, 0)).all(axis=2)
+    for panel in np.split(is_path, 2, axis=1):
+        rows, _ = np.nonzero(panel)
+        assert np.ptp(rows) > 0.3 * len(panel)
+        assert 5 < rows.min() < rows.max() < len(panel) - 5
 
 
 def test_key_objects_are_dense() -> None:
