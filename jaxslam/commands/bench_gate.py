@@ -37,8 +37,8 @@ class Gate(RunsOfSuite):
         presets, runs = (self.presets, self.runs) if before is None else (before.presets, before.runs)
         out = self.out or _OUT
         options = replace(self, presets=self.presets or presets, runs=self.runs or runs, out=out)
-        if before is not None and self.update is None and self.runs_here:
-            options = replace(options, workers=self.workers or runs_at_once(before))
+        if before is not None and self.update is None and self.runs_here and self.workers is None:
+            options = replace(options, workers=runs_at_once(before))
         results = options.results(suite)
         if self.update is not None:
             ran = tuple(dict.fromkeys(result["preset"] for result in results))

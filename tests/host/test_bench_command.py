@@ -318,6 +318,7 @@ class TestGate:
         assert "cannot be read" in fails(capsys, "gate", *nowhere)
         assert "--of SUITE" in fails(capsys, "gate", *nowhere, "--update", "why")
         assert "expected a reason" in fails(capsys, *command[1:], "--update", " ")
+        assert "--workers: expected at least 1, got 0" in fails(capsys, *command[1:], "--workers", "0")
 
 
 class TestPublished:
