@@ -88,9 +88,7 @@ def object_boxes(found: Detections, depth: Float32[np.ndarray, "_h _w"], view: V
         inside = (mask & (depth > 0)).ravel()
         if inside.sum() < _FEWEST:
             continue
-        z = depth.ravel()[inside]
-        X = np.concatenate([view.rays[:, inside] * z, z[None]])
-        low, high = np.percentile(X, _BOUNDS, axis=1)
+        low, high = np.percentile(view.points(depth, inside), _BOUNDS, axis=1)
         boxes.append(np.stack([low - _BEYOND_M, high + _BEYOND_M]))
     return np.array(boxes, np.float32).reshape(-1, 2, 3)
 

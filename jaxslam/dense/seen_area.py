@@ -34,7 +34,6 @@ class SeenArea:
             farthest_m: Farthest.
         """
         self._view = View(camera, max(1, camera.width // _COLUMNS), farthest_m, nearest_m)
-        self._nearest_m, self._farthest_m = nearest_m, farthest_m
         half = 0.5 / np.array([self._view.intrinsics.fx, self._view.intrinsics.fy], np.float64)
         self._least, self._most = self._view.rays.min(axis=1) - half, self._view.rays.max(axis=1) + half
         self._keyframes: deque[np.ndarray] = deque(maxlen=_MOST)
@@ -53,18 +52,17 @@ class SeenArea:
             ignore: Where something moves or may.
             T_world_cam: Where the frame was taken.
         """
-        z = self._view.every(depth).ravel()
-        usable = (z >= self._nearest_m) & (z <= self._farthest_m) & ~self._view.every(ignore).ravel()
-        if np.count_nonzero(usable) < _LEAST_PIXELS:
+        small = np.ascontiguousarray(self._view.every(depth), np.float32)
+        usable = np.flatnonzero(self._view.is_believed(small, self._view.every(ignore)))
+        if len(usable) < _LEAST_PIXELS:
             return 1.0
-        z = z[usable]
-        X = np.concatenate([self._view.rays[:, usable] * z, z[None]]).astype(np.float64)
-        shown = np.zeros(len(z), bool)
+        X = self._view.points(small, usable).astype(np.float64)
+        shown = np.zeros(len(usable), bool)
         for keyframe in reversed(self._keyframes):
             there = transform(between(keyframe, T_world_cam), X[:, ~shown])
-            xy = there[:2] / np.maximum(there[2], self._nearest_m)
+            xy = there[:2] / np.maximum(there[2], self._view.nearest_m)
             inside = (xy > self._least[:, None]) & (xy < self._most[:, None])
-            shown[~shown] = inside.all(axis=0) & (there[2] > self._nearest_m)
+            shown[~shown] = inside.all(axis=0) & (there[2] > self._view.nearest_m)
             if shown.all():
                 break
         return float(shown.mean())

@@ -39,7 +39,8 @@ class View:
         intrinsics: Of the camera in these pixels.
         rays: `(2, h w)` where the ray of each meets the plane one metre ahead.
         borders: `(2, 2)` left and top, right and bottom of all that any pixel may see, in that plane.
-        farthest_m: Farthest depth believed.
+        nearest_m: Nearest depth believed.
+        farthest_m: Farthest.
     """
 
     def __init__(self, camera: Camera, step: int, farthest_m: float, nearest_m: float) -> None:
@@ -49,7 +50,7 @@ class View:
 
     def _begin(self, reduced: tuple[Reduced, ...], farthest_m: float, nearest_m: float) -> None:
         """Use the pixels that are left when images are made smaller, one time after the other."""
-        self._reduced, self._bounds_m = reduced, (nearest_m, farthest_m)
+        self._reduced = reduced
         self.step = math.prod(once.step for once in reduced)
         self.shape, intrinsics = reduced[-1].raster
         self.intrinsics: Intrinsics = intrinsics
@@ -59,13 +60,13 @@ class View:
         )
         pixel = 1 / np.array([self.intrinsics.fx, self.intrinsics.fy], np.float32)
         self.borders = np.stack([self.rays.min(axis=1) - pixel, self.rays.max(axis=1) + pixel])
-        self.farthest_m = farthest_m
+        self.nearest_m, self.farthest_m = nearest_m, farthest_m
 
     def halved(self) -> "View":
         """The view of every second of these pixels."""
         half = View.__new__(View)
         last = Reduced(self._reduced[-1].raster, max(8, self.shape[1] // 2))
-        half._begin((*self._reduced, last), self.farthest_m, self._bounds_m[0])
+        half._begin((*self._reduced, last), self.farthest_m, self.nearest_m)
         return half
 
     def every(self, image: Shaped[np.ndarray, "*colours h w"]) -> Shaped[np.ndarray, "*colours _h _w"]:
@@ -88,8 +89,20 @@ class View:
     ) -> tuple[Float32[np.ndarray, "3 n"], UInt8[np.ndarray, "3 n"]]:
         """Points where there is depth, in the axes of the camera, with their colours."""
         seen = np.flatnonzero(depth)
-        z = depth.ravel()[seen]
-        return np.concatenate([self.rays[:, seen] * z, z[None]]), self.colours(image)[:, seen]
+        return self.points(depth, seen), self.colours(image)[:, seen]
+
+    def points(
+        self, depth: Float32[np.ndarray, "_h _w"], which: Shaped[np.ndarray, " k"]
+    ) -> Float32[np.ndarray, "3 n"]:
+        """Points of some of the pixels, a mask of all in a row or their numbers, in the axes of the camera."""
+        z = depth.ravel()[which]
+        return np.concatenate([self.rays[:, which] * z, z[None]])
+
+    def is_believed(
+        self, small: Float[np.ndarray, "_h _w"], ignore: Bool[np.ndarray, "_h _w"]
+    ) -> Bool[np.ndarray, "_h _w"]:
+        """Where depth of the pixels used is within bounds, and not ignored."""
+        return cv2.inRange(small, np.array([self.nearest_m]), np.array([self.farthest_m])).view(bool) & ~ignore
 
     def depth(self, depth: Float[np.ndarray, "h w"], ignore: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "_h _w"]:
         """Depth to be believed at the pixels used: within bounds, not ignored, not at an outline; else 0.
@@ -103,16 +116,15 @@ class View:
         self, small: Float[np.ndarray, "_h _w"], ignore: Bool[np.ndarray, "_h _w"]
     ) -> Float32[np.ndarray, "_h _w"]:
         """The same of an image that has the pixels used only."""
-        nearest_m, farthest_m = self._bounds_m
         small = np.ascontiguousarray(small, np.float32)
-        good = cv2.inRange(small, np.array([nearest_m]), np.array([farthest_m])).view(bool) & ~ignore
+        good = self.is_believed(small, ignore)
         small = np.where(good, small, np.float32(0))
-        least, most = np.where(good, small, np.float32(2 * farthest_m)), small
+        least, most = np.where(good, small, np.float32(2 * self.farthest_m)), small
         limit = _EDGE_SHARE * self.step * small + _EDGE_M
         most, least = _dilated(most), _eroded(least)
         outline = most - least >= limit
         # On a plane the inverse of depth is even: its mean is that of the plane.
-        inverse = np.where(good, 1 / np.maximum(small, np.float32(nearest_m)), np.float32(0))
+        inverse = np.where(good, 1 / np.maximum(small, np.float32(self.nearest_m)), np.float32(0))
         count, total = (
             cv2.boxFilter(array, -1, (5, 5), normalize=False) for array in (good.astype(np.float32), inverse)
         )
