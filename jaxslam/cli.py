@@ -18,7 +18,7 @@ from jaxslam.commands.eval import Eval
 from jaxslam.commands.export import Export
 from jaxslam.commands.models import Models
 from jaxslam.commands.run import Demo, Run
-from jaxslam.errors import JaxSlamError
+from jaxslam.errors import JaxSlamError, MissingModelError
 
 _DESCRIPTION = "Real-time visual SLAM for dynamic scenes. Start with: jaxslam demo"
 _OF_BENCH: dict[str, type[Any]] = {"batch": Batch, "gate": Gate, "kernels": Kernels}
@@ -26,14 +26,14 @@ _OF_BENCH: dict[str, type[Any]] = {"batch": Batch, "gate": Gate, "kernels": Kern
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """The `jaxslam` command: known errors are one line and exit code 1."""
+    """The `jaxslam` command: known errors are one line and exit code 1, that of a network to get first is 2."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s: %(message)s")
     command = _parsed(list(sys.argv[1:] if arguments is None else arguments))
     try:
         command.main()
     except JaxSlamError as error:
         print(f"error: {error}", file=sys.stderr)
-        sys.exit(1)
+        sys.exit(2 if isinstance(error, MissingModelError) else 1)
     except KeyboardInterrupt:
         print("error: interrupted", file=sys.stderr)
         sys.exit(130)

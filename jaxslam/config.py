@@ -147,15 +147,19 @@ class SemanticsConfig(Checked):
     """Finding what may move by a network, and following it."""
 
     model: str | None = "yolox-nano"
-    """Network: a name of `jaxslam models list`, or an ONNX file. With `null`, or where a known one is not on this
-    machine, which is said, geometry alone decides. `scene` is the truth of a rendered room: there only."""
+    """Network: a name of `jaxslam models list`, or an ONNX file. With `null` geometry alone decides. `scene` is the truth
+    of a rendered room: there only."""
+    missing_model: Literal["error", "allow"] | None = None
+    """What to do where a known network is not on this machine: `error` refuses to start; `allow` goes on without it, and
+    every output says so. If not set, the default network alone may be missing. Presets of systems that are built
+    around a network say `error`."""
     labels: tuple[str, ...] = ("person",)
     """What may move, as the network names it; in a rendered room `person` and `box`."""
     min_score: Annotated[float, Share] = 0.3
     """Detections below this score are dropped."""
     prompt_encoder: str | None = None
     """Encoder of a promptable segmenter (SAM and its family), which makes masks of the boxes that `model` finds: a name
-    of `jaxslam models list`, or an ONNX file. Where a known one is not on this machine, which is said, masks are made
+    of `jaxslam models list`, or an ONNX file. Where `missing_model` allows it not to be on this machine, masks are made
     by depth."""
     prompt_decoder: str | None = None
     """Its decoder."""

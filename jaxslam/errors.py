@@ -36,6 +36,10 @@ class ModelError(JaxSlamError):
     """A network that is missing, damaged, or of a kind that is not supported."""
 
 
+class MissingModelError(ModelError):
+    """A known network that the settings need and that is not on this machine; the message says how to get it."""
+
+
 class DownloadError(JaxSlamError):
     """A file that cannot be fetched, or is not the one expected; the message says where to place it by hand."""
 

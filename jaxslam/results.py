@@ -102,7 +102,12 @@ def _write_pictures(
     written: list[str] = []
     if len(slam.trajectory):
         plot_trajectory(
-            slam.trajectory, info.dataset.ground_truth, evaluation, folder / _OF_THE_PATH[0], pictures.snapshots
+            slam.trajectory,
+            info.dataset.ground_truth,
+            evaluation,
+            folder / _OF_THE_PATH[0],
+            pictures.snapshots,
+            title=_title(slam, info),
         )
         write_kitti_frames(folder / _OF_THE_PATH[1], slam.trajectory, info.dataset.timestamps_ns)
         written += _OF_THE_PATH
@@ -118,6 +123,12 @@ def _write_pictures(
         write_mask_pictures(folder, pictures.masks)
         written += _OF_MASKS
     return written
+
+
+def _title(slam: Slam, info: RunInfo) -> str:
+    """What was run, for a picture."""
+    why = slam.without_network
+    return f"{info.dataset.name}, {info.preset}" + ("" if why is None else f", without a network ({why})")
 
 
 def _worst(dataset: Dataset, evaluation: Evaluation | None) -> list[Snapshot]:
@@ -145,6 +156,8 @@ def _summary(
         "dataset": info.dataset.name,
         "camera": info.dataset.camera.name,
         "preset": info.preset,
+        "model": slam.config.semantics.model,
+        "without_network": slam.without_network,
         "deterministic": slam.config.run.in_turn,
         "realtime": slam.config.run.realtime,
         "seed": slam.config.run.seed,

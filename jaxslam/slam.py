@@ -23,7 +23,7 @@ from jaxslam.dense.cloud import DenseCloud
 from jaxslam.dense.dense_map import DenseMap
 from jaxslam.dense.mapping import DenseMapping
 from jaxslam.dense.seen_area import SeenArea
-from jaxslam.detector_choice import detector_of, key_detector_of
+from jaxslam.detector_choice import detector_of, key_detector_of, why_no_network
 from jaxslam.dynamic_masks import DynamicMasks, FrameMask, MaskSource
 from jaxslam.dynamics.known import with_cue_params, with_cues
 from jaxslam.dynamics.point_mask import mask_around, moving_points
@@ -84,6 +84,7 @@ class Slam:
     Attributes:
         camera: That takes the frames.
         config: Settings in effect.
+        without_network: Why no network looks at frames, as a part of a sentence; `None` if one or a `detector` does.
         dense_mapping: What makes the dense map; `None` without `dense.enabled`.
         compile_s: Seconds that compiling took.
         times: Of the stages of every frame: `take over` what mapping has done, `flow`, `wait for mask`, `pose`,
@@ -115,8 +116,10 @@ class Slam:
 
         Raises:
             MapFileError: If the map is of a camera of another size.
-            ModelError: If the network of the settings cannot be used. One that is known and only not there is no
-                error: that is said once, and geometry alone decides.
+            MissingModelError: If the network of the settings is not on this machine and `semantics.missing_model` does
+                not allow that, as in presets of systems that need one (`ngd`, `rts`, `usd`, `occlusion`). By default
+                the default network may be missing: a warning is logged, and geometry alone decides.
+            ModelError: If the network of the settings cannot be used.
         """
         self.camera = camera
         self.config = config or Config()
@@ -135,6 +138,7 @@ class Slam:
         self._eager_params = self._params._replace(keyframe_below=jnp.float32(_ALL_IS_NEW))
         self._plan = with_cues(track_plan(self.config.track), self.config.dynamics, pairs=camera.is_stereo)
         self._detector = detector or detector_of(self.config.semantics)
+        self.without_network = None if self._detector is not None else why_no_network(self.config.semantics)
         self._key_detector = key_detector or key_detector_of(self.config)
         self._rough_depth = RoughDepth(camera) if camera.is_stereo else None
         motion = self._plan.motion

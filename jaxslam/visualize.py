@@ -51,6 +51,8 @@ def plot_trajectory(
     evaluation: Evaluation | None,
     path: str | os.PathLike[str],
     snapshots: Sequence[Snapshot] = (),
+    *,
+    title: str = "",
 ) -> None:
     """Write one PNG: the path and, if it was evaluated, the error over time and the figures; below, some frames.
 
@@ -63,6 +65,7 @@ def plot_trajectory(
         evaluation: `evaluate(estimate, reference, ...)`, if it was done.
         path: Where the picture goes.
         snapshots: Frames to show with their points.
+        title: One line to write above the picture; empty for none.
 
     Raises:
         TrajectoryError: If there is nothing to draw or the file cannot be written.
@@ -76,14 +79,15 @@ def plot_trajectory(
         parts = np.asarray(figure.subfigures(2, 1, height_ratios=(height, frames_height)))
         plots = parts[0]
         _draw_snapshots(parts[1], snapshots)
+    above = f"{title}\n" if title else ""
     if evaluation is None:
         _draw_paths(plots.add_subplot(), estimate, reference)
-        plots.suptitle(f"{len(estimate)} poses, not evaluated", fontsize=9)
+        plots.suptitle(f"{above}{len(estimate)} poses, not evaluated", fontsize=9)
     else:
         seen, over_time = plots.subplots(2, height_ratios=(3, 1))
         _draw_evaluated_paths(seen, reference, evaluation)
         _draw_errors(over_time, evaluation)
-        plots.suptitle(str(evaluation), fontsize=8, family="monospace", x=0.02, ha="left")
+        plots.suptitle(f"{above}{evaluation}", fontsize=8, family="monospace", x=0.02, ha="left")
     _write_png(figure, path)
 
 

@@ -31,6 +31,9 @@ if TYPE_CHECKING:
     from jaxslam.viewer import Viewer
 
 _OnFrame: TypeAlias = Callable[[Frame | None, Tracked | Rejected], None]
+ALLOW_MISSING_MODEL = "semantics.missing_model=allow"
+"""The setting behind `--allow-missing-model`."""
+
 _Settings: TypeAlias = Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction]
 
 
@@ -112,6 +115,8 @@ class OfRecording:
     """Run everything in turn: two runs give the same bytes."""
     realtime: bool = False
     """Feed frames at the rate they were taken at, and drop those that come late; each module in its thread."""
+    allow_missing_model: bool = False
+    """Go on without the network of a preset that needs one, where it is not on this machine; all results say so."""
     set: _Settings = ()
     """Settings, as in `--set track.num_points=400 run.seed=3`; may be given again."""
 
@@ -119,6 +124,7 @@ class OfRecording:
         """The settings of a run, with more overrides if there are any."""
         chosen = ["run.deterministic=false"] if not self.deterministic else []
         chosen += ["run.realtime=true"] if self.realtime else []
+        chosen += [ALLOW_MISSING_MODEL] if self.allow_missing_model else []
         return load_config(preset, self.config, (*chosen, *itertools.chain(*self.set), *overrides))
 
     def opened(self) -> Dataset:
@@ -241,6 +247,7 @@ def _print_summary(summary: dict[str, Any], evaluation: Evaluation | None, out: 
     table = Table("figure", "value", "unit", title=summary["dataset"], title_justify="left")
     statuses = ", ".join(f"{name} {count}" for name, count in summary["status_counts"].items())
     table.add_row("tracked", f"{summary['tracked']} of {summary['frames']}", f"frames ({statuses})")
+    table.add_row("network", *_network(summary))
     if summary["realtime"]:
         table.add_row("dropped", f"{summary['dropped']} of {summary['frames']}", "frames, which came late")
     if (age := summary["mask_age_frames"]) is not None:
@@ -265,6 +272,12 @@ def _print_summary(summary: dict[str, Any], evaluation: Evaluation | None, out: 
     for note in evaluation.notes if evaluation is not None else ():
         console.print(f"Note: {note}.")
     console.print(f"Results in {out}: {', '.join(name for name in RESULT_FILES if (out / name).exists())}")
+
+
+def _network(summary: dict[str, Any]) -> tuple[str, str]:
+    """The network that looked at frames, or that none did and why."""
+    why = summary["without_network"]
+    return (summary["model"] or "given", "") if why is None else ("none", why)
 
 
 def number(value: float | None, digits: int) -> str:

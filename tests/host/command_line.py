@@ -9,8 +9,8 @@ from jaxslam.cli import main
 Fails = Callable[..., str]
 
 
-def failing(*command: str) -> Fails:
-    """What takes `capsys` and the rest of a command's arguments: it must end with code 1 and one line, `error: ...`.
+def failing(*command: str, code: int = 1) -> Fails:
+    """What takes `capsys` and the rest of a command's arguments: it must end with a code and one line, `error: ...`.
 
     Returns:
         Of the line, what comes after `error: `.
@@ -19,7 +19,7 @@ def failing(*command: str) -> Fails:
     def fails(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         with pytest.raises(SystemExit) as stop:
             main([*command, *arguments])
-        assert stop.value.code == 1
+        assert stop.value.code == code
         lines = capsys.readouterr().err.strip().splitlines()
         assert len(lines) == 1
         assert lines[0].startswith("error: ")

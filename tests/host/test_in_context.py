@@ -1,5 +1,6 @@
 """Examples as prompts: files of them, what is like them in other images, and settings that put networks together."""
 
+import dataclasses
 import logging
 import shutil
 from collections.abc import Callable
@@ -23,7 +24,7 @@ from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.detector_choice import SCENE, detector_of
 from jaxslam.download import sha256_of
 from jaxslam.dynamic_masks import DynamicMasks, MaskSource
-from jaxslam.errors import ConfigError, FrameError, JaxSlamError, ModelError
+from jaxslam.errors import ConfigError, FrameError, JaxSlamError, MissingModelError, ModelError
 from jaxslam.frame import to_grey
 from jaxslam.semantics import OnnxDetector
 from jaxslam.semantics.network import Network
@@ -382,8 +383,11 @@ class TestSettings:
 
     @pytest.mark.usefixtures("models_cache")
     def test_known_but_not_here(self, yolox: str, caplog: pytest.LogCaptureFixture) -> None:
-        """Said, and masks are made by depth, as without."""
-        settings = SemanticsConfig(model=yolox, prompt_encoder="mobilesam-encoder", prompt_decoder="mobilesam-decoder")
+        """Refused; where that is allowed it is said, and masks are made by depth, as without."""
+        named = SemanticsConfig(model=yolox, prompt_encoder="mobilesam-encoder", prompt_decoder="mobilesam-decoder")
+        with pytest.raises(MissingModelError, match=r"semantics.prompt_encoder: .*--allow-missing-model"):
+            detector_of(named)
+        settings = dataclasses.replace(named, missing_model="allow")
         with caplog.at_level(logging.WARNING):
             assert isinstance(detector_of(settings), OnnxDetector)
         assert "masks are made by depth: mobilesam-encoder is not on this machine" in caplog.text

@@ -16,7 +16,7 @@ from jaxslam.cli import main
 from jaxslam.config import SemanticsConfig
 from jaxslam.datasets import Subset, open_dataset
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset, with_true_masks
-from jaxslam.detector_choice import SCENE, detector_of, model_file
+from jaxslam.detector_choice import SCENE, detector_of, network_files, why_no_network
 from jaxslam.errors import BenchmarkError, ConfigError
 from jaxslam.masks.box_mask import mask_of_detections
 
@@ -104,7 +104,8 @@ class TestWithTrueMasks:
 
 class TestNoNetwork:
     def test_is_no_file(self) -> None:
-        assert model_file(TRUTH) is None
+        assert network_files(TRUTH) == {}
+        assert why_no_network(TRUTH) is None
 
     def test_is_no_detector_without_a_room(self, room: SyntheticDataset) -> None:
         with pytest.raises(ConfigError, match=r"semantics.model: expected a network, got 'scene'"):
