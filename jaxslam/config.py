@@ -147,11 +147,11 @@ class SemanticsConfig(Checked):
     """Finding what may move by a network, and following it."""
 
     model: str | None = "yolox-nano"
-    """Network: a name of `jaxslam models list`, or an ONNX file. With `null` geometry alone decides. `scene` is the truth
-    of a rendered room: there only."""
+    """Network: a name of `jaxslam models list`, or an ONNX file. With `null` geometry alone decides. `scene` is the
+    truth of a rendered room: there only."""
     missing_model: Literal["error", "allow"] | None = None
-    """What to do where a known network is not on this machine: `error` refuses to start; `allow` goes on without it, and
-    every output says so. If not set, the default network alone may be missing. Presets of systems that are built
+    """What to do where a known network is not on this machine: `error` refuses to start; `allow` goes on without it,
+    and every output says so. If not set, the default network alone may be missing. Presets of systems that are built
     around a network say `error`."""
     labels: tuple[str, ...] = ("person",)
     """What may move, as the network names it; in a rendered room `person` and `box`."""

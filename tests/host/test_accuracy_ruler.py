@@ -1,0 +1,147 @@
+"""The accuracy ruler on results made by hand: what is worse, what cannot be compared, what is chance."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from jaxslam.benchmark.accuracy import (
+    AccuracyBaseline,
+    Measured,
+    compare_accuracy,
+    load_accuracy_baseline,
+    measured,
+    save_accuracy_baseline,
+)
+from jaxslam.errors import BenchmarkError
+
+SEEDS = 10
+ATES = tuple(0.010 + 0.0002 * seed for seed in range(SEEDS))
+
+
+def runs(scale: float = 1.0, *, tracked: int = 900, name: str = "") -> Measured:
+    trajectories = tuple(f"{name}{scale}{seed}" for seed in range(SEEDS))
+    return Measured(90, tracked, tuple(scale * ate for ate in ATES), trajectories, "data", "network")
+
+
+BASELINE = AccuracyBaseline("8561ab9", "first", "a CPU", "numpy 2", "default", {"a": runs(), "b": runs(2.0)})
+
+
+class TestComparison:
+    def test_of_the_same_bytes(self) -> None:
+        reading = compare_accuracy(BASELINE.recordings, BASELINE)
+        assert reading.mean_ratio == pytest.approx(1)
+        assert reading.worse == ()
+        assert [row.equal_runs for row in reading.recordings] == [SEEDS, SEEDS]
+
+    def test_geometric_mean(self) -> None:
+        """A gain on one recording pays for a loss on another, up to the limit of a single one."""
+        reading = compare_accuracy({"a": runs(1.1), "b": runs(2.0 / 1.1)}, BASELINE)
+        assert [row.ratio for row in reading.recordings] == pytest.approx([1.1, 1 / 1.1])
+        assert reading.mean_ratio == pytest.approx(1)
+        assert reading.worse == ()
+        assert [row.equal_runs for row in reading.recordings] == [0, 0]
+
+    @pytest.mark.parametrize(
+        ("scales", "sentences"),
+        [
+            ((1.03, 1.045), ()),
+            ((1.05, 1.05), ("geometric mean of the ratios 1.050, expected at most 1.04",)),
+            ((1.16, 0.8), ("a: ratio 1.160, expected at most 1.15",)),
+        ],
+    )
+    def test_limits(self, scales: Sequence[float], sentences: Sequence[str]) -> None:
+        reading = compare_accuracy({"a": runs(scales[0]), "b": runs(2 * scales[1])}, BASELINE)
+        assert reading.worse == tuple(sentences)
+
+    def test_one_frame_fewer_is_worse(self) -> None:
+        reading = compare_accuracy({"a": runs(tracked=899), "b": runs(2.0)}, BASELINE)
+        assert reading.worse == ("a: 899 frames tracked over all seeds, expected 900",)
+
+    def test_new_and_missing_recordings(self) -> None:
+        """One that the baseline lacks has no say; one that was not run is named."""
+        reading = compare_accuracy({"a": runs(), "new": runs(9.0)}, BASELINE)
+        assert (reading.mean_ratio, reading.left_out, reading.worse) == (pytest.approx(1), ("b",), ())
+        assert [row.ratio for row in reading.recordings] == [pytest.approx(1), None]
+
+    def test_by_chance(self) -> None:
+        """Two medians of the same seeds differ by some percent, their mean over recordings by less."""
+        reading = compare_accuracy(BASELINE.recordings, BASELINE)
+        (low, high), (mean_low, mean_high) = reading.recordings[0].by_chance, reading.mean_by_chance
+        assert 0.9 < low < mean_low < 1 < mean_high < high < 1.1
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"frames": 30}, "a: frames: expected 90 as in the baseline, got 30"),
+            ({"data_sha256": "x"}, "a: data_sha256: expected data as in the baseline, got x"),
+            ({"network_sha256": "none"}, "a: network_sha256: expected network as in the baseline, got none"),
+            ({"ates_m": ATES[:3]}, "a: expected 10 seeds as in the baseline, got 3"),
+        ],
+    )
+    def test_refuses_something_else(self, change: dict[str, Any], message: str) -> None:
+        with pytest.raises(BenchmarkError, match=message):
+            compare_accuracy({"a": replace(runs(), **change)}, BASELINE)
+
+
+class TestFile:
+    def test_round_trip(self, tmp_path: Path) -> None:
+        save_accuracy_baseline(tmp_path / "file.json", BASELINE)
+        assert load_accuracy_baseline(tmp_path / "file.json") == BASELINE
+
+    @pytest.mark.parametrize(
+        ("recordings", "message"),
+        [
+            ({}, "recordings: expected at least one, got none"),
+            ({"a": {"ates_m": [0.1]}}, "expected a baseline as `bench accuracy --update` writes it"),
+            ({"a": {**vars(runs()), "ates_m": [float("nan")]}}, "a: ates_m: expected positive numbers"),
+            ({"a": {**vars(runs()), "ates_m": []}}, "a: ates_m: expected positive numbers"),
+        ],
+    )
+    def test_that_is_none(self, tmp_path: Path, recordings: dict[str, Any], message: str) -> None:
+        (tmp_path / "file.json").write_text(json.dumps({**vars(BASELINE), "recordings": recordings}, default=vars))
+        with pytest.raises(BenchmarkError, match=message):
+            load_accuracy_baseline(tmp_path / "file.json")
+
+    def test_that_is_missing(self, tmp_path: Path) -> None:
+        with pytest.raises(BenchmarkError, match=r"nowhere\.json: expected a baseline, cannot be read"):
+            load_accuracy_baseline(tmp_path / "nowhere.json")
+
+
+class TestMeasured:
+    def result(self, folder: Path, number: int, **changes: Any) -> dict[str, Any]:
+        seed = changes.get("seed", number)
+        place = folder / "a" / "default" / str(seed)
+        place.mkdir(parents=True)
+        (place / "trajectory.txt").write_text(f"{seed}")
+        return {
+            **{"sequence": "a", "label": "default", "seed": seed, "status": "done", "problem": None, "frames": 90},
+            **{"tracked": 90, "ate_rmse_m": ATES[seed], "data_sha256": None, "networks_sha256": {"model": "n"}},
+            **changes,
+        }
+
+    def test_of_results(self, tmp_path: Path) -> None:
+        """By seed, in whatever order they ended."""
+        found = measured([self.result(tmp_path, seed) for seed in (1, 0)], tmp_path)["a"]
+        assert (found.frames, found.tracked, found.ates_m) == (90, 180, ATES[:2])
+        assert (found.data_sha256, found.network_sha256) == ("", "n")
+        assert found.tracked_percent == 100
+        assert len(set(found.trajectories_sha256)) == 2
+
+    @pytest.mark.parametrize(
+        ("changes", "message"),
+        [
+            ({"status": "failed", "problem": "killed"}, "a, seed 1: expected a run with an ATE, got none: killed"),
+            ({"ate_rmse_m": None, "evaluation_problem": "no truth"}, "a, seed 1: .* got none: no truth"),
+            ({"frames": 4}, "a: frames: expected the same in all runs, got 90 and 4"),
+            ({"networks_sha256": {}}, "a: networks_sha256: expected the same in all runs"),
+            ({"seed": 2}, r"a: expected the seeds 0 to 1 of one preset, got \[0, 2\]"),
+        ],
+    )
+    def test_of_runs_that_do_not_fit(self, tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+        results = [self.result(tmp_path, 0), self.result(tmp_path, 1, **changes)]
+        with pytest.raises(BenchmarkError, match=message):
+            measured(results, tmp_path)
