@@ -1,27 +1,28 @@
 """Trajectories: poses over time, matched by time, read from and written to the files of the field."""
 
-import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
+from jaxtyping import Int
 
 from jaxslam.errors import TrajectoryError
 from jaxslam.files import write_atomically
 from jaxslam.pose import between
-from jaxslam.rotation import matrices, quaternions, slerp
-from jaxslam.timestamp import decimal_seconds, nanoseconds
-
-PathLike: TypeAlias = str | os.PathLike[str]
-
-_Rows: TypeAlias = Sequence[tuple[int, list[str]]]
-"""The line number and the words of every line that counts."""
+from jaxslam.rotation import matrices, slerp
+from jaxslam.timestamp import decimal_seconds
+from jaxslam.trajectory_file import (
+    NOT_FINITE,
+    PathLike,
+    PoseRows,
+    read_euroc_rows,
+    read_kitti_rows,
+    read_rows,
+    read_times,
+    read_tum_rows,
+)
 
 _KITTI_RATE_HZ = 10.0
-_LONGEST_YEARS = 30
-_NOT_FINITE = "holds a number that is not finite"
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +68,10 @@ class Trajectory:
     def select(self, index: np.ndarray) -> "Trajectory":
         """The poses at these indices, or where this mask is true."""
         return Trajectory(self.timestamps_ns[index], self.T_world_cam[index])
+
+    def shifted(self, seconds: float) -> "Trajectory":
+        """The same poses with this time added to their stamps, seconds; rounded to nanoseconds."""
+        return Trajectory(self.timestamps_ns + round(seconds * 1e9), self.T_world_cam)
 
     def at(self, timestamps_ns: np.ndarray) -> "Trajectory":
         """Poses at other times: linear in position, spherical in rotation, held before the first and after the last.
@@ -125,20 +130,12 @@ def associate(first_ns: np.ndarray, second_ns: np.ndarray, max_gap_s: float = 0.
 
 
 def read(path: PathLike) -> Trajectory:
-    """Read a trajectory in the TUM format (8 columns) or the KITTI format (12 columns), whichever it is.
+    """Read a trajectory in the TUM format (8 columns), the KITTI format (12) or EuRoC's (commas), whichever it is.
 
     Raises:
-        TrajectoryError: If the file is missing, unreadable, empty, or in neither format.
+        TrajectoryError: If the file is missing, unreadable, empty, or in none of these formats.
     """
-    rows = list(_rows(path))
-    number, words = rows[0]
-    match len(words):
-        case 8:
-            return _from_tum(path, rows)
-        case 12:
-            return _from_kitti(path, rows, None)
-        case found:
-            raise TrajectoryError(f"{path}:{number}: expected 8 (TUM) or 12 (KITTI) columns, found {found}")
+    return of_rows(read_rows(path))
 
 
 def read_tum(path: PathLike) -> Trajectory:
@@ -149,7 +146,7 @@ def read_tum(path: PathLike) -> Trajectory:
     Raises:
         TrajectoryError: If the file is missing or unreadable, or a row is wrong; the message names file and line.
     """
-    return _from_tum(path, list(_rows(path)))
+    return of_rows(read_tum_rows(path))
 
 
 def read_kitti(path: PathLike, times: PathLike | None = None) -> Trajectory:
@@ -162,7 +159,41 @@ def read_kitti(path: PathLike, times: PathLike | None = None) -> Trajectory:
     Raises:
         TrajectoryError: If a file is missing or unreadable, a row is wrong, or the files differ in length.
     """
-    return _from_kitti(path, list(_rows(path)), times)
+    rows = read_kitti_rows(path)
+    if times is None:
+        return of_rows(rows)
+    stamps = read_times(times)
+    if len(stamps) != len(rows):
+        raise TrajectoryError(f"{times}: expected one stamp a pose, {len(rows)}, got {len(stamps)}")
+    return of_rows(rows, stamps)
+
+
+def read_euroc(path: PathLike) -> Trajectory:
+    """Read the ground truth of EuRoC, `nanoseconds, x, y, z, qw, qx, qy, qz, ...`: poses of the body, the IMU.
+
+    Raises:
+        TrajectoryError: If the file is missing or unreadable, or a row is wrong; the message names file and line.
+    """
+    return of_rows(read_euroc_rows(path))
+
+
+def of_rows(rows: PoseRows, timestamps_ns: Int[np.ndarray, " n"] | None = None) -> Trajectory:
+    """The trajectory that the rows of a file hold, which must be in the order of time.
+
+    Args:
+        rows: What the file holds.
+        timestamps_ns: The stamps of the rows, nanoseconds. By default those of the file, and for KITTI, which has none,
+            0.1 s apart.
+
+    Raises:
+        TrajectoryError: If a row cannot be right; the message names file and line.
+    """
+    stamps = rows.timestamps_ns if timestamps_ns is None else timestamps_ns
+    if stamps is None:
+        stamps = np.round(np.arange(len(rows)) * (1e9 / _KITTI_RATE_HZ)).astype(np.int64)
+    if problem := _first_problem(stamps, rows.T_world_cam):
+        raise TrajectoryError(f"{rows.path}:{rows.lines[problem[0]]}: {problem[1]}")
+    return Trajectory(stamps, rows.T_world_cam)
 
 
 def write_tum(path: PathLike, trajectory: Trajectory) -> None:
@@ -235,7 +266,7 @@ def _first_problem(stamps: np.ndarray, poses: np.ndarray) -> tuple[int, str] | N
     """Index and description of the first pose that cannot be right."""
     off = np.abs(np.linalg.norm(poses[:, :4], axis=1) - 1)
     checks = (
-        (~np.isfinite(poses).all(axis=1), _NOT_FINITE),
+        (~np.isfinite(poses).all(axis=1), NOT_FINITE),
         (~(off <= 0.05), "the quaternion is not of unit length; expected wxyz in memory, xyzw in TUM files"),
         (np.diff(stamps, prepend=stamps[:1]) < 0, "time goes backwards"),
     )
@@ -261,88 +292,6 @@ def _mutually_nearest(stamps: np.ndarray, second: np.ndarray, limit: int) -> np.
 def _last_true(flags: np.ndarray) -> np.ndarray:
     """At each place, where the last true flag up to there is; -1 if there is none."""
     return np.maximum.accumulate(np.where(flags, np.arange(len(flags)), -1))
-
-
-def _rows(path: PathLike) -> Iterator[tuple[int, list[str]]]:
-    """Line number and words of every line that is neither empty nor a comment; at least one."""
-    try:
-        text = Path(path).read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise TrajectoryError(f"{path}: cannot be read: {error}") from error
-    found = False
-    for number, line in enumerate(text.split("\n"), 1):
-        words = line.split()
-        if words and not words[0].startswith("#"):
-            found = True
-            yield number, words
-    if not found:
-        raise TrajectoryError(f"{path}: holds no poses")
-
-
-def _from_tum(path: PathLike, rows: _Rows) -> Trajectory:
-    numbers = _table(path, rows, 8, "timestamp tx ty tz qx qy qz qw")
-    stamps = _stamps(path, rows)
-    return _checked(path, rows, stamps, numbers[:, [7, 4, 5, 6, 1, 2, 3]])
-
-
-def _from_kitti(path: PathLike, rows: _Rows, times: PathLike | None) -> Trajectory:
-    top = _table(path, rows, 12, "the 3 x 4 matrix of a pose, row by row").reshape(-1, 3, 4)
-    R = top[:, :, :3]
-    error = np.abs(R @ R.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
-    wrong = ~((error < 0.05) & (np.linalg.det(R) > 0))
-    if wrong.any():
-        raise TrajectoryError(f"{path}:{rows[int(np.argmax(wrong))][0]}: the 3 x 3 matrix is not a rotation")
-    if times is None:
-        stamps = np.round(np.arange(len(rows)) * (1e9 / _KITTI_RATE_HZ)).astype(np.int64)
-    else:
-        stamps = read_times(times)
-        if len(stamps) != len(rows):
-            raise TrajectoryError(f"{times}: expected one stamp a pose, {len(rows)}, got {len(stamps)}")
-    return _checked(path, rows, stamps, np.hstack([quaternions(R), top[:, :, 3]]))
-
-
-def read_times(path: PathLike) -> np.ndarray:
-    """`(n,)` int64 nanoseconds of a file of one stamp in seconds a line, as KITTI's `times.txt`.
-
-    Raises:
-        TrajectoryError: If the file is missing, unreadable or empty, or a line is not one number.
-    """
-    rows = list(_rows(path))
-    _table(path, rows, 1, "timestamp")
-    return _stamps(path, rows)
-
-
-def _table(path: PathLike, rows: _Rows, columns: int, meaning: str) -> np.ndarray:
-    """All words as floats, `(n, columns)`."""
-    values: list[list[float]] = []
-    for number, words in rows:
-        if len(words) != columns:
-            found = f"{len(words)}: {' '.join(words)[:80]}"
-            raise TrajectoryError(f"{path}:{number}: expected {columns} columns ({meaning}), found {found}")
-        try:
-            values.append([float(word) for word in words])
-        except ValueError as error:
-            raise TrajectoryError(f"{path}:{number}: expected {columns} numbers ({meaning}): {error}") from None
-    table = np.array(values)
-    wrong = ~np.isfinite(table).all(axis=1)
-    if wrong.any():
-        raise TrajectoryError(f"{path}:{rows[int(np.argmax(wrong))][0]}: {_NOT_FINITE}")
-    return table
-
-
-def _stamps(path: PathLike, rows: _Rows) -> np.ndarray:
-    """`(n,)` int64 nanoseconds of the first words."""
-    stamps = np.array([nanoseconds(words[0], f"{path}:{number}", TrajectoryError) for number, words in rows])
-    years = np.ptp(stamps / 1e9) / 31_557_600
-    if years > _LONGEST_YEARS:
-        raise TrajectoryError(f"{path}: the timestamps span {years:.0f} years; are they all in seconds?")
-    return stamps
-
-
-def _checked(path: PathLike, rows: _Rows, stamps: np.ndarray, poses: np.ndarray) -> Trajectory:
-    if problem := _first_problem(stamps, poses):
-        raise TrajectoryError(f"{path}:{rows[problem[0]][0]}: {problem[1]}")
-    return Trajectory(stamps, poses)
 
 
 def _numbers(values: Sequence[float]) -> str:

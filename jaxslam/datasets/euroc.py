@@ -3,7 +3,6 @@
 Source: Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016.
 """
 
-import csv
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,17 +14,17 @@ from jaxslam.camera import Camera
 from jaxslam.datasets.image_file import read_grey
 from jaxslam.datasets.image_pairs import ImagePairs, check_present, check_stereo, moved
 from jaxslam.datasets.protocol import Fit, Loader, Unmatched
-from jaxslam.errors import CameraError, DatasetError, TrajectoryError
+from jaxslam.errors import CameraError, DatasetError
 from jaxslam.pose import between, compose
 from jaxslam.rectification import RectifiedPair
 from jaxslam.rig import Rig
 from jaxslam.rig_file import lens_of_kalibr, transform_of
-from jaxslam.trajectory import Trajectory
+from jaxslam.trajectory import Trajectory, read_euroc
+from jaxslam.trajectory_file import text_rows
 from jaxslam.yaml_file import read_mapping
 
 _CAMERAS = ("cam0", "cam1")
 _LIST, _SENSOR, _TRUTH = "data.csv", "sensor.yaml", Path("state_groundtruth_estimate0") / "data.csv"
-_POSE_COLUMNS = 8
 
 
 class EurocDataset(ImagePairs):
@@ -68,7 +67,7 @@ class EurocDataset(ImagePairs):
 
     def _truth(self) -> Trajectory | None:
         path = self._root / _TRUTH
-        return moved(_read_truth(path), self._T_body_camera) if path.is_file() else None
+        return moved(read_euroc(path), self._T_body_camera) if path.is_file() else None
 
     @property
     def _readers(self) -> tuple[Callable[[Path], np.ndarray], Callable[[Path], np.ndarray]]:
@@ -87,48 +86,16 @@ def _listed(folder: Path) -> dict[int, Path]:
     """Paths of the images of one camera by their times in nanoseconds."""
     path = folder / _LIST
     found: dict[int, Path] = {}
-    for number, row in _rows(path, DatasetError):
-        if len(row) != 2 or not row[0].strip().isdecimal():
+    for number, row in text_rows(path, DatasetError, commas=True):
+        if len(row) != 2 or not row[0].isdecimal():
             raise DatasetError(f"{path}:{number}: expected `nanoseconds,file`, got '{','.join(row)[:60]}'")
         stamp = int(row[0])
         if stamp in found:
             raise DatasetError(f"{path}:{number}: expected each time once, got {stamp} again")
-        found[stamp] = folder / "data" / row[1].strip()
+        found[stamp] = folder / "data" / row[1]
     if not found:
         raise DatasetError(f"{path}: expected at least one line `nanoseconds,file`, got none")
     return found
-
-
-def _rows(path: Path, error: type[DatasetError | TrajectoryError]) -> list[tuple[int, list[str]]]:
-    """Numbers and cells of the lines that count."""
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as problem:
-        raise error(f"{path}: cannot be read: {problem}") from None
-    return [
-        (number, row)
-        for number, row in enumerate(csv.reader(lines), 1)
-        if row and "".join(row).strip() and not row[0].lstrip().startswith("#")
-    ]
-
-
-def _read_truth(path: Path) -> Trajectory:
-    """Poses of the body: `nanoseconds, x, y, z, qw, qx, qy, qz` and more."""
-    stamps: list[int] = []
-    poses: list[list[float]] = []
-    for number, row in _rows(path, TrajectoryError):
-        try:
-            stamps.append(int(row[0]))
-            x, y, z, *wxyz = (float(cell) for cell in row[1:_POSE_COLUMNS])
-        except (ValueError, IndexError):
-            raise TrajectoryError(f"{path}:{number}: expected nanoseconds, x y z and qw qx qy qz") from None
-        poses.append([*wxyz, x, y, z])
-        if len(poses[-1]) != _POSE_COLUMNS - 1:
-            raise TrajectoryError(f"{path}:{number}: expected at least {_POSE_COLUMNS} columns, got {len(row)}")
-    try:
-        return Trajectory(np.array(stamps, np.int64), np.array(poses))
-    except TrajectoryError as problem:
-        raise TrajectoryError(f"{path}: {problem}") from None
 
 
 def _T_body_left(mav: Path) -> np.ndarray:

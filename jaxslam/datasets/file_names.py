@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxslam.errors import DatasetError, TrajectoryError
-from jaxslam.trajectory import read_times
+from jaxslam.trajectory_file import read_times
 
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm")
 _NANOSECONDS = re.compile(r"\d{16,19}\Z")

@@ -14,7 +14,8 @@ from jaxslam.datasets.image_file import read_color, read_grey
 from jaxslam.datasets.image_pairs import ImagePairs, check_stereo, moved
 from jaxslam.datasets.protocol import Fit, Loader
 from jaxslam.errors import CameraError, DatasetError, TrajectoryError
-from jaxslam.trajectory import Trajectory, read_kitti, read_times
+from jaxslam.trajectory import Trajectory, read_kitti
+from jaxslam.trajectory_file import read_times
 
 _CALIBRATION, _TIMES = "calib.txt", "times.txt"
 

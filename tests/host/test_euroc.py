@@ -103,7 +103,7 @@ class TestBad:
 
     @pytest.mark.parametrize(
         ("text", "message"),
-        [("1,0,0,0,1,0,0\n", "data.csv:1: expected"), ("1,0,0,0,2,0,0,0\n", "data.csv: pose 0: the quaternion")],
+        [("1,0,0,0,1,0,0\n", "data.csv:1: expected"), ("1,0,0,0,2,0,0,0\n", "data.csv:1: the quaternion")],
     )
     def test_ground_truth(self, tiny: Path, text: str, message: str) -> None:
         (tiny / "mav0" / "state_groundtruth_estimate0" / "data.csv").write_text(text)
