@@ -76,7 +76,7 @@ def write_results(
     evaluation, problem = None, None if truth is not None else "no ground truth"
     if truth is not None:
         try:
-            evaluation = evaluate(slam.trajectory, truth)
+            evaluation = evaluate(slam.trajectory, truth, frames_ns=info.dataset.timestamps_ns)
         except TrajectoryError as error:
             problem = str(error)
     dense, dense_files = write_dense(folder, slam.dense_mapping, slam.trajectory, slam.times.ms)

@@ -1,9 +1,10 @@
 """The constant offset between the clocks of two trajectories, estimated from how the camera moves."""
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
+from jaxslam_kernels.alignment import AlignmentKind
 from jaxtyping import Bool, Float
 
 from jaxslam.errors import TrajectoryError
@@ -21,8 +22,6 @@ _MOST_SAMPLES, _FEWEST_SAMPLES = 1000, 10
 _LARGEST_SHARE_OF_TIME = 0.25
 _BRIDGED_INTERVALS = 3.0
 """Nothing is interpolated between poses that are more than this many median intervals apart."""
-
-_Alignment: TypeAlias = Literal["none", "se3", "sim3"]
 
 
 class Disagreement(NamedTuple):
@@ -60,7 +59,7 @@ class TimeOffset(NamedTuple):
 
 
 def estimate_time_offset(
-    estimate: Trajectory, reference: Trajectory, align: _Alignment = "se3", range_s: float = OFFSET_RANGE_S
+    estimate: Trajectory, reference: Trajectory, align: AlignmentKind = "se3", range_s: float = OFFSET_RANGE_S
 ) -> TimeOffset:
     """Find the time offset with which the aligned positions of two trajectories agree best.
 
@@ -97,7 +96,7 @@ def estimate_time_offset(
         offsets = offsets[best] + step * np.arange(-10, 11)
         best = int(np.argmin((found := comparison.at(offsets)).ate_m))
     at_best, at_zero = (Disagreement(float(d.ate_m[k]), float(d.turn_rad[k])) for d, k in ((found, best), (without, 0)))
-    return TimeOffset(float(offsets[best]), at_best, at_zero)
+    return TimeOffset(round(float(offsets[best]), 5), at_best, at_zero)
 
 
 @dataclass(frozen=True)
@@ -154,10 +153,10 @@ class _Comparison:
     values: Float[np.ndarray, "n 4"]
     other: _Course
     samples_are_true: bool
-    align: _Alignment
+    align: AlignmentKind
 
     @classmethod
-    def of(cls, estimate: Trajectory, reference: Trajectory, align: _Alignment) -> "_Comparison":
+    def of(cls, estimate: Trajectory, reference: Trajectory, align: AlignmentKind) -> "_Comparison":
         """Choose the samples."""
         pair = [t.select(np.unique(t.timestamps_ns, return_index=True)[1]) for t in (estimate, reference)]
         if min(len(trajectory) for trajectory in pair) < 2:
@@ -199,7 +198,7 @@ def _aligned_rmse(
     estimate: Float[np.ndarray, "k n 3"],
     reference: Float[np.ndarray, "k n 3"],
     known: Bool[np.ndarray, "k n"],
-    align: _Alignment,
+    align: AlignmentKind,
 ) -> Float[np.ndarray, " k"]:
     """The RMSE after the best alignment, which itself is not computed (Umeyama, PAMI 1991, eq. 33)."""
     weights = known / np.maximum(known.sum(axis=1, keepdims=True), 1)

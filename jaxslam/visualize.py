@@ -225,7 +225,7 @@ def _draw_errors(axes: Axes, evaluation: Evaluation) -> None:
     axes.plot(*over_time.T, color=_PATH_COLOR)
     rmse = f"rmse {evaluation.ate_rmse_m:.4f} m"
     axes.axhline(evaluation.ate_rmse_m, color="0.3", linestyle="--", linewidth=0.8, label=rmse)
-    for k, (lost, found) in enumerate((evaluation.lost_spans_ns - begin) / 1e9):
+    for k, (lost, found) in enumerate((_joined(evaluation.lost_spans_ns) - begin) / 1e9):
         label = "no estimate" if k == 0 else None
         axes.axvspan(lost, found, color=_LOST_COLOR, alpha=0.15, linewidth=0, label=label)
     axes.set(xlabel="time [s]", ylabel="error [m]")
@@ -233,6 +233,14 @@ def _draw_errors(axes: Axes, evaluation: Evaluation) -> None:
     axes.margins(x=0)
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
+
+
+def _joined(spans_ns: np.ndarray) -> np.ndarray:
+    """`(k, 2)` spans in the order of time, those that touch made one: where poses are sparse, there are thousands."""
+    if not len(spans_ns):
+        return spans_ns
+    apart = spans_ns[1:, 0] > spans_ns[:-1, 1]
+    return np.column_stack([spans_ns[np.append(True, apart), 0], spans_ns[np.append(apart, True), 1]])
 
 
 def _prepare(axes: Axes, positions: np.ndarray) -> list[int]:

@@ -1,14 +1,15 @@
 """`jaxslam eval`: an estimated trajectory against the truth."""
 
-from dataclasses import dataclass
+import json
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import tyro
 
-from jaxslam.commands.console import console
+from jaxslam.commands.console import plain_console
 from jaxslam.evaluation import evaluate
-from jaxslam.trajectory import read
+from jaxslam.trajectory_pair import read_pair
 from jaxslam.visualize import plot_trajectory
 
 
@@ -16,7 +17,7 @@ from jaxslam.visualize import plot_trajectory
 class Eval:
     """Compare an estimated trajectory with the truth: ATE, RPE, and KITTI's t_rel and r_rel if it is 100 m long.
 
-    Formats (TUM, KITTI) are recognised.
+    Formats (TUM, KITTI, EuRoC's ground truth) are recognised.
     """
 
     estimate: tyro.conf.Positional[Path]
@@ -27,14 +28,34 @@ class Eval:
     """What to fit before comparing positions."""
     max_gap: float = 0.02
     """Poses further apart in time than this do not match, seconds."""
+    time_offset: float | Literal["auto"] = 0.0
+    """Seconds to add to the stamps of the estimate; auto finds the offset of least ATE, up to a second."""
+    times: tuple[Path, ...] = ()
+    """Stamps of rows of KITTI, one a line: a file for either or both sides, or one for each."""
+    frames: Path | None = None
+    """Frames of the recording, for the coverage: rgb.txt of TUM or a stamp a line; else found beside the truth."""
+    json: bool = False
+    """Print all figures as JSON, and nothing else."""
     plot: Path | None = None
     """Also draw both to this PNG."""
 
     def main(self) -> None:
         """Run the command."""
-        estimate, truth = read(self.estimate), read(self.groundtruth)
-        evaluation = evaluate(estimate, truth, align=self.align, max_gap_s=self.max_gap)
-        console.print(str(evaluation), highlight=False)
+        pair = read_pair(self.estimate, self.groundtruth, self.times, self.frames)
+        evaluation = evaluate(
+            pair.estimate,
+            pair.reference,
+            align=self.align,
+            max_gap_s=self.max_gap,
+            frames_ns=pair.frames_ns,
+            time_offset_s=self.time_offset,
+        )
+        evaluation = replace(evaluation, notes=pair.notes + evaluation.notes)
+        if self.json:
+            print(json.dumps(evaluation.summary(), indent=2))
+        else:
+            plain_console.print(str(evaluation))
         if self.plot is not None:
-            plot_trajectory(estimate, truth, evaluation, self.plot)
-            console.print(f"Plot: {self.plot}")
+            plot_trajectory(pair.estimate, pair.reference, evaluation, self.plot)
+            if not self.json:
+                plain_console.print(f"Plot: {self.plot}")

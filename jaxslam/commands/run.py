@@ -261,7 +261,8 @@ def _print_summary(summary: dict[str, Any], evaluation: Evaluation | None, out: 
     table.add_row("loops closed", str(summary["loops_closed"]), f"{summary['submaps']} submaps")
     table.add_row("ATE (SE(3) aligned)", number(summary["ate_rmse_m"], 4), "m RMSE")
     table.add_row("ATE (Sim(3) aligned)", number(summary["ate_sim3_rmse_m"], 4), "m RMSE")
-    table.add_row("RPE over 1 s", number(summary["rpe_trans_m_per_s"], 4), "m/s RMSE")
+    pairs = "" if evaluation is None else f" ({evaluation.rpe_spacing})"
+    table.add_row("RPE over 1 s", number(summary["rpe_trans_m_per_s"], 4), f"m/s RMSE{pairs}")
     table.add_row("RPE over 1 s, rotation", number(summary["rpe_rot_deg_per_s"], 3), "deg/s RMSE")
     if summary["track_ms"] is not None:
         for name in ("median", "p95", "max"):

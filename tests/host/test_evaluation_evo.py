@@ -83,11 +83,11 @@ def pair(request: pytest.FixtureRequest, data_dir: Path) -> Pair:
         return Pair(name, slam.trajectory, dataset.ground_truth)
 
 
-def one_second_apart(stamps_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Each pose and the first at least a second later."""
+def one_second_apart(stamps_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Each pose, the first at least a second later, and the seconds between them."""
     later = ((i, np.flatnonzero(stamps_ns >= stamp + 10**9)) for i, stamp in enumerate(stamps_ns))
     pairs = np.array([(i, found[0]) for i, found in later if len(found)])
-    return pairs[:, 0], pairs[:, 1]
+    return pairs[:, 0], pairs[:, 1], np.diff(stamps_ns[pairs])[:, 0] / 1e9
 
 
 def figures_of_evo(estimate: Trajectory, reference: Trajectory, align: AlignmentKind) -> dict[str, float]:
