@@ -94,6 +94,12 @@ class TestTables:
         summary = json.loads((out / "summary.json").read_text())
         assert np.sqrt(np.mean(np.square(errors.errors_m))) == pytest.approx(summary["ate_rmse_m"], abs=1e-8)
 
+    def test_coverage_is_of_the_frames(self, out: Path) -> None:
+        """Ten of them are black, and that they are a sixth of the time does not depend on how poses are spaced."""
+        evaluation = json.loads((out / "summary.json").read_text())["evaluation"]
+        assert evaluation["num_frames"] == 60
+        assert evaluation["coverage_percent"] == pytest.approx(100 * 50 / 60)
+
     def test_stages_fill_the_frame(self, out: Path) -> None:
         """Those of the tracking thread, together, are the time of a frame."""
         summary = json.loads((out / "summary.json").read_text())

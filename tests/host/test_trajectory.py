@@ -16,6 +16,7 @@ from jaxslam.trajectory import (
     Trajectory,
     associate,
     read,
+    read_euroc,
     read_kitti,
     read_tum,
     write_kitti,
@@ -297,6 +298,45 @@ class TestKitti:
         (tmp_path / "k.txt").write_text(text)
         with pytest.raises(TrajectoryError, match=message):
             read(tmp_path / "k.txt")
+
+
+class TestEuroc:
+    HEADER = "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []\n"
+    ROW = "1403636580838555648,1,2,3,0.8,0.6,0,0,0.1,0.2,0.3,0,0,0,0,0,0\n"
+
+    @pytest.mark.parametrize(("name", "header"), [("data.csv", HEADER), ("data.csv", ""), ("truth.txt", HEADER)])
+    def test_is_recognized(self, tmp_path, name, header):
+        (tmp_path / name).write_text(header + self.ROW)
+        for trajectory in (read(tmp_path / name), read_euroc(tmp_path / name)):
+            assert trajectory.timestamps_ns.tolist() == [1403636580838555648]
+            np.testing.assert_allclose(trajectory.T_world_cam, [[0.8, 0.6, 0, 0, 1, 2, 3]])
+
+    def test_as_real_poses_are_in_tum_lines(self, data_dir, tmp_path):
+        """Those of EuRoC's V1_03, in EuRoC's own columns: the order of the quaternion is another one."""
+        tum = read(data_dir / "imu" / "euroc_V103" / "groundtruth.txt").select(np.arange(500))
+        rows = (
+            f"{stamp},{','.join(map(repr, pose[4:]))},{','.join(map(repr, pose[:4]))},0,0,0,0,0,0,0,0,0\n"
+            for stamp, pose in zip(tum.timestamps_ns.tolist(), tum.T_world_cam.tolist(), strict=True)
+        )
+        (tmp_path / "data.csv").write_text(self.HEADER + "".join(rows))
+        euroc = read(tmp_path / "data.csv")
+        np.testing.assert_array_equal(euroc.timestamps_ns, tum.timestamps_ns)
+        assert_same_poses(euroc, tum, atol=1e-15)
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("1,2,3\n", r"data\.csv:2: expected at least 8 columns .*, got 3"),
+            ("1403636580.8,1,2,3,1,0,0,0\n", r"data\.csv:2: expected nanoseconds, x y z and qw qx qy qz"),
+            ("5,1,2,3,1,0,0,0\n4,1,2,3,1,0,0,0\n", r"data\.csv:3: time goes backwards"),
+            ("5,1,nan,3,1,0,0,0\n", r"data\.csv:2: holds a number that is not finite"),
+            ("5,1,2,3,2,0,0,0\n", r"data\.csv:2: the quaternion is not of unit length"),
+        ],
+    )
+    def test_refuses(self, tmp_path, text, message):
+        (tmp_path / "data.csv").write_text(self.HEADER + text)
+        with pytest.raises(TrajectoryError, match=message):
+            read(tmp_path / "data.csv")
 
 
 @pytest.mark.parametrize(

@@ -56,6 +56,17 @@ def test_draws_the_evaluated_path_and_its_errors(tmp_path, figures):
     assert picture[..., :3].std() > 0.05
 
 
+def test_shades_sparse_poses_in_one_piece(tmp_path, figures):
+    """Every fourth frame has a pose: no patch for each of the pieces between, which may be thousands."""
+    reference = make_trajectory(61)
+    estimate = reference.select(np.r_[0:60:4, 60])
+    evaluation = evaluate(estimate, reference, frames_ns=reference.timestamps_ns)
+    assert len(evaluation.lost_spans_ns) == 15
+    plot_trajectory(estimate, reference, evaluation, tmp_path / "plot.png")
+    (patch,) = figures[0].axes[1].patches
+    assert (patch.get_x(), patch.get_x() + patch.get_width()) == pytest.approx((0, 6))
+
+
 @pytest.mark.parametrize("with_reference", [True, False])
 def test_draws_without_evaluation(tmp_path, figures, with_reference):
     estimate = make_trajectory()
