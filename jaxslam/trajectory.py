@@ -71,6 +71,8 @@ class Trajectory:
 
     def shifted(self, seconds: float) -> "Trajectory":
         """The same poses with this time added to their stamps, seconds; rounded to nanoseconds."""
+        if not seconds:
+            return self  # quaternions normalized once more would differ in the last digit
         return Trajectory(self.timestamps_ns + round(seconds * 1e9), self.T_world_cam)
 
     def at(self, timestamps_ns: np.ndarray) -> "Trajectory":

@@ -38,7 +38,7 @@ def printed(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 
 class TestJson:
     def test_is_the_summary(self, capsys: pytest.CaptureFixture[str], files: tuple[str, str]) -> None:
-        expected = evaluate(*(read(path) for path in files)).summary()
+        expected = evaluate(read(files[0]), read(files[1])).summary()
         assert json.loads(printed(capsys, *files, "--json")) == json.loads(json.dumps(expected))
 
     def test_is_all_there_is(self, capsys: pytest.CaptureFixture[str], files: tuple[str, str], tmp_path: Path) -> None:
