@@ -179,7 +179,7 @@ class Evaluation:
         """What is known of the coverage, in words."""
         if self.coverage_percent is not None:
             return f"{self.coverage_percent:.1f} % of {self.num_frames} frames covered"
-        unknown = "coverage unknown, as the frames of the recording are not given"
+        unknown = "coverage unknown without the frames of the recording"
         if self.pose_interval_s is None:
             return unknown
         return (

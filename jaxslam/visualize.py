@@ -87,7 +87,7 @@ def plot_trajectory(
         seen, over_time = plots.subplots(2, height_ratios=(3, 1))
         _draw_evaluated_paths(seen, reference, evaluation)
         _draw_errors(over_time, evaluation)
-        plots.suptitle(f"{above}{evaluation}", fontsize=8, family="monospace", x=0.02, ha="left")
+        plots.suptitle(f"{above}{evaluation}", fontsize=8, family="monospace", x=0.02, ha="left", wrap=True)
     _write_png(figure, path)
 
 

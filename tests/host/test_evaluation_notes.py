@@ -168,5 +168,5 @@ class TestFrames:
         assert known.coverage_percent == pytest.approx(100 * 13 / 780)
         assert "1.7 % of 780 frames covered" in str(known)
         assert unknown.coverage_percent is unknown.summary()["coverage_percent"] is None
-        assert "coverage unknown, as the frames of the recording are not given\n  estimated a pose each" in str(unknown)
+        assert "coverage unknown without the frames of the recording\n  estimated a pose each" in str(unknown)
         assert "100.0 %" not in str(known) + str(unknown)
