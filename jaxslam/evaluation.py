@@ -101,12 +101,14 @@ def evaluate(
     if len(matched) < _FEWEST_TO_ALIGN:
         notes += (f"fewer than {_FEWEST_TO_ALIGN} matches: no alignment",)
     else:
-        notes += _notes_on_alignment(errors)
-        notes += on_counts(estimate, reference, len(matched), max_gap_s)
-        notes += on_rotations(matches, later, np.asarray(errors.per_second.rotations)[later.first])
-        notes += on_pairs(later, successive, rpe_delta_s, frames_ns)
-        notes += on_frames(coverage.num_frames, coverage.coverage_percent, max_gap_s)
-        notes += on_time_offset(estimate, reference, align, time_offset_s)
+        notes += (
+            *_notes_on_alignment(errors),
+            *on_counts(estimate, reference, len(matched), max_gap_s),
+            *on_rotations(matches, later, np.asarray(errors.per_second.rotations)[later.first]),
+            *on_pairs(later, successive, rpe_delta_s, frames_ns),
+            *on_frames(coverage.num_frames, coverage.coverage_percent, max_gap_s),
+            *on_time_offset(estimate, reference, align, time_offset_s),
+        )
     fitted = errors.absolute[align].alignment
     T, scale = np.asarray(fitted.T_reference_estimate.wxyz_xyz), float(fitted.scale)
     return Evaluation(
