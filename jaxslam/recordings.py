@@ -40,6 +40,8 @@ class Recording(Checked):
         sha256: Of that archive, if known.
         typical_size: Of the archives of the dataset, in words, where the size of this one is not known.
         how: How to come by it, where there is no `url`.
+        frames: How many frames the whole recording has, if that is known: its pairs of images, or its color images,
+            of which a few have no depth image taken at the same time.
 
     Raises:
         DatasetError: If a field has the wrong type or cannot be right.
@@ -58,6 +60,7 @@ class Recording(Checked):
     sha256: str | None = None
     typical_size: str = "-"
     how: str = ""
+    frames: Annotated[int, Range(at_least=1)] | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()

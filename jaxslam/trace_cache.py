@@ -136,16 +136,26 @@ def _sources() -> str | None:
     """Hash of all that a trace depends on but its arguments; `None` if it may not be what was loaded."""
     versions = [platform.python_version(), *(f"{name} {metadata.version(name)}" for name in _TRACED_WITH)]
     digest = hashlib.sha256(" ".join(versions).encode())
+    files = source_files()
+    if files is None or any(file.stat().st_mtime > _loaded - _SETTLED_S for file in files):
+        return None
+    for file, name in files.items():
+        digest.update(f"{name}\n".encode() + file.read_bytes())
+    return digest.hexdigest()
+
+
+def source_files() -> dict[Path, Path] | None:
+    """The Python files of jaxslam and its kernels, each with its path inside its package; `None` if a package is not
+    found as a folder of files.
+    """
+    found: dict[Path, Path] = {}
     for package in _PACKAGES:
         spec = util.find_spec(package)
         if spec is None or not spec.submodule_search_locations:
             return None
         root = Path(spec.submodule_search_locations[0])
-        for file in sorted(root.rglob("*.py")):
-            if file.stat().st_mtime > _loaded - _SETTLED_S:
-                return None
-            digest.update(f"{file.relative_to(root)}\n".encode() + file.read_bytes())
-    return digest.hexdigest()
+        found |= {file: file.relative_to(root) for file in sorted(root.rglob("*.py"))}
+    return found
 
 
 def _read(file: Path) -> _Kept | None:

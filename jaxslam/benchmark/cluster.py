@@ -9,12 +9,13 @@ import concurrent.futures
 import socket
 import tempfile
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
+from jaxslam.benchmark.identity import identities
 from jaxslam.benchmark.job import RESULT, Job, failed, run_in_process
 from jaxslam.benchmark.runner import Executor
 from jaxslam.errors import BenchmarkError
@@ -28,6 +29,7 @@ try:
 except ImportError as missing:
     raise BenchmarkError(f"distributed cannot be imported ({missing}): pip install 'jaxslam[cluster]'") from missing
 
+_GONE = "--executor: the scheduler is gone; --resume goes on with the runs that have been made"
 _PATIENCE_S = 5.0
 """For a scheduler to answer, and for its first worker."""
 
@@ -67,16 +69,34 @@ class _Cluster:
     root: Path | None
     recordings: Mapping[str, list[str] | None]
 
+    def identities(self, jobs: Sequence[Job]) -> list[dict[str, Any]]:
+        by_recording: dict[str, list[Job]] = {}
+        for job in jobs:
+            by_recording.setdefault(job.clip.recording, []).append(job)
+        futures = {name: self._submitted(identities, of_it, name) for name, of_it in by_recording.items()}
+        found = {}
+        for name, of_it in by_recording.items():
+            found |= dict(zip(of_it, self._result(futures[name]), strict=True))
+        return [found[job] for job in jobs]
+
     def run(self, jobs: Sequence[Job], out: Path) -> Iterator[tuple[Job, dict[str, Any]]]:
-        waiting = {self._submitted(job): job for job in jobs}
+        waiting = {self._submitted(run_and_pack, job, job.clip.recording): job for job in jobs}
         for future in as_completed(list(waiting), loop=self.client.loop):
             job = waiting.pop(future)  # with the last reference to it, workers forget its files
             yield job, _received(future, job, out)
 
-    def _submitted(self, job: Job) -> Future:
-        return self.client.submit(
-            run_and_pack, job, self.root, workers=self.recordings.get(job.clip.recording), pure=False
-        )
+    def _submitted(self, function: Callable[..., Any], what: Any, recording: str) -> Future:
+        """Have a worker call a function of jobs and of `root`, where their recording is."""
+        return self.client.submit(function, what, self.root, workers=self.recordings.get(recording), pure=False)
+
+    @staticmethod
+    def _result(future: Future) -> Any:
+        try:
+            return future.result()
+        except concurrent.futures.CancelledError:
+            raise BenchmarkError(_GONE) from None
+        except Exception as problem:
+            raise BenchmarkError(f"--executor: {_words(problem)}") from None
 
 
 def run_and_pack(job: Job, root: Path | None) -> tuple[dict[str, Any], dict[str, bytes]]:
@@ -138,9 +158,7 @@ def _received(future: Future, job: Job, out: Path) -> dict[str, Any]:
     try:
         result, files = future.result()
     except concurrent.futures.CancelledError:
-        raise BenchmarkError(
-            "--executor: the scheduler is gone; --resume goes on with the runs that have been made"
-        ) from None
+        raise BenchmarkError(_GONE) from None
     except Exception as problem:  # of whatever kind: it happened to this run, the others go on
         return failed(job, _words(problem))
     write_files(out / job.folder, files)

@@ -10,17 +10,15 @@ Another processor rounds otherwise, and so do other releases of the compiler: th
 There, what counts as worse is more than the seeds' own spread explains, and times of other processors are left alone.
 """
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from jaxslam.benchmark.baseline import ATE, Baseline
 from jaxslam.benchmark.rows import by_sequence, row_name, rows_of
 from jaxslam.errors import BenchmarkError
-from jaxslam.files import write_atomically
 from jaxslam.results import machine
 from jaxslam.xla import usable_cores
 
@@ -34,33 +32,8 @@ _VERSIONS = ("jaxlib", "opencv-python-headless", "numpy")
 _LEAST_ATE_M = 1e-5
 """Smaller differences are of no interest to anybody."""
 _LEAST_PERCENT = 1e-6
-_ATE, _TRACKED, _TIME = "ate_rmse_m", "tracked_percent", "time_of_flows"
+_TRACKED, _TIME = "tracked_percent", "time_of_flows"
 """The last: the median frame of a run, in times of optical flow."""
-
-
-@dataclass(frozen=True)
-class Baseline:
-    """What a suite once showed.
-
-    Attributes:
-        suite: Name of the suite, or its file.
-        presets: With what it was run.
-        runs: How often each.
-        reason: Why these figures are the ones to keep to.
-        machine: On which they were measured.
-        versions: Of the libraries that computed them.
-        noise: By label, the standard deviation of errors over seeds, as a share of them; none where there was one run.
-        rows: Figures by sequence and label.
-    """
-
-    suite: str
-    presets: tuple[str, ...]
-    runs: int
-    reason: str
-    machine: str
-    versions: str
-    noise: Mapping[str, float]
-    rows: Mapping[str, Mapping[str, float]]
 
 
 @dataclass(frozen=True)
@@ -92,22 +65,43 @@ class Complaint:
 
 
 def make_baseline(
-    suite: str, presets: Sequence[str], runs: int, reason: str, results: Sequence[Mapping[str, Any]]
+    suite: str,
+    presets: Sequence[str],
+    runs: int,
+    reason: str,
+    results: Sequence[Mapping[str, Any]],
+    plan: Mapping[str, Any],
 ) -> Baseline:
     """The figures of runs, to keep to.
 
+    Args:
+        suite: Name of the suite, or its file.
+        presets: With what it was run.
+        runs: How often each.
+        reason: Why these figures are the ones to keep to.
+        results: Of all runs.
+        plan: What was run, from `jaxslam.benchmark.plan.fingerprint`.
+
     Raises:
-        BenchmarkError: If a run failed, none was made, or no reason is given.
+        BenchmarkError: If a run failed, none was made, one has no ATE, or no reason is given.
     """
-    if not reason.strip():
-        raise BenchmarkError("--update: expected a reason, got none")
+    check_reason(reason)
     failed = [result for result in results if result["status"] != "done"]
     if failed or not results:
         raise BenchmarkError(f"baseline: expected runs that all ended well, got {len(failed)} of {len(results)} failed")
     figures = _figures_of(results, "median")
-    return Baseline(
-        suite, tuple(presets), runs, reason, _machine(results), _versions(results), _noise_of(results), figures
-    )
+    machines, versions, noise = _machine(results), _versions(results), _noise_of(results)
+    return Baseline(suite, tuple(presets), runs, reason, machines, versions, noise, figures, plan)
+
+
+def check_reason(reason: str) -> None:
+    """See whether a reason for new figures says anything.
+
+    Raises:
+        BenchmarkError: If not.
+    """
+    if not reason.strip():
+        raise BenchmarkError("--update: expected a reason, got none")
 
 
 def differences(baseline: Baseline, results: Sequence[Mapping[str, Any]]) -> str:
@@ -147,54 +141,27 @@ def complaints(baseline: Baseline, results: Sequence[Mapping[str, Any]]) -> list
             value, limit = now[row].get(figure), limits(row, figure, was)
             if value is None:
                 found.append(Complaint(row, f"{figure} is missing", None, None))
-            elif value < limit if figure == _TRACKED else value > limit:
+            elif not (value >= limit if figure == _TRACKED else value <= limit):  # also if it is not a number
                 found.append(Complaint(row, figure, was, value))
     return found
-
-
-def load_baseline(path: Path) -> Baseline:
-    """The baseline in a file.
-
-    Raises:
-        BenchmarkError: If it is missing, or no baseline.
-    """
-    try:
-        content = json.loads(path.read_text())
-        presets = tuple(str(preset) for preset in content["presets"])
-        rows = {str(row): {str(k): float(v) for k, v in figures.items()} for row, figures in content["rows"].items()}
-        suite, reason, machine = (str(content[key]) for key in ("suite", "reason", "machine"))
-        noise = {str(label): float(share) for label, share in content["noise"].items()}
-        return Baseline(suite, presets, int(content["runs"]), reason, machine, str(content["versions"]), noise, rows)
-    except OSError as problem:
-        raise BenchmarkError(f"{path}: expected a baseline, cannot be read: {problem.strerror}") from None
-    except (ValueError, KeyError, TypeError, AttributeError) as problem:
-        raise BenchmarkError(
-            f"{path}: expected a baseline as `bench gate --update` writes it, got {problem!r}"
-        ) from None
-
-
-def save_baseline(path: Path, baseline: Baseline) -> None:
-    """Write a baseline.
-
-    Raises:
-        BenchmarkError: If it cannot be written.
-    """
-    text = json.dumps({**vars(baseline), "noise": dict(baseline.noise), "rows": dict(baseline.rows)}, indent=1)
-    write_atomically(path, (text + "\n").encode(), BenchmarkError)
 
 
 def _figures_of(results: Sequence[Mapping[str, Any]], which_time: str) -> dict[str, dict[str, float]]:
     """By row: the median error, the least share of tracked frames, and the median or least time."""
     done = [run for run in results if run["status"] == "done"]
-    flow_ms = {sequence: min(run["flow_ms"] for run in runs) for sequence, runs in by_sequence(done).items()}
+    flow_ms = {name: min(known) for name, runs in by_sequence(done).items() if (known := _flow_times(runs))}
     figures: dict[str, dict[str, float]] = {}
     for row in rows_of(done):
         of_row = figures[row_name(row["sequence"], row["label"])] = {_TRACKED: row[_TRACKED]["least"]}
-        if row[_ATE] is not None:
-            of_row[_ATE] = round(row[_ATE]["median"], 7)
-        if row["track_ms_median"] is not None:
+        if row[ATE] is not None:
+            of_row[ATE] = round(row[ATE]["median"], 7)
+        if row["track_ms_median"] is not None and row["sequence"] in flow_ms:
             of_row[_TIME] = round(row["track_ms_median"][which_time] / flow_ms[row["sequence"]], 4)
     return figures
+
+
+def _flow_times(runs: Sequence[Mapping[str, Any]]) -> list[float]:
+    return [run["flow_ms"] for run in runs if run["flow_ms"] is not None]
 
 
 def _limits(baseline: Baseline, results: Sequence[Mapping[str, Any]]) -> Callable[[str, str, float], float]:
@@ -207,7 +174,9 @@ def _limits(baseline: Baseline, results: Sequence[Mapping[str, Any]]) -> Callabl
             return before - _LEAST_PERCENT
         if figure == _TIME:
             return before * (1 + _WORSE_TIME) if same_machine else np.inf
-        noise = _NOISE * baseline.noise.get(row.rpartition(", ")[2], 0.0)
+        noise = _NOISE * max(
+            (share for label, share in baseline.noise.items() if row.endswith(f", {label}")), default=0.0
+        )
         share = _WORSE_ATE if same_rounding else max(_ROUNDING, noise)
         return before * (1 + share) + _LEAST_ATE_M
 
@@ -219,7 +188,7 @@ def _noise_of(results: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     shares: dict[str, list[float]] = {}
     for row in rows_of(results):
         runs = [run for run in results if (run["sequence"], run["label"]) == (row["sequence"], row["label"])]
-        ates = [run[_ATE] for run in runs if run.get(_ATE) is not None]
+        ates = [run[ATE] for run in runs if run.get(ATE) is not None]
         if len(ates) > 1:
             shares.setdefault(row["label"], []).append(float(np.std(ates, ddof=1) / np.mean(ates)))
     return {label: round(float(np.sqrt(np.mean(np.square(of_it)))), 4) for label, of_it in shares.items()}

@@ -13,22 +13,22 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from jaxslam.benchmark.identity import camera_sha256, data_sha256, networks_sha256, sources_sha256
+from jaxslam.benchmark.names import flattened, run_folder
 from jaxslam.benchmark.opencv_flow import flow_time_ms
 from jaxslam.benchmark.suite import Sequence as Clip
-from jaxslam.config import Config, SemanticsConfig, load_config, to_yaml
-from jaxslam.datasets import Dataset, Subset, open_dataset
+from jaxslam.config import Config, load_config, to_yaml
+from jaxslam.datasets import Associated, Dataset, Subset, open_dataset
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset, with_true_masks
 from jaxslam.datasets.synthetic.sensor import SensorConfig
 from jaxslam.datasets.synthetic.stored import StoredRoom
-from jaxslam.detector_choice import network_files
-from jaxslam.download import sha256_of
 from jaxslam.errors import BenchmarkError, JaxSlamError
 from jaxslam.files import write_atomically
 from jaxslam.recordings import find_recording
@@ -36,11 +36,13 @@ from jaxslam.results import RunInfo, write_results
 from jaxslam.run_pictures import RunPictures
 from jaxslam.slam import Slam
 from jaxslam.xla import enable_compile_cache, prefer_one_thread
+from jaxslam.yaml_file import parse_yaml
 
 RESULT = "result.json"
 """The last file of a run to be written: where it is, the run is done."""
-_JOB = "job.json"
-_MOST_HASHED_BYTES = 5_000_000
+DONE, FAILED, NOT_RUN = "done", "failed", "not run"
+"""The status of a run in its result: made to its end, ended by a problem, planned and not made."""
+_JOB, _CONFIG, _CHECKSUM = "job.json", "config.yaml", "result_sha256"
 _LAST_WORDS = 400
 
 
@@ -70,7 +72,7 @@ class Job:
     @property
     def folder(self) -> Path:
         """Where its results go, seen from those of the suite."""
-        return Path(self.clip.name) / self.label / str(self.seed)
+        return run_folder(self.clip.name, self.label, self.seed)
 
     @property
     def config(self) -> Config:
@@ -121,17 +123,49 @@ def opened(clip: Clip, root: Path | None, rooms: Path | None = None) -> tuple[Da
     return (dataset if clip.whole else Subset(dataset, clip.start, clip.stop, clip.every)), folder
 
 
-def finished(job: Job, out: Path) -> dict[str, Any] | None:
-    """What came of a job, if it has been run to its end, with the settings that it has now."""
+def stored(job: Job, out: Path) -> tuple[dict[str, Any], list[str]] | None:
+    """The result of a job that has been run to its end, if there is one.
+
+    Returns:
+        Its figures, and what is different about the job now, in words: none if it has the settings and the sequence
+        that it was run with, and nobody has changed the file.
+
+    Raises:
+        BenchmarkError: If the files of the run cannot be read.
+    """
     folder = out / job.folder
     try:
-        if (folder / _JOB).read_text() != job.to_json() or (folder / "config.yaml").read_text() != to_yaml(job.config):
-            return None
-        return json.loads((folder / RESULT).read_text())
+        result = json.loads((folder / RESULT).read_text())
+        clip = json.loads((folder / _JOB).read_text())["clip"]
+        config = _read_config((folder / _CONFIG).read_text())
     except FileNotFoundError:
         return None
-    except (OSError, ValueError) as problem:
+    except (OSError, ValueError, KeyError, BenchmarkError) as problem:
         raise BenchmarkError(f"{folder}: expected the results of a run, got something unreadable: {problem}") from None
+    different = _differences(clip, json.loads(job.to_json())["clip"])
+    different += _differences(config, _read_config(to_yaml(job.config)))
+    if result.get(_CHECKSUM) != _checksum(result):
+        different.append(f"{RESULT} is not as the run wrote it")
+    return result, different
+
+
+def _read_config(text: str) -> dict[str, Any]:
+    return parse_yaml(text, _CONFIG, BenchmarkError)
+
+
+def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    old, new = flattened(before), flattened(now)
+    return [
+        f"{key} was {old.get(key)}, is {new.get(key)}"
+        for key in dict.fromkeys((*old, *new))
+        if old.get(key) != new.get(key)
+    ]
+
+
+def _checksum(result: Mapping[str, Any]) -> str:
+    """Hash of all of a result but the checksum itself."""
+    content = {key: value for key, value in result.items() if key != _CHECKSUM}
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def run_in_process(job: Job, out: Path, root: Path | None, rooms: Path | None = None) -> dict[str, Any]:
@@ -161,16 +195,21 @@ def run_in_process(job: Job, out: Path, root: Path | None, rooms: Path | None = 
         os.close(reading)
         os.close(writing)
     (folder / "log.txt").write_text(done.stdout + done.stderr)
-    result = finished(job, out)
-    if result is not None and done.returncode == 0:
-        return result
+    result = stored(job, out)
+    if result is not None and not result[1] and done.returncode == 0:
+        return result[0]
     (folder / RESULT).unlink(missing_ok=True)
     return failed(job, _problem(done))
 
 
 def failed(job: Job, problem: str) -> dict[str, Any]:
     """What is said of a run that did not come to its end."""
-    return _figures(job) | {"status": "failed", "problem": problem}
+    return about(job) | {"status": FAILED, "problem": problem}
+
+
+def not_run(job: Job) -> dict[str, Any]:
+    """What is said of a run that is planned and has not been made."""
+    return about(job) | {"status": NOT_RUN, "problem": None}
 
 
 def run_here(folder: Path, root: Path | None, rooms: Path | None) -> None:
@@ -181,7 +220,7 @@ def run_here(folder: Path, root: Path | None, rooms: Path | None) -> None:
     """
     prefer_one_thread()
     enable_compile_cache()
-    job = Job.of_json((folder / _JOB).read_text())
+    job, sources = Job.of_json((folder / _JOB).read_text()), sources_sha256()
     whole, recording = opened(job.clip, root, rooms)
     dataset, truth = with_true_masks(whole, job.config.semantics)
     flow_ms = flow_time_ms(dataset)
@@ -194,29 +233,29 @@ def run_here(folder: Path, root: Path | None, rooms: Path | None) -> None:
     info = RunInfo(dataset, job.preset, time.perf_counter() - began)
     summary, _ = write_results(folder, slam, records, info, pictures)
     times = summary["track_ms"]
-    ratios = {} if times is None else {f"flow_ratio_{name}": round(times[name] / flow_ms, 4) for name in times}
-    result = _figures(job) | {
-        "status": "done",
+    ratios = {} if flow_ms is None else {f"flow_ratio_{name}": round(times[name] / flow_ms, 4) for name in times or ()}
+    result = about(job) | {
+        "status": DONE,
         "problem": None,
         **summary,
+        "images": _num_images(whole),
         "rate_hz": _rate_hz(dataset),
-        "flow_ms": round(flow_ms, 4),
+        "flow_ms": None if flow_ms is None else round(flow_ms, 4),
         **ratios,
-        "data_sha256": None if recording is None else _fingerprint(recording),
+        "sources_sha256": sources,
+        "data_sha256": None if recording is None else data_sha256(recording),
+        "camera_sha256": camera_sha256(job.clip),
         "model": job.config.semantics.model,
         "networks_sha256": networks_sha256(job.config.semantics),
         "config": dataclasses.asdict(job.config),
     }
+    result |= {_CHECKSUM: _checksum(result)}
     write_atomically(folder / RESULT, (json.dumps(result, indent=2) + "\n").encode(), BenchmarkError)
 
 
-def networks_sha256(config: SemanticsConfig) -> dict[str, str | None]:
-    """Hashes of the networks of a run by the settings that name them; `None` for one that is not on this machine.
-
-    Raises:
-        ModelError: If a file is named that is not there.
-    """
-    return {setting: path and sha256_of(path) for setting, path in network_files(config).items()}
+def _num_images(whole: Dataset) -> int:
+    """How many color images, or pairs, the recording has; also those that no depth image was taken with."""
+    return len(whole) + (whole.unmatched.color if isinstance(whole, Associated) else 0)
 
 
 def _rate_hz(dataset: Dataset) -> float:
@@ -225,7 +264,7 @@ def _rate_hz(dataset: Dataset) -> float:
     return round(1e9 / float(np.median(steps_ns)), 3) if len(steps_ns) else dataset.camera.fps
 
 
-def _figures(job: Job) -> dict[str, Any]:
+def about(job: Job) -> dict[str, Any]:
     """What a result says of its job."""
     return {
         "sequence": job.clip.name,
@@ -234,16 +273,6 @@ def _figures(job: Job) -> dict[str, Any]:
         "variant": job.variant,
         "seed": job.seed,
     }
-
-
-def _fingerprint(folder: Path) -> str:
-    """A hash of the text files of a recording, and of names and sizes of the others."""
-    digest = hashlib.sha256()
-    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
-        digest.update(f"{path.relative_to(folder)} {path.stat().st_size}\n".encode())
-        if path.suffix in (".txt", ".yaml", ".csv") and path.stat().st_size <= _MOST_HASHED_BYTES:
-            digest.update(path.read_bytes())
-    return digest.hexdigest()
 
 
 def _problem(done: "subprocess.CompletedProcess[str]") -> str:

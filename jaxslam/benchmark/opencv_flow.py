@@ -1,5 +1,6 @@
 """OpenCV's optical flow of 1000 corners: the unit in which times are given, the same on every machine."""
 
+import itertools
 import time
 
 import cv2
@@ -7,6 +8,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from jaxslam.datasets import Dataset
+from jaxslam.errors import DatasetError, FrameError
 from jaxslam.frame import to_grey
 
 NUM_CORNERS, WINDOW_PX, LEVELS = 1000, 21, 4
@@ -54,18 +56,33 @@ def flow_ms(before: Grey, after: Grey, corners: Corners) -> float:
     return 1e3 * (time.perf_counter() - began)
 
 
-def flow_time_ms(dataset: Dataset) -> float:
+def flow_time_ms(dataset: Dataset) -> float | None:
     """What a frame costs on this machine, whatever is done with it.
 
-    The median over pairs of frames all over the recording, in one thread.
+    The median over pairs of frames all over the recording, in one thread. Frames that cannot be read are passed over.
+
+    Returns:
+        Milliseconds; `None` if no two frames in a row can be read.
     """
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        first = np.linspace(0, max(len(dataset) - 2, 0), _PAIRS).astype(int)
-        return float(np.median([_of_pair_ms(dataset, int(index)) for index in np.unique(first)]))
+        starts = np.unique(np.linspace(0, max(len(dataset) - 2, 0), _PAIRS).astype(int)).tolist()
+        parts = [range(*ends) for ends in itertools.pairwise([*starts, max(len(dataset) - 1, 1)])]
+        found = [time_ms for part in parts if (time_ms := _of_part_ms(dataset, part)) is not None]
+        return float(np.median(found)) if found else None
     finally:
         cv2.setNumThreads(before)
+
+
+def _of_part_ms(dataset: Dataset, part: range) -> float | None:
+    """The time of the first pair, of those that begin in a part of the recording, that can be read."""
+    for index in part:
+        try:
+            return _of_pair_ms(dataset, index)
+        except (DatasetError, FrameError):  # as `Slam.run` does: the tracker passes over it too
+            continue
+    return None
 
 
 def _of_pair_ms(dataset: Dataset, index: int) -> float:

@@ -16,12 +16,13 @@ from jaxslam.benchmark.report import (
     how,
     overview_table,
     protocols,
-    published_table,
+    published_tables,
     summary_lines,
-    without_network,
+    warnings,
 )
 from jaxslam.benchmark.rows import ACCURACY, RUNNING, by_sequence, median_run, rows_of
 from jaxslam.benchmark.suite import Suite
+from jaxslam.benchmark.verdicts import kitti_means
 from jaxslam.visualize import png
 
 _PICTURE_PX = 1000
@@ -67,14 +68,15 @@ def html_report(suite: Suite, results: Sequence[Mapping[str, Any]], missing: Map
 
     Args:
         suite: What was run.
-        results: Of every run, as `run_jobs` gives them.
+        results: Of every planned run, as `Collected.every` gives them.
         missing: Names of what was not run, with the reason.
         out: The folder of the results, whose files are shown.
     """
     rows, runs = rows_of(results), by_sequence(results)
     parts = [f"<h1>{_text(suite.name)}</h1>", f"<p>{_text(suite.about)}</p>", _table(overview_table(suite, rows))]
     parts += [f"<p>{_text(line)}</p>" for line in summary_lines(suite, rows)]
-    parts += [f'<p class="failed">{_text(line)}</p>' for line in without_network(results)]
+    parts += [f'<p class="failed">{_text(line)}</p>' for line in warnings(suite, results)]
+    parts.append(_table(kitti_means(suite, rows)))
     rates = _by_rate(suite, results)
     if rates:
         parts.append(_figure(png(plot_rates(rates)), "Error over the rate of frames: median and range of the runs."))
@@ -82,7 +84,7 @@ def html_report(suite: Suite, results: Sequence[Mapping[str, Any]], missing: Map
         parts.append(f"<h2>{_text(sequence)}</h2>")
         parts += [_table(figure_table(of_it, columns)) for columns in (ACCURACY, RUNNING)]
         parts += [f'<p class="failed">{_text(line)}</p>' for line in failures(of_it)]
-        parts.append(_table(published_table(suite, sequence, of_it)))
+        parts += [_table(found) for found in published_tables(suite, sequence, of_it)]
         parts += _plots(sequence, [run for run in runs[sequence] if run["status"] == "done"], out)
     if missing:
         parts.append("<h2>Not run</h2><ul>")

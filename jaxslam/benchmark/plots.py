@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from jaxslam.benchmark.names import run_folder
 from jaxslam.benchmark.rows import median_run
 from jaxslam.frame_log import Errors, read_errors, read_track_ms
 from jaxslam.visualize import with_breaks
@@ -18,6 +19,8 @@ _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#0
 """Told apart by the colour-blind too (Okabe and Ito)."""
 _STAGES = ("take over", "flow", "wait for mask", "pose", "match with map", "hand over")
 _ROOM = 0.15
+_LONGEST = 29
+"""Letters of a label."""
 
 
 def plot_spread(done: Sequence[Mapping[str, Any]]) -> Figure:
@@ -34,13 +37,13 @@ def plot_spread(done: Sequence[Mapping[str, Any]]) -> Figure:
         )
     for index in known:
         errors.plot(found[index], np.full(len(found[index]), positions[index]), ".", color=_color(index), alpha=0.7)
-    errors.set(xlabel="ATE [m]", yticks=positions, yticklabels=labels)
+    errors.set(xlabel="ATE [m]", yticks=positions, yticklabels=_shortened(labels))
     for name, marker in (("flow_ratio_median", "o"), ("flow_ratio_p95", "|"), ("flow_ratio_max", "x")):
         values = [_figures(done, label, name) for label in labels]
         middle = [np.median(value) if value else np.nan for value in values]
         times.plot(middle, positions, marker, color="0.2", markersize=7, label=name.removeprefix("flow_ratio_"))
     times.axvline(1, color="0.6", linewidth=0.8)
-    times.set(xlabel="time of a frame / LK", yticks=positions, yticklabels=labels, xscale="log")
+    times.set(xlabel="time of a frame / LK", yticks=positions, yticklabels=_shortened(labels), xscale="log")
     times.legend(fontsize=8, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
     for axes in (errors, times):
         axes.set_ylim(0.4, len(labels) + 0.6)
@@ -71,7 +74,7 @@ def plot_paths(done: Sequence[Mapping[str, Any]], out: Path) -> Figure | None:
             color=_color(list(runs).index(label)),
             linewidth=1,
         )
-        axes.set_title(f"{label}, {_rmse(errors):.4f} m", fontsize=9)
+        axes.set_title(f"{_short(label)}, {_rmse(errors):.4f} m", fontsize=9)
         axes.set(xlim=(low[0] - room, high[0] + room), ylim=(low[1] - room, high[1] + room), aspect="equal")
         axes.grid(alpha=0.3)
         axes.tick_params(labelsize=8)
@@ -92,7 +95,7 @@ def plot_errors(done: Sequence[Mapping[str, Any]], out: Path) -> Figure | None:
         start = errors.timestamps_ns[0] if start is None else start
         seconds = (errors.timestamps_ns - start) * 1e-9
         lines = with_breaks(errors.timestamps_ns, np.column_stack([seconds, errors.errors_m]))
-        axes.plot(*lines.T, color=_color(index), linewidth=1, label=label)
+        axes.plot(*lines.T, color=_color(index), linewidth=1, label=_short(label))
     if start is None:
         return None
     axes.set(xlabel="time [s]", ylabel="error [m]", yscale="log")
@@ -114,7 +117,9 @@ def plot_times(done: Sequence[Mapping[str, Any]], out: Path) -> Figure:
         bins = np.geomspace(max(together.min(), 1e-2), max(together.max(), 2e-2), 50)
         for index, (label, times) in enumerate(shown.items()):
             weights = np.full(len(times), 100 / len(times))
-            frames.hist(times, bins=bins.tolist(), weights=weights, histtype="step", color=_color(index), label=label)
+            frames.hist(
+                times, bins=bins.tolist(), weights=weights, histtype="step", color=_color(index), label=_short(label)
+            )
         frames.legend(fontsize=8)
     frames.set(xlabel="time of a frame [ms]", ylabel="share of the frames [%]", xscale="log")
     _draw_stages(stages, done, labels)
@@ -140,7 +145,7 @@ def plot_rates(groups: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
             rates = sorted({run["rate_hz"] for run in _of(done, label)})
             found = [[run["ate_rmse_m"] for run in _of(done, label) if run["rate_hz"] == rate] for rate in rates]
             known = [(rate, [a for a in ates if a is not None]) for rate, ates in zip(rates, found, strict=True)]
-            _draw_rates(axes, [(rate, ates) for rate, ates in known if ates], label, _color(index))
+            _draw_rates(axes, [(rate, ates) for rate, ates in known if ates], _short(label), _color(index))
         axes.set(xscale="log", yscale="log", xlabel="frames a second", ylabel="ATE [m]", title=name)
         ticks = sorted({round(run["rate_hz"]) for run in done})
         axes.set_xticks(ticks, [str(tick) for tick in ticks])
@@ -166,13 +171,24 @@ def _draw_stages(axes: Axes, done: Sequence[Mapping[str, Any]], labels: Sequence
         means = np.array([_stage_ms(done, label, stage) for label in labels])
         axes.barh(positions, means, left=left, height=0.6, color=color, label=stage)
         left += means
-    axes.set(xlabel="mean time of a frame, by stages [ms]", yticks=positions, yticklabels=labels)
+    axes.set(xlabel="mean time of a frame, by stages [ms]", yticks=positions, yticklabels=_shortened(labels))
     axes.legend(fontsize=7, ncols=3, loc="upper center", bbox_to_anchor=(0.4, -0.5))
 
 
 def _stage_ms(done: Sequence[Mapping[str, Any]], label: str, stage: str) -> float:
     times = [run["stage_ms"][stage]["mean"] for run in _of(done, label) if run["stage_ms"].get(stage)]
     return float(np.median(times)) if times else 0.0
+
+
+def _shortened(labels: Sequence[str]) -> list[str]:
+    return [_short(label) for label in labels]
+
+
+def _short(label: str) -> str:
+    """The beginning and the end of a label that would leave no room for what it labels; never a formula."""
+    ends = (_LONGEST - 1) // 2
+    shown = label if len(label) <= _LONGEST else f"{label[:ends]}\N{HORIZONTAL ELLIPSIS}{label[-ends:]}"
+    return shown.replace("$", r"\$")
 
 
 def _labels(done: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -193,7 +209,7 @@ def _color(index: int) -> str:
 
 def folder_of(run: Mapping[str, Any], out: Path) -> Path:
     """Where the files of a run are."""
-    return out / run["sequence"] / run["label"] / str(run["seed"])
+    return out / run_folder(run["sequence"], run["label"], run["seed"])
 
 
 def _errors(done: Sequence[Mapping[str, Any]], label: str, out: Path) -> Errors | None:

@@ -1,5 +1,6 @@
 """What the runs of a sequence have in common: a row of a table."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -23,7 +24,9 @@ class Column(NamedTuple):
 
 
 ACCURACY = (
-    Column("tracked, %", "tracked_percent", 1),
+    Column("frames", "frames", 0, "least"),
+    Column("tracked, %", "tracked_percent", 1, "least"),
+    Column("matched poses", "num_matched", 0, "least"),
     Column("ATE, m", "ate_rmse_m", 4),
     Column("from - to", "ate_rmse_m", 4, "range"),
     Column("ATE Sim(3), m", "ate_sim3_rmse_m", 4),
@@ -49,6 +52,10 @@ RUNNING = (
     Column("memory, MB", "peak_rss_mb", 0, "most"),
 )
 """How they came about."""
+COVERAGE = ("images", "tracked_of_all_percent", "matched_percent", "coverage_percent")
+"""What else decides whether figures may be compared with published ones: images of the whole recording, and shares of
+the frames, dropped ones too, that were tracked, and that were matched with ground truth; and of its time."""
+_FIGURES = (*(column.figure for column in (*ACCURACY, *RUNNING)), *COVERAGE)
 
 
 def row_name(sequence: str, label: str) -> str:
@@ -57,10 +64,11 @@ def row_name(sequence: str, label: str) -> str:
 
 
 def rows_of(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Results by sequence and label: how many runs, and the figures of those that are done.
+    """Results by sequence and label: how many runs were planned, and the figures of those that are done.
 
-    A row has `sequence`, `label`, `runs`, `done`, `problems`, and by the name of each figure its `median`, `least` and
-    `most`, or `None`.
+    A row has `sequence`, `label`, `runs` (planned), `done`, `failed`, `problems` of those that failed, `unevaluated`
+    (why runs that are done have no ATE, with how many), `notes` of the evaluations, and by the name of each figure its
+    `median`, `least` and `most`, or `None`.
     """
     groups: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
     for result in results:
@@ -83,12 +91,15 @@ def median_run(results: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
 
 
 def figures_of(result: Mapping[str, Any]) -> dict[str, float | None]:
-    """Every figure of a run that a table may show, by name."""
+    """Every figure of a run that a table may show or a verdict needs, by name."""
     flat = {**(result["evaluation"] or {}), **result}
+    if frames := flat.get("frames"):
+        flat["tracked_of_all_percent"] = 100 * flat["tracked"] / frames
+        flat["matched_percent"] = 100 * (flat.get("num_matched") or 0) / frames
     for name in ("track_ms", "mask_age_frames"):
         short = name.removesuffix("_frames")
         flat |= {f"{short}_{measure}": value for measure, value in (result[name] or {}).items()}
-    return {column.figure: flat.get(column.figure) for column in (*ACCURACY, *RUNNING)}
+    return {name: flat.get(name) for name in _FIGURES}
 
 
 def columns_of(rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]) -> list[Column]:
@@ -106,15 +117,23 @@ def cell(row: Mapping[str, Any], column: Column) -> str:
 
 
 def _row(sequence: str, label: str, group: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    done = [figures_of(result) for result in group if result["status"] == "done"]
-    columns = {column.figure: [figures[column.figure] for figures in done] for column in (*ACCURACY, *RUNNING)}
+    done = [result for result in group if result["status"] == "done"]
+    failed = [result for result in group if result["status"] == "failed"]
+    figures = [figures_of(result) for result in done]
+    values = {name: [value for of_run in figures if (value := of_run[name]) is not None] for name in _FIGURES}
+    notes = (note for result in done for note in (result["evaluation"] or {}).get("notes", ()))
     return {
         "sequence": sequence,
         "label": label,
         "runs": len(group),
         "done": len(done),
-        "problems": sorted({result["problem"] for result in group if result["problem"]}),
-        **{name: _spread([value for value in values if value is not None]) for name, values in columns.items()},
+        "failed": len(failed),
+        "problems": sorted({result["problem"] for result in failed}),
+        "unevaluated": Counter(
+            result.get("evaluation_problem") or "not evaluated" for result in done if result["ate_rmse_m"] is None
+        ),
+        "notes": list(dict.fromkeys(notes)),
+        **{name: _spread(of_it) for name, of_it in values.items()},
     }
 
 

@@ -1,22 +1,19 @@
 """Runs of a suite: planned, spread over processes, and gone on with where they were broken off."""
 
-import json
 import shutil
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from jaxslam.benchmark.job import Job, finished, run_in_process
-from jaxslam.benchmark.suite import Suite
-from jaxslam.errors import BenchmarkError
-from jaxslam.files import write_atomically
+from jaxslam.benchmark.identity import changes, identities
+from jaxslam.benchmark.job import Job, run_in_process, stored
 from jaxslam.recordings import found_recordings
 
-RESULTS = "results.json"
+_MOST_REASONS = 4
 _ROOMS = ".rooms"
 """Frames of rendered rooms, as long as there are runs that need them."""
 
@@ -29,62 +26,13 @@ class Executor(Protocol):
         """Names of the recordings that are there."""
         ...
 
+    def identities(self, jobs: Sequence[Job]) -> list[dict[str, Any]]:
+        """What the figures of jobs depend on where they would be run now: `jaxslam.benchmark.identity.identities`."""
+        ...
+
     def run(self, jobs: Sequence[Job], out: Path) -> Iterator[tuple[Job, dict[str, Any]]]:
         """Run jobs, each in a process of its own, and give their figures as they end; files go below `out`, here."""
         ...
-
-
-def plan(suite: Suite, *, presets: Sequence[str] = (), runs: int | None = None) -> list[Job]:
-    """All runs of a suite.
-
-    Args:
-        suite: What is run.
-        presets: Instead of its own, if there are any.
-        runs: How often each, instead of as often as it says.
-    """
-    variants = suite.variants or {"": ()}
-    return [
-        Job(clip, preset, variant, (*suite.settings, *settings), seed)
-        for clip in suite.sequences
-        for preset in presets or suite.presets
-        for variant, settings in variants.items()
-        for seed in range(suite.runs if runs is None else runs)
-    ]
-
-
-def missing(suite: Suite, found: Collection[str]) -> dict[str, str]:
-    """Recordings that are not there, by name, and how to get them.
-
-    Args:
-        suite: What is run.
-        found: Names of the recordings that are there.
-    """
-    names = [clip.recording for clip in suite.sequences if clip.recording and clip.recording not in found]
-    return {name: f"not there; to get it: jaxslam data get {name}" for name in names}
-
-
-def swept(suite: Suite, sweeps: Iterable[str]) -> Suite:
-    """The suite with every combination of values as a variant.
-
-    Args:
-        suite: What is run.
-        sweeps: `key=v1,v2,...` each.
-
-    Raises:
-        BenchmarkError: If one is no such text.
-    """
-    variants = dict(suite.variants) or {"": ()}
-    for sweep in sweeps:
-        key, found, values = sweep.partition("=")
-        if not found or not key or not all(values.split(",")):
-            raise BenchmarkError(f"--sweep: expected key=value,value,..., got '{sweep}'")
-        short = key.rpartition(".")[2]
-        variants = {
-            ",".join(filter(None, (name, f"{short}={value}"))): (*settings, f"{key}={value}")
-            for name, settings in variants.items()
-            for value in values.split(",")
-        }
-    return replace(suite, variants=variants)
 
 
 def run_jobs(
@@ -93,30 +41,31 @@ def run_jobs(
     *,
     executor: Executor,
     on_result: Callable[[dict[str, Any]], None],
-) -> list[dict[str, Any]]:
-    """Run jobs that have not been run to their end, and give the results of all, in order.
+    on_stale: Callable[[Job, str], None],
+) -> None:
+    """Run jobs that have not been run to their end, and those whose results would be others now.
 
     Args:
         jobs: From `plan`.
         out: Folder of the results, each job's in one of its own.
         executor: Where they are run.
         on_result: Called with each result, those of earlier runs first.
+        on_stale: Called with each job that is run anew, and why, before any is run.
 
     Raises:
         BenchmarkError: If a result of an earlier run is unreadable, or there is nobody any more to run the others.
     """
-    results: dict[Job, dict[str, Any]] = {}
-    for job in jobs:
-        earlier = finished(job, out)
-        if earlier is not None:
-            results[job] = earlier
-            on_result(earlier)
-    for job, result in executor.run([job for job in jobs if job not in results], out):
-        results[job] = result
+    there = {job: found for job in jobs if (found := stored(job, out)) is not None}
+    same = [job for job, (_, different) in there.items() if not different]
+    for job, now in zip(same, executor.identities(same), strict=True):
+        there[job][1].extend(changes(there[job][0], now))
+    for job, (result, different) in there.items():
+        if different:
+            on_stale(job, "; ".join(different[:_MOST_REASONS]) + (" ..." if len(different) > _MOST_REASONS else ""))
+        else:
+            on_result(result)
+    for _, result in executor.run([job for job in jobs if job not in there or there[job][1]], out):
         on_result(result)
-    ordered = [results[job] for job in jobs]
-    write_atomically(out / RESULTS, (json.dumps(ordered, indent=1) + "\n").encode(), BenchmarkError)
-    return ordered
 
 
 @contextmanager
@@ -142,6 +91,9 @@ class _Local:
     pool: ThreadPoolExecutor
     root: Path | None
     recordings: Collection[str]
+
+    def identities(self, jobs: Sequence[Job]) -> list[dict[str, Any]]:
+        return identities(jobs, self.root)
 
     def run(self, jobs: Sequence[Job], out: Path) -> Iterator[tuple[Job, dict[str, Any]]]:
         rooms = out / _ROOMS

@@ -15,9 +15,11 @@ sequences:
 ablation: false                      # true shows published figures of parts of systems too
 variants:                            # every preset with each of these settings too
   few-points: [track.num_points=256]
+
+Settings of the command line beat those of a suite and its variants.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -133,7 +135,7 @@ def load_suite(name_or_path: str) -> Suite:
 
 
 def checked_presets(names: tuple[str, ...]) -> tuple[str, ...]:
-    """The names, if all of them are presets.
+    """The names, each once, if all of them are presets.
 
     Raises:
         BenchmarkError: If one is not, or there is none.
@@ -143,7 +145,7 @@ def checked_presets(names: tuple[str, ...]) -> tuple[str, ...]:
     for name in names:
         if name not in presets():
             raise BenchmarkError(f"presets: unknown preset '{name}'{nearest(name, presets())}")
-    return names
+    return tuple(dict.fromkeys(names))
 
 
 def _suite_of_folder(folder: Path) -> Suite:
@@ -195,12 +197,16 @@ def _suite(name: str, content: Mapping[str, Any], folder: Path) -> Suite:
     )
     for variant in suite.variants.values() or [()]:
         for preset in suite.presets:
-            _check_masks(made, load_config(preset, overrides=(*suite.settings, *variant)))  # now, not after hours
+            check_masks(made, load_config(preset, overrides=(*suite.settings, *variant)))  # now, not after hours
     return suite
 
 
-def _check_masks(sequences: tuple[Sequence, ...], config: Config) -> None:
-    """Nobody knows the truth of a recording."""
+def check_masks(sequences: Iterable[Sequence], config: Config) -> None:
+    """See whether true masks are asked for where there are any: nobody knows the truth of a recording.
+
+    Raises:
+        BenchmarkError: If they are asked for of a recording.
+    """
     recordings = [sequence.name for sequence in sequences if sequence.room is None]
     if config.semantics.model == SCENE and recordings:
         raise BenchmarkError(f"semantics.model: '{SCENE}' expected rendered rooms, got the recording {recordings[0]}")

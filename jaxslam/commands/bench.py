@@ -1,23 +1,27 @@
 """`jaxslam bench`: run a suite of recordings with presets, and write a report."""
 
 import re
-from collections.abc import Collection
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import tyro
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from jaxslam.benchmark.job import Job
+from jaxslam.benchmark.collected import RESULTS, Collected, read_results
+from jaxslam.benchmark.job import DONE, FAILED, NOT_RUN, Job, about
 from jaxslam.benchmark.page import html_report
+from jaxslam.benchmark.plan import missing, plan, replaced_settings, swept
 from jaxslam.benchmark.report import markdown_report
 from jaxslam.benchmark.rows import row_name
-from jaxslam.benchmark.runner import RESULTS, Executor, local, missing, plan, run_jobs, swept
-from jaxslam.benchmark.suite import checked_presets, load_suite, suites
-from jaxslam.commands.console import console
+from jaxslam.benchmark.runner import Executor, local, run_jobs
+from jaxslam.benchmark.suite import Suite, check_masks, checked_presets, load_suite, suites
+from jaxslam.commands.console import console, plain_console
+from jaxslam.commands.settings import Settings, flat
 from jaxslam.config import load_config
 from jaxslam.errors import BenchmarkError
 from jaxslam.files import make_folder, write_atomically
@@ -25,6 +29,20 @@ from jaxslam.files import make_folder, write_atomically
 _REPORT, _PAGE = "report.md", "report.html"
 _LOCAL = "local"
 _DASK = re.compile(r"dask://((?:\[[0-9A-Fa-f:.]+\]|[^\s/:@\[\]]+):[0-9]+)")
+
+
+class SuitePlan(NamedTuple):
+    """What is going to be run.
+
+    Attributes:
+        suite: With sweeps as variants.
+        jobs: Every run.
+        replaced: What the command line changes about the suite's own settings, in words.
+    """
+
+    suite: Suite
+    jobs: list[Job]
+    replaced: list[str]
 
 
 @dataclass(frozen=True)
@@ -46,10 +64,32 @@ class RunsOfSuite:
     """Go on with results that are there."""
     out: Path | None = None
     """Folder for the results; results/bench/SUITE if not given."""
-    set: tuple[str, ...] = ()
-    """Settings of all runs, as in `--set track.num_points=400`."""
-    sweep: tuple[str, ...] = ()
+    set: Settings = ()
+    """Settings of all runs, as in `--set track.num_points=400`; they beat those of the suite. May be given again."""
+    sweep: Settings = ()
     """Settings with several values each, all combinations of which are run: `track.num_points=256,512`."""
+
+    def plan(self, name: str) -> SuitePlan:
+        """The runs that the suite and these options come to.
+
+        Args:
+            name: Of the suite.
+
+        Raises:
+            BenchmarkError: If there is no such suite, or an option does not fit.
+            ConfigError: If a setting is unknown or cannot be.
+        """
+        for option, value in (("--runs", self.runs), ("--workers", self.workers)):
+            if value is not None and value < 1:
+                raise BenchmarkError(f"{option}: expected at least 1, got {value}")
+        known, settings, sweeps = load_suite(name), flat(self.set), flat(self.sweep)
+        replaced = replaced_settings(known, settings, sweeps)
+        suite = swept(known, sweeps)
+        chosen = checked_presets(self.presets) if self.presets else ()
+        jobs = plan(suite, presets=chosen, runs=self.runs, settings=settings)
+        for preset, of_it in dict.fromkeys((job.preset, job.settings) for job in jobs):  # an error now, not after hours
+            check_masks([job.clip for job in jobs], load_config(preset, overrides=of_it))
+        return SuitePlan(suite, jobs, replaced)
 
     def results(self, name: str, rows: Collection[str] | None = None) -> list[dict[str, Any]]:
         """Run what has not been run; the report is written, and the results given back.
@@ -58,31 +98,28 @@ class RunsOfSuite:
             name: Of the suite.
             rows: What to run of it, by `row_name`; all if not given.
         """
-        for option, value in (("--runs", self.runs), ("--workers", self.workers)):
-            if value is not None and value < 1:
-                raise BenchmarkError(f"{option}: expected at least 1, got {value}")
-        suite = swept(load_suite(name), self.sweep)
-        chosen = checked_presets(self.presets) if self.presets else ()
-        jobs = plan(replace(suite, settings=(*self.set, *suite.settings)), presets=chosen, runs=self.runs)
+        planned = self.plan(name)
+        suite, jobs = planned.suite, planned.jobs
         jobs = [job for job in jobs if rows is None or row_name(job.clip.name, job.label) in rows]
-        for preset, settings in {(job.preset, job.settings) for job in jobs}:
-            load_config(preset, overrides=settings)  # an error now, not after hours
+        for line in planned.replaced if rows is None else ():
+            plain_console.print(line)
         out = self.out or Path("results") / "bench" / suite.name
         with self._executor(self._root(name)) as executor:
             absent = missing(suite, executor.recordings)
-            self._prepare(out)
+            earlier = self._prepare(out)
             for why in dict.fromkeys(absent.values()):
                 names = ", ".join(name for name in absent if absent[name] == why)
-                console.print(f"Not run: {names}: {why}", highlight=False)
-            results = self._run([job for job in jobs if job.clip.recording not in absent], out, executor)
-        write_atomically(out / _REPORT, markdown_report(suite, results, absent).encode(), BenchmarkError)
-        write_atomically(out / _PAGE, html_report(suite, results, absent, out).encode(), BenchmarkError)
-        failed = sum(result["status"] != "done" for result in results)
-        console.print(f"{len(results) - failed} runs, {failed} failed, {len(absent)} recordings not run.")
-        console.print(
-            f"Report: {out / _PAGE}, {out / _REPORT}; figures: {out / RESULTS}; each run in {out}/SEQUENCE/PRESET/SEED"
-        )
-        return results
+                plain_console.print(f"Not run: {names}: {why}")
+            there = [job for job in jobs if job.clip.recording not in absent]
+            collected = Collected(there, earlier)
+            try:
+                self._run(there, out, executor, collected, lambda: _write_text(suite, collected, absent, out))
+            finally:  # also if it was interrupted: what is done can be seen
+                _write_text(suite, collected, absent, out)
+                page = html_report(suite, collected.every, absent, out)
+                write_atomically(out / _PAGE, page.encode(), BenchmarkError)
+                _print_outcome(collected, absent, out)
+        return collected.planned
 
     @property
     def runs_here(self) -> bool:
@@ -114,14 +151,18 @@ class RunsOfSuite:
 
         return cluster(match[1], root)
 
-    def _prepare(self, out: Path) -> None:
+    def _prepare(self, out: Path) -> list[dict[str, Any]]:
+        """Make the folder of the results; gives those of an earlier call that are gone on with."""
         if not self.resume and out.is_dir() and any(out.iterdir()):
             raise BenchmarkError(
                 f"{out}: expected no results there; --resume goes on with them, --out names another folder"
             )
         make_folder(out, BenchmarkError)
+        return read_results(out) if self.resume else []
 
-    def _run(self, jobs: list[Job], out: Path, executor: Executor) -> list[dict[str, Any]]:
+    def _run(
+        self, jobs: Sequence[Job], out: Path, executor: Executor, collected: Collected, save: Callable[[], None]
+    ) -> None:
         columns = (
             TextColumn("Runs"),
             BarColumn(),
@@ -131,12 +172,18 @@ class RunsOfSuite:
         )
         with Progress(*columns, console=console) as progress:
             task = progress.add_task("runs", total=len(jobs))
+            save()
 
             def told(result: dict[str, Any]) -> None:
+                collected.add(result)
+                save()
                 progress.console.print(_line(result), highlight=False)
                 progress.advance(task)
 
-            return run_jobs(jobs, out, executor=executor, on_result=told)
+            def stale(job: Job, why: str) -> None:
+                progress.console.print(f"{_name(about(job))}: run anew: {why}", highlight=False)
+
+            run_jobs(jobs, out, executor=executor, on_result=told, on_stale=stale)
 
 
 @dataclass(frozen=True)
@@ -156,17 +203,40 @@ class Bench(RunsOfSuite):
             _list()
             return
         results = self.results(self.suite)
-        failed = sum(result["status"] != "done" for result in results)
+        failed = sum(result["status"] != DONE for result in results)
         if failed or not results:
             raise BenchmarkError(f"{failed} of {len(results)} runs failed" if results else "nothing could be run")
 
 
-def _line(result: dict[str, Any]) -> str:
-    name = f"{row_name(result['sequence'], result['label'])}, seed {result['seed']}"
-    if result["status"] != "done":
-        return f"{name}: {result['problem']}"
+def _write_text(suite: Suite, collected: Collected, absent: Mapping[str, str], out: Path) -> None:
+    """Write the results and the report that is made in no time."""
+    collected.write(out)
+    write_atomically(out / _REPORT, markdown_report(suite, collected.every, absent).encode(), BenchmarkError)
+
+
+def _print_outcome(collected: Collected, absent: Mapping[str, str], out: Path) -> None:
+    statuses = Counter(result["status"] for result in collected.planned)
+    left = f", {statuses[NOT_RUN]} not made" if statuses[NOT_RUN] else ""
+    made = statuses.total() - statuses[NOT_RUN]
+    plain_console.print(f"{made} runs, {statuses[FAILED]} failed{left}, {len(absent)} recordings not run.")
+    kept = len(collected.every) - len(collected.planned)
+    if kept:
+        plain_console.print(f"In the report too: {kept} runs of earlier calls.")
+    plain_console.print(
+        f"Report: {out / _PAGE}, {out / _REPORT}; figures: {out / RESULTS}; each run in {out}/SEQUENCE/PRESET/SEED"
+    )
+
+
+def _name(result: Mapping[str, Any]) -> str:
+    return f"{row_name(result['sequence'], result['label'])}, seed {result['seed']}"
+
+
+def _line(result: Mapping[str, Any]) -> str:
+    if result["status"] != DONE:
+        return f"{_name(result)}: {result['problem']}"
     ate = result["ate_rmse_m"]
-    return f"{name}: ATE {'-' if ate is None else f'{ate:.4f} m'}, {result['tracked_percent']:.1f} % tracked"
+    known = f"ATE {ate:.4f} m" if ate is not None else f"no ATE ({result['evaluation_problem']})"
+    return f"{_name(result)}: {known}, {result['tracked_percent']:.1f} % tracked"
 
 
 def _list() -> None:

@@ -1,14 +1,17 @@
 """`jaxslam bench gate`: whether a suite has become worse than its baseline."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
-from jaxslam.benchmark.gate import complaints, differences, load_baseline, make_baseline, runs_at_once, save_baseline
+from jaxslam.benchmark.baseline import Baseline, check_same_plan, load_baseline, save_baseline
+from jaxslam.benchmark.gate import check_reason, complaints, differences, make_baseline, runs_at_once
+from jaxslam.benchmark.plan import fingerprint
 from jaxslam.commands.bench import RunsOfSuite
-from jaxslam.commands.console import console
+from jaxslam.commands.console import plain_console
 from jaxslam.errors import BenchmarkError
 
 _MOST_AGAIN = 2
@@ -30,26 +33,25 @@ class Gate(RunsOfSuite):
         """Run the command."""
         if self.baseline is None:
             raise BenchmarkError("bench gate: expected --baseline FILE")
-        before = load_baseline(self.baseline) if self.baseline.exists() or self.update is None else None
+        before = self._before(self.baseline)
         suite = self.of or (None if before is None else before.suite)
         if suite is None:
             raise BenchmarkError(f"{self.baseline}: not there yet; --of SUITE says of what to make it")
         presets, runs = (self.presets, self.runs) if before is None else (before.presets, before.runs)
         out = self.out or _OUT
-        options = replace(self, presets=self.presets or presets, runs=self.runs or runs, out=out)
+        options = replace(self, presets=self.presets or presets, runs=runs if self.runs is None else self.runs, out=out)
         if before is not None and self.update is None and self.runs_here and self.workers is None:
             options = replace(options, workers=runs_at_once(before))
-        results = options.results(suite)
+        planned = fingerprint(options.plan(suite).jobs)
         if self.update is not None:
-            ran = tuple(dict.fromkeys(result["preset"] for result in results))
-            repeats = 1 + max((result["seed"] for result in results), default=0)
-            save_baseline(self.baseline, make_baseline(suite, ran, repeats, self.update, results))
-            console.print(f"Baseline: {self.baseline}")
+            self._update(self.baseline, self.update, options, suite, planned)
             return
         assert before is not None
+        _check(self.baseline, before, planned)
+        results = options.results(suite)
         other = differences(before, results)
         if other:
-            console.print(
+            plain_console.print(
                 f"Here: {other}. Errors may differ as those of seeds do; times of other machines are left out."
             )
         worse = complaints(before, results)
@@ -57,11 +59,37 @@ class Gate(RunsOfSuite):
             slow = sorted({complaint.row for complaint in worse if complaint.of_time})
             if not slow:
                 break
-            console.print(f"Slower, and measured again: {'; '.join(slow)}", highlight=False)
+            plain_console.print(f"Slower, and measured again: {'; '.join(slow)}")
             results += replace(options, out=out / f"again-{again}").results(suite, slow)
             worse = complaints(before, results)
         for complaint in worse:
-            console.print(f"worse: {complaint}", highlight=False)
+            plain_console.print(f"worse: {complaint}")
         if worse:
             raise BenchmarkError(f"{len(worse)} figures are worse than in {self.baseline} ({before.reason})")
-        console.print(f"Nothing is worse than in {self.baseline}.")
+        plain_console.print(f"Nothing is worse than in {self.baseline}.")
+
+    def _before(self, path: Path) -> Baseline | None:
+        """The baseline that is there; `None` if a new one of a named suite takes the place of none, or of a bad one."""
+        if self.update is not None and not path.exists():
+            return None
+        try:
+            return load_baseline(path)
+        except BenchmarkError:
+            if self.update is None or self.of is None:
+                raise
+            return None
+
+    @staticmethod
+    def _update(path: Path, reason: str, options: "Gate", suite: str, planned: Mapping[str, Any]) -> None:
+        check_reason(reason)
+        results = options.results(suite)
+        presets = tuple(dict.fromkeys(of_label["preset"] for of_label in planned["presets"].values()))
+        save_baseline(path, make_baseline(suite, presets, planned["runs"], reason, results, planned))
+        plain_console.print(f"Baseline: {path}")
+
+
+def _check(path: Path, before: Baseline, planned: Mapping[str, Any]) -> None:
+    try:
+        check_same_plan(before, planned)
+    except BenchmarkError as problem:
+        raise BenchmarkError(f"{path}: {problem}") from None
