@@ -2,13 +2,14 @@
 
 import json
 import statistics
+from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
 from rich.table import Table
 
 from jaxslam.benchmark.report import table
-from jaxslam.commands.console import console
+from jaxslam.commands.console import console, plain_console
 from jaxslam.commands.run import OfRecording, number, track
 from jaxslam.config import presets
 from jaxslam.errors import ConfigError, nearest
@@ -16,7 +17,11 @@ from jaxslam.files import write_atomically
 from jaxslam.slam import Slam
 from jaxslam.xla import prefer_one_thread
 
-_COLUMNS = ("preset", "tracked", "dropped", "ATE, m", "from - to", "ATE Sim(3), m", "mean ms", "median ms", "p95 ms")
+_ERRORS = (
+    *("preset", "tracked", "dropped", "matched poses", "ATE, m", "from - to", "ATE Sim(3), m"),
+    *("RPE, m/s", "RPE, deg/s"),
+)
+_COLUMNS = (*_ERRORS, "mean ms", "median ms", "p95 ms")
 
 
 @dataclass(frozen=True)
@@ -36,13 +41,14 @@ class Compare(OfRecording):
         """Run the command."""
         if self.runs < 1:
             raise ConfigError(f"--runs: expected at least 1, got {self.runs}")
-        for preset in self.presets:
+        chosen = tuple(dict.fromkeys(self.presets))
+        for preset in chosen:
             if preset not in presets():
                 raise ConfigError(f"--presets: unknown preset '{preset}'{nearest(preset, presets())}")
         dataset, out = self.opened(), self.folder()
         prefer_one_thread()  # nothing else computes while a recording is tracked
         rows: list[dict[str, Any]] = []
-        for preset in self.presets:
+        for preset in chosen:
             summaries = []
             for seed in range(self.runs):
                 console.print(f"{preset}, run {seed + 1} of {self.runs}")
@@ -51,14 +57,21 @@ class Compare(OfRecording):
                 summaries.append(track(dataset, slam, preset, folder, quiet=True))
             rows.append(_row(preset, summaries))
         console.print(_table(dataset.name, rows))
+        remarks = [line for row in rows for line in _remarks(row)]
+        for line in remarks:
+            plain_console.print(line)
         write_atomically(out / "comparison.json", (json.dumps(rows, indent=2) + "\n").encode())
-        write_atomically(out / "comparison.md", table(_COLUMNS, [_cells(row) for row in rows]).encode())
+        text = table(_COLUMNS, [_cells(row) for row in rows]) + "".join(f"\n- {line}\n" for line in remarks)
+        write_atomically(out / "comparison.md", text.encode())
         console.print(f"Table in {out}: comparison.md, comparison.json; results of each run in {out}/PRESET/SEED")
 
 
 def _row(preset: str, summaries: list[dict[str, Any]]) -> dict[str, Any]:
     """The figures of a preset over its runs; those of accuracy over the runs that could be evaluated."""
     ates = [summary["ate_rmse_m"] for summary in summaries if summary["ate_rmse_m"] is not None]
+    problems = [summary["evaluation_problem"] for summary in summaries if summary["ate_rmse_m"] is None]
+    evaluations = [summary["evaluation"] for summary in summaries if summary["evaluation"] is not None]
+    known = lambda name: [evaluation[name] for evaluation in evaluations if evaluation[name] is not None]
     similar = [summary["ate_sim3_rmse_m"] for summary in summaries if summary["ate_sim3_rmse_m"] is not None]
     times = [summary["track_ms"] for summary in summaries if summary["track_ms"] is not None]
     middle = lambda values: statistics.median(values) if values else None
@@ -70,6 +83,10 @@ def _row(preset: str, summaries: list[dict[str, Any]]) -> dict[str, Any]:
         "ate_rmse_m": middle(ates),
         "ate_rmse_m_of_runs": ates,
         "ate_sim3_rmse_m": middle(similar),
+        **{name: middle(known(name)) for name in ("rpe_trans_m_per_s", "rpe_rot_deg_per_s")},
+        "num_matched": min((evaluation["num_matched"] for evaluation in evaluations), default=None),
+        "evaluation_problems": problems,
+        "notes": list(dict.fromkeys(note for evaluation in evaluations for note in evaluation["notes"])),
         **{f"track_ms_{name}": middle([time[name] for time in times]) for name in ("mean", "median", "p95")},
     }
 
@@ -80,11 +97,21 @@ def _cells(row: dict[str, Any]) -> list[str]:
         row["preset"],
         f"{row['tracked_percent']:.1f} %",
         f"{row['dropped_percent']:.1f} %",
+        number(row["num_matched"], 0),
         number(row["ate_rmse_m"], 4),
         f"{min(ates):.4f} - {max(ates):.4f}" if ates else "-",
         number(row["ate_sim3_rmse_m"], 4),
+        number(row["rpe_trans_m_per_s"], 4),
+        number(row["rpe_rot_deg_per_s"], 3),
         *(number(row[f"track_ms_{name}"], 1) for name in ("mean", "median", "p95")),
     ]
+
+
+def _remarks(row: dict[str, Any]) -> list[str]:
+    """Why runs of a preset have no ATE, and what the evaluations say about their figures."""
+    missing = Counter(row["evaluation_problems"])
+    lines = [f"{row['preset']}: no ATE of {count} runs: {problem}" for problem, count in missing.items()]
+    return lines + [f"{row['preset']}: note: {note}" for note in row["notes"]]
 
 
 def _table(title: str, rows: list[dict[str, Any]]) -> Table:

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from jaxslam.benchmark.job import Job, opened
-from jaxslam.benchmark.runner import missing, plan, swept
+from jaxslam.benchmark.plan import missing, plan, swept
 from jaxslam.benchmark.suite import Sequence, load_suite, suites
 from jaxslam.datasets.synthetic import SyntheticConfig
 from jaxslam.errors import BenchmarkError

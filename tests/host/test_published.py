@@ -16,8 +16,8 @@ from jaxslam.benchmark.published import (
     read_published,
     verdict,
 )
-from jaxslam.benchmark.report import published_of
 from jaxslam.benchmark.suite import load_suite, suites
+from jaxslam.benchmark.verdicts import published_of
 from jaxslam.camera import Camera
 from jaxslam.config import configs_dir
 from jaxslam.datasets import bonn, tum
@@ -29,6 +29,7 @@ FOLDER = configs_dir() / "benchmarks" / "published"
 W = "rgbd_dataset_freiburg3_walking_"
 S = "rgbd_dataset_freiburg3_sitting_"
 B = "rgbd_bonn_"
+FR1 = "rgbd_dataset_freiburg1_"
 ATE, TRANS, ROT = "ate_rmse_m", "rpe_trans_m_per_s", "rpe_rot_deg_per_s"
 COLLECTION = "Collection of best figures"
 
@@ -90,6 +91,31 @@ TYPED = [
     (COLLECTION, "CFP-SLAM", None, S + "xyz", ATE, 0.0090),
     (COLLECTION, "ORB-SLAM2", None, S + "rpy", ATE, 0.0195),
     (COLLECTION, "DynaMoN", None, B + "person_tracking2", ATE, 0.022),
+    (COLLECTION, "WF-SLAM", None, W + "rpy", ATE, 0.0252),
+    (COLLECTION, "WF-SLAM", None, W + "xyz", ATE, 0.0127),
+    (COLLECTION, "WF-SLAM", None, S + "xyz", ATE, 0.0087),
+    (COLLECTION, "WildGS-SLAM with sensor depth", None, W + "halfsphere", ATE, 0.014),
+    (COLLECTION, "Dream-SLAM", None, B + "person_tracking", ATE, 0.015),
+    (COLLECTION, "Dream-SLAM", None, B + "moving_nonobstructing_box", ATE, 0.006),
+    (COLLECTION, "Dream-SLAM", None, B + "moving_nonobstructing_box2", ATE, 0.014),
+    (COLLECTION, "Dream-SLAM", None, B + "balloon2", ATE, 0.019),
+    (COLLECTION, "Dream-SLAM", None, W + "static", ATE, 0.003),
+    (COLLECTION, "Dream-SLAM", None, S + "static", ATE, 0.003),
+    (COLLECTION, "Dream-SLAM", None, S + "xyz", ATE, 0.006),
+    (COLLECTION, "best system with a GPU, not named", None, FR1 + "xyz", ATE, 0.009),
+    (COLLECTION, "best system with a GPU, not named", None, FR1 + "rpy", ATE, 0.017),
+    (COLLECTION, "best system, not named", None, FR1 + "desk", ATE, 0.0148),
+    (COLLECTION, "best system without a GPU, not named", None, FR1 + "xyz", ATE, 0.011),
+    (COLLECTION, "best system without a GPU, not named", None, FR1 + "rpy", ATE, 0.022),
+    (COLLECTION, "best system without a GPU, not named", None, FR1 + "desk", ATE, 0.016),
+    (COLLECTION, "ORB-SLAM2", None, FR1 + "desk2", ATE, 0.022),
+    (COLLECTION, "DVO-SLAM", None, FR1 + "room", ATE, 0.043),
+    (COLLECTION, "OV2SLAM", None, "kitti_00", ATE, 1.17),
+    (COLLECTION, "OV2SLAM", None, "kitti_07", ATE, 0.37),
+    (COLLECTION, "OV2SLAM", None, "kitti_09", ATE, 1.59),
+    ("ORB-SLAM2", "ORB-SLAM2", None, "kitti_00", ATE, 1.3),
+    ("ORB-SLAM2", "ORB-SLAM2", None, "kitti_07", ATE, 0.5),
+    ("ORB-SLAM2", "ORB-SLAM2", None, "kitti_09", ATE, 3.2),
 ]
 # Suite: paper; preset of each column, and its system and variant in the data files; the table of the paper, ATE in m.
 ABLATIONS = {
@@ -253,7 +279,8 @@ class TestDataFiles:
             assert bonn.LOADER.camera(folder) == Camera.load("bonn")
         else:
             assert tum.LOADER.fit(folder) is Fit.NAME
-            assert tum.LOADER.camera(folder) == Camera.load("tum_fr3")
+            number = sequence.removeprefix("rgbd_dataset_freiburg")[0]
+            assert tum.LOADER.camera(folder) == Camera.load(f"tum_fr{number}")
 
     def test_kitti_is_stereo_and_the_rest_is_not(self) -> None:
         assert all((figure.sensor == "stereo") == figure.sequence.startswith("kitti_") for figure in FIGURES)
