@@ -55,18 +55,18 @@ class Compare(OfRecording):
                 slam = Slam(dataset.camera, self.settings(preset, f"run.seed={seed}"))
                 folder = out / preset / str(seed)
                 summaries.append(track(dataset, slam, preset, folder, quiet=True))
-            rows.append(_row(preset, summaries))
+            rows.append(figures(preset, summaries))
         console.print(_table(dataset.name, rows))
-        remarks = [line for row in rows for line in _remarks(row)]
-        for line in remarks:
+        lines = [line for row in rows for line in remarks(row)]
+        for line in lines:
             plain_console.print(line)
         write_atomically(out / "comparison.json", (json.dumps(rows, indent=2) + "\n").encode())
-        text = table(_COLUMNS, [_cells(row) for row in rows]) + "".join(f"\n- {line}\n" for line in remarks)
+        text = table(_COLUMNS, [_cells(row) for row in rows]) + "".join(f"\n- {line}\n" for line in lines)
         write_atomically(out / "comparison.md", text.encode())
         console.print(f"Table in {out}: comparison.md, comparison.json; results of each run in {out}/PRESET/SEED")
 
 
-def _row(preset: str, summaries: list[dict[str, Any]]) -> dict[str, Any]:
+def figures(preset: str, summaries: list[dict[str, Any]]) -> dict[str, Any]:
     """The figures of a preset over its runs; those of accuracy over the runs that could be evaluated."""
     ates = [summary["ate_rmse_m"] for summary in summaries if summary["ate_rmse_m"] is not None]
     problems = [summary["evaluation_problem"] for summary in summaries if summary["ate_rmse_m"] is None]
@@ -107,7 +107,7 @@ def _cells(row: dict[str, Any]) -> list[str]:
     ]
 
 
-def _remarks(row: dict[str, Any]) -> list[str]:
+def remarks(row: dict[str, Any]) -> list[str]:
     """Why runs of a preset have no ATE, and what the evaluations say about their figures."""
     missing = Counter(row["evaluation_problems"])
     lines = [f"{row['preset']}: no ATE of {count} runs: {problem}" for problem, count in missing.items()]

@@ -14,10 +14,9 @@ import pytest
 from command_line import failing
 from small_scene import SETTINGS
 
+from jaxslam.benchmark.collected import ALWAYS
 from jaxslam.benchmark.page import html_report
 from jaxslam.benchmark.plots import plot_rates
-from jaxslam.benchmark.published import published_for
-from jaxslam.benchmark.report import overview_table, protocols, published_table, summary_lines, without_network
 from jaxslam.benchmark.suite import Sequence, Suite
 from jaxslam.cli import main
 from jaxslam.datasets.synthetic import SyntheticConfig
@@ -33,7 +32,7 @@ sequences:
   - name: room
     room: {{frames: 8, people: 1, width: 160, height: 120}}
 """
-COLUMNS = ("preset", "runs", "tracked, %", "ATE, m", "from - to")
+COLUMNS = ("preset", "runs", "frames", "tracked, %", "matched poses", "ATE, m", "from - to")
 
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
@@ -108,6 +107,8 @@ class TestResults:
             assert run["flow_ratio_median"] == pytest.approx(run["track_ms"]["median"] / run["flow_ms"], rel=1e-2)
             assert {"cpu", "cores", "threads", "versions", "commit", "peak_rss_mb", "seed"} <= set(run)
             assert run["networks_sha256"] == {}
+            assert run["images"] == 8
+            assert set(ALWAYS) <= set(run)
 
     def test_report(self, out: Path) -> None:
         text = (out / "report.md").read_text()
@@ -117,10 +118,13 @@ class TestResults:
         results = json.loads((out / "results.json").read_text())
         for row in accuracy[1:]:
             ates = sorted(run["ate_rmse_m"] for run in results if run["label"] == row[0])
-            assert row[3:5] == [f"{sum(ates) / 2:.4f}", f"{ates[0]:.4f} - {ates[1]:.4f}"]
+            assert row[5:7] == [f"{sum(ates) / 2:.4f}", f"{ates[0]:.4f} - {ates[1]:.4f}"]
         assert overview == [
-            ["ATE, m", "static", "default", "best published", "of"],
-            ["room", *column(accuracy, 3), "-", "-"],
+            [
+                *("ATE, m", "static", "default", "best published", "of"),
+                *("frames", "tracked, %", "matched poses", "runs done"),
+            ],
+            ["room", *column(accuracy, 5), "-", "-", "8", "100.0", "8", "4 of 4"],
         ]
         times = sorted(run["track_ms"]["p95"] for run in results if run["label"] == "static")
         assert float(running[1][running[0].index("p95, ms")]) == pytest.approx(sum(times) / 2, abs=0.06)
@@ -192,16 +196,29 @@ class TestGoingOn:
     def test_not_by_mistake(self, out: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert "--resume goes on" in fails(capsys, suite_file(out.parent), "--out", str(out))
 
-    def test_other_settings_are_other_runs(self, mine: Path, tmp_path: Path) -> None:
-        """Those alone that differ are run again."""
+    def test_what_differs_is_run_again(self, mine: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        """That alone, and it is said why; other presets and seeds stay in the report."""
         config = mine / "room/default/0/config.yaml"
         assert "probation_frames: 8" in config.read_text()
         config.write_text(config.read_text().replace("probation_frames: 8", "probation_frames: 9"))
+        result = mine / "room/default/1/result.json"
+        edited = json.loads(result.read_text()) | {"commit": "deadbeef", "data_sha256": "x", "ate_rmse_m": 1e-9}
+        result.write_text(json.dumps(edited))
         before = times_of(sorted(mine.rglob("result.json")))
-        main(["bench", suite_file(tmp_path), "--out", str(mine), "--resume"])
+        main(["bench", suite_file(tmp_path), "--out", str(mine), "--resume", "--presets", "default"])
         assert "probation_frames: 8" in config.read_text()
         now = times_of(sorted(mine.rglob("result.json")))
-        assert [path for path in now if now[path] != before[path]] == [config.parent / "result.json"]
+        assert [path for path in now if now[path] != before[path]] == [config.parent / "result.json", result]
+        out = capsys.readouterr().out
+        assert "room, default, seed 0: run anew: track.probation_frames was 9, is 8" in out
+        assert "room, default, seed 1: run anew: result.json is not as the run wrote it" in out
+        assert "In the report too: 2 runs of earlier calls." in out
+        results = json.loads((mine / "results.json").read_text())
+        assert [(run["label"], run["seed"]) for run in results] == [
+            ("static", 0), ("static", 1), ("default", 0), ("default", 1)
+        ]  # fmt: skip
+        assert "| static | 2 of 2 |" in (mine / "report.md").read_text()
+        assert "<td>static</td><td>2 of 2</td>" in (mine / "report.html").read_text()
 
     def test_killed_in_the_middle(self, tmp_path: Path) -> None:
         """No run that was finished is repeated, and none is lost: one at work then, one not begun."""
@@ -234,11 +251,14 @@ class TestTrouble:
         options = ["--out", str(mine), "--root", str(tmp_path / "data"), "--resume"]
         assert "2 of 4 runs failed" in fails(capsys, suite_file(tmp_path, text), *options)
         results = json.loads((mine / "results.json").read_text())
-        assert [run["status"] for run in results] == ["done", "done", "failed", "failed"]
+        assert [run["status"] for run in results] == ["done"] * 4 + ["failed"] * 2
+        assert len({tuple(run) for run in results}) == 1  # the same keys, as a table has
+        assert results[-1]["frames"] is None
         assert results[-1]["problem"].startswith("ended with 1: error: ")
         report = (mine / "report.md").read_text()
         assert "1 runs failed: ended with 1" in report
         assert "| static | 0 of 1 |" in report
+        assert "- 4 of 6 planned runs are done, 2 failed\n" in report
 
     def test_recording_that_is_not_there(self, mine: Path, tmp_path: Path) -> None:
         suite = suite_file(tmp_path, SUITE + "  - recording: rgbd_bonn_nowhere\n")
@@ -319,61 +339,3 @@ class TestGate:
         assert "--of SUITE" in fails(capsys, "gate", *nowhere, "--update", "why")
         assert "expected a reason" in fails(capsys, *command[1:], "--update", " ")
         assert "--workers: expected at least 1, got 0" in fails(capsys, *command[1:], "--workers", "0")
-
-
-class TestPublished:
-    """Figures of papers beside ours."""
-
-    @staticmethod
-    def lines(clip: Sequence, ates: tuple[float, float]) -> list[list[str]]:
-        spread = {"median": sum(ates) / 2, "least": ates[0], "most": ates[1]}
-        return published_table(Suite("any", "", (clip,)), clip.name, [{"label": "ours", "ate_rmse_m": spread}])
-
-    def test_beside_ours(self) -> None:
-        head, *lines = self.lines(Sequence("crowd", "rgbd_bonn_crowd"), (0.020, 0.025))
-        assert head[:4] == ["published ATE", "m", "ours is", "aligned"]
-        found = {line[0]: (float(line[1]), line[2]) for line in lines}
-        assert found["NGD-SLAM"] == (0.024, "in range")
-        assert {verdict for value, verdict in found.values() if value < 0.020} == {"worse"}
-        assert {verdict for value, verdict in found.values() if value > 0.025} == {"better"}
-
-    def test_parts_of_systems_in_an_ablation(self) -> None:
-        clip = Sequence("w", "rgbd_dataset_freiburg3_walking_xyz")
-        whole, parts = (published_table(Suite("any", "", (clip,), ablation=a), "w", []) for a in (False, True))
-        assert ["NGD-SLAM, yolo", "0.014"] in [line[:2] for line in parts]
-        assert not any("," in line[0] for line in whole)
-
-    def test_wins_and_losses(self) -> None:
-        clips = Sequence("crowd", "rgbd_bonn_crowd"), Sequence("mine", "my_own_recording")
-        spread = {"median": 0.02, "least": 0.02, "most": 0.02}
-        rows = [{"sequence": clip.name, "label": "ours", "ate_rmse_m": spread} for clip in clips]
-        suite = Suite("any", "", clips)
-        known = [figure.value for figure in published_for("rgbd_bonn_crowd")]
-        better, worse = sum(value > 0.02 for value in known), sum(value < 0.02 for value in known)
-        best = published_for("rgbd_bonn_crowd")[0]
-        lines = [["crowd", "0.0200", f"{best.value:g}", best.system], ["mine", "0.0200", "-", "-"]]
-        assert overview_table(suite, rows)[1:] == lines
-        assert summary_lines(suite, rows) == [
-            f"ours: against the best published figures 0 better, 0 in range, 1 worse; against all {better} better,"
-            f" {len(known) - better - worse} in range, {worse} worse"
-        ]
-
-    def test_protocols(self) -> None:
-        suite = Suite("any", "", (Sequence("crowd", "rgbd_bonn_crowd"), Sequence("mine", "my_own_recording")))
-        lines = protocols(suite, [{"sequence": clip.name} for clip in suite.sequences])
-        assert any(line.startswith("RTS-SLAM (") and "Mean of 20 runs" in line for line in lines)
-        assert len(lines) == len({line.partition(" (")[0] for line in lines})
-        assert not protocols(suite, [{"sequence": "mine"}])
-
-    def test_without_a_network(self) -> None:
-        run = {"status": "done", "model": "yolox-nano", "networks_sha256": {"model": None}, "label": "ngd"}
-        (line,) = without_network(
-            [run, run, {**run, "label": "default"}, {**run, "networks_sha256": {"model": "0" * 64}}]
-        )
-        assert line.startswith("ngd, default: without a network, because yolox-nano was not")
-        assert not without_network([{**run, "networks_sha256": {}}, {"status": "failed"}])
-
-    def test_nothing_about_parts_and_rooms(self) -> None:
-        assert not self.lines(Sequence("crowd", "rgbd_bonn_crowd", stop=220), (0.02, 0.03))
-        assert not self.lines(Sequence("room", room=SyntheticConfig(frames=5)), (0.02, 0.03))
-        assert not self.lines(Sequence("mine", "my_own_recording"), (0.02, 0.03))

@@ -1,6 +1,7 @@
 """The gate: what it lets pass and what it does not."""
 
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -8,20 +9,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jaxslam.benchmark.gate import (
-    Baseline,
-    complaints,
-    differences,
-    load_baseline,
-    make_baseline,
-    runs_at_once,
-    save_baseline,
-)
+from jaxslam.benchmark.baseline import Baseline, check_same_plan, load_baseline, save_baseline
+from jaxslam.benchmark.gate import complaints, differences, make_baseline, runs_at_once
+from jaxslam.benchmark.plan import fingerprint, plan
+from jaxslam.benchmark.suite import load_suite
 from jaxslam.errors import BenchmarkError
 from jaxslam.results import machine
 from jaxslam.xla import usable_cores
 
+ROOT = Path(__file__).resolve().parents[2]
 LABELS = ("static", "default")
+PLAN: dict[str, Any] = {
+    "sequences": {"room": {"room": {"frames": 12}}},
+    "presets": {label: {"preset": label, "settings": []} for label in LABELS},
+    "runs": 2,
+}
 
 
 def results(
@@ -60,7 +62,7 @@ def results(
 
 
 def baseline() -> Baseline:
-    return make_baseline("smoke", LABELS, 2, "first", results())
+    return make_baseline("smoke", LABELS, 2, "first", results(), PLAN)
 
 
 class TestComplaints:
@@ -81,7 +83,7 @@ class TestComplaints:
         disturbed = [
             {**run, "flow_ms": run["flow_ms"] * (1.5 if index == 1 else 1)} for index, run in enumerate(results())
         ]
-        assert make_baseline("smoke", LABELS, 2, "first", disturbed).rows == baseline().rows
+        assert make_baseline("smoke", LABELS, 2, "first", disturbed, PLAN).rows == baseline().rows
         assert {complaint.of_time for complaint in complaints(baseline(), results(time=1.5, flow=1.0))} == {True}
         assert not complaints(baseline(), results(time=1.5, flow=1.5))
 
@@ -111,7 +113,7 @@ class TestComplaints:
         assert complaints(baseline(), results(time=2.0, jaxlib="2"))
 
     def test_runs_at_once_where_times_do_not_count(self) -> None:
-        here = make_baseline("smoke", LABELS, 2, "first", [{**run, **machine()} for run in results()])
+        here = make_baseline("smoke", LABELS, 2, "first", [{**run, **machine()} for run in results()], PLAN)
         assert runs_at_once(here) == 1
         assert runs_at_once(baseline()) == usable_cores()
 
@@ -123,6 +125,8 @@ class TestComplaints:
         failed = [{**run, "status": "failed", "problem": "killed by signal 9"} for run in results()]
         assert "killed by signal 9" in " ".join(map(str, complaints(baseline(), failed)))
         assert [str(complaint) for complaint in complaints(baseline(), results()[:2])] == ["room, default: is missing"]
+        wrong = [{**run, "ate_rmse_m": float("nan")} for run in results()]
+        assert {complaint.figure for complaint in complaints(baseline(), wrong)} == {"ate_rmse_m"}
         lost = [{**run, "ate_rmse_m": None} for run in results()]
         assert {complaint.figure for complaint in complaints(baseline(), lost)} == {"ate_rmse_m is missing"}
 
@@ -145,11 +149,11 @@ class TestFile:
 
     def test_reason_and_whole_results(self) -> None:
         with pytest.raises(BenchmarkError, match="expected a reason"):
-            make_baseline("smoke", LABELS, 2, " ", results())
+            make_baseline("smoke", LABELS, 2, " ", results(), PLAN)
         with pytest.raises(BenchmarkError, match="ended well"):
-            make_baseline("smoke", LABELS, 2, "so", [{**results()[0], "status": "failed"}])
+            make_baseline("smoke", LABELS, 2, "so", [{**results()[0], "status": "failed"}], PLAN)
         with pytest.raises(BenchmarkError, match="ended well"):
-            make_baseline("smoke", LABELS, 2, "so", [])
+            make_baseline("smoke", LABELS, 2, "so", [], PLAN)
 
     def test_is_plain(self, tmp_path: Path) -> None:
         save_baseline(tmp_path / "baseline.json", baseline())
@@ -159,3 +163,44 @@ class TestFile:
             "tracked_percent": 100.0,
             "time_of_flows": 3.075,
         }
+
+    @pytest.mark.parametrize(
+        ("key", "value", "message"),
+        [
+            ("rows", {}, "rows: expected figures of at least one sequence, got none"),
+            ("rows", {"room, static": {"ate_rmse_m": float("nan")}}, "ate_rmse_m: expected a finite number, got nan"),
+            ("rows", {"room, static": {"tracked_percent": 100.0}}, "room, static: expected ate_rmse_m, got none"),
+            ("rows", {"room, static": {"ate_rmse_m": 0.1}}, "room, default is planned, and not in rows"),
+            ("noise", {"static": float("inf")}, "noise: static: expected a finite number >= 0, got inf"),
+        ],
+    )
+    def test_nothing_can_be_held_to_it(self, tmp_path: Path, key: str, value: object, message: str) -> None:
+        path = tmp_path / "baseline.json"
+        save_baseline(path, baseline())
+        path.write_text(json.dumps(json.loads(path.read_text()) | {key: value}))
+        with pytest.raises(BenchmarkError, match=re.escape(message)) as raised:
+            load_baseline(path)
+        assert str(raised.value).startswith(str(path))
+
+    def test_that_does_not_say_what_was_run(self, tmp_path: Path) -> None:
+        path = tmp_path / "baseline.json"
+        save_baseline(path, baseline())
+        path.write_text(json.dumps({k: v for k, v in json.loads(path.read_text()).items() if k != "plan"}))
+        with pytest.raises(BenchmarkError, match=r"plan: expected what was run.*--of SUITE --update REASON"):
+            load_baseline(path)
+
+    def test_without_ground_truth(self) -> None:
+        with pytest.raises(BenchmarkError, match="expected ate_rmse_m, got none"):
+            make_baseline("smoke", LABELS, 2, "so", [{**run, "ate_rmse_m": None} for run in results()], PLAN)
+
+
+class TestSamePlan:
+    def test_differences_are_named(self) -> None:
+        check_same_plan(baseline(), PLAN)
+        other = {**PLAN, "sequences": {"room": {"room": {"frames": 4}}}, "runs": 1}
+        with pytest.raises(BenchmarkError, match=r"sequences\.room\.room\.frames: 12, now 4; runs: 2, now 1"):
+            check_same_plan(baseline(), other)
+
+    def test_that_of_the_project_is_what_its_suite_runs_now(self) -> None:
+        ours = load_baseline(ROOT / ".ci" / "baseline.json")
+        check_same_plan(ours, fingerprint(plan(load_suite(ours.suite), presets=ours.presets, runs=ours.runs)))

@@ -1,12 +1,13 @@
 """Suites: what is in their files, what is wrong with them, and the runs they come to."""
 
+import json
 from pathlib import Path
 
 import pytest
 
 from jaxslam.benchmark.job import Job, opened
-from jaxslam.benchmark.plan import missing, plan, swept
-from jaxslam.benchmark.suite import Sequence, load_suite, suites
+from jaxslam.benchmark.plan import fingerprint, missing, plan, plan_differences, replaced_settings, swept
+from jaxslam.benchmark.suite import Sequence, checked_presets, load_suite, suites
 from jaxslam.datasets.synthetic import SyntheticConfig
 from jaxslam.errors import BenchmarkError
 from jaxslam.recordings import known_recordings
@@ -162,10 +163,81 @@ class TestPlan:
         assert jobs[1].label == "default@num_points=256,prefetch_frames=3"
         assert jobs[1].settings == ("semantics.model=null", "track.num_points=256", "run.prefetch_frames=3")
 
+    def test_sweep_of_lists(self, tmp_path: Path) -> None:
+        """Commas inside brackets or quotes are no other value."""
+        suite = swept(load_suite(suite_file(tmp_path, SUITE)), ["dynamics.cues=[clusters,epipolar],[]"])
+        jobs = plan(suite, presets=("default",), runs=1)[:2]
+        assert [job.label for job in jobs] == ["default@cues=[clusters,epipolar]", "default@cues=[]"]
+        assert [job.config.dynamics.cues for job in jobs] == [("clusters", "epipolar"), ()]
+
+    def test_folders_of_labels(self, tmp_path: Path) -> None:
+        """Never nested, and one for each; the label itself is as it was given."""
+        models = "semantics.model=/some/path/a.onnx,/some/path_a.onnx," + "x" * 300
+        suite = swept(load_suite(suite_file(tmp_path, SUITE)), [models])
+        jobs = plan(suite, presets=("static",), runs=1)[:3]
+        assert jobs[0].label == "static@model=/some/path/a.onnx"
+        assert len({job.folder for job in jobs}) == 3
+        for job in jobs:
+            assert len(job.folder.parts) == 3
+            (tmp_path / job.folder).mkdir(parents=True)
+
+    def test_command_line_beats_the_suite(self, tmp_path: Path) -> None:
+        """And its variants; what is replaced is told."""
+        text = SUITE.replace("model=null]", "model=null, track.num_points=300]")
+        suite = load_suite(suite_file(tmp_path, text + "variants: {few: [track.num_points=256]}\n"))
+        given = ("track.num_points=200", "semantics.model=yolox-nano", "run.prefetch_frames=2")
+        job = plan(suite, presets=("static",), runs=1, settings=given)[0]
+        config = job.config
+        assert (config.track.num_points, config.semantics.model) == (200, "yolox-nano")
+        assert replaced_settings(suite, given) == [
+            "track.num_points=200 from the command line replaces 300 of the suite",
+            "track.num_points=200 from the command line replaces 256 of variant few",
+            "semantics.model=yolox-nano from the command line replaces null of the suite",
+        ]
+        assert not replaced_settings(suite, ["semantics.min_score=0.5"])
+        assert replaced_settings(suite, [], ["track.num_points=1,2"])[0].startswith("track.num_points=1,2 from")
+
+    @pytest.mark.parametrize("sweep", ["track.num_points=1,2", "track={num_points: 1}"])
+    def test_setting_that_is_swept_too(self, tmp_path: Path, sweep: str) -> None:
+        suite = load_suite(suite_file(tmp_path, SUITE))
+        with pytest.raises(BenchmarkError, match=r"--sweep: expected no setting that --set gives"):
+            replaced_settings(suite, ["track.num_points=200"], [sweep])
+        with pytest.raises(BenchmarkError, match=r"expected all values of track\.num_points in one"):
+            swept(suite, ["track.num_points=1", "track.num_points=2"])
+
+    def test_preset_twice_is_once(self, tmp_path: Path) -> None:
+        assert checked_presets(("static", "ngd", "static")) == ("static", "ngd")
+        suite = load_suite(suite_file(tmp_path, SUITE.replace("static, default", "static, static")))
+        assert len(plan(suite, runs=1)) == 2
+
     @pytest.mark.parametrize("sweep", ["", "track.num_points", "track.num_points=", "=1,2", "track.num_points=1,,2"])
     def test_wrong_sweep(self, tmp_path: Path, sweep: str) -> None:
         with pytest.raises(BenchmarkError, match="--sweep: expected key=value,value"):
             swept(load_suite(suite_file(tmp_path, SUITE)), [sweep])
+
+    def test_fingerprint(self, tmp_path: Path) -> None:
+        """Plain, and the same but for what was changed, which is named."""
+        suite = load_suite(suite_file(tmp_path, SUITE))
+        found = fingerprint(plan(suite))
+        assert json.loads(json.dumps(found)) == found == {
+            "sequences": {
+                "room": {"room": {"frames": 5, "people": 1}},
+                "start": {"recording": "rgbd_bonn_crowd", "stop": 20},
+            },
+            "presets": {
+                "static": {"preset": "static", "settings": ["semantics.model=null"]},
+                "default": {"preset": "default", "settings": ["semantics.model=null"]},
+            },
+            "runs": 3,
+        }  # fmt: skip
+        assert not plan_differences(found, fingerprint(plan(suite)))
+        longer = load_suite(suite_file(tmp_path, SUITE.replace("frames: 5", "frames: 7")))
+        assert plan_differences(found, fingerprint(plan(longer, runs=2, settings=["run.prefetch_frames=2"]))) == [
+            "sequences.room.room.frames: 5, now 7",
+            "presets.static.settings: ['semantics.model=null'], now ['semantics.model=null', 'run.prefetch_frames=2']",
+            "presets.default.settings: ['semantics.model=null'], now ['semantics.model=null', 'run.prefetch_frames=2']",
+            "runs: 3, now 2",
+        ]
 
     def test_job_as_text(self, tmp_path: Path) -> None:
         for job in plan(load_suite(suite_file(tmp_path, SUITE))):

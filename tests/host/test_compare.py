@@ -4,9 +4,11 @@ import json
 from pathlib import Path
 
 import pytest
+from made_results import done
 from small_scene import HEIGHT, SETTINGS, WIDTH
 
 from jaxslam.cli import main
+from jaxslam.commands.compare import figures, remarks
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset, write_tum
 
 FRAMES = 8
@@ -34,6 +36,9 @@ def test_a_table(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
         assert row["tracked_percent"] == 100
         assert row["dropped_percent"] == 0
         assert row["track_ms_p95"] >= row["track_ms_median"] > 0
+        assert row["num_matched"] == FRAMES
+        assert row["rpe_trans_m_per_s"] is None  # the clip is shorter than a second
+        assert row["evaluation_problems"] == []
     lines = (tmp_path / "comparison.md").read_text().splitlines()
     assert len(lines) == 4
     assert lines[2].startswith("| static | 100.0 % |")
@@ -42,6 +47,18 @@ def test_a_table(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "ngd, run 2 of 2" in printed
     seeds = [(tmp_path / "ngd" / seed / "config.yaml").read_text().count(f"seed: {seed}\n") for seed in "01"]
     assert seeds == [1, 1]
+
+
+def test_figures_of_a_preset() -> None:
+    """RPE over the runs that have it; why the others have no error is said, and what evaluations note."""
+    run = done(tracked_percent=90.0, track_ms={"mean": 1.0, "median": 1.0, "p95": 2.0}, evaluation={"notes": ["odd"]})
+    other = run | {"evaluation": run["evaluation"] | {"rpe_trans_m_per_s": 0.05, "num_matched": 5}}
+    lost = run | {"ate_rmse_m": None, "ate_sim3_rmse_m": None, "evaluation": None, "evaluation_problem": "no truth"}
+    row = figures("static", [run, other, lost])
+    assert row["rpe_trans_m_per_s"] == pytest.approx(0.04)
+    assert row["rpe_rot_deg_per_s"] == pytest.approx(0.7)
+    assert row["num_matched"] == 5
+    assert remarks(row) == ["static: no ATE of 1 runs: no truth", "static: note: odd"]
 
 
 @pytest.mark.parametrize(
