@@ -129,7 +129,8 @@ def _figure(picture: bytes, caption: str, kind: str = "png") -> str:
 
 
 def _plots(sequence: str, done: Sequence[Mapping[str, Any]], out: Path) -> list[str]:
-    """Everything there is to look at of a sequence."""
+    """Everything there is to look at of a sequence, of runs whose files are still there."""
+    done = [run for run in done if (folder_of(run, out) / "frames.csv").is_file()]
     if not done:
         return []
     drawn = (

@@ -112,10 +112,12 @@ def progress_lines(results: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def reservation_lines(suite: Suite, rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Why rows with published figures get no verdict, or what is not known about it; a line a reason."""
+    """Why rows with published figures get no verdict, or what is not known about it."""
     of_rows = [(row, reservations(suite, row)) for row in rows if published_of(suite, row["sequence"])]
-    lines = [f"no verdict for {of_it}: {reason}" for reason, of_it in _grouped(of_rows)]
-    unknown = [row["sequence"] for row, reasons in of_rows if not reasons and not _length_known(suite, row)]
+    reasons = [(row, ["; ".join(found)]) for row, found in of_rows if found]
+    lines = [f"no verdict for {of_it}: {reason}" for reason, of_it in _grouped(reasons)]
+    judged = [row for row, found in of_rows if not found and row["ate_rmse_m"] is not None]
+    unknown = [row["sequence"] for row in judged if not _length_known(suite, row)]
     if unknown:
         names = ", ".join(dict.fromkeys(unknown))
         lines.append(f"{names}: the published length is not known; whether all of it was run is judged by ground truth")

@@ -133,8 +133,10 @@ def kitti_means(suite: Suite, rows: Sequence[Mapping[str, Any]]) -> list[list[st
     """Published means over the eleven sequences of KITTI odometry, and ours where all are whole; headings first.
 
     Returns:
-        Lines of as many texts; none for a suite without KITTI.
+        Lines of as many texts; none for a suite that does not have all of them.
     """
+    if not {clip.recording for clip in suite.sequences if clip.whole} >= set(_KITTI):
+        return []
     of_kitti = [row for row in rows if (clip := clip_of(suite, row["sequence"])) and clip.recording in _KITTI]
     if not of_kitti:
         return []

@@ -210,7 +210,7 @@ class TestGoingOn:
         now = times_of(sorted(mine.rglob("result.json")))
         assert [path for path in now if now[path] != before[path]] == [config.parent / "result.json", result]
         out = capsys.readouterr().out
-        assert "room, default, seed 0: run anew: track.probation_frames was 9, is 8" in out
+        assert "room, default, seed 0: run anew: track.probation_frames was 9.0, is 8.0" in out
         assert "room, default, seed 1: run anew: result.json is not as the run wrote it" in out
         assert "In the report too: 2 runs of earlier calls." in out
         results = json.loads((mine / "results.json").read_text())

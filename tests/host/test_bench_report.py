@@ -58,6 +58,10 @@ class TestReservations:
             ([done(), not_done("failed", "killed", seed=1)], "1 of 2 planned runs are done"),
             ([done(), not_done("not run", seed=1)], "1 of 2 planned runs are done"),
             ([done(), done(seed=1, tracked=870, tracked_percent=93.9)], "93.9 % of the frames tracked"),
+            (
+                [done(tracked=870), not_done("failed", "killed", seed=1)],
+                "1 of 2 planned runs are done; 93.9 % of the frames tracked",
+            ),
             ([done(tracked=464, dropped=463, dropped_percent=49.9)], "50.1 % of the frames tracked, 49.9 % dropped"),
             (
                 [done(frames=30, images=30, tracked=30, evaluation={"num_matched": 30})],
@@ -71,11 +75,23 @@ class TestReservations:
             ([done(evaluation={"coverage_percent": 30.0})], None),  # its length is known
             ([done(evaluation={"coverage_percent": None})], None),
         ],
-        ids=["all", "failed", "not-run", "lost", "dropped", "part", "no-depth", "half-truth", "known", "no-coverage"],
+        ids=[
+            "all",
+            "failed",
+            "not-run",
+            "lost",
+            "both",
+            "dropped",
+            "part",
+            "no-depth",
+            "half-truth",
+            "known",
+            "no-coverage",
+        ],
     )
     def test_of_a_row(self, runs: list[dict[str, Any]], reason: str | None) -> None:
         (row,) = rows_of(runs)
-        assert reservations(CROWD, row) == ([] if reason is None else [reason])
+        assert "; ".join(reservations(CROWD, row)) == (reason or "")
         (ate, *_) = published_tables(CROWD, "crowd", [row])
         verdicts = {line[2] for line in ate[1:]}
         assert (verdicts == {NO_VERDICT}) == (reason is not None)
@@ -102,6 +118,8 @@ class TestReservations:
         found = reservations(suite, *rows_of(runs))
         assert [text in reason for text, reason in zip(said, found, strict=True)] == [True] * len(said)
         assert any("the published length is not known" in line for line in warnings(suite, runs))
+        unevaluated = [done("b", ate_rmse_m=None, evaluation=None, evaluation_problem="no ground truth")]
+        assert warnings(suite, unevaluated) == ["no ATE of b (static, 1 of 1 runs): no ground truth"]
 
     def test_nothing_of_the_sort_where_nothing_is_published(self) -> None:
         runs = [done("mine", frames=3, images=3, tracked=3, evaluation={"num_matched": 3})]
@@ -218,8 +236,8 @@ class TestRemarks:
         assert all(f"- {line}\n" in text for line in self.SAID)
         assert "over the poses matched with ground truth" in " ".join(text.split())
 
-    def test_page(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("jaxslam.benchmark.page._plots", lambda *_: [])  # there are no files to draw from
+    def test_page(self, tmp_path: Path) -> None:
+        """Also where the files of runs, of which pictures would be made, are gone."""
         page = html_report(CROWD, self.RUNS, {}, tmp_path)
         assert all(line in page for line in self.SAID)
 

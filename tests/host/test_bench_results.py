@@ -137,7 +137,6 @@ def test_broken_off(
         yield Broken(problem)
 
     monkeypatch.setattr("jaxslam.commands.bench.local", broken)
-    monkeypatch.setattr("jaxslam.benchmark.page._plots", lambda *_: [])
     (tmp_path / "suite.yaml").write_text(SUITE)
     with pytest.raises(SystemExit):
         main(
