@@ -33,7 +33,7 @@ class Gate(RunsOfSuite):
         """Run the command."""
         if self.baseline is None:
             raise BenchmarkError("bench gate: expected --baseline FILE")
-        before = self._before(self.baseline)
+        before = self.before(self.baseline)
         suite = self.of or (None if before is None else before.suite)
         if suite is None:
             raise BenchmarkError(f"{self.baseline}: not there yet; --of SUITE says of what to make it")
@@ -68,8 +68,12 @@ class Gate(RunsOfSuite):
             raise BenchmarkError(f"{len(worse)} figures are worse than in {self.baseline} ({before.reason})")
         plain_console.print(f"Nothing is worse than in {self.baseline}.")
 
-    def _before(self, path: Path) -> Baseline | None:
-        """The baseline that is there; `None` if a new one of a named suite takes the place of none, or of a bad one."""
+    def before(self, path: Path) -> Baseline | None:
+        """The baseline that is there; `None` if a new one of a named suite takes the place of none, or of a bad one.
+
+        Raises:
+            BenchmarkError: If it is missing or damaged, and is not replaced.
+        """
         if self.update is not None and not path.exists():
             return None
         try:

@@ -337,5 +337,11 @@ class TestGate:
         assert "expected --baseline FILE" in fails(capsys, "gate")
         assert "cannot be read" in fails(capsys, "gate", *nowhere)
         assert "--of SUITE" in fails(capsys, "gate", *nowhere, "--update", "why")
+        other = json.loads(Path(command[3]).read_text())
+        other["plan"]["sequences"]["room"]["room"]["frames"] = 12
+        (tmp_path / "other.json").write_text(json.dumps(other))
+        told = fails(capsys, "gate", "--baseline", str(tmp_path / "other.json"), *command[4:])
+        assert "other.json: expected the runs of the baseline; sequences.room.room.frames: 12, now 8" in told
+        assert "presets.default.settings" in fails(capsys, *command[1:], "--set", "track.num_points=100")
         assert "expected a reason" in fails(capsys, *command[1:], "--update", " ")
         assert "--workers: expected at least 1, got 0" in fails(capsys, *command[1:], "--workers", "0")

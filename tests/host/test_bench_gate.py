@@ -13,6 +13,7 @@ from jaxslam.benchmark.baseline import Baseline, check_same_plan, load_baseline,
 from jaxslam.benchmark.gate import complaints, differences, make_baseline, runs_at_once
 from jaxslam.benchmark.plan import fingerprint, plan
 from jaxslam.benchmark.suite import load_suite
+from jaxslam.commands.bench_gate import Gate
 from jaxslam.errors import BenchmarkError
 from jaxslam.results import machine
 from jaxslam.xla import usable_cores
@@ -188,6 +189,15 @@ class TestFile:
         path.write_text(json.dumps({k: v for k, v in json.loads(path.read_text()).items() if k != "plan"}))
         with pytest.raises(BenchmarkError, match=r"plan: expected what was run.*--of SUITE --update REASON"):
             load_baseline(path)
+
+    def test_new_one_in_the_place_of_a_bad_one(self, tmp_path: Path) -> None:
+        """Of a suite that is named; without a name, nobody knows of what."""
+        path = tmp_path / "baseline.json"
+        path.write_text("{}")
+        assert Gate(baseline=path, update="so", of="smoke").before(path) is None
+        for options in ({"update": "so"}, {"of": "smoke"}):
+            with pytest.raises(BenchmarkError, match="expected a baseline"):
+                Gate(baseline=path, **options).before(path)
 
     def test_without_ground_truth(self) -> None:
         with pytest.raises(BenchmarkError, match="expected ate_rmse_m, got none"):
