@@ -144,7 +144,9 @@ def stored(job: Job, out: Path) -> tuple[dict[str, Any], list[str]] | None:
         raise BenchmarkError(f"{folder}: expected the results of a run, got something unreadable: {problem}") from None
     different = _differences(clip, json.loads(job.to_json())["clip"])
     different += _differences(config, _read_config(to_yaml(job.config)))
-    if result.get(_CHECKSUM) != _checksum(result):
+    if _CHECKSUM not in result:
+        different.append(f"{RESULT} is of an older jaxslam, which did not say what it depends on")
+    elif result[_CHECKSUM] != _checksum(result):
         different.append(f"{RESULT} is not as the run wrote it")
     return result, different
 
@@ -199,7 +201,8 @@ def run_in_process(job: Job, out: Path, root: Path | None, rooms: Path | None = 
     if result is not None and not result[1] and done.returncode == 0:
         return result[0]
     (folder / RESULT).unlink(missing_ok=True)
-    return failed(job, _problem(done))
+    other = "; ".join(result[1]) if result is not None and done.returncode == 0 else ""
+    return failed(job, f"it was run otherwise than planned: {other}" if other else _problem(done))
 
 
 def failed(job: Job, problem: str) -> dict[str, Any]:

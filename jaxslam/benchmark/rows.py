@@ -95,7 +95,8 @@ def figures_of(result: Mapping[str, Any]) -> dict[str, float | None]:
     flat = {**(result["evaluation"] or {}), **result}
     if frames := flat.get("frames"):
         flat["tracked_of_all_percent"] = 100 * flat["tracked"] / frames
-        flat["matched_percent"] = 100 * (flat.get("num_matched") or 0) / frames
+        if (matched := flat.get("num_matched")) is not None:
+            flat["matched_percent"] = 100 * matched / frames
     for name in ("track_ms", "mask_age_frames"):
         short = name.removesuffix("_frames")
         flat |= {f"{short}_{measure}": value for measure, value in (result[name] or {}).items()}

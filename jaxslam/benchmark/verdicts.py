@@ -89,6 +89,9 @@ def reservations(suite: Suite, row: Mapping[str, Any]) -> list[str]:
     if tracked is not None and tracked < _LEAST_TRACKED_PERCENT:
         late = _of(row, "dropped_percent", "most")
         found.append(f"{tracked:.1f} % of the frames tracked" + (f", {late:.1f} % dropped" if late else ""))
+    without = sum(row["unevaluated"].values())
+    if without and row["ate_rmse_m"] is not None:
+        found.append(f"{without} of {row['done']} runs have no ATE")
     clip, frames = clip_of(suite, row["sequence"]), _of(row, "frames", "least")
     if clip is not None and clip.recording and clip.whole and frames is not None:
         found += _of_a_part(clip.recording, frames, _of(row, "images", "least") or frames)

@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -112,13 +112,12 @@ class RunsOfSuite:
                 plain_console.print(f"Not run: {names}: {why}")
             there = [job for job in jobs if job.clip.recording not in absent]
             collected = Collected(there, earlier)
+            report = _Report(suite, collected, absent, out)
             try:
-                self._run(there, out, executor, collected, lambda: _write_text(suite, collected, absent, out))
+                self._run(there, executor, report)
             finally:  # also if it was interrupted: what is done can be seen
-                _write_text(suite, collected, absent, out)
-                page = html_report(suite, collected.every, absent, out)
-                write_atomically(out / _PAGE, page.encode(), BenchmarkError)
-                _print_outcome(collected, absent, out)
+                report.write()
+                report.print_outcome()
         return collected.planned
 
     @property
@@ -160,9 +159,7 @@ class RunsOfSuite:
         make_folder(out, BenchmarkError)
         return read_results(out) if self.resume else []
 
-    def _run(
-        self, jobs: Sequence[Job], out: Path, executor: Executor, collected: Collected, save: Callable[[], None]
-    ) -> None:
+    def _run(self, jobs: Sequence[Job], executor: Executor, report: "_Report") -> None:
         columns = (
             TextColumn("Runs"),
             BarColumn(),
@@ -172,18 +169,18 @@ class RunsOfSuite:
         )
         with Progress(*columns, console=console) as progress:
             task = progress.add_task("runs", total=len(jobs))
-            save()
+            report.write_text()
 
             def told(result: dict[str, Any]) -> None:
-                collected.add(result)
-                save()
+                report.collected.add(result)
+                report.write_text()
                 progress.console.print(_line(result), highlight=False)
                 progress.advance(task)
 
             def stale(job: Job, why: str) -> None:
                 progress.console.print(f"{_name(about(job))}: run anew: {why}", highlight=False)
 
-            run_jobs(jobs, out, executor=executor, on_result=told, on_stale=stale)
+            run_jobs(jobs, report.out, executor=executor, on_result=told, on_stale=stale)
 
 
 @dataclass(frozen=True)
@@ -208,23 +205,45 @@ class Bench(RunsOfSuite):
             raise BenchmarkError(f"{failed} of {len(results)} runs failed" if results else "nothing could be run")
 
 
-def _write_text(suite: Suite, collected: Collected, absent: Mapping[str, str], out: Path) -> None:
-    """Write the results and the report that is made in no time."""
-    collected.write(out)
-    write_atomically(out / _REPORT, markdown_report(suite, collected.every, absent).encode(), BenchmarkError)
+@dataclass(frozen=True)
+class _Report:
+    """What is written about the runs of a suite.
 
+    Attributes:
+        suite: With sweeps as variants.
+        collected: Results, of earlier calls too.
+        absent: Recordings that are not there, by name, and how to get them.
+        out: Folder of the results.
+    """
 
-def _print_outcome(collected: Collected, absent: Mapping[str, str], out: Path) -> None:
-    statuses = Counter(result["status"] for result in collected.planned)
-    left = f", {statuses[NOT_RUN]} not made" if statuses[NOT_RUN] else ""
-    made = statuses.total() - statuses[NOT_RUN]
-    plain_console.print(f"{made} runs, {statuses[FAILED]} failed{left}, {len(absent)} recordings not run.")
-    kept = len(collected.every) - len(collected.planned)
-    if kept:
-        plain_console.print(f"In the report too: {kept} runs of earlier calls.")
-    plain_console.print(
-        f"Report: {out / _PAGE}, {out / _REPORT}; figures: {out / RESULTS}; each run in {out}/SEQUENCE/PRESET/SEED"
-    )
+    suite: Suite
+    collected: Collected
+    absent: Mapping[str, str]
+    out: Path
+
+    def write_text(self) -> None:
+        """Write the results, and the report that is made in no time."""
+        self.collected.write(self.out)
+        text = markdown_report(self.suite, self.collected.every, self.absent)
+        write_atomically(self.out / _REPORT, text.encode(), BenchmarkError)
+
+    def write(self) -> None:
+        """Write all of it."""
+        self.write_text()
+        page = html_report(self.suite, self.collected.every, self.absent, self.out)
+        write_atomically(self.out / _PAGE, page.encode(), BenchmarkError)
+
+    def print_outcome(self) -> None:
+        """Say how many runs were made, and where everything is."""
+        planned, out = self.collected.planned, self.out
+        statuses = Counter(result["status"] for result in planned)
+        made, left = len(planned) - statuses[NOT_RUN], f", {statuses[NOT_RUN]} not made" if statuses[NOT_RUN] else ""
+        plain_console.print(f"{made} runs, {statuses[FAILED]} failed{left}, {len(self.absent)} recordings not run.")
+        if (kept := len(self.collected.every) - len(planned)) > 0:
+            plain_console.print(f"In the report too: {kept} runs of earlier calls.")
+        plain_console.print(
+            f"Report: {out / _PAGE}, {out / _REPORT}; figures: {out / RESULTS}; each run in {out}/SEQUENCE/PRESET/SEED"
+        )
 
 
 def _name(result: Mapping[str, Any]) -> str:

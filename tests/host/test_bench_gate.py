@@ -195,9 +195,9 @@ class TestFile:
         path = tmp_path / "baseline.json"
         path.write_text("{}")
         assert Gate(baseline=path, update="so", of="smoke").before(path) is None
-        for options in ({"update": "so"}, {"of": "smoke"}):
+        for gate in (Gate(baseline=path, update="so"), Gate(baseline=path, of="smoke")):
             with pytest.raises(BenchmarkError, match="expected a baseline"):
-                Gate(baseline=path, **options).before(path)
+                gate.before(path)
 
     def test_without_ground_truth(self) -> None:
         with pytest.raises(BenchmarkError, match="expected ate_rmse_m, got none"):

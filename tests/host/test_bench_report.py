@@ -72,22 +72,11 @@ class TestReservations:
                 "400 frames of 928 images",
             ),
             ([done(evaluation={"num_matched": 460})], "49.6 % of the frames matched with ground truth"),
+            ([done(), done(seed=1, ate_rmse_m=None, evaluation=None)], "1 of 2 runs have no ATE"),
             ([done(evaluation={"coverage_percent": 30.0})], None),  # its length is known
             ([done(evaluation={"coverage_percent": None})], None),
         ],
-        ids=[
-            "all",
-            "failed",
-            "not-run",
-            "lost",
-            "both",
-            "dropped",
-            "part",
-            "no-depth",
-            "half-truth",
-            "known",
-            "no-coverage",
-        ],
+        ids=["all", "failed", "left", "lost", "both", "late", "part", "no-depth", "truth", "no-ate", "known", "-"],
     )
     def test_of_a_row(self, runs: list[dict[str, Any]], reason: str | None) -> None:
         (row,) = rows_of(runs)
