@@ -136,7 +136,7 @@ def note_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def mixture_lines(results: Sequence[Mapping[str, Any]]) -> list[str]:
-    """What differs between the runs of a sequence that were made in several calls: jaxslam, or the data."""
+    """What differs between runs of several calls: jaxslam, the data of a sequence, or the networks of a label."""
     done = [result for result in results if result["status"] == "done"]
     lines = []
     if len({result.get("sources_sha256") for result in done}) > 1:
@@ -144,6 +144,10 @@ def mixture_lines(results: Sequence[Mapping[str, Any]]) -> list[str]:
     for sequence, of_it in by_sequence(done).items():
         if len({result.get("data_sha256") for result in of_it}) > 1:
             lines.append(f"{sequence}: its runs are of different recordings")
+    for label in dict.fromkeys(result["label"] for result in done):
+        networks = [result["networks_sha256"] for result in done if result["label"] == label]
+        if any(of_run != networks[0] for of_run in networks):
+            lines.append(f"{label}: its runs are of different networks")
     return lines
 
 

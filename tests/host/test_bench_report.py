@@ -233,9 +233,11 @@ class TestRemarks:
     def test_runs_of_several_calls(self) -> None:
         """Those of another version, or of other data under the same name."""
         runs = [done(), done(seed=1, sources_sha256="9", commit="def"), done("mine"), done("mine", data_sha256="8")]
-        assert warnings(CROWD, runs)[-2:] == [
+        runs += [done(label="ngd", networks_sha256={"model": sha256}) for sha256 in ("1", "2")]
+        assert warnings(CROWD, runs)[-3:] == [
             "runs of several versions of jaxslam stand beside each other: abc; def",
             "mine: its runs are of different recordings",
+            "ngd: its runs are of different networks",
         ]
 
     def test_bar_in_a_label(self) -> None:
