@@ -8,6 +8,7 @@ from typing import Any
 import tyro
 
 from jaxslam.commands.bench import Bench
+from jaxslam.commands.bench_accuracy import AccuracyRuler
 from jaxslam.commands.bench_batch import Batch
 from jaxslam.commands.bench_gate import Gate
 from jaxslam.commands.bench_kernels import Kernels
@@ -21,7 +22,7 @@ from jaxslam.commands.run import Demo, Run
 from jaxslam.errors import JaxSlamError, MissingModelError
 
 _DESCRIPTION = "Real-time visual SLAM for dynamic scenes. Start with: jaxslam demo"
-_OF_BENCH: dict[str, type[Any]] = {"batch": Batch, "gate": Gate, "kernels": Kernels}
+_OF_BENCH: dict[str, type[Any]] = {"accuracy": AccuracyRuler, "batch": Batch, "gate": Gate, "kernels": Kernels}
 """What `jaxslam bench` does that is no suite, with options of its own."""
 
 

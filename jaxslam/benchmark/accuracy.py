@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxslam.benchmark.plots import folder_of
+from jaxslam.benchmark.names import run_folder
+from jaxslam.benchmark.plan import plan_differences
 from jaxslam.benchmark.rows import by_sequence
 from jaxslam.errors import BenchmarkError
 from jaxslam.files import write_atomically
@@ -67,6 +68,7 @@ class AccuracyBaseline:
         machine: CPU, vector instructions and cores.
         versions: Of the libraries that computed them.
         preset: What was run.
+        sequences: What each recording is: part, camera or rendered room, from `jaxslam.benchmark.plan.fingerprint`.
         recordings: What was measured, by name of the sequence.
     """
 
@@ -75,6 +77,7 @@ class AccuracyBaseline:
     machine: str
     versions: str
     preset: str
+    sequences: Mapping[str, Any]
     recordings: Mapping[str, Measured]
 
 
@@ -140,12 +143,21 @@ def measured(results: Sequence[Mapping[str, Any]], out: Path) -> dict[str, Measu
     return {name: _measured(name, runs, out) for name, runs in by_sequence(results).items()}
 
 
-def compare_accuracy(now: Mapping[str, Measured], baseline: AccuracyBaseline) -> Accuracy:
+def compare_accuracy(now: Mapping[str, Measured], sequences: Mapping[str, Any], baseline: AccuracyBaseline) -> Accuracy:
     """Read the ruler.
+
+    Args:
+        now: From `measured`.
+        sequences: What each recording is, as in the baseline.
+        baseline: What to compare with.
 
     Raises:
         BenchmarkError: If a recording or a network is another one than in the baseline, or the seeds are not as many.
     """
+    common = [name for name in now if name in baseline.recordings]
+    different = plan_differences(*({name: which[name] for name in common} for which in (baseline.sequences, sequences)))
+    if different:
+        raise BenchmarkError(f"expected the recordings of the baseline; {'; '.join(different)}")
     for name, runs in now.items():
         _check_same(name, runs, baseline.recordings.get(name))
     random = np.random.default_rng(0)
@@ -166,7 +178,7 @@ def load_accuracy_baseline(path: Path) -> AccuracyBaseline:
     """Read a baseline.
 
     Raises:
-        BenchmarkError: If it is missing, is no baseline, or holds no finite errors.
+        BenchmarkError: If it is missing, is no baseline, or one that nothing can be compared with.
     """
     try:
         content = json.loads(path.read_text())
@@ -178,8 +190,8 @@ def load_accuracy_baseline(path: Path) -> AccuracyBaseline:
         raise BenchmarkError(
             f"{path}: expected a baseline as `bench accuracy --update` writes it, got {problem!r}"
         ) from None
-    if not recordings:
-        raise BenchmarkError(f"{path}: recordings: expected at least one, got none")
+    if not recordings or not recordings.keys() <= baseline.sequences.keys():
+        raise BenchmarkError(f"{path}: recordings: expected at least one, each in `sequences`, got {list(recordings)}")
     return baseline
 
 
@@ -205,7 +217,9 @@ def _measured(name: str, runs: Sequence[Mapping[str, Any]], out: Path) -> Measur
         frames=int(_same(name, "frames", runs)),
         tracked=sum(int(run["tracked"]) for run in runs),
         ates_m=tuple(float(run["ate_rmse_m"]) for run in ordered),
-        trajectories_sha256=tuple(_sha256(folder_of(run, out) / "trajectory.txt") for run in ordered),
+        trajectories_sha256=tuple(
+            _sha256(out / run_folder(name, run["label"], run["seed"]) / "trajectory.txt") for run in ordered
+        ),
         data_sha256=_same(name, "data_sha256", runs) or "",
         network_sha256=_same(name, "networks_sha256", runs).get("model") or _NO_NETWORK,
     )
@@ -266,7 +280,7 @@ def _interval(log_ratios: np.ndarray) -> tuple[float, float]:
 
 
 def _of_json(name: str, entry: Mapping[str, Any]) -> Measured:
-    fields = {key: tuple(value) if isinstance(value, list) else value for key, value in entry.items()}
+    fields: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in entry.items()}
     runs = Measured(**fields)
     ates = np.array(runs.ates_m, float)
     if not (ates.size and np.isfinite(ates).all() and (ates > 0).all()):

@@ -90,7 +90,7 @@ def make_baseline(
     if failed or not results:
         raise BenchmarkError(f"baseline: expected runs that all ended well, got {len(failed)} of {len(results)} failed")
     figures = _figures_of(results, "median")
-    machines, versions, noise = _machine(results), _versions(results), _noise_of(results)
+    machines, versions, noise = machine_of(results), versions_of(results), _noise_of(results)
     return Baseline(suite, tuple(presets), runs, reason, machines, versions, noise, figures, plan)
 
 
@@ -106,7 +106,7 @@ def check_reason(reason: str) -> None:
 
 def differences(baseline: Baseline, results: Sequence[Mapping[str, Any]]) -> str:
     """In what the machine of these runs differs from that of the baseline, in words; empty if in nothing."""
-    ours = _machine(results), _versions(results)
+    ours = machine_of(results), versions_of(results)
     theirs = baseline.machine, baseline.versions
     return "; ".join(f"{now}, not {before}" for now, before in zip(ours, theirs, strict=True) if now != before)
 
@@ -166,8 +166,8 @@ def _flow_times(runs: Sequence[Mapping[str, Any]]) -> list[float]:
 
 def _limits(baseline: Baseline, results: Sequence[Mapping[str, Any]]) -> Callable[[str, str, float], float]:
     """A function of row, figure and what it was, that gives the last value which is not worse."""
-    same_machine = _machine(results) == baseline.machine
-    same_rounding = same_machine and _versions(results) == baseline.versions
+    same_machine = machine_of(results) == baseline.machine
+    same_rounding = same_machine and versions_of(results) == baseline.versions
 
     def limit(row: str, figure: str, before: float) -> float:
         if figure == _TRACKED:
@@ -194,7 +194,8 @@ def _noise_of(results: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     return {label: round(float(np.sqrt(np.mean(np.square(of_it)))), 4) for label, of_it in shares.items()}
 
 
-def _machine(results: Sequence[Mapping[str, Any]]) -> str:
+def machine_of(results: Sequence[Mapping[str, Any]]) -> str:
+    """CPU, vector instructions and cores on which runs were made."""
     return "; ".join(sorted({_name(result) for result in results if result["status"] == "done"}))
 
 
@@ -202,6 +203,7 @@ def _name(machine: Mapping[str, Any]) -> str:
     return f"{machine['cpu']} ({machine['vectors']}), {machine['cores']} cores"
 
 
-def _versions(results: Sequence[Mapping[str, Any]]) -> str:
+def versions_of(results: Sequence[Mapping[str, Any]]) -> str:
+    """Versions of the libraries that round, with which runs were made."""
     done = (result for result in results if result["status"] == "done")
     return "; ".join(sorted({", ".join(f"{name} {run['versions'][name]}" for name in _VERSIONS) for run in done}))

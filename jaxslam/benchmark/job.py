@@ -29,6 +29,7 @@ from jaxslam.datasets import Associated, Dataset, Subset, open_dataset
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset, with_true_masks
 from jaxslam.datasets.synthetic.sensor import SensorConfig
 from jaxslam.datasets.synthetic.stored import StoredRoom
+from jaxslam.detector_choice import preset_needs_network
 from jaxslam.errors import BenchmarkError, JaxSlamError
 from jaxslam.files import write_atomically
 from jaxslam.recordings import find_recording
@@ -248,7 +249,7 @@ def run_here(folder: Path, root: Path | None, rooms: Path | None) -> None:
         "sources_sha256": sources,
         "data_sha256": None if recording is None else data_sha256(recording),
         "camera_sha256": camera_sha256(job.clip),
-        "model": job.config.semantics.model,
+        "lacks_network": slam.without_network is not None and preset_needs_network(job.preset),
         "networks_sha256": networks_sha256(job.config.semantics),
         "config": dataclasses.asdict(job.config),
     }

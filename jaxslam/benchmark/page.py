@@ -20,7 +20,7 @@ from jaxslam.benchmark.report import (
     summary_lines,
     warnings,
 )
-from jaxslam.benchmark.rows import ACCURACY, RUNNING, by_sequence, median_run, rows_of
+from jaxslam.benchmark.rows import ACCURACY, RUNNING, by_sequence, median_run, rows_of, with_shown_labels
 from jaxslam.benchmark.suite import Suite
 from jaxslam.benchmark.verdicts import kitti_means
 from jaxslam.visualize import png
@@ -72,6 +72,7 @@ def html_report(suite: Suite, results: Sequence[Mapping[str, Any]], missing: Map
         missing: Names of what was not run, with the reason.
         out: The folder of the results, whose files are shown.
     """
+    results = with_shown_labels(results)
     rows, runs = rows_of(results), by_sequence(results)
     parts = [f"<h1>{_text(suite.name)}</h1>", f"<p>{_text(suite.about)}</p>", _table(overview_table(suite, rows))]
     parts += [f"<p>{_text(line)}</p>" for line in summary_lines(suite, rows)]

@@ -13,6 +13,7 @@ from jaxslam.benchmark.names import flattened
 from jaxslam.benchmark.suite import Sequence as Clip
 from jaxslam.benchmark.suite import Suite
 from jaxslam.errors import BenchmarkError
+from jaxslam.recordings import known_recordings
 
 _OPENING, _CLOSING, _QUOTES = "([{", ")]}", "'\""
 
@@ -46,7 +47,9 @@ def missing(suite: Suite, found: Collection[str]) -> dict[str, str]:
         found: Names of the recordings that are there.
     """
     names = [clip.recording for clip in suite.sequences if clip.recording and clip.recording not in found]
-    return {name: f"not there; to get it: jaxslam data get {name}" for name in names}
+    public = known_recordings()
+    way = lambda name: f"; to get it: jaxslam data get {name}" if name in public else ", and not public; see --root"
+    return {name: f"not there{way(name)}" for name in names}
 
 
 def swept(suite: Suite, sweeps: Iterable[str]) -> Suite:

@@ -209,7 +209,7 @@ def _color(index: int) -> str:
 
 def folder_of(run: Mapping[str, Any], out: Path) -> Path:
     """Where the files of a run are."""
-    return out / run_folder(run["sequence"], run["label"], run["seed"])
+    return out / (run.get("folder") or run_folder(run["sequence"], run["label"], run["seed"]))
 
 
 def _errors(done: Sequence[Mapping[str, Any]], label: str, out: Path) -> Errors | None:

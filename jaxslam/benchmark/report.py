@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from jaxslam.benchmark.published import load_published
-from jaxslam.benchmark.rows import ACCURACY, RUNNING, Column, by_sequence, cell, columns_of, rows_of
+from jaxslam.benchmark.rows import ACCURACY, RUNNING, Column, by_sequence, cell, columns_of, rows_of, with_shown_labels
 from jaxslam.benchmark.suite import Suite
 from jaxslam.benchmark.verdicts import (
     ATE,
@@ -38,6 +38,7 @@ def markdown_report(suite: Suite, results: Sequence[Mapping[str, Any]], missing:
         results: Of every planned run, as `Collected.every` gives them.
         missing: Names of what was not run, with the reason.
     """
+    results = with_shown_labels(results)
     rows = rows_of(results)
     parts = [f"# {suite.name}\n", f"{suite.about}\n" if suite.about else ""]
     parts.append(_markdown(overview_table(suite, rows)))
@@ -152,15 +153,14 @@ def mixture_lines(results: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def without_network(results: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Runs that had to do without the network of their settings, a line a network."""
+    """Runs in which no network looked at frames, a line a reason."""
     lacking: dict[str, list[str]] = {}
     for result in results:
-        if result["status"] == "done" and ("model", None) in result["networks_sha256"].items():
-            lacking.setdefault(result["model"], []).append(result["label"])
+        if result["status"] == "done" and (why := result.get("without_network")) is not None:
+            lacking.setdefault(why, []).append(result["label"])
     return [
-        f"{', '.join(dict.fromkeys(labels))}: without a network, because {model} was not on the machine; depth alone"
-        f" decided. To get it: jaxslam models get {model}"
-        for model, labels in lacking.items()
+        f"{', '.join(dict.fromkeys(labels))}: without a network ({why}); geometry alone decided"
+        for why, labels in lacking.items()
     ]
 
 
@@ -200,7 +200,8 @@ def published_table(
         Lines of as many texts; none if nothing has been published.
     """
     figures = published_of(suite, sequence, metric.figure)
-    ours = [(row, reservations(suite, row)) for row in rows if row[metric.figure] is not None]
+    fit = [row for row in rows if row[metric.figure] is not None and not row["lacks_network"]]
+    ours = [(row, reservations(suite, row)) for row in fit]
     beside = [f"{row['label']} is" for row, _ in ours]
     lines = [[f"published {metric.name}", metric.unit, *beside, "aligned", "source", "note"]]
     for figure in figures:
@@ -209,7 +210,7 @@ def published_table(
         whose = figure.source if figure.reported_by is None else f"{figure.source} of {figure.reported_by}"
         verdicts = (verdict_on(row, metric.figure, figure.value, reasons) for row, reasons in ours)
         lines.append([name, f"{figure.value:g}", *verdicts, stated, whose, figure.note])
-    return lines if figures else []
+    return lines if figures and (ours or not any(row["lacks_network"] for row in rows)) else []
 
 
 def protocols(suite: Suite, rows: Sequence[Mapping[str, Any]]) -> list[str]:

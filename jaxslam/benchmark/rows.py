@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxslam.benchmark.names import run_folder
+
 
 class Column(NamedTuple):
     """A column of figures.
@@ -52,7 +54,7 @@ RUNNING = (
     Column("memory, MB", "peak_rss_mb", 0, "most"),
 )
 """How they came about."""
-COVERAGE = ("images", "tracked_of_all_percent", "matched_percent", "coverage_percent")
+COVERAGE = ("images", "tracked_of_all_percent", "matched_percent", "span_percent")
 """What else decides whether figures may be compared with published ones: images of the whole recording, and shares of
 the frames, dropped ones too, that were tracked, and that were matched with ground truth; and of its time."""
 _FIGURES = (*(column.figure for column in (*ACCURACY, *RUNNING)), *COVERAGE)
@@ -67,13 +69,19 @@ def rows_of(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Results by sequence and label: how many runs were planned, and the figures of those that are done.
 
     A row has `sequence`, `label`, `runs` (planned), `done`, `failed`, `problems` of those that failed, `unevaluated`
-    (why runs that are done have no ATE, with how many), `notes` of the evaluations, and by the name of each figure its
-    `median`, `least` and `most`, or `None`.
+    (why runs that are done have no ATE, with how many), `notes` of the evaluations, `lacks_network` (whether they went
+    without the network that their preset needs), and by the name of each figure its `median`, `least` and `most`, or
+    `None`.
     """
     groups: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
     for result in results:
         groups.setdefault((result["sequence"], result["label"]), []).append(result)
     return [_row(sequence, label, group) for (sequence, label), group in groups.items()]
+
+
+def with_shown_labels(results: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Results whose label says if they went without the network that their preset needs; `folder` is as it was."""
+    return [_shown(result) for result in results]
 
 
 def by_sequence(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
@@ -117,6 +125,12 @@ def cell(row: Mapping[str, Any], column: Column) -> str:
     return " - ".join(f"{spread[name]:.{column.digits}f}" for name in which)
 
 
+def _shown(result: Mapping[str, Any]) -> Mapping[str, Any]:
+    folder = str(run_folder(result["sequence"], result["label"], result["seed"]))
+    without = ", without a network" if result.get("lacks_network") else ""
+    return {**result, "folder": folder, "label": result["label"] + without}
+
+
 def _row(sequence: str, label: str, group: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     done = [result for result in group if result["status"] == "done"]
     failed = [result for result in group if result["status"] == "failed"]
@@ -134,6 +148,7 @@ def _row(sequence: str, label: str, group: Sequence[Mapping[str, Any]]) -> dict[
             result.get("evaluation_problem") or "not evaluated" for result in done if result["ate_rmse_m"] is None
         ),
         "notes": list(dict.fromkeys(notes)),
+        "lacks_network": any(result.get("lacks_network") for result in done),
         **{name: _spread(of_it) for name, of_it in values.items()},
     }
 

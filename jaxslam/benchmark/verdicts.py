@@ -85,6 +85,7 @@ def reservations(suite: Suite, row: Mapping[str, Any]) -> list[str]:
         row: From `rows_of`.
     """
     found = [f"{row['done']} of {row['runs']} planned runs are done"] if row["done"] < row["runs"] else []
+    found += ["run without the network that the preset needs"] if row["lacks_network"] else []
     tracked = _of(row, "tracked_of_all_percent", "least")
     if tracked is not None and tracked < _LEAST_TRACKED_PERCENT:
         late = _of(row, "dropped_percent", "most")
@@ -178,7 +179,7 @@ def _of_a_part(recording: str, frames: float, images: float) -> list[str]:
 
 
 def _without_truth(recording: str, row: Mapping[str, Any]) -> list[str]:
-    matched, covered = _of(row, "matched_percent", "least"), _of(row, "coverage_percent", "least")
+    matched, covered = _of(row, "matched_percent", "least"), _of(row, "span_percent", "least")
     if row["ate_rmse_m"] is None or matched is None:
         return []
     if matched < _LEAST_MATCHED_PERCENT:

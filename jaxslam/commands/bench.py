@@ -21,8 +21,9 @@ from jaxslam.benchmark.rows import row_name
 from jaxslam.benchmark.runner import Executor, local, run_jobs
 from jaxslam.benchmark.suite import Suite, check_masks, checked_presets, load_suite, suites
 from jaxslam.commands.console import console, plain_console
-from jaxslam.commands.settings import Settings, flat
+from jaxslam.commands.settings import ALLOW_MISSING_MODEL, Settings, flat
 from jaxslam.config import load_config
+from jaxslam.detector_choice import network_files
 from jaxslam.errors import BenchmarkError
 from jaxslam.files import make_folder, write_atomically
 
@@ -64,6 +65,8 @@ class RunsOfSuite:
     """Go on with results that are there."""
     out: Path | None = None
     """Folder for the results; results/bench/SUITE if not given."""
+    allow_missing_model: bool = False
+    """Go on without the network of a preset that needs one, where it is not on this machine; all results say so."""
     set: Settings = ()
     """Settings of all runs, as in `--set track.num_points=400`; they beat those of the suite. May be given again."""
     sweep: Settings = ()
@@ -78,17 +81,22 @@ class RunsOfSuite:
         Raises:
             BenchmarkError: If there is no such suite, or an option does not fit.
             ConfigError: If a setting is unknown or cannot be.
+            ModelError: If a network that a preset needs is not on this machine, where runs are.
         """
         for option, value in (("--runs", self.runs), ("--workers", self.workers)):
             if value is not None and value < 1:
                 raise BenchmarkError(f"{option}: expected at least 1, got {value}")
-        known, settings, sweeps = load_suite(name), flat(self.set), flat(self.sweep)
+        allowed = (ALLOW_MISSING_MODEL,) if self.allow_missing_model else ()
+        known, settings, sweeps = load_suite(name), (*allowed, *flat(self.set)), flat(self.sweep)
         replaced = replaced_settings(known, settings, sweeps)
         suite = swept(known, sweeps)
         chosen = checked_presets(self.presets) if self.presets else ()
         jobs = plan(suite, presets=chosen, runs=self.runs, settings=settings)
         for preset, of_it in dict.fromkeys((job.preset, job.settings) for job in jobs):  # an error now, not after hours
-            check_masks([job.clip for job in jobs], load_config(preset, overrides=of_it))
+            config = load_config(preset, overrides=of_it)
+            check_masks([job.clip for job in jobs], config)
+            if self.runs_here:
+                network_files(config.semantics)  # on a cluster, each run sees for itself
         return SuitePlan(suite, jobs, replaced)
 
     def results(self, name: str, rows: Collection[str] | None = None) -> list[dict[str, Any]]:
@@ -187,7 +195,8 @@ class RunsOfSuite:
 class Bench(RunsOfSuite):
     """Run a suite: recordings or rendered rooms, presets, several seeds. Without a suite, list those there are.
 
-    Three more have a --help of their own: `jaxslam bench gate` fails if a suite has become worse than its baseline,
+    Four more have a --help of their own: `jaxslam bench gate` fails if a suite has become worse than its baseline,
+    `jaxslam bench accuracy` if tracking has become less accurate on recordings and rooms than a frozen one,
     `jaxslam bench kernels` measures the kernels, `jaxslam bench batch` the tracker on many clips at once.
     """
 

@@ -12,6 +12,7 @@ from jaxslam.benchmark.report import table
 from jaxslam.commands.console import console, plain_console
 from jaxslam.commands.run import OfRecording, number, track
 from jaxslam.config import presets
+from jaxslam.detector_choice import network_files, preset_needs_network
 from jaxslam.errors import ConfigError, nearest
 from jaxslam.files import write_atomically
 from jaxslam.slam import Slam
@@ -46,6 +47,8 @@ class Compare(OfRecording):
             if preset not in presets():
                 raise ConfigError(f"--presets: unknown preset '{preset}'{nearest(preset, presets())}")
         dataset, out = self.opened(), self.folder()
+        for preset in chosen:
+            network_files(self.settings(preset).semantics)  # an error now, not after other presets
         prefer_one_thread()  # nothing else computes while a recording is tracked
         rows: list[dict[str, Any]] = []
         for preset in chosen:
@@ -71,12 +74,17 @@ def figures(preset: str, summaries: list[dict[str, Any]]) -> dict[str, Any]:
     ates = [summary["ate_rmse_m"] for summary in summaries if summary["ate_rmse_m"] is not None]
     problems = [summary["evaluation_problem"] for summary in summaries if summary["ate_rmse_m"] is None]
     evaluations = [summary["evaluation"] for summary in summaries if summary["evaluation"] is not None]
+    without = next(
+        (summary["without_network"] for summary in summaries if summary["without_network"] is not None), None
+    )
     known = lambda name: [evaluation[name] for evaluation in evaluations if evaluation[name] is not None]
     similar = [summary["ate_sim3_rmse_m"] for summary in summaries if summary["ate_sim3_rmse_m"] is not None]
     times = [summary["track_ms"] for summary in summaries if summary["track_ms"] is not None]
     middle = lambda values: statistics.median(values) if values else None
     return {
         "preset": preset,
+        "without_network": without,
+        "lacks_network": without is not None and preset_needs_network(preset),
         "runs": len(summaries),
         "tracked_percent": min(summary["tracked_percent"] for summary in summaries),
         "dropped_percent": max(summary["dropped_percent"] for summary in summaries),
@@ -94,7 +102,7 @@ def figures(preset: str, summaries: list[dict[str, Any]]) -> dict[str, Any]:
 def _cells(row: dict[str, Any]) -> list[str]:
     ates = row["ate_rmse_m_of_runs"]
     return [
-        row["preset"],
+        row["preset"] + (", without a network" if row["lacks_network"] else ""),
         f"{row['tracked_percent']:.1f} %",
         f"{row['dropped_percent']:.1f} %",
         number(row["num_matched"], 0),
@@ -108,9 +116,11 @@ def _cells(row: dict[str, Any]) -> list[str]:
 
 
 def remarks(row: dict[str, Any]) -> list[str]:
-    """Why runs of a preset have no ATE, and what the evaluations say about their figures."""
+    """Why a preset ran without a network, why runs have no ATE, and what the evaluations say about their figures."""
     missing = Counter(row["evaluation_problems"])
-    lines = [f"{row['preset']}: no ATE of {count} runs: {problem}" for problem, count in missing.items()]
+    why = row["without_network"]
+    lines = [] if why is None else [f"{row['preset']}: without a network ({why})"]
+    lines += [f"{row['preset']}: no ATE of {count} runs: {problem}" for problem, count in missing.items()]
     return lines + [f"{row['preset']}: note: {note}" for note in row["notes"]]
 
 

@@ -1,6 +1,5 @@
 """`jaxslam demo` and `jaxslam run`: track, show how it goes, and leave the results behind."""
 
-import itertools
 import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
@@ -13,6 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from jaxslam.commands.console import console
+from jaxslam.commands.settings import ALLOW_MISSING_MODEL, Settings, flat
 from jaxslam.config import Config, load_config
 from jaxslam.datasets import Dataset, Subset, dataset_kinds, open_dataset
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset, with_true_masks
@@ -31,10 +31,6 @@ if TYPE_CHECKING:
     from jaxslam.viewer import Viewer
 
 _OnFrame: TypeAlias = Callable[[Frame | None, Tracked | Rejected], None]
-ALLOW_MISSING_MODEL = "semantics.missing_model=allow"
-"""The setting behind `--allow-missing-model`."""
-
-_Settings: TypeAlias = Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction]
 
 
 @dataclass(frozen=True)
@@ -66,12 +62,12 @@ class Demo:
     """File to write a recording for that viewer to."""
     dense: bool = False
     """Make a dense map of what stands still too: points, an octree, and a picture."""
-    set: _Settings = ()
+    set: Settings = ()
     """Settings, as in `--set semantics.model=scene`, which tracks with the true masks of who moves."""
 
     def main(self) -> None:
         """Run the command."""
-        config = load_config(overrides=(*_dense(self.dense), *itertools.chain(*self.set)))
+        config = load_config(overrides=(*_dense(self.dense), *flat(self.set)))
         scene = SyntheticConfig(
             frames=self.frames,
             path=self.path,
@@ -117,7 +113,7 @@ class OfRecording:
     """Feed frames at the rate they were taken at, and drop those that come late; each module in its thread."""
     allow_missing_model: bool = False
     """Go on without the network of a preset that needs one, where it is not on this machine; all results say so."""
-    set: _Settings = ()
+    set: Settings = ()
     """Settings, as in `--set track.num_points=400 run.seed=3`; may be given again."""
 
     def settings(self, preset: str, *overrides: str) -> Config:
@@ -125,7 +121,7 @@ class OfRecording:
         chosen = ["run.deterministic=false"] if not self.deterministic else []
         chosen += ["run.realtime=true"] if self.realtime else []
         chosen += [ALLOW_MISSING_MODEL] if self.allow_missing_model else []
-        return load_config(preset, self.config, (*chosen, *itertools.chain(*self.set), *overrides))
+        return load_config(preset, self.config, (*chosen, *flat(self.set), *overrides))
 
     def opened(self) -> Dataset:
         """The recording, or the part of it that is wanted."""

@@ -8,6 +8,7 @@ def done(sequence: str = "crowd", label: str = "static", seed: int = 0, **change
     figures = {
         "num_matched": 927,
         "coverage_percent": 99.0,
+        "span_percent": 99.0,
         "rpe_trans_m_per_s": 0.03,
         "rpe_rot_deg_per_s": 0.7,
         "rpe_trans_m_per_frame": 0.01,
@@ -38,6 +39,8 @@ def done(sequence: str = "crowd", label: str = "static", seed: int = 0, **change
         "track_ms": None,
         "mask_age_frames": None,
         "model": None,
+        "without_network": None,
+        "lacks_network": False,
         "networks_sha256": {},
         "sources_sha256": "1",
         "data_sha256": "2",

@@ -1,7 +1,7 @@
 """The accuracy ruler on results made by hand: what is worse, what cannot be compared, what is chance."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from jaxslam.benchmark.accuracy import (
+    Accuracy,
     AccuracyBaseline,
     Measured,
     compare_accuracy,
@@ -27,19 +28,24 @@ def runs(scale: float = 1.0, *, tracked: int = 900, name: str = "") -> Measured:
     return Measured(90, tracked, tuple(scale * ate for ate in ATES), trajectories, "data", "network")
 
 
-BASELINE = AccuracyBaseline("8561ab9", "first", "a CPU", "numpy 2", "default", {"a": runs(), "b": runs(2.0)})
+SEQUENCES = {name: {"recording": name} for name in ("a", "b", "new")}
+BASELINE = AccuracyBaseline("8561ab9", "first", "a CPU", "numpy 2", "default", SEQUENCES, {"a": runs(), "b": runs(2.0)})
+
+
+def compare(now: Mapping[str, Measured]) -> Accuracy:
+    return compare_accuracy(now, SEQUENCES, BASELINE)
 
 
 class TestComparison:
     def test_of_the_same_bytes(self) -> None:
-        reading = compare_accuracy(BASELINE.recordings, BASELINE)
+        reading = compare(BASELINE.recordings)
         assert reading.mean_ratio == pytest.approx(1)
         assert reading.worse == ()
         assert [row.equal_runs for row in reading.recordings] == [SEEDS, SEEDS]
 
     def test_geometric_mean(self) -> None:
         """A gain on one recording pays for a loss on another, up to the limit of a single one."""
-        reading = compare_accuracy({"a": runs(1.1), "b": runs(2.0 / 1.1)}, BASELINE)
+        reading = compare({"a": runs(1.1), "b": runs(2.0 / 1.1)})
         assert [row.ratio for row in reading.recordings] == pytest.approx([1.1, 1 / 1.1])
         assert reading.mean_ratio == pytest.approx(1)
         assert reading.worse == ()
@@ -54,24 +60,29 @@ class TestComparison:
         ],
     )
     def test_limits(self, scales: Sequence[float], sentences: Sequence[str]) -> None:
-        reading = compare_accuracy({"a": runs(scales[0]), "b": runs(2 * scales[1])}, BASELINE)
+        reading = compare({"a": runs(scales[0]), "b": runs(2 * scales[1])})
         assert reading.worse == tuple(sentences)
 
     def test_one_frame_fewer_is_worse(self) -> None:
-        reading = compare_accuracy({"a": runs(tracked=899), "b": runs(2.0)}, BASELINE)
+        reading = compare({"a": runs(tracked=899), "b": runs(2.0)})
         assert reading.worse == ("a: 899 frames tracked over all seeds, expected 900",)
 
     def test_new_and_missing_recordings(self) -> None:
         """One that the baseline lacks has no say; one that was not run is named."""
-        reading = compare_accuracy({"a": runs(), "new": runs(9.0)}, BASELINE)
+        reading = compare({"a": runs(), "new": runs(9.0)})
         assert (reading.mean_ratio, reading.left_out, reading.worse) == (pytest.approx(1), ("b",), ())
         assert [row.ratio for row in reading.recordings] == [pytest.approx(1), None]
 
     def test_by_chance(self) -> None:
         """Two medians of the same seeds differ by some percent, their mean over recordings by less."""
-        reading = compare_accuracy(BASELINE.recordings, BASELINE)
+        reading = compare(BASELINE.recordings)
         (low, high), (mean_low, mean_high) = reading.recordings[0].by_chance, reading.mean_by_chance
         assert 0.9 < low < mean_low < 1 < mean_high < high < 1.1
+
+    def test_refuses_another_part_of_a_recording(self) -> None:
+        sequences = SEQUENCES | {"a": {"recording": "a", "stop": 20}}
+        with pytest.raises(BenchmarkError, match=r"recordings of the baseline; a.stop: not there, now 20"):
+            compare_accuracy({"a": runs()}, sequences, BASELINE)
 
     @pytest.mark.parametrize(
         ("change", "message"),
@@ -84,7 +95,7 @@ class TestComparison:
     )
     def test_refuses_something_else(self, change: dict[str, Any], message: str) -> None:
         with pytest.raises(BenchmarkError, match=message):
-            compare_accuracy({"a": replace(runs(), **change)}, BASELINE)
+            compare({"a": replace(runs(), **change)})
 
 
 class TestFile:
@@ -95,7 +106,7 @@ class TestFile:
     @pytest.mark.parametrize(
         ("recordings", "message"),
         [
-            ({}, "recordings: expected at least one, got none"),
+            ({}, r"recordings: expected at least one, each in `sequences`, got \[\]"),
             ({"a": {"ates_m": [0.1]}}, "expected a baseline as `bench accuracy --update` writes it"),
             ({"a": {**vars(runs()), "ates_m": [float("nan")]}}, "a: ates_m: expected positive numbers"),
             ({"a": {**vars(runs()), "ates_m": []}}, "a: ates_m: expected positive numbers"),

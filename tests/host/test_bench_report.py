@@ -73,8 +73,8 @@ class TestReservations:
             ),
             ([done(evaluation={"num_matched": 460})], "49.6 % of the frames matched with ground truth"),
             ([done(), done(seed=1, ate_rmse_m=None, evaluation=None)], "1 of 2 runs have no ATE"),
-            ([done(evaluation={"coverage_percent": 30.0})], None),  # its length is known
-            ([done(evaluation={"coverage_percent": None})], None),
+            ([done(evaluation={"span_percent": 30.0})], None),  # its length is known
+            ([done(evaluation={"span_percent": None})], None),
         ],
         ids=["all", "failed", "left", "lost", "both", "late", "part", "no-depth", "truth", "no-ate", "known", "-"],
     )
@@ -103,7 +103,7 @@ class TestReservations:
     def test_length_that_is_not_known(self, covered: float, said: list[str]) -> None:
         """Ground truth decides, and the report says that nothing better is known."""
         suite = Suite("any", "", (Sequence("b", "rgbd_bonn_balloon"),))
-        runs = [done("b", evaluation={"coverage_percent": covered})]
+        runs = [done("b", evaluation={"span_percent": covered})]
         found = reservations(suite, *rows_of(runs))
         assert [text in reason for text, reason in zip(said, found, strict=True)] == [True] * len(said)
         assert any("the published length is not known" in line for line in warnings(suite, runs))
@@ -189,12 +189,19 @@ class TestPublished:
         assert not protocols(CROWD, rows_of([done("mine")]))
 
     def test_without_a_network(self) -> None:
-        run = {"status": "done", "model": "yolox-nano", "networks_sha256": {"model": None}, "label": "ngd"}
-        (line,) = without_network(
-            [run, run, {**run, "label": "default"}, {**run, "networks_sha256": {"model": "0" * 64}}]
-        )
-        assert line.startswith("ngd, default: without a network, because yolox-nano was not")
-        assert not without_network([{**run, "networks_sha256": {}}, {"status": "failed"}])
+        """Every run says why; one of a preset that needs a network has another label, and nothing published beside."""
+        why = "yolox-nano not on this machine"
+        lacking = done(label="ngd", without_network=why, lacks_network=True)
+        default = done(label="default", without_network=why)
+        assert without_network([lacking, default, done(label="rts")]) == [
+            f"ngd, default: without a network ({why}); geometry alone decided"
+        ]
+        text = markdown_report(CROWD, [lacking, default], {})
+        assert "| ngd, without a network | 1 of 1 |" in text
+        assert "default is |" in text
+        assert "ngd, without a network is |" not in text
+        assert "no verdict for crowd (ngd, without a network): run without the network that the preset needs" in text
+        assert "published ATE" not in markdown_report(CROWD, [lacking], {})
 
     def test_nothing_about_parts_and_rooms(self) -> None:
         assert not self.lines(Sequence("crowd", "rgbd_bonn_crowd", stop=220), (0.02, 0.03))

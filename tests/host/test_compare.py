@@ -22,8 +22,8 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_table(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Two presets, twice each: every run has its folder, every preset its row."""
-    chosen = ["--presets", "static", "ngd", "--runs", "2", "--set", *SETTINGS]
+    """Two presets, twice each: every run has its folder, every preset its row, which says what it lacks."""
+    chosen = ["--presets", "static", "ngd", "--runs", "2", "--allow-missing-model", "--set", *SETTINGS]
     main(["compare", str(recording), "--out", str(tmp_path), *chosen])
     rows = json.loads((tmp_path / "comparison.json").read_text())
     assert [row["preset"] for row in rows] == ["static", "ngd"]
@@ -40,9 +40,13 @@ def test_a_table(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
         assert row["rpe_trans_m_per_s"] is None  # the clip is shorter than a second
         assert row["evaluation_problems"] == []
     lines = (tmp_path / "comparison.md").read_text().splitlines()
-    assert len(lines) == 4
     assert lines[2].startswith("| static | 100.0 % |")
-    assert len({line.count("|") for line in lines}) == 1
+    assert lines[3].startswith("| ngd, without a network | 100.0 % |")
+    assert len({line.count("|") for line in lines[:4]}) == 1
+    assert [line for line in lines[4:] if line] == [
+        "- static: without a network (semantics.model is null)",
+        "- ngd: without a network (yolox-nano not on this machine)",
+    ]
     printed = capsys.readouterr().out
     assert "ngd, run 2 of 2" in printed
     seeds = [(tmp_path / "ngd" / seed / "config.yaml").read_text().count(f"seed: {seed}\n") for seed in "01"]
