@@ -24,6 +24,7 @@ class Range:
     at_most: float | None = None
     above: float | None = None
     below: float | None = None
+    multiple_of: int | None = None
 
     def __contains__(self, value: float) -> bool:
         return (
@@ -31,11 +32,13 @@ class Range:
             and (self.at_most is None or value <= self.at_most)
             and (self.above is None or value > self.above)
             and (self.below is None or value < self.below)
+            and (self.multiple_of is None or value % self.multiple_of == 0)
         )
 
     def __str__(self) -> str:
         bounds = ((">=", self.at_least), (">", self.above), ("<=", self.at_most), ("<", self.below))
-        return " and ".join(f"{sign} {bound:g}" for sign, bound in bounds if bound is not None)
+        parts = [f"{sign} {bound:g}" for sign, bound in bounds if bound is not None]
+        return " and ".join(parts if self.multiple_of is None else [*parts, f"a multiple of {self.multiple_of}"])
 
 
 @dataclass(frozen=True)

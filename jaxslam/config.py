@@ -40,7 +40,7 @@ class TrackConfig(Checked):
     """Points looked up from each of them."""
     num_hypotheses: Annotated[int, Range(at_least=16, at_most=1024)] = 64
     """Pose hypotheses a frame."""
-    cell_px: Annotated[int, Range(at_least=8, at_most=80)] = 20
+    cell_px: Annotated[int, Range(at_least=8, at_most=80, multiple_of=2)] = 20
     """Side of the grid cells that each get at most one new corner, pixels, even."""
     new_points: Literal["always", "keyframes"] = "always"
     """In which frames new points are sought, where there are few."""
@@ -245,8 +245,8 @@ class MotionConfig(Checked):
     """Things in a frame that are judged, the largest; others are taken to move."""
     reserved: Annotated[int, Range(at_least=0, at_most=512)] = 48
     """Of `track.num_points`, how many are kept for what moves."""
-    dense_cell_px: Annotated[int, Range(at_least=8, at_most=80)] = 14
-    """Instead of `track.cell_px` where such things cover over half of the picture."""
+    dense_cell_px: Annotated[int, Range(at_least=8, at_most=80, multiple_of=2)] = 14
+    """Instead of `track.cell_px` where such things cover over half of the picture, even too."""
     sigmas: Annotated[float, Positive] = 3.0
     """A point moves if it moves more than points at rest do by so many standard deviations."""
     share: Annotated[float, Range(at_least=0, below=1)] = 0.7
