@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxslam.errors import ConfigError, FrameError
-from jaxslam.frame_arrays import FrameArrays
+from jaxslam.frame_arrays import FrameArrays, check_grey_range
 from jaxslam.state import TrackParams, TrackPlan, TrackState
 from jaxslam.trace_cache import traced_once
 from jaxslam.track import DEFAULT_PLAN, init_state, track_step
@@ -63,7 +63,7 @@ def track_clips(
             do not reach further ones.
 
     Raises:
-        FrameError: If there is no clip or no frame, or clips differ in shape or type.
+        FrameError: If there is no clip or no frame, clips differ in shape or type, or grey values are from 0 to 1.
         ConfigError: If `params` or `seeds` are not as many as clips, or `at_once` or `threads` is below 1.
     """
     _check_clips(clips)
@@ -143,6 +143,8 @@ def _check_clips(clips: Sequence[FrameArrays]) -> None:
         for name, one, other in zip(FrameArrays._fields, kinds[0], kind, strict=True):
             if one != other:
                 raise FrameError(f"clips: {name}: expected {one} as in the first clip, got {other} in clip {index}")
+    for index, clip in enumerate(clips):
+        check_grey_range(f"clips: image of clip {index}", clip.image, FrameError)
 
 
 def _check_settings(batch: _Batch, at_once: int, threads: int) -> None:

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Bool, Float, Num, UInt8
-from numpy.typing import DTypeLike
+from numpy.typing import ArrayLike, DTypeLike
 
 from jaxslam.aligned import aligned_array
 from jaxslam.errors import FrameError
@@ -42,13 +42,32 @@ def frame_arrays(frame: Frame, dt_s: float, dtype: DTypeLike = np.float32) -> Fr
     Args:
         frame: The frame; colour becomes grey. A stereo pair needs rough depth, see `stereo.RoughDepth`.
         dt_s: Seconds since the frame before; for the first one any number.
-        dtype: Floating-point type of everything but the image, that of the state.
+        dtype: Floating-point type of everything but the image, that of state and parameters; float32 if not given,
+            also with `jax_enable_x64`.
     """
     ignore = np.zeros(frame.size[::-1], bool) if frame.dynamic_mask is None else frame.dynamic_mask
     depth = _depth(frame).astype(dtype, copy=False)
     right = None if frame.right is None else to_grey(frame.right)
     arrays: Any = (to_grey(frame.image), depth, ignore, *_times(frame, dt_s, dtype), right)
     return FrameArrays(*arrays)
+
+
+def check_grey_range(name: str, image: ArrayLike, error: type[Exception] = ValueError) -> None:
+    """Refuse an image in floating point whose grey values are from 0 to 1 where 0 to 255 is expected.
+
+    A black one passes: it is a frame in which nothing is seen.
+
+    Args:
+        name: What to call it in the message.
+        image: Of any shape, no tracer.
+        error: The class of error to raise.
+    """
+    values = np.asarray(image)
+    if np.issubdtype(values.dtype, np.integer) or not values.size:
+        return
+    least, most = float(values.min()), float(values.max())
+    if least >= 0 and 0 < most <= 1:
+        raise error(f"{name}: expected grey values from 0 to 255, got {least:.3g} to {most:.3g}; multiply them by 255")
 
 
 class FrameMemory:

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 from jaxlie import SE3
 from jaxslam_kernels.camera import to_pixels, without_distortion
 from jaxslam_kernels.pnp import ransac_pnp
-from jaxslam_kernels.pose_refine import PoseRefinement, refine_pose
+from jaxslam_kernels.pose_refine import PoseRefinement, PoseStatus, refine_pose
 from jaxslam_kernels.transform import to_camera
-from jaxslam_kernels.types import Mask, Pixels, Points, Weights
+from jaxslam_kernels.types import Code, Mask, Pixels, Points, Weights
 from jaxtyping import Array, Float
 
 from jaxslam.observe import View, depth_sigma, match_depth, observe_points
@@ -26,12 +26,12 @@ instead of 16 in the room xyz.
 
 def coarse_pose(
     state: TrackState, view: View, uv: Pixels, votes: Weights, predicted: SE3, params: TrackParams, plan: TrackPlan
-) -> tuple[SE3, Mask]:
-    """The pose that gets most votes of points, and which agree with it."""
+) -> tuple[SE3, Mask, Code]:
+    """The pose that gets most votes of points, which agree with it, and its `PoseStatus`."""
     seen = observe_points(state.points.X_world, uv, predicted, state.twist, view, params, view.matched)
     by_noise = plan.even_votes or view.right is not None
     result = ransac_pnp(
-        jax.random.fold_in(state.key, state.frame),
+        jax.random.fold_in(state.random_key(), state.frame),
         state.points.X_world,
         to_pixels(params.intrinsics, seen.xy),
         without_distortion(params.intrinsics),
@@ -41,13 +41,14 @@ def coarse_pose(
         threshold_depth=_DEPTH_SIGMAS * depth_sigma(seen.depth, params) if by_noise else _DEPTH_GATE_M,
         averaged=plan.even_votes,
         num_hypotheses=plan.num_hypotheses,
+        max_steps=plan.pose_steps,
         initial=predicted,
     )
     if not plan.even_votes or view.right is not None:
-        return result.T_world_cam, result.inliers
+        return result.T_world_cam, result.inliers, result.status
     apart_m = to_camera(result.T_world_cam, state.points.X_world)[2] - seen.depth
     near = (seen.depth <= 0) | (jnp.abs(apart_m) < _DEPTH_GATE_M)
-    return result.T_world_cam, result.inliers & near
+    return result.T_world_cam, result.inliers & near, result.status
 
 
 def refined_pose(
@@ -59,11 +60,12 @@ def refined_pose(
     coarse: SE3,
     twist: Float[Array, "6"],
     params: TrackParams,
+    plan: TrackPlan,
 ) -> tuple[PoseRefinement, Mask]:
     """The pose that fits followed points and points of keyframes together, and which followed points it fits."""
     X_world = jnp.concatenate([state.points.X_world, looked_up.X_world], axis=1)
     expected = to_camera(coarse, looked_up.X_world)[2]
-    matched = match_depth(view, looked_up.uv, expected, looked_up.weight > 0, params)
+    matched = match_depth(view, looked_up.uv, expected, looked_up.weight > 0, params, plan=plan.pair_flow)
     matched = None if view.matched is None or matched is None else jnp.concatenate([view.matched, matched])
     seen = observe_points(X_world, jnp.concatenate([uv, looked_up.uv], axis=1), coarse, twist, view, params, matched)
     weights = jnp.concatenate([trust, looked_up.weight])
@@ -78,9 +80,16 @@ def refined_pose(
         sigma_depth=depth_sigma(seen.depth, params),
         loss="cauchy",
         scale=params.loss_scale,
+        max_steps=plan.pose_steps,
     )
     close = _close(refined.T_world_cam, X_world, seen.xy, params)
     return refined, (trust > 0) & close[: trust.shape[0]]
+
+
+def worse_status(coarse: Code, refined: Code) -> Code:
+    """The `PoseStatus` of a refined pose, `NOT_CONVERGED` also where the coarse pose it began with is."""
+    only_coarse = (refined == PoseStatus.OK) & (coarse == PoseStatus.NOT_CONVERGED)
+    return jnp.where(only_coarse, coarse, refined)
 
 
 def _close(T_world_cam: SE3, X_world: Points, xy: Pixels, params: TrackParams) -> Mask:

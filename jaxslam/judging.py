@@ -23,6 +23,7 @@ from jaxslam.dynamics.regions import (
 )
 from jaxslam.observe import View, depth_sigma, observe_points
 from jaxslam.state import TrackParams, TrackPlan, TrackState
+from jaxslam.step_checks import check_verdict
 
 _MOST_WITNESSES, _ENOUGH_WITNESSES = 10, 5
 """Of each region."""
@@ -106,7 +107,8 @@ class Judged(NamedTuple):
         old = points & (age > 0)
         there_old, there_new = self._in_regions(old), self._in_regions(points & ~old)
         after = jnp.sum(there_old, axis=1, dtype=jnp.int32)[:, None]
-        rank = jnp.where(there_old, jnp.cumsum(there_old, axis=1), after + jnp.cumsum(there_new, axis=1))
+        old_rank, new_rank = (jnp.cumsum(there, axis=1, dtype=jnp.int32) for there in (there_old, there_new))
+        rank = jnp.where(there_old, old_rank, after + new_rank)
         return jnp.any((there_old | there_new) & (rank <= _MOST_WITNESSES), axis=0)
 
     def without_watched(self, view: View, witnesses: Mask, plan: TrackPlan) -> View:
@@ -138,9 +140,12 @@ class Judged(NamedTuple):
         """Which points are in each region, and on each thing."""
         parts: list[Bool[Array, "_k n"]] = []
         if self.regions is not None:
-            parts.append(self.regions.of_point[None, :] == jnp.arange(self.regions.centers.shape[1])[:, None])
+            parts.append(
+                self.regions.of_point[None, :] == jnp.arange(self.regions.centers.shape[1], dtype=jnp.int32)[:, None]
+            )
         if self.motion is not None:
-            parts.append(self.motion.of_point[None, :] == jnp.arange(1, len(self.motion.at_rest) + 1)[:, None])
+            numbers = jnp.arange(1, len(self.motion.at_rest) + 1, dtype=jnp.int32)
+            parts.append(self.motion.of_point[None, :] == numbers[:, None])
         return points[None, :] & jnp.concatenate(parts)
 
     def at_rest(self, uv: Pixels) -> Mask:
@@ -173,11 +178,19 @@ def judge_points(
         judged = judged._replace(heard=left >= params.min_inliers)
     if plan.motion is None:
         return judged
-    return judged.with_motion(_motion(state, view, seen, coarse, twist, params), view)
+    motion = _motion(state, view, seen, coarse, twist, params, as_published=plan.motion.as_published)
+    return judged.with_motion(motion, view)
 
 
 def _motion(
-    state: TrackState, view: View, seen: PointsSeen, coarse: SE3, twist: Float[Array, "6"], params: TrackParams
+    state: TrackState,
+    view: View,
+    seen: PointsSeen,
+    coarse: SE3,
+    twist: Float[Array, "6"],
+    params: TrackParams,
+    *,
+    as_published: bool,
 ) -> MotionState:
     """What is known of the things that may move."""
     assert params.motion is not None
@@ -188,12 +201,15 @@ def _motion(
         params.pixel_sigma * observed.depth[None, :] / jnp.stack([params.intrinsics.fx, params.intrinsics.fy])[:, None]
     )
     sigma = jnp.concatenate([across, depth_sigma(observed.depth, params)[None, :]])
-    measured = jnp.concatenate([points.xy, jnp.ones_like(points.xy[:1])]) * points.depth[None, :]
-    before = to_world(state.T_world_cam, measured)
-    X_world = jnp.where(params.motion.as_published, before, points.X_world)
+    X_world = points.X_world
+    if as_published:
+        before = jnp.concatenate([points.xy, jnp.ones_like(points.xy[:1])]) * points.depth[None, :]
+        X_world = to_world(state.T_world_cam, before)
     measured = MeasuredPoints(X_world, observed.in_camera(), sigma, there)
     background = seen.agreeing.astype(sigma.dtype)
-    return judge_motion(measured, seen.thing, background, coarse, state.motion, params.motion)
+    return judge_motion(
+        measured, seen.thing, background, coarse, state.motion, params.motion, as_published=as_published
+    )
 
 
 def _with_regions(
@@ -247,7 +263,10 @@ def _verdicts(
         T_world_cam=coarse,
         intrinsics=ideal,
         size=jnp.array([width, height], seen.uv.dtype),
-        key=jax.random.fold_in(jax.random.fold_in(state.key, -1 - state.frame), 1),
+        key=jax.random.fold_in(jax.random.fold_in(state.random_key(), -1 - state.frame), 1),
         regions=regions,
     )
-    return tuple(cue(scene, chosen) for cue, chosen in zip(plan.cues, params.cues, strict=True))
+    verdicts = tuple(cue(scene, chosen) for cue, chosen in zip(plan.cues, params.cues, strict=True))
+    for index, verdict in enumerate(verdicts):
+        check_verdict(f"plan.cues[{index}]", verdict, seen.uv.shape[1], seen.uv.dtype)
+    return verdicts

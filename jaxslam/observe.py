@@ -6,8 +6,9 @@ import jax.numpy as jnp
 from jaxlie import SE3
 from jaxslam_kernels.camera import distort, normalise, to_pixels
 from jaxslam_kernels.depth_image import believable, sample_depth
-from jaxslam_kernels.disparity import row_disparities
+from jaxslam_kernels.disparity import ROW_PLAN, row_disparities
 from jaxslam_kernels.image import Pyramid, build_pyramid
+from jaxslam_kernels.lk_flow import FlowPlan
 from jaxslam_kernels.rolling_shutter import as_if_at_once, image_velocity, row_time
 from jaxslam_kernels.transform import to_camera
 from jaxslam_kernels.types import DepthImage, Mask, Pixels, Points, Scalar, Weights
@@ -118,7 +119,14 @@ def observe_points(
 
 
 def match_depth(
-    view: View, uv: Pixels, expected_depth: Weights, mask: Mask, params: TrackParams, *, known_point: bool = True
+    view: View,
+    uv: Pixels,
+    expected_depth: Weights,
+    mask: Mask,
+    params: TrackParams,
+    *,
+    known_point: bool = True,
+    plan: FlowPlan = ROW_PLAN,
 ) -> Weights | None:
     """Depth of pixels of the left image of a pair by matching them in the right one; `None` without a pair.
 
@@ -130,6 +138,7 @@ def match_depth(
         params: Camera, and the depths to be believed.
         known_point: Whether `expected_depth` is that of points of the map, static: where it is confirmed, a match needs
             no way back. Else it is rough depth of this very pair, which may be wrong in the same way.
+        plan: How rows are searched, static.
 
     Returns:
         `(n,)` metres, 0 where there is no match.
@@ -144,7 +153,7 @@ def match_depth(
     left = Pyramid(view.pyramid.levels[: len(view.right.levels)], view.pyramid.border)
     guess = focal_baseline / jnp.where(known, rough, 1)
     expected_px = _EXPECTED_PX if known_point else 0.0
-    match = row_disparities(left, view.right, uv, guess, known, expected_px=expected_px)
+    match = row_disparities(left, view.right, uv, guess, known, expected_px=expected_px, plan=plan)
     depth = focal_baseline / jnp.where(match.found, match.disparity, 1)
     return believable(jnp.where(match.found, depth, 0), params.min_depth_m, params.max_depth_m)
 

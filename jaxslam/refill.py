@@ -5,6 +5,7 @@ from jaxlie import SE3
 from jaxslam_kernels.corners import corner_score, grid_corners, occupied_cells
 from jaxslam_kernels.depth_image import sample_depth
 from jaxslam_kernels.transform import to_world
+from jaxslam_kernels.types import Code
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.observe import Observed, View, depth_sigma, match_depth, observe
@@ -28,7 +29,7 @@ def refill(
     *,
     first: Bool[Array, "h w"] | None = None,
     cell_px: int | None = None,
-) -> TrackedPoints:
+) -> tuple[TrackedPoints, Code]:
     """Put the best corners of empty grid cells into free slots, numbered from `next_id` on.
 
     Corners are sought on the second level of the pyramid: a quarter of the work, and less noise. A new point has the
@@ -50,6 +51,9 @@ def refill(
         plan: Static.
         first: Pixels whose corners come before all others; some slots are kept free for them.
         cell_px: Side of the cells instead of that of the plan, static.
+
+    Returns:
+        The points, and how many cells of the grid hold a corner, with depth or without.
     """
     border, cell, depth = view.pyramid.border, (cell_px or plan.cell_px) // 2, view.depth
     image = view.pyramid.levels[1][border:-border, border:-border]
@@ -77,12 +81,14 @@ def refill(
     candidate = order[jnp.clip(rank, 0, order.shape[0] - 1)]
     new = ~points.valid & (rank < room)
     uv, rough, *chosen = (jnp.take(array, candidate, axis=-1) for array in (uv, rough, *seen))
-    seen, matched = Observed(*chosen), match_depth(view, uv, rough, new, params, known_point=False)
+    seen = Observed(*chosen)
+    matched = match_depth(view, uv, rough, new, params, known_point=False, plan=plan.pair_flow)
     if matched is not None:
         seen, new = seen._replace(depth=matched), new & (matched > 0)
     X_world = to_world(T_world_cam, seen.in_camera())
     put = lambda old, fresh: jnp.where(new, fresh, old)
-    return TrackedPoints(
+    num_corners = jnp.sum(corners.score > _MIN_SCORE, dtype=jnp.int32)
+    filled = TrackedPoints(
         uv=put(points.uv, uv),
         xy=put(points.xy, seen.xy),
         depth=put(points.depth, seen.depth),
@@ -95,3 +101,4 @@ def refill(
         id=jnp.where(new, next_id + rank, points.id),
         valid=points.valid | new,
     )
+    return filled, num_corners

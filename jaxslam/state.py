@@ -3,12 +3,14 @@
 import enum
 from typing import Any, Literal, NamedTuple
 
+import jax
 from jaxlie import SE3
 from jaxslam_kernels.camera import Intrinsics
+from jaxslam_kernels.disparity import ROW_PLAN
 from jaxslam_kernels.image import Pyramid
 from jaxslam_kernels.lk_flow import FlowPlan, LevelPlan
 from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Points, Scalar, Weights
-from jaxtyping import Array, Bool, Float, Int, Key, Num
+from jaxtyping import Array, Bool, Float, Int, Key, Num, UInt32
 
 from jaxslam.dynamics.cue import Cue, Verdict
 from jaxslam.dynamics.motion_state import MotionMemory, MotionParams, MotionPlan, MotionState
@@ -62,6 +64,7 @@ class TrackReason(enum.IntEnum):
     IMPLAUSIBLE_MOTION = 4
     NO_DEPTH = 5
     BAD_TIME = 6
+    NO_CORNERS = 7
 
     @property
     def text(self) -> str:
@@ -75,8 +78,10 @@ _REASON_TEXT = {
     TrackReason.FEW_INLIERS: "too few points agree on one motion",
     TrackReason.FEW_SHARE: "only a small share of the points agrees on one motion",
     TrackReason.IMPLAUSIBLE_MOTION: "the motion found is faster than the limit",
-    TrackReason.NO_DEPTH: "too few points have depth to start from",
+    TrackReason.NO_DEPTH: "too few of the corners in the image have depth to start from",
     TrackReason.BAD_TIME: "the time since the last frame is not positive",
+    TrackReason.NO_CORNERS: "too few corners were found in the image to start from"
+    " (dark, blurred, covered, all to be ignored, or grey values not from 0 to 255)",
 }
 
 
@@ -101,6 +106,9 @@ class TrackPlan(NamedTuple):
         keyframe_choice: Whether a keyframe is made as soon as there is a reason, or at the right moment after.
         look_up: How points of keyframes are searched. A window of 21 takes 1 ms a frame more and is no more accurate;
             17, 15 and 13 are alike too: TUM `fr1_rpy` 10.2, 10.2, 10.2 mm, Bonn `crowd` (start) 9.7, 9.6, 9.5.
+        pose_steps: Bound on the evaluations of the cost in each refinement of the pose; `TrackOutput.pose_status`
+            says where it was reached.
+        pair_flow: How points of a stereo pair are matched along the rows of its images.
     """
 
     num_points: int = 512
@@ -119,18 +127,28 @@ class TrackPlan(NamedTuple):
     even_votes: bool = False
     motion: MotionPlan | None = None
     keyframe_choice: Literal["as_needed", "sparing"] = "as_needed"
+    pose_steps: int = 25
+    pair_flow: FlowPlan = ROW_PLAN
 
     def exact(self) -> "TrackPlan":
-        """The same with searches that go on until nothing moves, for derivatives that must be exact; in float64.
+        """The same with searches and solvers that go on until nothing moves, for derivatives that must be exact.
+
+        State, parameters and frames must be float64: float32 cannot hold what these searches stop at, and `track_step`
+        refuses it.
 
         A search that stops at a few hundredths of a pixel, as is enough to track with, leaves a result that still
         depends on where it started. Derivatives are those of the solution itself: over ten frames of a small picture
         they differ from finite differences of the tracker by 0.2 to 1 % for the camera and the map points, by up to
-        10 % for weights; with this plan by 1e-5. Points whose search never settles are dropped here.
+        10 % for weights; with this plan by 1e-5. Points whose search never settles are dropped here. A pose whose
+        refinement has not converged all the same has the `TrackOutput.pose_status` NOT_CONVERGED, and no exact
+        derivative.
         """
-        finest = LevelPlan(self.flow.finest.window, 100, 1e-10, 1e-8)
+        to_the_end = lambda level: LevelPlan(level.window, 100, 1e-10, 1e-8)
         return self._replace(
-            flow=self.flow._replace(finest=finest), look_up=LevelPlan(self.look_up.window, 100, 1e-10, 1e-8)
+            flow=self.flow._replace(finest=to_the_end(self.flow.finest)),
+            look_up=to_the_end(self.look_up),
+            pose_steps=1000,
+            pair_flow=self.pair_flow._replace(finest=to_the_end(self.pair_flow.finest)),
         )
 
 
@@ -284,7 +302,12 @@ class LookedUp(NamedTuple):
 
 
 class TrackState(NamedTuple):
-    """What the tracker knows after a frame.
+    """What the tracker knows after a frame: a pytree whose leaves are all plain arrays.
+
+    A state can be saved with `numpy.savez(path, *jax.tree.leaves(state))`, with `pickle`, or with
+    `equinox.tree_serialise_leaves`. To restore one from its leaves, take the structure of a state that `init_state`
+    makes for the same plan and size of image, `jax.tree.unflatten(jax.tree.structure(blank), leaves)`. Tracking goes on
+    from it with the same bytes.
 
     Attributes:
         pyramid: Of the last good frame.
@@ -298,7 +321,7 @@ class TrackState(NamedTuple):
         lost_frames: Frames since tracking was lost, 0 while it is not.
         frame: Frames seen.
         next_id: Number of the next new point.
-        key: Source of every random choice.
+        key: Data of the random key that every random choice is derived from, see `random_key`.
         regions: What is kept of the regions of the last frame, see `TrackPlan.regions`.
         motion: What is kept of the things in it that may move, see `TrackPlan.motion`.
     """
@@ -314,9 +337,13 @@ class TrackState(NamedTuple):
     lost_frames: Code
     frame: Code
     next_id: Code
-    key: Key[Array, ""]
+    key: UInt32[Array, " words"]
     regions: RegionMemory
     motion: MotionMemory
+
+    def random_key(self) -> Key[Array, ""]:
+        """The typed random key that `key` holds the data of; JAX's own typed keys cannot be saved as arrays."""
+        return jax.random.wrap_key_data(self.key)
 
 
 class TrackOutput(NamedTuple):
@@ -339,6 +366,10 @@ class TrackOutput(NamedTuple):
         looked_up: Points of keyframes found in the frame.
         twist: Velocity of the camera in its own axes, metres a second then radians a second.
         keyframe: A `KeyframeReason`.
+        pose_status: A `PoseStatus` of the refinement of the pose in this frame, also of one that was not taken because
+            the frame is lost. `NOT_CONVERGED` means that it ran out of `TrackPlan.pose_steps`: the pose is then near
+            the optimum, and its derivatives are not exact. With more steps than by default, as in
+            `TrackPlan.exact()`, it is `NOT_CONVERGED` too where the coarse pose that it began with is.
         verdicts: What each of `TrackPlan.cues` says of the points that were followed,
         regions: and the regions they speak of.
         moving: `(h, w)` true in regions and things that move; `None` without either.
@@ -361,6 +392,7 @@ class TrackOutput(NamedTuple):
     looked_up: LookedUp
     twist: Float[Array, "6"]
     keyframe: Code
+    pose_status: Code
     verdicts: tuple[Verdict, ...] = ()
     regions: Regions | None = None
     moving: Bool[Array, "h w"] | None = None

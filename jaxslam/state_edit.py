@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxlie import SE3
 from jaxslam_kernels.transform import composed, to_world
@@ -9,6 +10,7 @@ from jaxslam_kernels.types import Code, Pixels, Points, Weights
 from jaxtyping import Array, Bool, Float, Int, Num
 
 from jaxslam.state import TrackState
+from jaxslam.step_checks import check_array
 
 
 def carried(state: TrackState, T_new_old: Float[Array, "7"], T_new_old_keyframes: Float[Array, "k 7"]) -> TrackState:
@@ -18,8 +20,15 @@ def carried(state: TrackState, T_new_old: Float[Array, "7"], T_new_old_keyframes
         state: The state.
         T_new_old: Correction at the camera, `wxyz_xyz`: carries its pose and the points followed.
         T_new_old_keyframes: Correction at each keyframe of the state.
+
+    Raises:
+        ValueError: While tracing, if a shape does not fit the state.
+        TypeError: While tracing, if a type is not that of the state.
     """
     now, keyframes = SE3(T_new_old), state.keyframes
+    check_array("T_new_old", T_new_old, (7,), state.twist.dtype, " as the state")
+    each = keyframes.T_world_cam.shape
+    check_array("T_new_old_keyframes", T_new_old_keyframes, each, state.twist.dtype, " as the keyframes of the state")
     poses = jax.vmap(lambda correction, pose: composed(SE3(correction), SE3(pose)).wxyz_xyz)(
         T_new_old_keyframes, keyframes.T_world_cam
     )
@@ -54,9 +63,18 @@ def recalled(
         X_world: Where they are in the world, metres.
         weight: How much each counts, 0 for none.
         id: Numbers of the points.
+
+    Raises:
+        ValueError: While tracing, if a shape is not that of the keyframes of the state.
+        TypeError: While tracing, if a type is not: a picture in floating point has no room in one of whole numbers.
     """
     put = lambda ring, new: lax.dynamic_update_index_in_dim(ring, new.astype(ring.dtype), slot, 0)
     keyframes = state.keyframes
+    given = {"T_world_cam": T_world_cam, "uv": uv, "X_world": X_world, "weight": weight, "id": id}
+    rings = keyframes._asdict()
+    check_array("image", image, keyframes.images.shape[1:], keyframes.images.dtype, " as the keyframes of the state")
+    for name, array in given.items():
+        check_array(name, array, rings[name].shape[1:], rings[name].dtype, " as the keyframes of the state")
     return state._replace(
         keyframes=keyframes._replace(
             images=put(keyframes.images, image),
@@ -74,8 +92,13 @@ def forgotten(state: TrackState, ids: Int[Array, " m"]) -> TrackState:
 
     Args:
         state: The state.
-        ids: Their numbers, ascending; a number may come more than once.
+        ids: `(m,)` their numbers, ascending; a number may come more than once.
+
+    Raises:
+        ValueError: While tracing, if they are not in one row.
+        TypeError: While tracing, if they are not of the type of the numbers in the state.
     """
+    check_array("ids", ids, (np.size(ids),), state.points.id.dtype)
 
     def among(numbers: Int[Array, "*shape"]) -> Bool[Array, "*shape"]:
         at = jnp.minimum(jnp.searchsorted(ids, numbers), ids.shape[0] - 1)
@@ -92,7 +115,16 @@ def relocated(state: TrackState, T_world_cam: Float[Array, "7"]) -> TrackState:
     """The state of a tracker that is lost and begins anew at a pose: the next step starts there at once.
 
     Its keyframes are forgotten: nothing says how they lie to where it begins. Those that do can be `recalled`.
+
+    Args:
+        state: The state.
+        T_world_cam: `(7,)` the pose, `wxyz_xyz`.
+
+    Raises:
+        ValueError: While tracing, if the pose has another shape.
+        TypeError: While tracing, if it is not of the type of the state.
     """
+    check_array("T_world_cam", T_world_cam, (7,), state.twist.dtype, " as the state")
     return state._replace(
         T_world_cam=SE3(T_world_cam),
         twist=jnp.zeros_like(state.twist),

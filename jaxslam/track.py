@@ -7,12 +7,13 @@ carries it, by the implicit function theorem.
 """
 
 import enum
-from functools import partial
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.typing import DTypeLike
 from jaxlie import SE3
 from jaxslam_kernels.camera import without_distortion
 from jaxslam_kernels.depth_image import believable
@@ -26,8 +27,9 @@ from jaxtyping import Array, Float, Int
 
 from jaxslam.dynamics.motion_state import labels_at, no_motion
 from jaxslam.dynamics.regions import Regions, even_votes, find_regions, no_regions
+from jaxslam.floating_dtype import floating_dtype
 from jaxslam.frame_arrays import FrameArrays
-from jaxslam.frame_pose import coarse_pose, fits, refined_pose
+from jaxslam.frame_pose import coarse_pose, fits, refined_pose, worse_status
 from jaxslam.judging import Judged, PointsSeen, judge_points
 from jaxslam.keyframe_choice import Candidate, keyframe_reason
 from jaxslam.keyframes import empty_keyframes, look_up, with_keyframe
@@ -43,6 +45,7 @@ from jaxslam.state import (
     TrackState,
     TrackStatus,
 )
+from jaxslam.step_checks import check_followed, check_plan, check_pose, check_state, check_step
 
 DEFAULT_PLAN = TrackPlan()
 _MAX_PREDICTION_S = 0.1
@@ -101,9 +104,9 @@ def init_state(
     plan: TrackPlan = DEFAULT_PLAN,
     *,
     T_world_cam: SE3 | None = None,
-    seed: int = 0,
-    image_dtype: jnp.dtype = jnp.uint8,
-    dtype: jnp.dtype = jnp.float32,
+    seed: int | Int[Array, ""] = 0,
+    image_dtype: DTypeLike = jnp.uint8,
+    dtype: DTypeLike = jnp.float32,
 ) -> TrackState:
     """A state that has seen nothing: the first frame given to `track_step` starts tracking.
 
@@ -113,12 +116,21 @@ def init_state(
         plan: Capacities, static.
         T_world_cam: Pose of the camera at the first frame; the world's origin if not given.
         seed: Of every random choice.
-        image_dtype: Type of the images given later; floating point to differentiate with respect to them.
-        dtype: Floating-point type of everything else.
+        image_dtype: Type of the images given later, `uint8` or floating point to differentiate with respect to them.
+            The step refuses others, since keyframes hold images of this type.
+        dtype: Floating-point type of everything else, that of parameters and frames; float32 if not given, also with
+            `jax_enable_x64`.
+
+    Raises:
+        ValueError: If the parts of the plan do not go together, or the image is too small for its levels.
+        TypeError: If `T_world_cam` is no pose, or `dtype` is no floating-point type or is float64 while
+            `jax_enable_x64` is off.
     """
-    n = plan.num_points
+    check_plan(plan)
+    n, dtype = plan.num_points, floating_dtype(dtype)
     blank = build_pyramid(jnp.zeros((height, width), dtype), num_levels=plan.num_levels)
     pose = SE3.identity() if T_world_cam is None else T_world_cam
+    check_pose("T_world_cam", pose)
     return TrackState(
         pyramid=blank,
         points=TrackedPoints(
@@ -134,7 +146,7 @@ def init_state(
             id=jnp.zeros(n, jnp.int32),
             valid=jnp.zeros(n, bool),
         ),
-        keyframes=empty_keyframes(height, width, plan, image_dtype, dtype),
+        keyframes=empty_keyframes(height, width, plan, jnp.dtype(image_dtype), dtype),
         T_world_cam=SE3(pose.wxyz_xyz.astype(dtype)),
         twist=jnp.zeros(6, dtype),
         elapsed_s=jnp.zeros((), dtype),
@@ -143,10 +155,25 @@ def init_state(
         lost_frames=jnp.full((), 2**20, jnp.int32),
         frame=jnp.zeros((), jnp.int32),
         next_id=jnp.zeros((), jnp.int32),
-        key=jax.random.key(seed),
+        key=jax.random.key_data(jax.random.key(seed)),
         regions=no_regions(plan.regions, dtype),
         motion=no_motion(plan.motion, n, dtype),
     )
+
+
+@lru_cache(maxsize=32)
+def _state_for(height: int, width: int, plan: TrackPlan, image_dtype: jnp.dtype, dtype: jnp.dtype) -> TrackState:
+    """Shapes and types of a state for a plan and frames of a size and a type."""
+    return jax.eval_shape(partial(init_state, height, width, plan, image_dtype=image_dtype, dtype=dtype))
+
+
+def _check(state: TrackState, frame: FrameArrays, params: TrackParams, plan: TrackPlan) -> TrackState:
+    """Refuse arguments that do not fit each other; shapes and types of a state that does."""
+    check_step(state, frame, params, plan)
+    image = jax.typeof(frame.image)
+    expected = _state_for(*image.shape, plan._replace(cues=()), image.dtype, jax.typeof(state.twist).dtype)
+    check_state(state, expected)
+    return expected
 
 
 def track_step(
@@ -161,8 +188,14 @@ def track_step(
         plan: Capacities, static; those the state was made with.
 
     Returns:
-        The new state and what is known of the frame. Nothing raises: a frame that cannot be used leaves points and
+        The new state and what is known of the frame. A frame that cannot be used is no error: it leaves points and
         pose as they were and says so in `status` and `reason`.
+
+    Raises:
+        ValueError: While tracing, if a shape does not fit the image or the plan. Of an image that is no tracer, if its
+            grey values are from 0 to 1 and not to 255.
+        TypeError: While tracing, if state, parameters and frame are not of one floating-point type, the images of
+            the state are of another type than that of the frame, or float32 is given for `TrackPlan.exact()`.
     """
     return track_followed(state, frame, follow_points(state, frame, params, plan), params, plan)
 
@@ -173,7 +206,18 @@ def follow_points(
     """The first part of `track_step`: the points of the state followed into a frame by optical flow.
 
     It takes nothing of the frame but image and time: what is to be ignored may be found out meanwhile.
+
+    Args:
+        state: As for `track_step`.
+        frame: As for `track_step`; the values of depth, `ignore` and `movable` may still change after it.
+        params: As for `track_step`.
+        plan: As for `track_step`.
+
+    Raises:
+        ValueError: As `track_step`.
+        TypeError: As `track_step`.
     """
+    _check(state, frame, params, plan)
     height, width = frame.image.shape
     elapsed_s = state.elapsed_s + frame.dt_s
     pyramid = build_pyramid(frame.image, num_levels=plan.num_levels, dtype=state.twist.dtype)
@@ -196,10 +240,29 @@ def track_followed(
     params: TrackParams,
     plan: TrackPlan = DEFAULT_PLAN,
 ) -> tuple[TrackState, TrackOutput]:
-    """The second part of `track_step`: pose, points, keyframe, from where `follow_points` has them."""
+    """The second part of `track_step`: pose, points, keyframe, from where `follow_points` has them.
+
+    Args:
+        state: That the points were followed from.
+        frame: That they were followed into.
+        followed_points: From `follow_points`.
+        params: As for `track_step`.
+        plan: As for `track_step`.
+
+    Returns:
+        As `track_step`.
+
+    Raises:
+        ValueError: As `track_step`.
+        TypeError: As `track_step`.
+    """
+    expected = _check(state, frame, params, plan)
+    points = expected.points
+    check_followed(followed_points, Followed(expected.pyramid, expected.T_world_cam, points.uv, points.valid))
     pyramid, predicted, uv, found = followed_points
     depth = believable(frame.depth, params.min_depth_m, params.max_depth_m)
-    view = _matched(View(frame, pyramid, depth, state.elapsed_s + frame.dt_s), state, uv, found, predicted, params)
+    view = View(frame, pyramid, depth, state.elapsed_s + frame.dt_s)
+    view = _matched(view, state, uv, found, predicted, params, plan)
     column, row = jnp.round(lax.stop_gradient(uv)).astype(jnp.int32)
     masked = frame.ignore.at[row, column].get(mode="fill", fill_value=True)
     thing = _things_at(frame, uv, plan)
@@ -210,7 +273,7 @@ def track_followed(
     votes = jnp.where(followed, trust, 0)
     if regions is not None and plan.even_votes:
         votes = even_votes(votes, regions)
-    coarse, agreeing = coarse_pose(state, view, uv, votes, predicted, params, plan)
+    coarse, agreeing, coarse_status = coarse_pose(state, view, uv, votes, predicted, params, plan)
     twist = _twist(state.T_world_cam, coarse, view.elapsed_s)
     points = PointsSeen(uv, followed, found & masked, agreeing, trust, found & ~masked, thing)
     judged = judge_points(state, view, points, regions, coarse, twist, params, plan)
@@ -221,12 +284,16 @@ def track_followed(
     trust = judged.weights(trust)
     agreeing &= trust > 0
     looked_up = look_up(state.keyframes, coarse, twist, judged.without_movers(view), params, plan)
-    refined, inliers = refined_pose(state, view, uv, jnp.where(agreeing, trust, 0), looked_up, coarse, twist, params)
+    counting = jnp.where(agreeing, trust, 0)
+    refined, inliers = refined_pose(state, view, uv, counting, looked_up, coarse, twist, params, plan)
     verdict = _judge(state, view, refined, followed & judged.counts(), inliers, params)
     witnesses = judged.witnesses(uv, state.points.anchor_age, followed & ~inliers)
     kept = _update_points(state, view, uv, inliers, witnesses, refined.T_world_cam, params)
     new_state, output = _conclude(state, view, kept, refined, looked_up, verdict, judged, params, plan)
     said = {"verdicts": judged.verdicts, "regions": judged.regions, "moving": judged.moving, "motion": judged.motion}
+    if plan.pose_steps > DEFAULT_PLAN.pose_steps:
+        # Not always: one more use of the coarse pose's status has XLA round the pose itself in another way.
+        said["pose_status"] = worse_status(coarse_status, refined.status)
     return new_state, output._replace(**said)
 
 
@@ -234,8 +301,7 @@ def _things_at(frame: FrameArrays, uv: Pixels, plan: TrackPlan) -> Int[Array, " 
     """Number of the thing that may move at each pixel; 0 for none, and where nobody asks."""
     if plan.motion is None:
         return jnp.zeros(uv.shape[1], jnp.int32)
-    if frame.movable is None:
-        raise ValueError("frame.movable: expected numbers of what may move for a plan with `motion`, got None")
+    assert frame.movable is not None
     return labels_at(frame.movable, uv)
 
 
@@ -249,15 +315,17 @@ def _background(state: TrackState, there: Mask, thing: Int[Array, " n"], params:
         return outside
     before = state.motion.of_point
     stood = there & (before > 0) & state.motion.at_rest[jnp.maximum(before - 1, 0)]
-    few = jnp.sum(outside, dtype=params.weak_inliers.dtype) < params.weak_inliers
+    few = jnp.sum(outside, dtype=state.twist.dtype) < params.weak_inliers
     return outside | (few & stood)
 
 
-def _matched(view: View, state: TrackState, uv: Pixels, found: Mask, predicted: SE3, params: TrackParams) -> View:
+def _matched(
+    view: View, state: TrackState, uv: Pixels, found: Mask, predicted: SE3, params: TrackParams, plan: TrackPlan
+) -> View:
     """The frame with the right image of a pair, and the depth of the points followed by it; without one as it was."""
     view = view.with_right()
     expected = to_camera(predicted, state.points.X_world)[2]
-    return view._replace(matched=match_depth(view, uv, expected, found, params))
+    return view._replace(matched=match_depth(view, uv, expected, found, params, plan=plan.pair_flow))
 
 
 def _widened(params: TrackParams, before: Pixels, after: Pixels, followed: Mask) -> TrackParams:
@@ -284,7 +352,7 @@ def _regions(
     if plan.regions is None:
         return None
     seen = observe_points(state.points.X_world, uv, predicted, state.twist, view, params, view.matched)
-    key, ideal = jax.random.fold_in(state.key, -1 - state.frame), without_distortion(params.intrinsics)
+    key, ideal = jax.random.fold_in(state.random_key(), -1 - state.frame), without_distortion(params.intrinsics)
     return find_regions(key, view.depth, state.regions.centers, seen.in_camera(), ideal, plan.regions)
 
 
@@ -380,7 +448,7 @@ def _conclude(
 ) -> tuple[TrackState, TrackOutput]:
     """The new state, and the output: tracked, held, or started anew."""
     lost_frames = jnp.where(verdict.lost, state.lost_frames + 1, 0)
-    start = verdict.lost & (lost_frames.astype(params.restart_after.dtype) > params.restart_after)
+    start = verdict.lost & (lost_frames.astype(state.twist.dtype) > params.restart_after)
     held = verdict.lost & ~start
     choose = lambda when_lost, when_tracked: jax.tree.map(
         lambda a, b: jnp.where(verdict.lost, a, b), when_lost, when_tracked
@@ -412,11 +480,11 @@ def _conclude(
     seek = partial(refill, first=unwatched, next_id=state.next_id, view=free)
     seek = partial(seek, T_world_cam=pose, twist=twist, params=params, plan=plan)
     sought = (start | (may & ~verdict.lost)).astype(jnp.int32)
-    branches = [lambda p: p, seek]
+    branches = [lambda p: (p, jnp.zeros((), jnp.int32)), seek]
     if plan.motion is not None:  # more features from the rest, as in USD-SLAM
         branches.append(partial(seek, cell_px=plan.motion.dense_cell_px))
         sought = sought * jnp.where(movable > 0.5, 2, 1)
-    points = lax.switch(sought, branches, points)
+    points, num_corners = lax.switch(sought, branches, points)
     failed = start & (jnp.sum(points.valid, dtype=twist.dtype) < params.min_inliers)
     started, stale = start & ~failed, held | failed
     keyframe = reason_to_keep(started)
@@ -445,7 +513,9 @@ def _conclude(
         [_code(TrackStatus.STARTED), _code(TrackStatus.LOST), _code(TrackStatus.WEAK)],
         _code(TrackStatus.OK),
     )
-    reason = jnp.select([failed, started], [_code(TrackReason.NO_DEPTH), _code(TrackReason.NONE)], verdict.reason)
+    plain = num_corners.astype(twist.dtype) < params.min_inliers
+    why_not = jnp.where(plain, _code(TrackReason.NO_CORNERS), _code(TrackReason.NO_DEPTH))
+    reason = jnp.select([failed, started], [why_not, _code(TrackReason.NONE)], verdict.reason)
     found = looked_up._replace(weight=jnp.where(verdict.lost, 0, looked_up.weight))
     output = TrackOutput(
         T_world_cam=pose,
@@ -464,5 +534,6 @@ def _conclude(
         looked_up=found,
         twist=twist,
         keyframe=keyframe,
+        pose_status=refined.status,
     )
     return new_state, output

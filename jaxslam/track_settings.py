@@ -4,10 +4,11 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
+from jax.typing import DTypeLike
 
 from jaxslam.camera import Camera
 from jaxslam.config import Config, TrackConfig
+from jaxslam.floating_dtype import floating_dtype
 from jaxslam.state import TrackParams, TrackPlan
 
 
@@ -42,8 +43,19 @@ def track_plan(config: TrackConfig) -> TrackPlan:
     return TrackPlan(**{name: getattr(config, name) for name in TrackPlan._fields if hasattr(config, name)})
 
 
-def track_params(camera: Camera, config: TrackConfig, dtype: type[np.floating] = np.float32) -> TrackParams:
-    """The traced part of the tracker's settings, with the camera; `track_step` takes it."""
+def track_params(camera: Camera, config: TrackConfig, dtype: DTypeLike = jnp.float32) -> TrackParams:
+    """The traced part of the tracker's settings, with the camera; `track_step` takes it.
+
+    Args:
+        camera: That takes the frames.
+        config: The tracker's settings.
+        dtype: Floating-point type of every parameter, that of the state and the frames; float32 if not given, also
+            with `jax_enable_x64`.
+
+    Raises:
+        TypeError: If `dtype` is no floating-point type, or is float64 while `jax_enable_x64` is off.
+    """
+    dtype = floating_dtype(dtype)
     noise = depth_noise(camera, config)
     by_camera: dict[str, float] = {
         "readout_s": camera.readout_s,

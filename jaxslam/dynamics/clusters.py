@@ -5,20 +5,22 @@ region of the depth image against a threshold that depends on the mean over all 
 that is missed costs more than a surface at rest that is left out.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from functools import lru_cache
+from typing import NamedTuple, TypeAlias
 
 import jax.numpy as jnp
 from jaxslam_kernels.camera import project
 from jaxslam_kernels.robust import loss_value
 from jaxslam_kernels.transform import to_camera
-from jaxslam_kernels.types import Flag, Mask, Scalar, Weights
+from jaxslam_kernels.types import Mask, Scalar, Weights
 
 from jaxslam.dynamics.cue import Scene, Verdict, judge
-from jaxslam.dynamics.regions import RegionVerdict, mean_of_regions, of_points
+from jaxslam.dynamics.regions import Regions, RegionVerdict, mean_of_regions, of_points
 
 
 class ClusterParams(NamedTuple):
-    """Of `cluster_cue`; scalars.
+    """Of the cluster cue; scalars.
 
     Attributes:
         times_mean: A region moves if its mean error is beyond so many times that of all points. The paper gives no
@@ -28,8 +30,6 @@ class ClusterParams(NamedTuple):
         robust_px: Errors beyond count hardly more, however large, pixels (the loss of Geman and McClure; the paper has
             a robust one and does not name it). With Huber's, one wrong match in five gives a region at rest away.
         fewest: Least number of points of which a mean is worth anything.
-        as_published: Whether the mean over all points is taken over all of them, or over those that agree with the
-            pose, which a large mover does not raise.
         temperature: See `cue.judge`.
     """
 
@@ -37,36 +37,52 @@ class ClusterParams(NamedTuple):
     least_px: Scalar
     robust_px: Scalar
     fewest: Scalar
-    as_published: Flag
     temperature: Scalar
 
 
-def cluster_cue(scene: Scene, params: ClusterParams) -> Verdict:
-    """How large the mean error of each point's region is, in thresholds.
+ClusterCue: TypeAlias = Callable[[Scene, ClusterParams], Verdict]
+
+
+@lru_cache  # the same function for the same choice: another one would be compiled anew
+def make_cluster_cue(as_published: bool = False) -> ClusterCue:
+    """The cue that judges regions of the depth image.
 
     Args:
-        scene: What is known of the points; its `regions` must be there.
-        params: Thresholds.
-
-    Raises:
-        ValueError: If the scene has no regions.
+        as_published: Whether the mean over all points is taken over all of them, or over those that agree with the
+            pose, which a large mover does not raise.
     """
-    if scene.regions is None:
-        raise ValueError("scene.regions: expected regions for the cluster cue, got None; set TrackPlan.regions")
+
+    def cluster_cue(scene: Scene, params: ClusterParams) -> Verdict:
+        """How large the mean error of each point's region is, in thresholds.
+
+        Args:
+            scene: What is known of the points; its `regions` must be there.
+            params: Thresholds.
+
+        Raises:
+            ValueError: If the scene has no regions.
+        """
+        if scene.regions is None:
+            raise ValueError("scene.regions: expected regions for the cluster cue, got None; set TrackPlan.regions")
+        return _verdict(scene, scene.regions, params, as_published)
+
+    return cluster_cue
+
+
+def _verdict(scene: Scene, regions: Regions, params: ClusterParams, as_published: bool) -> Verdict:
     error, known = _robust_errors(scene, params)
-    mean, number = mean_of_regions(error, known, scene.regions)
-    counts = known & (scene.agrees | params.as_published)
+    mean, number = mean_of_regions(error, known, regions)
+    counts = known if as_published else known & scene.agrees
     overall = jnp.sum(jnp.where(counts, error, 0)) / jnp.maximum(jnp.sum(counts, dtype=error.dtype), 1)
     limit = jnp.maximum(params.times_mean * overall, jnp.square(params.least_px))
     enough = (number >= params.fewest) & (limit > 0)
     weight, evidence, judged, _ = judge(mean / jnp.where(limit > 0, limit, 1), enough, params.temperature)
-    regions = RegionVerdict(weight, evidence, judged)
     one, none = jnp.ones_like(overall), jnp.zeros_like(overall)
     return Verdict(
-        weight=of_points(weight, scene.regions, one),
-        evidence=of_points(evidence, scene.regions, none),
-        known=of_points(judged, scene.regions, jnp.zeros((), bool)),
-        regions=regions,
+        weight=of_points(weight, regions, one),
+        evidence=of_points(evidence, regions, none),
+        known=of_points(judged, regions, jnp.zeros((), bool)),
+        regions=RegionVerdict(weight, evidence, judged),
     )
 
 

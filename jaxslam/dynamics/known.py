@@ -4,15 +4,16 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
+from jax.typing import DTypeLike
 
 from jaxslam.config import DynamicsConfig, MotionConfig
-from jaxslam.dynamics.clusters import ClusterParams, cluster_cue
+from jaxslam.dynamics.clusters import ClusterParams, make_cluster_cue
 from jaxslam.dynamics.cue import Cue
 from jaxslam.dynamics.epipolar import EpipolarParams, make_epipolar_cue
 from jaxslam.dynamics.motion_state import MotionParams, MotionPlan
 from jaxslam.dynamics.regions import RegionPlan
-from jaxslam.dynamics.trajectory import TrajectoryParams, trajectory_cue
+from jaxslam.dynamics.trajectory import TrajectoryParams, make_trajectory_cue
+from jaxslam.floating_dtype import floating_dtype
 from jaxslam.state import TrackParams, TrackPlan
 
 
@@ -31,9 +32,11 @@ class _Known(NamedTuple):
 
 
 _KNOWN = {
-    "trajectory": _Known(lambda _: trajectory_cue, TrajectoryParams),
+    "trajectory": _Known(lambda config: make_trajectory_cue(config.trajectory.as_published), TrajectoryParams),
     "epipolar": _Known(lambda config: make_epipolar_cue(config.epipolar.num_hypotheses), EpipolarParams),
-    "clusters": _Known(lambda _: cluster_cue, ClusterParams, needs_regions=True),
+    "clusters": _Known(
+        lambda config: make_cluster_cue(config.clusters.as_published), ClusterParams, needs_regions=True
+    ),
 }
 
 
@@ -54,23 +57,31 @@ def with_cues(plan: TrackPlan, config: DynamicsConfig, *, pairs: bool = False) -
     )
 
 
-def with_cue_params(params: TrackParams, config: DynamicsConfig, dtype: type[np.floating] = np.float32) -> TrackParams:
-    """The parameters with those of the cues of the settings, all of one floating-point type but for flags."""
+def with_cue_params(params: TrackParams, config: DynamicsConfig, dtype: DTypeLike | None = None) -> TrackParams:
+    """The parameters with those of the cues of the settings, all of one floating-point type.
+
+    Args:
+        params: From `track_params`.
+        config: Settings of the cues.
+        dtype: Floating-point type of the parameters added; that of `params` if not given.
+
+    Raises:
+        TypeError: If `dtype` is no floating-point type, or is float64 while `jax_enable_x64` is off.
+    """
+    dtype = jnp.result_type(params.pixel_sigma) if dtype is None else floating_dtype(dtype)
     cues = tuple(_params_of(getattr(config, name), _KNOWN[name].params, config, dtype) for name in config.cues)
     motion = _params_of(config.motion, MotionParams, config, dtype) if config.motion.enabled else None
     return params._replace(cues=cues, motion=motion)
 
 
 def _motion_plan(config: MotionConfig) -> MotionPlan | None:
-    return MotionPlan(config.num_objects, config.reserved, config.dense_cell_px) if config.enabled else None
+    if not config.enabled:
+        return None
+    return MotionPlan(config.num_objects, config.reserved, config.dense_cell_px, config.as_published)
 
 
-def _params_of(chosen: Any, make: Callable[..., Any], config: DynamicsConfig, dtype: type[np.floating]) -> Any:
+def _params_of(chosen: Any, make: Callable[..., Any], config: DynamicsConfig, dtype: jnp.dtype) -> Any:
     fields: Any = make._fields  # type: ignore[attr-defined]
     values = {field: getattr(chosen, field) for field in fields if field != "temperature"}
     values["temperature"] = config.temperature
-    return make(**{field: _scalar(value, dtype) for field, value in values.items()})
-
-
-def _scalar(value: bool | float, dtype: type[np.floating]) -> Any:
-    return jnp.asarray(value) if isinstance(value, bool) else jnp.asarray(value, dtype)
+    return make(**{field: jnp.asarray(value, dtype) for field, value in values.items()})

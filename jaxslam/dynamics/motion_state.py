@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxlie import SE3
 from jaxslam_kernels.motion import flow_length, group_motion, scene_flow, upper_limit
-from jaxslam_kernels.types import Flag, Mask, Pixels, Points, Scalar, Weights
+from jaxslam_kernels.types import Mask, Pixels, Points, Scalar, Weights
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from jaxslam.dynamics.cue import judge
@@ -28,11 +28,14 @@ class MotionPlan(NamedTuple):
         reserved: Slots of points that are kept free for points on them.
         dense_cell_px: Side of the cells that each get at most one new corner where things take up over half of the
             picture, even: more points from what is left of it.
+        as_published: Whether motion is measured in metres from frame to frame, its limit from mean and standard
+            deviation, and the points of a thing are counted alone.
     """
 
     num_objects: int = 16
     reserved: int = 48
     dense_cell_px: int = 14
+    as_published: bool = False
 
 
 class MotionParams(NamedTuple):
@@ -45,8 +48,6 @@ class MotionParams(NamedTuple):
         fewest: Least number of points that say anything of a thing.
         still_frames: Frames in which it must be at rest to be taken to stand still,
         moving_frames: and in which it must move to be taken to move again.
-        as_published: Whether motion is measured in metres from frame to frame, its limit from mean and standard
-            deviation, and the points of a thing are counted alone.
         temperature: See `cue.judge`; of the verdict on a thing.
     """
 
@@ -56,7 +57,6 @@ class MotionParams(NamedTuple):
     fewest: Scalar
     still_frames: Scalar
     moving_frames: Scalar
-    as_published: Flag
     temperature: Scalar
 
 
@@ -150,6 +150,8 @@ def judge_motion(
     T_world_cam: SE3,
     before: MotionMemory,
     params: MotionParams,
+    *,
+    as_published: bool = False,
 ) -> MotionState:
     """Which things stand still, given the pose that what cannot move has.
 
@@ -165,21 +167,22 @@ def judge_motion(
         T_world_cam: Pose of the camera.
         before: From the frame before.
         params: Limits.
+        as_published: As of `MotionPlan`, static.
     """
     flow = scene_flow(points.X_world, points.X_cam, T_world_cam)
-    unit = jnp.where(points.there[None, :] & ~params.as_published, points.sigma, 1)
-    flow = jnp.where(points.there[None, :], flow, 0) / unit
+    flow = jnp.where(points.there[None, :], flow, 0)
+    if not as_published:
+        flow = flow / jnp.where(points.there[None, :], points.sigma, 1)
     length, counts = flow_length(flow), jnp.where(points.there, background, 0)
-    limits = [upper_limit(length, counts, params.sigmas, robust=robust) for robust in (False, True)]
-    limit = jnp.where(params.as_published, limits[0], limits[1])
+    limit = upper_limit(length, counts, params.sigmas, robust=not as_published)
     moves = (length > limit).astype(length.dtype)
     num = before.at_rest.shape[0]
     groups = group_motion(flow, moves, points.there, of_point - 1, num)
     by_share = groups.share / (1 - params.share)
     mean_limit = params.least + limit / jnp.sqrt(jnp.maximum(groups.number, 1))
-    by_mean = jnp.where(params.as_published, 0, groups.mean / mean_limit)
+    evidence = by_share if as_published else jnp.maximum(by_share, groups.mean / mean_limit)
     known = (groups.number >= params.fewest) & (limit > 0)
-    verdict = RegionVerdict(*judge(jnp.maximum(by_share, by_mean), known, params.temperature)[:3])
+    verdict = RegionVerdict(*judge(evidence, known, params.temperature)[:3])
     return MotionState(points.there, verdict, _remembered(verdict, of_point, before, params))
 
 

@@ -4,34 +4,38 @@ Source: RTS-SLAM (Sensors 2026), trajectory consistency, up to formula 14: the d
 against that of the camera, with a tolerance that grows with depth.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from functools import lru_cache
+from typing import NamedTuple, TypeAlias
 
 import jax.numpy as jnp
 from jaxslam_kernels.camera import Intrinsics, back_project
 from jaxslam_kernels.transform import between, to_camera, to_world
-from jaxslam_kernels.types import Flag, Mask, Pixels, Points, Scalar, Weights
+from jaxslam_kernels.types import Mask, Pixels, Points, Scalar, Weights
 
 from jaxslam.dynamics.cue import Scene, Verdict, judge
 
 
 class TrajectoryParams(NamedTuple):
-    """Of `trajectory_cue`; scalars.
+    """Of the trajectory cue; scalars.
 
     Attributes:
         tolerance_m: Difference of ways that says nothing, close to the camera: the paper's alpha.
         tolerance_per_m: Its growth with the smaller of both depths: the paper's beta.
-        as_published: Whether lengths of ways are compared, as in the paper, not the ways.
         temperature: See `cue.judge`.
     """
 
     tolerance_m: Scalar
     tolerance_per_m: Scalar
-    as_published: Flag
     temperature: Scalar
 
 
-def trajectory_cue(scene: Scene, params: TrajectoryParams) -> Verdict:
-    """How far each point is from where it would be at rest, in tolerances.
+TrajectoryCue: TypeAlias = Callable[[Scene, TrajectoryParams], Verdict]
+
+
+@lru_cache  # the same function for the same choice: another one would be compiled anew
+def make_trajectory_cue(as_published: bool = False) -> TrajectoryCue:
+    """The cue that judges the way of each point from frame to frame.
 
     The paper compares the lengths of two ways: that of the point in the axes of the camera, and that of the camera.
     A point far from the axis about which the camera turns is then taken to move, and one that moves along with the
@@ -39,21 +43,36 @@ def trajectory_cue(scene: Scene, params: TrajectoryParams) -> Verdict:
     where it is found is what counts: `|P_t - T P_{t-1}|`.
 
     Args:
-        scene: What is known of the points; those without depth in one frame are not judged.
-        params: Tolerances.
+        as_published: Whether lengths of ways are compared, as in the paper, not the ways.
     """
+
+    def trajectory_cue(scene: Scene, params: TrajectoryParams) -> Verdict:
+        """How far each point is from where it would be at rest, in tolerances.
+
+        Args:
+            scene: What is known of the points; those without depth in one frame are not judged.
+            params: Tolerances.
+        """
+        apart_m, known = _apart(scene, as_published)
+        tolerance_m = params.tolerance_m + params.tolerance_per_m * jnp.minimum(scene.depth_before, scene.depth)
+        return judge(apart_m / jnp.where(known, tolerance_m, 1), known, params.temperature)
+
+    return trajectory_cue
+
+
+def _apart(scene: Scene, as_published: bool) -> tuple[Weights, Mask]:
+    """How far each point is from where it would be at rest, metres, and of which points that is known."""
     seen = jnp.isfinite(scene.uv_before).all(axis=0) & jnp.isfinite(scene.uv).all(axis=0)
     known = scene.followed & seen & (scene.depth_before > 0) & (scene.depth > 0)
     before, now = (
         _in_camera(uv, depth, known, scene.intrinsics)
         for uv, depth in ((scene.uv_before, scene.depth_before), (scene.uv, scene.depth))
     )
+    if as_published:
+        camera_m = _length(between(scene.T_world_before, scene.T_world_cam).translation()[:, None])
+        return jnp.abs(_length(now - before) - camera_m), known
     carried = to_camera(scene.T_world_cam, to_world(scene.T_world_before, before))
-    camera_m = _length(between(scene.T_world_before, scene.T_world_cam).translation()[:, None])
-    published = jnp.abs(_length(now - before) - camera_m)
-    apart_m = jnp.where(params.as_published, published, _length(now - carried))
-    tolerance_m = params.tolerance_m + params.tolerance_per_m * jnp.minimum(scene.depth_before, scene.depth)
-    return judge(apart_m / jnp.where(known, tolerance_m, 1), known, params.temperature)
+    return _length(now - carried), known
 
 
 def _in_camera(uv: Pixels, depth: Weights, known: Mask, intrinsics: Intrinsics) -> Points:

@@ -12,7 +12,7 @@ from jax.test_util import check_grads
 from jaxslam_kernels.camera import make_intrinsics
 from jaxslam_kernels.transform import moved, to_camera
 
-from jaxslam.dynamics.clusters import ClusterParams, cluster_cue
+from jaxslam.dynamics.clusters import ClusterCue, ClusterParams, make_cluster_cue
 from jaxslam.dynamics.cue import Scene
 from jaxslam.dynamics.regions import (
     RegionPlan,
@@ -144,17 +144,19 @@ def in_regions(given: Scene) -> Scene:
     return given._replace(regions=Regions(jnp.zeros((2, 2), int), label, jnp.zeros((3, 3)), jnp.ones(3, int)))
 
 
+cluster_cue, published_cue = make_cluster_cue(), make_cluster_cue(as_published=True)
+
+
 def params(**fields: Any) -> ClusterParams:
     plain = {"times_mean": 1.5, "least_px": 0.5, "robust_px": 2.45, "fewest": 3.0, "temperature": 0.0}
-    flags = {"as_published": False}
-    return ClusterParams(**{name: jnp.array(value) for name, value in (plain | flags | fields).items()})
+    return ClusterParams(**{name: jnp.array(value) for name, value in (plain | fields).items()})
 
 
 class TestCue:
     @pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS)
-    @pytest.mark.parametrize("as_published", [False, True])
-    def test_tells_the_region_that_moves(self, motion: Any, as_published: bool) -> None:
-        found = cluster_cue(in_regions(scene(motion, (0.15, 0, 0), noise_px=0.3)), params(as_published=as_published))
+    @pytest.mark.parametrize("cue", [cluster_cue, published_cue], ids=["corrected", "published"])
+    def test_tells_the_region_that_moves(self, motion: Any, cue: ClusterCue) -> None:
+        found = cue(in_regions(scene(motion, (0.15, 0, 0), noise_px=0.3)), params())
         expected = ~moves()
         expected[-1] = True  # in no region
         assert (np.asarray(found.weight) == expected).all()
@@ -174,7 +176,7 @@ class TestCue:
         robust = squared * 4 / (4 + squared)
         label = np.asarray(ideal.regions.of_point) if ideal.regions is not None else np.zeros(N)
         means = [robust[label == region].mean() for region in (0, 1)]
-        found = cluster_cue(ideal, params(as_published=True, robust_px=2.0, least_px=0.0))
+        found = published_cue(ideal, params(robust_px=2.0, least_px=0.0))
         assert found.regions is not None
         np.testing.assert_allclose(found.regions.evidence[:2], np.array(means) / (1.5 * robust.mean()), rtol=1e-9)
 
@@ -186,7 +188,7 @@ class TestCue:
         regions = given.regions._replace(of_point=jnp.where(jnp.asarray(slow), 2, given.regions.of_point))
         given = given._replace(regions=regions, uv=given.uv.at[0].add(jnp.where(jnp.asarray(slow), 2.0, 0)))
         given = given._replace(agrees=given.agrees & ~jnp.asarray(slow))
-        published, ours = (cluster_cue(given, params(as_published=flag)).regions for flag in (True, False))
+        published, ours = (cue(given, params()).regions for cue in (published_cue, cluster_cue))
         assert published is not None
         assert ours is not None
         assert published.weight.tolist() == [0, 1, 1]

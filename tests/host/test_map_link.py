@@ -39,7 +39,7 @@ def rng() -> np.random.Generator:
 
 @pytest.fixture(scope="module")
 def blank() -> Any:
-    return jax.device_get(init_state(*SHAPE, PLAN)._replace(key=None))  # type: ignore[arg-type]
+    return jax.device_get(init_state(*SHAPE, PLAN))
 
 
 def frame() -> FrameArrays:

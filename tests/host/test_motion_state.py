@@ -35,12 +35,20 @@ ON = np.repeat([0, 1, 2], N // 3).astype(np.int32)
 """Points on nothing, on thing 1 and on thing 2."""
 
 
-def _motion(**changes: float | bool) -> Any:
+def _motion(**changes: float) -> Any:
     assert PARAMS.motion is not None
     return PARAMS.motion._replace(**{key: jnp.asarray(value) for key, value in changes.items()})
 
 
-def _judged(moved_m: dict[int, float], before: MotionMemory, seed: int = 0, of_point=ON, **changes: Any) -> MotionState:
+def _judged(
+    moved_m: dict[int, float],
+    before: MotionMemory,
+    seed: int = 0,
+    of_point=ON,
+    *,
+    as_published: bool = False,
+    **changes: Any,
+) -> MotionState:
     """Two things of which each has gone so far to the side since the last frame."""
     rng = np.random.default_rng(seed)
     X_world = rng.uniform([-1, -1, 1.5], [1, 1, 2.5], (N, 3)).T.astype(np.float32)
@@ -51,7 +59,8 @@ def _judged(moved_m: dict[int, float], before: MotionMemory, seed: int = 0, of_p
         jnp.asarray(X_world), jnp.asarray(X_cam, jnp.float32), jnp.asarray(sigma), jnp.ones(N, bool)
     )
     background = jnp.asarray((of_point == 0).astype(np.float32))
-    return judge_motion(points, jnp.asarray(of_point), background, SE3.identity(), before, _motion(**changes))
+    limits, pose = _motion(**changes), SE3.identity()
+    return judge_motion(points, jnp.asarray(of_point), background, pose, before, limits, as_published=as_published)
 
 
 def _start() -> MotionMemory:
@@ -121,7 +130,8 @@ def test_share_of_points() -> None:
             jnp.asarray(X_world), jnp.asarray(X_cam, jnp.float32), jnp.ones((3, N)), jnp.ones(N, bool)
         )
         background = jnp.asarray((ON == 0).astype(np.float32))
-        state = judge_motion(points, jnp.asarray(ON), background, SE3.identity(), _start(), _motion(as_published=True))
+        pose, limits = SE3.identity(), _motion()
+        state = judge_motion(points, jnp.asarray(ON), background, pose, _start(), limits, as_published=True)
         assert (state.verdict.weight[0] == 1) == expected, share
 
 

@@ -33,7 +33,7 @@ def state() -> Any:
 
 def parts(state: TrackState) -> dict[str, np.ndarray]:
     """Every array of a state by name."""
-    plain: Any = state._replace(key=jax.random.key_data(state.key), T_world_cam=state.T_world_cam.wxyz_xyz)  # type: ignore[arg-type]
+    plain: Any = state._replace(T_world_cam=state.T_world_cam.wxyz_xyz)  # type: ignore[arg-type]
     leaves = jax.tree_util.tree_flatten_with_path(plain)[0]
     return {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in leaves}
 
