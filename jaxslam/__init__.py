@@ -3,6 +3,11 @@
 The public index. `Slam` is for robots and recordings, `track_step` for gradients and batches.
 """
 
+from jaxslam_kernels.camera import Intrinsics as Intrinsics
+from jaxslam_kernels.lk_flow import FlowPlan as FlowPlan
+from jaxslam_kernels.lk_flow import LevelPlan as LevelPlan
+from jaxslam_kernels.pose_refine import PoseStatus as PoseStatus
+
 from jaxslam.batch import track_clips as track_clips
 from jaxslam.camera import Camera as Camera
 from jaxslam.camera import known_cameras as known_cameras
@@ -25,11 +30,15 @@ from jaxslam.rectification import RectifiedPair as RectifiedPair
 from jaxslam.rig import Lens as Lens
 from jaxslam.rig import Rig as Rig
 from jaxslam.slam import Slam as Slam
+from jaxslam.state import KeyframeReason as KeyframeReason
+from jaxslam.state import TrackedPoints as TrackedPoints
 from jaxslam.state import TrackOutput as TrackOutput
 from jaxslam.state import TrackParams as TrackParams
 from jaxslam.state import TrackPlan as TrackPlan
+from jaxslam.state import TrackReason as TrackReason
 from jaxslam.state import TrackState as TrackState
 from jaxslam.state import TrackStatus as TrackStatus
+from jaxslam.track import Followed as Followed
 from jaxslam.track import follow_points as follow_points
 from jaxslam.track import init_state as init_state
 from jaxslam.track import track_followed as track_followed
@@ -38,6 +47,7 @@ from jaxslam.track_settings import track_params as track_params
 from jaxslam.track_settings import track_plan as track_plan
 from jaxslam.tracked import Tracked as Tracked
 from jaxslam.trajectory import Trajectory as Trajectory
+from jaxslam.xla import enable_compile_cache as enable_compile_cache
 from jaxslam.xla import prefer_one_thread as prefer_one_thread
 
 __version__ = "0.1.0"
