@@ -2,23 +2,41 @@
 
 import itertools
 import math
+import pickle
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
+from jaxslam_kernels.pose_refine import PoseStatus
+from jaxslam_kernels.transform import moved
 from quick_compile import quick_compile
 from small_scene import HEIGHT, PLAN, TRACK, WIDTH, at, clip, new_state, params, stacked
 
+from jaxslam import frame_pose
 from jaxslam.config import Config, DynamicsConfig, SemanticsConfig, load_config
 from jaxslam.frame_arrays import FrameArrays
+from jaxslam.frame_pose import refined_pose, worse_status
+from jaxslam.observe import View
 from jaxslam.semantics import Detections, no_detections
 from jaxslam.slam import Slam
-from jaxslam.state import KeyframeReason, TrackOutput, TrackParams, TrackState, TrackStatus
+from jaxslam.state import (
+    KeyframeReason,
+    LookedUp,
+    TrackOutput,
+    TrackParams,
+    TrackPlan,
+    TrackReason,
+    TrackState,
+    TrackStatus,
+)
 from jaxslam.track import init_state, track_step
 from jaxslam.tracked import Tracked
 
@@ -146,6 +164,111 @@ class TestCompiled:
                 singles[which], output = counted.step(singles[which], pair[which], params())
                 np.testing.assert_allclose(outputs.T_world_cam.wxyz_xyz[which], output.T_world_cam.wxyz_xyz, atol=1e-4)
                 assert int(outputs.status[which]) == int(output.status)
+
+
+def _by_numpy(state: TrackState, path: Path) -> TrackState:
+    np.savez(path, *jax.tree.leaves(state))
+    with np.load(path) as leaves:
+        return jax.tree.unflatten(jax.tree.structure(new_state()), list(leaves.values()))
+
+
+def _by_equinox(state: TrackState, path: Path) -> TrackState:
+    eqx.tree_serialise_leaves(path, state)
+    return eqx.tree_deserialise_leaves(path, new_state())
+
+
+def _by_pickle(state: TrackState, path: Path) -> TrackState:
+    path.write_bytes(pickle.dumps(state))
+    return pickle.loads(path.read_bytes())
+
+
+class TestSaved:
+    @pytest.mark.parametrize(("save", "name"), [(_by_numpy, "s.npz"), (_by_equinox, "s.eqx"), (_by_pickle, "s.pkl")])
+    def test_goes_on_with_the_same_bytes(
+        self, counted: Counted, frames: FrameArrays, tmp_path: Path, save: Callable[..., TrackState], name: str
+    ) -> None:
+        state, middle = new_state(seed=3), 4
+        for index in range(middle):
+            state, _ = counted.step(state, at(frames, index), params())
+        other = save(state, tmp_path / name)
+        for index in range(middle, middle + 4):
+            state, output = counted.step(state, at(frames, index), params())
+            other, again = counted.step(other, at(frames, index), params())
+            assert int(output.status) == TrackStatus.OK
+            jax.tree.map(np.testing.assert_array_equal, (state, output), (other, again))
+
+
+class TestReason:
+    """Of a frame in which tracking cannot begin."""
+
+    def reason(self, counted: Counted, frame: FrameArrays) -> TrackReason:
+        _, output = counted.step(new_state(), frame, params())
+        assert int(output.status) == TrackStatus.LOST
+        return TrackReason(int(output.reason))
+
+    def test_corners_without_depth(self, counted: Counted, frames: FrameArrays) -> None:
+        frame = at(frames, 0)
+        assert self.reason(counted, frame._replace(depth=jnp.zeros_like(frame.depth))) is TrackReason.NO_DEPTH
+
+    @pytest.mark.parametrize("image", [lambda image: image // 255, lambda image: jnp.full_like(image, 90)])
+    def test_no_corners(self, counted: Counted, frames: FrameArrays, image: Callable[[Any], Any]) -> None:
+        """As of grey values from 0 to 1 in compiled code, and of a wall in one colour."""
+        frame = at(frames, 0)
+        reason = self.reason(counted, frame._replace(image=image(frame.image)))
+        assert reason is TrackReason.NO_CORNERS
+        assert "too few corners were found in the image" in reason.text
+
+    def test_all_is_to_be_ignored(self, counted: Counted, frames: FrameArrays) -> None:
+        frame = at(frames, 0)
+        assert self.reason(counted, frame._replace(ignore=jnp.ones_like(frame.ignore))) is TrackReason.NO_CORNERS
+
+
+class TestPoseStatus:
+    def test_of_tracked_frames(self, counted: Counted, frames: FrameArrays) -> None:
+        _, outputs = track(counted.step, frames)
+        statuses = [int(output.pose_status) for output in outputs]
+        assert statuses == [PoseStatus.TOO_FEW_POINTS] + [PoseStatus.OK] * (COUNT - 1)
+
+    def test_steps_of_the_plan_run_out(self, counted: Counted, frames: FrameArrays) -> None:
+        """The refinement alone, from a pose some centimetres away."""
+        state, _ = counted.step(new_state(), at(frames, 0), params())
+
+        @quick_compile
+        def status(state: TrackState, frame: FrameArrays, given: TrackParams) -> Any:
+            view = View(frame, state.pyramid, frame.depth, state.elapsed_s)
+            none = LookedUp(jnp.zeros((3, 0)), jnp.zeros((2, 0)), jnp.zeros(0), jnp.zeros(0, jnp.int32), jnp.zeros(()))
+            away, trust = moved(state.T_world_cam, jnp.full(6, 0.02)), state.points.valid.astype(jnp.float32)
+            refine = partial(refined_pose, state, view, state.points.uv, trust, none, away, state.twist, given)
+            return [refine(PLAN._replace(pose_steps=steps))[0].status for steps in (2, 25)]
+
+        found = [int(code) for code in status(state, at(frames, 0), params())]
+        assert found == [PoseStatus.NOT_CONVERGED, PoseStatus.OK]
+
+    def test_of_the_coarse_pose_counts_too(self) -> None:
+        """Only where the refinement has nothing worse to say."""
+        fine, stopped, few = (
+            jnp.int32(code) for code in (PoseStatus.OK, PoseStatus.NOT_CONVERGED, PoseStatus.TOO_FEW_POINTS)
+        )
+        pairs = [(fine, fine), (stopped, fine), (fine, stopped), (few, fine), (stopped, few)]
+        assert [int(worse_status(*pair)) for pair in pairs] == [fine, stopped, stopped, fine, few]
+
+    @pytest.mark.parametrize("plan", [PLAN, PLAN.exact()], ids=["default", "exact"])
+    def test_both_refinements_have_the_steps_of_the_plan(
+        self, plan: TrackPlan, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        given: list[int] = []
+
+        def watched(function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+            given.append(kwargs["max_steps"])
+            return function(*args, **kwargs)
+
+        for name in ("refine_pose", "ransac_pnp"):
+            monkeypatch.setattr(frame_pose, name, partial(watched, getattr(frame_pose, name)))
+        with jax.enable_x64(True):
+            frame = at(stacked(clip().frames[:1], np.float64), 0)
+            jax.eval_shape(partial(track_step, plan=plan), new_state(np.float64), frame, params(np.float64))
+        assert given == [plan.pose_steps] * 2
+        assert plan.pose_steps == (25 if plan is PLAN else 1000)
 
 
 LONGER = 30
