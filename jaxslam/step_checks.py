@@ -23,11 +23,13 @@ _FINEST = float(jnp.finfo(jnp.float32).eps)
 
 
 def check_step(state: TrackState, frame: FrameArrays, params: TrackParams, plan: TrackPlan) -> None:
-    """Refuse arguments of `track_step` that do not fit each other; whether the state fits is for `check_state`.
+    """Refuse arguments of both parts of the step that do not fit each other.
+
+    Whether the state fits is for `check_state`, whether those of cues are there for `check_cues`.
 
     Raises:
-        ValueError: If a shape does not fit the image or the plan, parameters of the plan's cues are missing, or an
-            image that is no tracer has grey values from 0 to 1.
+        ValueError: If a shape does not fit the image, the parts of the plan do not go together, or an image that is no
+            tracer has grey values from 0 to 1.
         TypeError: If an argument is of another class, or its arrays are of another type than the state's.
     """
     for name, value, cls in (("state", state, TrackState), ("frame", frame, FrameArrays), ("plan", plan, TrackPlan)):
@@ -35,8 +37,33 @@ def check_step(state: TrackState, frame: FrameArrays, params: TrackParams, plan:
     dtype = _state_dtype(state)
     check_plan(plan)
     _check_precision(plan, dtype)
-    _check_frame(frame, dtype, plan)
-    _check_params(params, dtype, plan)
+    _check_frame(frame, dtype)
+    _check_class("params", params, TrackParams)
+    _check_numbers("params", params._replace(cues=(), motion=None), dtype)
+
+
+def check_cues(state: TrackState, frame: FrameArrays, params: TrackParams, plan: TrackPlan) -> None:
+    """Refuse arguments that lack what the cues of a plan and its `motion` need; following points takes none of it.
+
+    Raises:
+        ValueError: If there are not as many parameters of cues as cues, or no numbers of what may move.
+        TypeError: If parameters are of another class or type.
+    """
+    dtype = _state_dtype(state)
+    if len(params.cues) != len(plan.cues):
+        raise ValueError(
+            f"params.cues: expected {len(plan.cues)}, one for each of plan.cues, got {len(params.cues)};"
+            " `with_cue_params` adds those of the settings"
+        )
+    for path, leaf in jax.tree_util.tree_leaves_with_path(params.cues):
+        # A cue may have arrays of any shape, whole numbers, and what is no array.
+        if jnp.issubdtype(getattr(leaf, "dtype", np.bool_), jnp.floating):
+            check_array(f"params.cues{jax.tree_util.keystr(path)}", leaf, np.shape(leaf), dtype, _STATE_DTYPE)
+    if plan.motion is not None:
+        _check_class("params.motion", params.motion, MotionParams)
+        _check_numbers("params.motion", params.motion, dtype)
+        if frame.movable is None:
+            raise ValueError("frame.movable: expected numbers of what may move for a plan with `motion`, got None")
 
 
 def check_array(name: str, value: object, shape: tuple[int, ...], dtype: DTypeLike | None, like: str = "") -> None:
@@ -126,7 +153,7 @@ def _check_like(name: str, given: Any, expected: Any) -> None:
         raise ValueError(f"{name}: expected {jax.tree.structure(expected)}, got {jax.tree.structure(given)}")
 
 
-def _check_frame(frame: FrameArrays, dtype: jnp.dtype, plan: TrackPlan) -> None:
+def _check_frame(frame: FrameArrays, dtype: jnp.dtype) -> None:
     image = _checked_image(frame)
     for name, of in (("depth", dtype), ("ignore", np.bool_)):
         check_array(f"frame.{name}", getattr(frame, name), image.shape, None, " as frame.image")
@@ -138,8 +165,6 @@ def _check_frame(frame: FrameArrays, dtype: jnp.dtype, plan: TrackPlan) -> None:
     if frame.movable is not None:
         check_array("frame.movable", frame.movable, image.shape, None, " as frame.image")
         check_array("frame.movable", frame.movable, image.shape, np.uint8)
-    if frame.movable is None and plan.motion is not None:
-        raise ValueError("frame.movable: expected numbers of what may move for a plan with `motion`, got None")
 
 
 def _checked_image(frame: FrameArrays) -> Any:
@@ -158,23 +183,6 @@ def _checked_image(frame: FrameArrays) -> Any:
     if not isinstance(frame.image, Tracer):
         check_grey_range("frame.image", frame.image)
     return image
-
-
-def _check_params(params: TrackParams, dtype: jnp.dtype, plan: TrackPlan) -> None:
-    _check_class("params", params, TrackParams)
-    _check_numbers("params", params._replace(cues=(), motion=None), dtype)
-    if len(params.cues) != len(plan.cues):
-        raise ValueError(
-            f"params.cues: expected {len(plan.cues)}, one for each of plan.cues, got {len(params.cues)};"
-            " `with_cue_params` adds those of the settings"
-        )
-    for path, leaf in jax.tree_util.tree_leaves_with_path(params.cues):
-        # A cue may have arrays of any shape, whole numbers, and what is no array.
-        if jnp.issubdtype(getattr(leaf, "dtype", np.bool_), jnp.floating):
-            check_array(f"params.cues{jax.tree_util.keystr(path)}", leaf, np.shape(leaf), dtype, _STATE_DTYPE)
-    if plan.motion is not None:
-        _check_class("params.motion", params.motion, MotionParams)
-        _check_numbers("params.motion", params.motion, dtype)
 
 
 def _check_numbers(name: str, params: Any, dtype: jnp.dtype) -> None:

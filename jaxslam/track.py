@@ -45,7 +45,7 @@ from jaxslam.state import (
     TrackState,
     TrackStatus,
 )
-from jaxslam.step_checks import check_followed, check_plan, check_pose, check_state, check_step
+from jaxslam.step_checks import check_cues, check_followed, check_plan, check_pose, check_state, check_step
 
 DEFAULT_PLAN = TrackPlan()
 _MAX_PREDICTION_S = 0.1
@@ -197,6 +197,8 @@ def track_step(
         TypeError: While tracing, if state, parameters and frame are not of one floating-point type, the images of
             the state are of another type than that of the frame, or float32 is given for `TrackPlan.exact()`.
     """
+    _check(state, frame, params, plan)
+    check_cues(state, frame, params, plan)  # here too: before anything is computed where nothing is traced
     return track_followed(state, frame, follow_points(state, frame, params, plan), params, plan)
 
 
@@ -210,7 +212,7 @@ def follow_points(
     Args:
         state: As for `track_step`.
         frame: As for `track_step`; the values of depth, `ignore` and `movable` may still change after it.
-        params: As for `track_step`.
+        params: As for `track_step`; those of cues need not be there.
         plan: As for `track_step`.
 
     Raises:
@@ -257,6 +259,7 @@ def track_followed(
         TypeError: As `track_step`.
     """
     expected = _check(state, frame, params, plan)
+    check_cues(state, frame, params, plan)
     points = expected.points
     check_followed(followed_points, Followed(expected.pyramid, expected.T_world_cam, points.uv, points.valid))
     pyramid, predicted, uv, found = followed_points
