@@ -82,9 +82,10 @@ class TestFrame:
         refused(ValueError, "frame.dt_s: expected () as the state, got (3,)", frame._replace(dt_s=jnp.zeros(3)))
 
     def test_without_labels_for_a_plan_with_motion(self, frame: FrameArrays) -> None:
-        plan = with_cues(PLAN, USD)
+        plan, given = with_cues(PLAN, USD), with_cue_params(params(), USD)
         state = init_state(HEIGHT, WIDTH, plan)
-        refused(ValueError, "frame.movable: expected numbers of what may move", frame, state=state, plan=plan)
+        message = "frame.movable: expected numbers of what may move for a plan with `motion`, got None"
+        refused(ValueError, message, frame, state=state, given=given, plan=plan)
 
     def test_another_class(self) -> None:
         other: Any = clip().frames[0]
