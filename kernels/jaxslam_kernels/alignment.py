@@ -146,8 +146,9 @@ def ate(
         fitted, residuals = _identity(weights), estimate_xyz - reference_xyz
     else:
         fitted, residuals = _fit(estimate_xyz, reference_xyz, weights, with_scale=alignment == "sim3")
-    distances = jnp.where(weights > 0, _norm(residuals.T), 0.0)
-    return AbsoluteErrors(distances, _statistics(distances, weights), fitted, _count(weights))
+    distances = _norm(residuals.T)
+    statistics = _statistics(distances, weights)
+    return AbsoluteErrors(jnp.where(weights > 0, distances, 0.0), statistics, fitted, _count(weights))
 
 
 def rpe(
@@ -258,7 +259,8 @@ def _identity(like: Weights) -> Alignment:
 
 def _usable(weights: Weights, *positions: Points) -> tuple[Weights, list[Points]]:
     """Weights with zeros, and positions with zeros, where any position or the weight cannot be used."""
-    known = (weights > 0) & (weights < jnp.inf)
+    # Of weight 0 too, if any others count: the derivative by the weight sees where the pose is.
+    known = ((weights > 0) | ((weights == 0) & (weights > 0).any())) & (weights < jnp.inf)
     for xyz in positions:
         known = known & (jnp.abs(xyz) < MAX_DISTANCE).all(axis=0)
     return jnp.where(known, weights, 0.0), [jnp.where(known[None, :], xyz, 0.0) for xyz in positions]
@@ -292,7 +294,7 @@ def _statistics(errors: Weights, weights: Weights) -> Statistics:
         rmse=_root(jnp.sum(share * errors * errors)),
         mean=mean,
         median=_median(errors, weights),
-        maximum=jnp.max(errors, initial=0.0),
+        maximum=jnp.max(jnp.where(weights > 0, errors, 0.0), initial=0.0),
         std=_root(jnp.sum(share * jnp.square(errors - mean))),
     )
 

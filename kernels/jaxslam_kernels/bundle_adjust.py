@@ -7,7 +7,8 @@ A camera may have a lens to be found with its pose, three numbers more (`bundle_
 
 The result is differentiable, forward and reverse, by the implicit function theorem at the optimum, with one more
 elimination of the exact Hessian, however many steps the solver took. Where a solve starts has no derivative, apart
-from what is held fixed.
+from what is held fixed. Of a weight that is exactly 0 the derivative is the one-sided limit from above; see
+`bundle_idle` for points that have no weight at all. Second derivatives raise `NotImplementedError`.
 
 Source: Triggs et al., "Bundle Adjustment: A Modern Synthesis", 2000, section 6.
 """
@@ -26,16 +27,20 @@ from jaxslam_kernels.bundle_cost import (
     BundleEquations,
     BundleProblem,
     Observations,
+    Plane,
     Poses,
     bundle_cost,
     bundle_problem,
     bundle_views,
+    clean_weights,
     exact_blocks,
     free_cameras,
     normal_equations,
 )
+from jaxslam_kernels.bundle_idle import idle_points
 from jaxslam_kernels.bundle_lens import Cameras, Lenses, move_cameras, shift_cameras, usable_lenses
 from jaxslam_kernels.bundle_schur import Reduced, eliminate, is_determined, points_determined, solve_reduced
+from jaxslam_kernels.first_order import first_order
 from jaxslam_kernels.pose_cost import UNKNOWN_CHI2
 from jaxslam_kernels.pose_refine import usable_pose
 from jaxslam_kernels.robust import Loss
@@ -117,7 +122,8 @@ def bundle_adjust(
         observations: What is seen.
         fixed_poses: Poses that do not move.
         fixed_points: Points that do not move; `None` for none.
-        point_weights: Factor of all observations of a point, not negative; `None` for one each.
+        point_weights: Factor of all observations of a point, not negative; `None` for one each. A point of weight 0
+            stays where it starts and has no influence; the derivative by its weight is the limit from above.
         lenses: Where a lens of each camera's own starts (focal length, k1, k2); the observations then are pixels from
             the principal point, see `Observations`. `None` for ideal cameras.
         fixed_lenses: Lenses that do not change; `None` for none.
@@ -145,10 +151,12 @@ def bundle_adjust(
     # What is fixed keeps its derivative, what is free gets that of the optimum.
     start = _where_free(problem, solution.cameras, cameras)
     start_points = jnp.where(fixed_points[None, :], X_world, solution.X_world)
-    tangents, shifts = _optimum_shift(start, start_points, problem, loss)
+    relative = _on_grid(clean_weights(observations.weights), slot, problem)
+    tangents, shifts, more_cost = _optimum_shift(start, start_points, problem, relative, loss)
     optimum = shift_cameras(start, tangents)
     initial_cost = bundle_cost(bundle_views(cameras, X_world, problem, loss), problem, loss)
-    return _report(optimum, start_points + shifts, problem, slot, loss, initial_cost, solution)
+    result = _report(optimum, start_points + shifts, problem, slot, loss, initial_cost, solution)
+    return result._replace(cost=result.cost + more_cost)
 
 
 class Solution(NamedTuple):
@@ -224,33 +232,49 @@ def _where_free(problem: BundleProblem, new: Cameras, old: Cameras) -> Cameras:
     return Cameras(poses, jnp.where(problem.free_lens[:, None], new.lenses, old.lenses))
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(3,))
+def _on_grid(values: Float[Array, " m"], slot: Int[Array, " m"], problem: BundleProblem) -> Plane:
+    """What belongs to observations, in their slots; 0 elsewhere."""
+    k, n = problem.weights.shape
+    return jnp.zeros(k * n + 1, values.dtype).at[slot].set(values)[:-1].reshape(k, n)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(4,))
 def _optimum_shift(
-    cameras: Cameras, X_world: Points, problem: BundleProblem, loss: Loss
-) -> tuple[Float[Array, "k c"], Points]:
-    """Zero, with the derivative of the optimum with respect to the problem and to what is fixed.
+    cameras: Cameras, X_world: Points, problem: BundleProblem, relative: Plane, loss: Loss
+) -> tuple[Float[Array, "k c"], Points, Scalar]:
+    """Zeros, with the derivative of the optimum with respect to the problem and to what is fixed.
 
     At the optimum the gradient g of the cost vanishes whatever the problem θ, so dξ = -H⁻¹ (∂g/∂θ) dθ with H the
-    exact Hessian.
+    exact Hessian. Points without weight count where they would go, see `bundle_idle`; the last zero has the derivative
+    that the cost lacks because they are not there.
     """
-    del problem, loss
+    del problem, relative, loss
     c = 6 if cameras.lenses is None else 9
-    return jnp.zeros((cameras.poses.shape[0], c), X_world.dtype), jnp.zeros_like(X_world)
+    return jnp.zeros((cameras.poses.shape[0], c), X_world.dtype), jnp.zeros_like(X_world), jnp.zeros((), X_world.dtype)
 
 
 @_optimum_shift.defjvp
 def _optimum_shift_jvp(loss: Loss, primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
-    cameras, X_world, problem = primals
+    cameras, X_world, problem, relative = first_order(primals, "bundle_adjust")
+    idle = idle_points(cameras, X_world, problem, relative, loss)
+    change, silent = tangents[2], idle.mask & ~idle.rising
+    heard = change._replace(weights=jnp.where(silent[None, :], 0.0, change.weights))
 
     def gradients(cameras: Cameras, X_world: Points, problem: BundleProblem) -> tuple[Array, Array]:
         equations = normal_equations(bundle_views(cameras, X_world, problem, loss))
         return equations.camera_gradient, equations.point_gradient
 
-    (camera_gradient, point_gradient), changes = jax.jvp(gradients, primals, tangents)
+    _, changes = jax.jvp(gradients, (cameras, idle.X_world, problem), (*tangents[:2], heard))
     reduced, determined = lax.stop_gradient(_at_optimum(cameras, X_world, problem, loss))
     keep = lambda change: jnp.where(determined, change, 0.0)
     shifts = solve_reduced(reduced, *map(keep, changes))
-    return (jnp.zeros_like(camera_gradient), jnp.zeros_like(point_gradient)), shifts
+
+    def cost_at(X_world: Points, weights: Plane) -> Scalar:  # linear in the weights
+        counted = jnp.where(idle.mask[None, :], weights, 0.0)
+        return bundle_cost(bundle_views(cameras, X_world, problem, loss), problem._replace(weights=counted), loss)
+
+    more_cost = cost_at(idle.X_world, heard.weights) - cost_at(X_world, change.weights)
+    return _optimum_shift(cameras, X_world, problem, relative, loss), (*shifts, more_cost)
 
 
 def _at_optimum(cameras: Cameras, X_world: Points, problem: BundleProblem, loss: Loss) -> tuple[Reduced, Flag]:

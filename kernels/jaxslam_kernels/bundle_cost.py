@@ -143,7 +143,7 @@ def bundle_problem(
     Of several observations of a point by a camera the last one of positive weight has the slot.
     """
     k, n, m = free_pose.shape[0], free_point.shape[0], observations.weights.shape[0]
-    weights = _clean_weights(observations.weights)
+    weights = clean_weights(observations.weights)
     usable_scale = jnp.isfinite(scale) & (scale > 0)
     slot = jnp.where(_known(observations, k, n) & usable_scale, observations.camera * n + observations.point, k * n)
     order = jnp.arange(m, dtype=jnp.int32)
@@ -158,7 +158,7 @@ def bundle_problem(
         xy=jnp.stack([gather(observations.xy[0]), gather(observations.xy[1])]),
         depth=gather(jnp.where(has_depth, observations.depth, 0.0)),
         precision=jnp.stack([gather(row) for row in precision]),
-        weights=gather(weights) * _clean_weights(point_weights)[None, :],
+        weights=gather(weights) * clean_weights(point_weights)[None, :],
         known=known,
         scale=jnp.where(usable_scale, scale, 1.0),
         free_pose=free_pose,
@@ -411,6 +411,6 @@ def _known(observations: Observations, k: int, n: int) -> Bool[Array, " m"]:
     return observations.valid & inside & pixel
 
 
-def _clean_weights(weights: Array) -> Array:
+def clean_weights(weights: Array) -> Array:
     """What is not a weight is 0; a weight of 0 keeps its derivative, which says what letting it back in would do."""
     return jnp.where(jnp.isfinite(weights) & (weights >= 0), weights, 0.0)

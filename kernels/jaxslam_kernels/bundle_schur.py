@@ -14,7 +14,7 @@ from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Float
 
 from jaxslam_kernels.bundle_cost import BundleEquations, BundleProblem, free_cameras
-from jaxslam_kernels.types import Flag, Mask, Points, Scalar
+from jaxslam_kernels.types import Flag, Mask, Points, Scalar, Weights
 
 
 class Reduced(NamedTuple):
@@ -37,7 +37,7 @@ def eliminate(equations: BundleEquations, problem: BundleProblem, damping: Scala
     """Eliminates the points from equations whose diagonal is raised by the fraction `damping`."""
     (k, c, _), n = equations.camera_hessian.shape, equations.point_hessian.shape[2]
     units = _units(jnp.diagonal(equations.camera_hessian, axis1=1, axis2=2), free_cameras(problem))
-    root = _inverse_root(equations.point_hessian, problem.free_point, damping)
+    root = inverse_root(equations.point_hessian, problem.free_point, damping)
     cross = equations.cross * units[:, :, None, None]
     first, second, third = (cross[:, :, j, None, :] * root[:, j][None, None] for j in range(3))
     coupling = (first + second + third).reshape(c * k, 3 * n)
@@ -64,7 +64,7 @@ def solve_reduced(
 
 def points_determined(hessian: Float[Array, "3 3 n"], free: Mask) -> Mask:
     """Points whose Hessian is positive definite to working precision."""
-    return (jnp.diagonal(_inverse_root(hessian, free, jnp.zeros((), hessian.dtype))) > 0).all(axis=1)
+    return (jnp.diagonal(inverse_root(hessian, free, jnp.zeros((), hessian.dtype))) > 0).all(axis=1)
 
 
 def is_determined(reduced: Reduced) -> Flag:
@@ -82,7 +82,7 @@ def _units(diagonal: Array, free: Array) -> Array:
     return jnp.where(counts, lax.rsqrt(jnp.where(counts, diagonal, 1.0)), 0.0)
 
 
-def _inverse_root(hessian: Float[Array, "3 3 n"], free: Mask, damping: Scalar) -> Float[Array, "3 3 n"]:
+def inverse_root(hessian: Float[Array, "3 3 n"], free: Mask, damping: Scalar | Weights) -> Float[Array, "3 3 n"]:
     """Lower triangular C with `Cᵀ C = V⁻¹`, from the Cholesky factor in units of the diagonal.
 
     A pivot within rounding of zero is a direction that nothing determines (along the ray of a single view): it is

@@ -8,8 +8,10 @@ Source: the OpenCV calibration manual; Brown, "Decentering Distortion of Lenses"
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple, TypeAlias
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.typing import DTypeLike
@@ -103,8 +105,8 @@ def distort(intrinsics: Intrinsics, xy: Pixels) -> Pixels:
 def normalise(intrinsics: Intrinsics, uv: Pixels) -> Pixels:
     """Undistorted normalised coordinates `(x / z, y / z)` of distorted pixels; 0 where `uv` is not finite.
 
-    Newton's method on `distort`, a fixed number of steps. The last step alone carries the derivative, which is
-    then that of the implicit function theorem, forward and reverse. Meant for pixels where the distortion can be
+    Newton's method on `distort`, a fixed number of steps. Its derivatives are those of the implicit function theorem,
+    forward and reverse, of any order. Meant for pixels where the distortion can be
     inverted: far outside the image of a strong lens the result is finite and nothing more.
     """
     known = jnp.isfinite(uv).all(axis=0)
@@ -113,16 +115,7 @@ def normalise(intrinsics: Intrinsics, uv: Pixels) -> Pixels:
         jnp.where(known, (u - intrinsics.cx) / intrinsics.fx, 0.0),
         jnp.where(known, (v - intrinsics.cy) / intrinsics.fy, 0.0),
     )
-    coefficients = tuple(intrinsics.distortion)
-    fixed_coefficients, fixed_target = lax.stop_gradient((coefficients, target))
-
-    def step(_: Array, xy: _Planes) -> _Planes:
-        return _newton_step(fixed_coefficients, *xy, _distort(fixed_coefficients, *xy), fixed_target)
-
-    # A loop, not unrolled: XLA's CPU backend fuses unrolled steps into one kernel and evaluates an earlier step
-    # again for each of its uses, 4^steps times in all (200 ms for 500 points instead of 10 us).
-    x, y = lax.fori_loop(0, _NEWTON_STEPS - 1, step, fixed_target)
-    x, y = _newton_step(fixed_coefficients, x, y, _distort(coefficients, x, y), target)
+    x, y = _undistort(tuple(intrinsics.distortion), target)
     return jnp.stack([jnp.where(known, x, 0.0), jnp.where(known, y, 0.0)])
 
 
@@ -154,6 +147,41 @@ def _distort(coefficients: _Coefficients, x: Array, y: Array) -> _Planes:
         x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
         y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
     )
+
+
+@jax.custom_jvp
+def _undistort(coefficients: _Coefficients, target: _Planes) -> _Planes:
+    """The inverse of `_distort`."""
+    return _last_step(coefficients, _nearly_undistorted(coefficients, target), coefficients, target)
+
+
+@_undistort.defjvp
+def _undistort_jvp(primals: tuple, tangents: tuple) -> tuple[_Planes, _Planes]:
+    coefficients, target = primals
+    held = _nearly_undistorted(coefficients, target)
+    return jax.jvp(partial(_last_step, coefficients, held), primals, tangents)
+
+
+def _last_step(held: _Coefficients, at: _Planes, coefficients: _Coefficients, target: _Planes) -> _Planes:
+    """The Newton step from `at`, whose derivative with the first two held is that of the solution."""
+    return _newton_step(held, *at, _distort(coefficients, *at), target)
+
+
+@jax.custom_jvp
+def _nearly_undistorted(coefficients: _Coefficients, target: _Planes) -> _Planes:
+    """The solution but for the last step, with the derivative of the solution: for second derivatives."""
+
+    def step(_: Array, xy: _Planes) -> _Planes:
+        return _newton_step(coefficients, *xy, _distort(coefficients, *xy), target)
+
+    # A loop, not unrolled: XLA's CPU backend fuses unrolled steps into one kernel and evaluates an earlier step
+    # again for each of its uses, 4^steps times in all (200 ms for 500 points instead of 10 us).
+    return lax.fori_loop(0, _NEWTON_STEPS - 1, step, target)
+
+
+@_nearly_undistorted.defjvp
+def _nearly_undistorted_jvp(primals: tuple, tangents: tuple) -> tuple[_Planes, _Planes]:
+    return _nearly_undistorted(*primals), jax.jvp(_undistort, primals, tangents)[1]
 
 
 def _newton_step(coefficients: _Coefficients, x: Array, y: Array, value: _Planes, target: _Planes) -> _Planes:

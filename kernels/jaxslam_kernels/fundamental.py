@@ -83,7 +83,8 @@ def ransac_fundamental(
         key: Random key; the same key gives the same answer.
         uv_before: Pixels in the first view, without lens distortion.
         uv_after: Pixels in the second view.
-        weights: How likely each match is to be drawn, and its part in the score; `None` for one each.
+        weights: How likely each match is to be drawn, and its part in the score; `None` for one each. The derivative by
+            a weight of 0 is the limit from above.
         threshold_px: Largest Sampson distance of an inlier, pixels: about two standard deviations of a coordinate.
         num_hypotheses: How many samples are drawn, static.
         num_improved: How many of the best hypotheses are improved, static: half of the time with 8. Over 60 scenes with
@@ -98,7 +99,7 @@ def ransac_fundamental(
     Returns:
         A `FundamentalResult`; everything in it is finite, and so are its derivatives.
     """
-    views, shift, scale = _two_views(uv_before, uv_after, weights, threshold_px)
+    views, idle, shift, scale = _two_views(uv_before, uv_after, weights, threshold_px)
     fixed = lax.stop_gradient(views)
     draw_key, plane_key = jax.random.split(key)
     samples = draw_samples(draw_key, fixed.weights, num_hypotheses, SAMPLE_SIZE)
@@ -115,7 +116,9 @@ def ransac_fundamental(
         best = jnp.argmax(scores)
         consensus = jnp.where(scores[best] >= 0, hypotheses[:, :, best], jnp.asarray(_SIDEWAYS, hypotheses.dtype))
     on_inliers = views._replace(weights=jnp.where(_agree(consensus, fixed), views.weights, 0.0))
-    F, converged, determined = refine_matrix(consensus, on_inliers, "huber", 0.5, max_steps)
+    agrees = sampson_squared(consensus, *lax.stop_gradient(idle[:2])) < jnp.square(fixed.threshold)
+    idle = idle._replace(weights=jnp.where(agrees, idle.weights, 0.0))
+    F, converged, determined = refine_matrix(consensus, on_inliers, idle, "huber", 0.5, max_steps)
     inliers = _agree(lax.stop_gradient(F), fixed)
     num_inliers = jnp.sum(inliers, dtype=jnp.int32)
     plane = homography_suffices(plane_key, F, fixed._replace(weights=jnp.where(inliers, fixed.weights, 0.0)))
@@ -141,18 +144,21 @@ def ransac_fundamental(
 
 def _two_views(
     uv_before: Pixels, uv_after: Pixels, weights: Weights | None, threshold_px: Scalar | float
-) -> tuple[TwoViews, Float[Array, "2 2"], Scalar]:
+) -> tuple[TwoViews, TwoViews, Float[Array, "2 2"], Scalar]:
     """Clean matches around the origin, a distance of about one away, and the shift of each view and the scale.
 
-    One scale for both views, so that a Sampson distance is one in pixels times a constant.
+    The second of the views holds the idle matches: those of weight exactly 0 that are usable otherwise. One scale for
+    both views, so that a Sampson distance is one in pixels times a constant.
     """
     dtype = uv_before.dtype
     threshold = jnp.asarray(threshold_px, dtype)
     weights = jnp.ones_like(uv_before[0]) if weights is None else weights
     counts = jnp.isfinite(uv_before).all(axis=0) & jnp.isfinite(uv_after).all(axis=0)
-    counts = counts & jnp.isfinite(weights) & (weights > 0) & jnp.isfinite(threshold) & (threshold > 0)
-    both = jnp.stack([uv_before, uv_after])
-    both = jnp.where(counts[None, None], both, 0.0)
+    finite = counts & jnp.isfinite(threshold) & (threshold > 0)
+    counts = finite & jnp.isfinite(weights) & (weights > 0)
+    idle = finite & (weights == 0)
+    pixels = jnp.stack([uv_before, uv_after])
+    both = jnp.where(counts[None, None], pixels, 0.0)
     fixed = lax.stop_gradient(both)
     number = jnp.maximum(counts.sum(), 1).astype(dtype)
     shift = fixed.sum(axis=2) / number
@@ -161,7 +167,9 @@ def _two_views(
     scale = 1.0 / jnp.where(spread > 1e-6, spread, 1.0)
     before, after = jnp.where(counts[None, None], (both - shift[:, :, None]) * scale, 0.0)
     threshold = jnp.where(jnp.isfinite(threshold) & (threshold > 0), threshold, 1.0) * scale
-    return TwoViews(before, after, jnp.where(counts, weights, 0.0), threshold), shift, scale
+    idle_before, idle_after = jnp.where(idle[None, None], (pixels - shift[:, :, None]) * scale, 0.0)
+    views = TwoViews(before, after, jnp.where(counts, weights, 0.0), threshold)
+    return views, TwoViews(idle_before, idle_after, jnp.where(idle, weights, 0.0), threshold), shift, scale
 
 
 def _improved(F: Float[Array, "3 3 h"], scores: Float[Array, " h"], views: TwoViews, num: int, steps: int) -> Matrix:

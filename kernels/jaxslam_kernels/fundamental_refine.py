@@ -20,6 +20,7 @@ from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Float
 
 from jaxslam_kernels.epipolar import LEAST_SLOPE, adjugate, sampson_squared
+from jaxslam_kernels.first_order import first_order
 from jaxslam_kernels.levenberg_marquardt import ManifoldLevenbergMarquardt, NormalEquations
 from jaxslam_kernels.robust import Loss, loss_value, loss_weight
 from jaxslam_kernels.types import Flag, Pixels, Scalar, Weights
@@ -61,10 +62,15 @@ class FramedMatrix(NamedTuple):
         return self.U[:, :2] @ self.S @ self.V[:, :2].T
 
 
-def refine_matrix(F: Matrix, views: TwoViews, loss: Loss, scale: float, max_steps: int) -> tuple[Matrix, Flag, Flag]:
-    """The optimum near F with its derivative by the points, whether it converged, and whether it is determined."""
+def refine_matrix(
+    F: Matrix, views: TwoViews, idle: TwoViews, loss: Loss, scale: float, max_steps: int
+) -> tuple[Matrix, Flag, Flag]:
+    """The optimum near F with its derivative by the points, whether it converged, and whether it is determined.
+
+    The idle points, all of weight 0, matter to the derivative by their weights only.
+    """
     optimum, hessian, converged = solve_matrix(F, views, loss, scale, max_steps)
-    refined = _retract(optimum, _optimum_shift(optimum, views, loss, scale))
+    refined = _retract(optimum, _optimum_shift(optimum, views, idle, loss, scale))
     return refined.matrix(), converged, _is_determined(hessian)
 
 
@@ -169,26 +175,30 @@ def _completed(axis: Float[Array, "3"]) -> Matrix:
     return jnp.stack([jnp.stack(row) for row in rows])
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(2, 3))
-def _optimum_shift(optimum: FramedMatrix, views: TwoViews, loss: Loss, scale: float) -> Float[Array, "7"]:
+@partial(jax.custom_jvp, nondiff_argnums=(3, 4))
+def _optimum_shift(
+    optimum: FramedMatrix, views: TwoViews, idle: TwoViews, loss: Loss, scale: float
+) -> Float[Array, "7"]:
     """Zero, with the derivative of the optimum by the points, in the tangent of `_retract`.
 
     At the optimum the gradient g of the cost vanishes whatever the points θ, so dξ = -H⁻¹ (∂g/∂θ) dθ with H the
     exact Hessian.
     """
-    del views, loss, scale
+    del views, idle, loss, scale
     return jnp.zeros(7, optimum.S.dtype)
 
 
 @_optimum_shift.defjvp
 def _optimum_shift_jvp(loss: Loss, scale: float, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    optimum, views = lax.stop_gradient(primals[0]), primals[1]
+    optimum, views, idle = first_order((lax.stop_gradient(primals[0]), *primals[1:]), "ransac_fundamental")
     zero = jnp.zeros(7, optimum.S.dtype)
 
     def gradient(tangent: Array, views: TwoViews) -> Array:
         return jax.grad(lambda t: _cost(_retract(optimum, t), views, loss, scale))(tangent)
 
+    of_idle = lambda weights: gradient(zero, idle._replace(weights=weights))
     _, change = jax.jvp(partial(gradient, zero), (views,), (tangents[1],))
+    change = change + jax.jvp(of_idle, (idle.weights,), (tangents[2].weights,))[1]
     exact = jax.jacfwd(gradient)(zero, views)
     exact = 0.5 * (exact + exact.T)
     reweighted = _equations(optimum, views, loss, scale)[1].hessian

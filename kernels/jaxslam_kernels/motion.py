@@ -52,7 +52,7 @@ def upper_limit(intensity: Weights, weights: Weights, sigmas: Scalar | float, *,
 
     Args:
         intensity: `(n,)` motion of each point, not negative; what is not finite does not count.
-        weights: `(n,)` how much each counts, 0 for what may move.
+        weights: `(n,)` how much each counts, not negative, 0 for what may move.
         sigmas: Standard deviations above the mean; 3 in the paper.
         robust: Median and 1.4826 times the median absolute deviation instead: one wrong match in fifty doubles the
             standard deviation. Static.
@@ -63,7 +63,7 @@ def upper_limit(intensity: Weights, weights: Weights, sigmas: Scalar | float, *,
     weights = jnp.where(jnp.isfinite(intensity), weights, 0)
     if robust:
         return weighted_median(intensity, weights) + sigmas * robust_scale(intensity, weights)
-    counted = jnp.where(weights > 0, intensity, 0)
+    counted = jnp.where(jnp.isfinite(intensity) & (weights >= 0), intensity, 0)
     total = jnp.sum(weights)
     mean = jnp.sum(weights * counted) / jnp.where(total > 0, total, 1)
     # One less than there are, as in equation 8; of a single point nothing is known of how they spread.

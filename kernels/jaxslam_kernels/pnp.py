@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from jaxslam_kernels.absolute_orientation import absolute_orientation
 from jaxslam_kernels.camera import MIN_DEPTH, Intrinsics
 from jaxslam_kernels.p3p import p3p
-from jaxslam_kernels.pose_cost import PoseProblem, pose_problem
+from jaxslam_kernels.pose_cost import PoseProblem, pose_problem_and_idle
 from jaxslam_kernels.pose_refine import PoseStatus, refine_problem, solve_pose, usable_pose
 from jaxslam_kernels.robust import Loss
 from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Points, Scalar, Weights
@@ -81,7 +81,8 @@ def ransac_pnp(
         X_world: Points in the world, metres. At least `SAMPLE_SIZE` usable ones, not all on a line.
         uv: Where they are seen, pixels of the distorted image.
         intrinsics: The camera.
-        weights: How likely each point is to be drawn, and its part in the score; `None` for one each.
+        weights: How likely each point is to be drawn, and its part in the score; `None` for one each. The derivative by
+            a weight of 0 is the limit from above.
         depth: Measured depths in metres, 0 or NaN where missing; `None` for pixels alone. They take part in the
             choice of the root, in the score and in the refinement.
         initial: A predicted pose, tried as one more hypothesis.
@@ -97,7 +98,7 @@ def ransac_pnp(
     Returns:
         A `PnpResult`; everything in it is finite.
     """
-    problem = pose_problem(
+    problem, idle = pose_problem_and_idle(
         X_world,
         uv,
         intrinsics,
@@ -118,7 +119,9 @@ def ransac_pnp(
     inliers, _ = _consensus(consensus, fixed, averaged)
     weights_of_inliers = jnp.where(inliers, problem.weights, 0.0)
     on_inliers = problem._replace(weights=weights_of_inliers, scale=0.5 * problem.scale)
-    refined = refine_problem(consensus, on_inliers, loss, max_steps)
+    agrees = _squared_errors(_as_transform(consensus), *_observed(lax.stop_gradient(idle))) < 1.0
+    idle = idle._replace(weights=jnp.where(agrees, idle.weights, 0.0))
+    refined = refine_problem(consensus, on_inliers, idle, loss, max_steps)
     return _result(refined.T_world_cam, refined.status, fixed, fallback, scores.max() >= 0, min_inliers, averaged)
 
 

@@ -14,17 +14,21 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxlie import SE3
 from jaxtyping import Array, Float
 
 from jaxslam_kernels.camera import MIN_DEPTH, Intrinsics, normalise
 from jaxslam_kernels.levenberg_marquardt import NormalEquations
-from jaxslam_kernels.robust import Loss, loss_value, loss_weight
+from jaxslam_kernels.robust import LARGEST_SQUARED, Loss, loss_value, loss_weight
 from jaxslam_kernels.transform import to_camera
 from jaxslam_kernels.types import Flag, Mask, Pixels, Points, Scalar, Weights
 
 UNKNOWN_CHI2 = 1e4
 """Squared residual of a point behind the camera or without a value: 100 standard deviations, and no derivative."""
+
+FARTHEST_M = 1e9
+"""Metres. For derivatives by weights of 0, a point farther away than this is no point: products would overflow."""
 
 
 class PosePrior(NamedTuple):
@@ -80,6 +84,25 @@ def pose_problem(
 
     A camera or a scale that means nothing takes all of them out.
     """
+    return pose_problem_and_idle(X_world, uv, intrinsics, weights, depth, sigma_px, sigma_depth, scale, prior)[0]
+
+
+def pose_problem_and_idle(
+    X_world: Points,
+    uv: Pixels,
+    intrinsics: Intrinsics,
+    weights: Weights | None,
+    depth: Weights | None,
+    sigma_px: Weights | Scalar | float,
+    sigma_depth: Weights | Scalar | float,
+    scale: Scalar | float,
+    prior: PosePrior | None,
+) -> tuple[PoseProblem, PoseProblem]:
+    """The problem of `pose_problem`, and the idle points: those of weight exactly 0 that are usable otherwise.
+
+    Idle points have no influence on the optimum, but the derivative by their weight is not zero. The second problem
+    holds them alone, in their columns; its weights are all 0 and carry the derivative. See `with_idle`.
+    """
     dtype, n = X_world.dtype, X_world.shape[1]
     weights = jnp.ones(n, dtype) if weights is None else weights
     depth = jnp.zeros(n, dtype) if depth is None else depth
@@ -89,18 +112,41 @@ def pose_problem(
     intrinsics, loss_scale = jax.tree.map(lambda x: jnp.where(usable, x, 1.0), (intrinsics, loss_scale))
     has_depth = positive(depth) & positive(sigma_depth)
     known = jnp.isfinite(X_world).all(axis=0) & jnp.isfinite(uv).all(axis=0)
-    known = known & positive(sigma_px) & positive(weights) & usable
-    safe_sigma = jnp.where(known, sigma_px, 1.0)
+    known = known & positive(sigma_px)
     focal = jnp.stack([intrinsics.fx, intrinsics.fy])
     inverse_depth_sigma = jnp.where(has_depth, 1.0 / jnp.where(has_depth, sigma_depth, 1.0), 0.0)
-    return PoseProblem(
-        X_world=jnp.where(known[None, :], X_world, 0.0),
-        xy=jnp.where(known[None, :], normalise(intrinsics, uv), 0.0),
-        depth=jnp.where(has_depth, depth, 0.0),
-        precision=jnp.concatenate([focal[:, None] / safe_sigma[None, :], inverse_depth_sigma[None, :]]),
-        weights=jnp.where(known, weights, 0.0),
-        scale=loss_scale,
-        prior=_usable_prior(prior),
+    xy, clean_prior = normalise(intrinsics, uv), _usable_prior(prior)
+
+    def problem_of(counts: Mask) -> PoseProblem:
+        safe_sigma = jnp.where(counts, sigma_px, 1.0)
+        return PoseProblem(
+            X_world=jnp.where(counts[None, :], X_world, 0.0),
+            xy=jnp.where(counts[None, :], xy, 0.0),
+            depth=jnp.where(has_depth, depth, 0.0),
+            precision=jnp.concatenate([focal[:, None] / safe_sigma[None, :], inverse_depth_sigma[None, :]]),
+            weights=jnp.where(counts, weights, 0.0),
+            scale=loss_scale,
+            prior=clean_prior,
+        )
+
+    return problem_of(known & positive(weights) & usable), problem_of(known & (weights == 0) & usable)
+
+
+def with_idle(problem: PoseProblem, idle: PoseProblem, T_world_cam: SE3, loss: Loss) -> PoseProblem:
+    """The problem with its idle points back in their columns, for derivatives: the values of all sums are the same.
+
+    An idle point whose residual at the pose is beyond what the loss can tell apart, or that is farther away than
+    `FARTHEST_M`, stays out, so that a weight of 0 never multiplies an overflow.
+    """
+    chi2 = lax.stop_gradient(pose_cost(T_world_cam, idle._replace(prior=None), loss).chi2)
+    near = (jnp.abs(idle.X_world) < FARTHEST_M).all(axis=0)
+    back = (problem.weights == 0) & near & (chi2 < LARGEST_SQUARED)  # false for NaN
+    pick = lambda of_idle, of_problem: jnp.where(back.reshape((1,) * (of_idle.ndim - 1) + (-1,)), of_idle, of_problem)
+    return problem._replace(
+        X_world=pick(idle.X_world, problem.X_world),
+        xy=pick(idle.xy, problem.xy),
+        precision=pick(idle.precision, problem.precision),
+        weights=pick(idle.weights, problem.weights),
     )
 
 

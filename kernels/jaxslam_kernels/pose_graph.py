@@ -4,7 +4,8 @@ Levenberg-Marquardt on the cost of `pose_graph_cost`; each step solves the spars
 gradients of `block_band` or, much faster for graphs of thousands of nodes, on the host by `pose_graph_sparse`. The
 result is differentiable, forward and reverse, by the implicit function theorem at the optimum, with respect to measured
 poses, scales, information, weights and loss scale: one sparse solve with the exact Hessian. The initial poses have no
-derivative, but for nodes that are fixed or otherwise stay where they were.
+derivative, but for nodes that are fixed or otherwise stay where they were. Of a weight that is exactly 0 the derivative
+is the one-sided limit from above. Second derivatives raise `NotImplementedError`.
 
 Source: Grisetti et al., "A Tutorial on Graph-Based SLAM", 2010; Strasdat et al., "Scale Drift-Aware Large Scale
 Monocular SLAM", 2010, for Sim(3); Madsen, Nielsen and Tingleff, "Methods for Non-Linear Least Squares Problems", 2004,
@@ -26,6 +27,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from jaxslam_kernels.block_band import GraphMatrix, Vector, conjugate_gradients, factorise, multiply, solve_factor
+from jaxslam_kernels.first_order import first_order
 from jaxslam_kernels.pose_graph_cost import (
     GraphEquations,
     GraphProblem,
@@ -36,7 +38,9 @@ from jaxslam_kernels.pose_graph_cost import (
     graph_equations,
     graph_gradient,
     graph_nodes,
-    graph_problem,
+    graph_problem_and_idle,
+    idle_cost,
+    idle_gradient,
     move_nodes,
     shift_nodes,
 )
@@ -171,7 +175,7 @@ def optimise_pose_graph(
     mask = jnp.ones(k, bool) if mask is None else mask
     rank = jnp.arange(k) if rank is None else rank
     initial, usable = graph_nodes(T_world_cam, scales)
-    problem = graph_problem(edges, mask & usable, loss_scale, d)
+    problem, idle = graph_problem_and_idle(edges, mask & usable, loss_scale, d)
     used = problem.weights > 0
     anchored = _anchored(problem, fixed & mask & usable)
     free = anchored & ~fixed
@@ -182,7 +186,10 @@ def optimise_pose_graph(
     graph = _Graph(problem, free, rank)
     end = _solve(lax.stop_gradient(initial), lax.stop_gradient(graph), solver)
     optimum = jnp.where(free[:, None], end.nodes, initial)
-    optimum = shift_nodes(optimum, _optimum_shift(solver, end.converged, optimum, graph))
+    # An edge that would connect what has no path to a fixed node is fitted exactly, however small its weight.
+    idle_counts = anchored[idle.source] == anchored[idle.target]
+    idle = idle._replace(weights=jnp.where(idle_counts, idle.weights, 0.0))
+    optimum = shift_nodes(optimum, _optimum_shift(solver, end.converged, optimum, graph, idle))
     status = jnp.select(
         [bad_initial, ~(touched & free).any(), ~end.converged, (mask & ~anchored).any()],
         [
@@ -197,8 +204,8 @@ def optimise_pose_graph(
     return PoseGraph(
         T_world_cam=SE3(optimum[:, :7]),
         scales=jnp.exp(optimum[:, 7]),
-        cost_before=graph_cost(initial, problem, loss)[0],
-        cost=cost,
+        cost_before=graph_cost(initial, problem, loss)[0] + idle_cost(initial, idle, loss),
+        cost=cost + idle_cost(optimum, idle, loss),
         chi2=chi2,
         robust_weights=robust_weights,
         anchored=anchored,
@@ -336,27 +343,28 @@ def _system(equations: GraphEquations, graph: _Graph, damping: Scalar | float) -
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _optimum_shift(solver: _Solver, converged: Flag, optimum: Nodes, graph: _Graph) -> Steps:
+def _optimum_shift(solver: _Solver, converged: Flag, optimum: Nodes, graph: _Graph, idle: GraphProblem) -> Steps:
     """Zero, with the derivative of the optimum with respect to the problem and to the nodes that stay.
 
     At the optimum the gradient g of the cost vanishes whatever the problem θ, so dξ = -H⁻¹ (∂g/∂θ) dθ with H the
     exact Hessian. Zero where the solver did not converge.
     """
-    del solver, converged
+    del solver, converged, idle
     return jnp.zeros((optimum.shape[0], graph.problem.information.shape[1]), optimum.dtype)
 
 
 @_optimum_shift.defjvp
 def _optimum_shift_jvp(solver: _Solver, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    converged, optimum, graph = primals
+    converged, optimum, graph, idle = first_order(primals, "optimise_pose_graph")
     free = graph.free[:, None]
-    value = _optimum_shift(solver, converged, optimum, graph)
+    value = _optimum_shift(solver, converged, optimum, graph, idle)
     still = jnp.where(free, 0.0, tangents[1])  # the initial values of the free nodes do not matter
 
     def gradient(nodes: Nodes, problem: GraphProblem) -> Steps:
         return graph_gradient(nodes, problem, solver.loss)
 
     _, change = jax.jvp(gradient, (optimum, graph.problem), (still, tangents[2].problem))
+    change = change + idle_gradient(optimum, idle, tangents[3].weights, solver.loss)
     constant = lax.stop_gradient((optimum, graph))
     shift = -_solve_exact(solver, *constant, jnp.where(free & converged, change, 0.0))
     return value, jnp.where(free & converged, shift, 0.0)

@@ -11,6 +11,7 @@ logarithm, whose reverse derivative at the identity is NaN in jaxlie. It is the 
 with isotropic information, of SE-Sync's objective; g2o's leaves out the 2. The cost is `½ Σ w ρ(s)`.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -20,7 +21,7 @@ from jaxlie import SE3
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam_kernels.pose_cost import retract, tangent_basis
-from jaxslam_kernels.robust import Loss, loss_value, loss_weight
+from jaxslam_kernels.robust import LARGEST_SQUARED, Loss, loss_value, loss_weight
 from jaxslam_kernels.transform import between, cross_matrix
 from jaxslam_kernels.types import Scalar
 
@@ -99,6 +100,17 @@ def graph_problem(
     edges: PoseGraphEdges, usable_node: Bool[Array, " k"], loss_scale: Scalar | float, dimension: int
 ) -> GraphProblem:
     """Cleans the edges: one that is not finite, leads nowhere or to itself, or measures less than all, has weight 0."""
+    return graph_problem_and_idle(edges, usable_node, loss_scale, dimension)[0]
+
+
+def graph_problem_and_idle(
+    edges: PoseGraphEdges, usable_node: Bool[Array, " k"], loss_scale: Scalar | float, dimension: int
+) -> tuple[GraphProblem, GraphProblem]:
+    """The problem of `graph_problem`, and the idle edges: those of weight exactly 0 that are usable otherwise.
+
+    Idle edges have no influence on the optimum, but the derivative by their weight is not zero. The second problem
+    holds them alone, in their rows; its weights are all 0 and carry the derivative.
+    """
     k, dtype = usable_node.shape[0], edges.information.dtype
     scale = jnp.asarray(loss_scale, dtype)
     usable_scale = jnp.isfinite(scale) & (scale > 0)
@@ -108,16 +120,22 @@ def graph_problem(
     source, target = jnp.where(inside.all(axis=0), ends, 0)
     information = 0.5 * (edges.information + edges.information.swapaxes(1, 2))
     used = edges.mask & finite & inside.all(axis=0) & (source != target) & usable_node[source] & usable_node[target]
-    used = used & jnp.isfinite(edges.weights) & (edges.weights > 0) & usable_scale & _measures_all(information)
+    finite = used & jnp.isfinite(edges.weights)
     identity = jnp.zeros(8, dtype).at[0].set(1.0)
-    return GraphProblem(
-        source=jnp.where(used, source, 0),
-        target=jnp.where(used, target, 0),
-        measured=jnp.where(used[:, None], measured, identity[None, :]),
-        information=jnp.where(used[:, None, None], information, jnp.eye(dimension, dtype=dtype)[None]),
-        weights=jnp.where(used, edges.weights, 0.0),
-        loss_scale=jnp.where(usable_scale, scale, 1.0),
-    )
+
+    def problem_of(used: Bool[Array, " m"]) -> GraphProblem:
+        return GraphProblem(
+            source=jnp.where(used, source, 0),
+            target=jnp.where(used, target, 0),
+            measured=jnp.where(used[:, None], measured, identity[None, :]),
+            information=jnp.where(used[:, None, None], information, jnp.eye(dimension, dtype=dtype)[None]),
+            weights=jnp.where(used, edges.weights, 0.0),
+            loss_scale=jnp.where(usable_scale, scale, 1.0),
+        )
+
+    measures_all = _measures_all(information)
+    used, idle = (finite & chosen & usable_scale & measures_all for chosen in (edges.weights > 0, edges.weights == 0))
+    return problem_of(used), problem_of(idle)
 
 
 def edge_errors(nodes: Nodes, problem: GraphProblem) -> Float[Array, "m d"]:
@@ -149,6 +167,35 @@ def graph_gradient(nodes: Nodes, problem: GraphProblem, loss: Loss) -> Steps:
     by_source, by_target, weighted = _weighted(nodes, problem, loss)
     pull = jnp.einsum("mij,mj->mi", weighted, edge_errors(nodes, problem))
     return _gather_gradient(nodes, problem, by_source, by_target, pull)
+
+
+def idle_gradient(nodes: Nodes, idle: GraphProblem, change: Float[Array, " m"], loss: Loss) -> Steps:
+    """The gradient of the idle edges for the weights `change`, linear in those."""
+    heard = _heard(nodes, idle, loss)
+    of_weights = lambda weights: graph_gradient(nodes, idle._replace(weights=weights), loss)
+    return jax.jvp(of_weights, (heard,), (jnp.where(heard > 0, change, 0.0),))[1]
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(2,))
+def idle_cost(nodes: Nodes, idle: GraphProblem, loss: Loss) -> Scalar:
+    """The cost of the idle edges: zero, with its derivative by their weights."""
+    del idle, loss
+    return jnp.zeros((), nodes.dtype)
+
+
+@idle_cost.defjvp
+def _idle_cost_jvp(loss: Loss, primals: tuple, tangents: tuple) -> tuple[Scalar, Scalar]:
+    nodes, idle = primals
+    heard = _heard(nodes, idle, loss)
+    _, chi2, _ = graph_cost(nodes, idle._replace(weights=heard), loss)
+    change = jnp.where(heard > 0, tangents[1].weights, 0.0)
+    return idle_cost(nodes, idle, loss), 0.5 * jnp.sum(change * loss_value(chi2, idle.loss_scale, loss))
+
+
+def _heard(nodes: Nodes, idle: GraphProblem, loss: Loss) -> Float[Array, " m"]:
+    """1 for each edge whose error the loss can tell from an overflow, 0 for others."""
+    _, chi2, _ = graph_cost(nodes, idle._replace(weights=jnp.ones_like(idle.weights)), loss)
+    return lax.stop_gradient(jnp.where(chi2 < LARGEST_SQUARED, 1.0, 0.0).astype(chi2.dtype))
 
 
 def graph_equations(nodes: Nodes, problem: GraphProblem, loss: Loss) -> GraphEquations:

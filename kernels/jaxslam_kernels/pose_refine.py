@@ -3,7 +3,9 @@
 The solver is optimistix's loop around fused normal equations (`levenberg_marquardt`); the cost is `pose_cost`'s. The
 result is differentiable, forward and reverse, by the implicit function theorem at the optimum: its derivative with
 respect to points, pixels, weights, depths, deviations, intrinsics, scale and prior costs one 6 x 6 solve, however
-many steps the solver took. The initial pose has no derivative, since the optimum does not depend on it.
+many steps the solver took. The initial pose has no derivative, since the optimum does not depend on it. Of a weight
+that is exactly 0 the derivative is the one-sided limit from above: what letting the point back in would do. Second
+derivatives raise `NotImplementedError`.
 """
 
 from enum import IntEnum
@@ -19,14 +21,17 @@ from jaxlie import SE3
 from jaxtyping import Array, Float, Int
 
 from jaxslam_kernels.camera import Intrinsics
+from jaxslam_kernels.first_order import first_order
 from jaxslam_kernels.levenberg_marquardt import ManifoldLevenbergMarquardt, NormalEquations
 from jaxslam_kernels.pose_cost import (
+    PoseCost,
     PosePrior,
     PoseProblem,
     pose_cost,
-    pose_problem,
+    pose_problem_and_idle,
     retract,
     tangent_basis,
+    with_idle,
 )
 from jaxslam_kernels.robust import Loss
 from jaxslam_kernels.types import Code, Flag, Pixels, Points, Scalar, Weights
@@ -114,7 +119,8 @@ def refine_pose(
         X_world: Points in the world, metres.
         uv: Where they are seen, pixels of the distorted image.
         intrinsics: The camera.
-        weights: Factor of each point's cost, `None` for one each. Points of weight 0 have no influence.
+        weights: Factor of each point's cost, `None` for one each. Points of weight 0 have no influence; the derivative
+            by their weight is the limit from above.
         depth: Measured depths in metres, 0 or NaN where missing; `None` for pixels alone.
         sigma_px: Standard deviation of a pixel, each coordinate, in pixels.
         sigma_depth: Standard deviation of a depth, metres.
@@ -126,15 +132,17 @@ def refine_pose(
     Returns:
         A `PoseRefinement`; everything in it is finite, and so are its derivatives.
     """
-    problem = pose_problem(X_world, uv, intrinsics, weights, depth, sigma_px, sigma_depth, scale, prior)
-    return refine_problem(T_world_cam, problem, loss, max_steps)
+    problem, idle = pose_problem_and_idle(X_world, uv, intrinsics, weights, depth, sigma_px, sigma_depth, scale, prior)
+    return refine_problem(T_world_cam, problem, idle, loss, max_steps)
 
 
-def refine_problem(T_world_cam: SE3, problem: PoseProblem, loss: Loss, max_steps: int) -> PoseRefinement:
-    """`refine_pose` on a problem that is already clean."""
+def refine_problem(
+    T_world_cam: SE3, problem: PoseProblem, idle: PoseProblem, loss: Loss, max_steps: int
+) -> PoseRefinement:
+    """`refine_pose` on a problem that is already clean; the idle points matter to derivatives only."""
     initial, finite_initial = usable_pose(T_world_cam)
     optimum, solver = solve_pose(initial, problem, loss, max_steps)
-    optimum = SE3(optimum.wxyz_xyz + tangent_basis(optimum) @ _optimum_shift(optimum, problem, loss))
+    optimum = SE3(optimum.wxyz_xyz + tangent_basis(optimum) @ _optimum_shift(optimum, problem, idle, loss))
     status = jnp.select(
         [
             ~finite_initial,
@@ -147,7 +155,7 @@ def refine_problem(T_world_cam: SE3, problem: PoseProblem, loss: Loss, max_steps
     ).astype(jnp.int32)
     found = status <= PoseStatus.NOT_CONVERGED
     pose = SE3(jnp.where(found, optimum.wxyz_xyz, initial.wxyz_xyz))
-    return _report(pose, problem, loss, status, solver.num_steps)
+    return _report(pose, problem, idle, loss, status, solver.num_steps)
 
 
 def solve_pose(initial: SE3, problem: PoseProblem, loss: Loss, max_steps: int) -> tuple[SE3, SolverReport]:
@@ -172,30 +180,30 @@ def solve_pose(initial: SE3, problem: PoseProblem, loss: Loss, max_steps: int) -
     return solution.value, SolverReport(hessian, solution.stats["num_steps"].astype(jnp.int32), converged)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(2,))
-def _optimum_shift(optimum: SE3, problem: PoseProblem, loss: Loss) -> Float[Array, "6"]:
+@partial(jax.custom_jvp, nondiff_argnums=(3,))
+def _optimum_shift(optimum: SE3, problem: PoseProblem, idle: PoseProblem, loss: Loss) -> Float[Array, "6"]:
     """Zero, with the derivative of the optimum with respect to the problem, in the right tangent.
 
     At the optimum the gradient g of the cost vanishes whatever the problem θ, so dξ = -H⁻¹ (∂g/∂θ) dθ with H the
-    exact Hessian.
+    exact Hessian. Points of weight zero take part with their weights.
     """
-    del problem, loss
+    del problem, idle, loss
     return jnp.zeros(6, optimum.wxyz_xyz.dtype)
 
 
 @_optimum_shift.defjvp
 def _optimum_shift_jvp(loss: Loss, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    optimum, problem = primals
+    optimum, problem, idle = first_order(primals, "refine_pose")
 
     basis = tangent_basis(optimum)
 
-    def gradient(tangent: Array, problem: PoseProblem) -> Array:
+    def gradient(tangent: Array, problem: PoseProblem, idle: PoseProblem) -> Array:
         moved = SE3(optimum.wxyz_xyz + basis @ tangent)
-        return pose_cost(moved, problem, loss).equations.gradient
+        return pose_cost(moved, with_idle(problem, idle, optimum, loss), loss).equations.gradient
 
     zero = jnp.zeros(6, optimum.wxyz_xyz.dtype)
-    _, gradient_change = jax.jvp(partial(gradient, zero), (problem,), (tangents[1],))
-    exact = jax.jacfwd(gradient)(zero, problem)
+    _, gradient_change = jax.jvp(partial(gradient, zero), (problem, idle), tuple(tangents[1:]))
+    exact = jax.jacfwd(gradient)(zero, problem, idle)
     exact = 0.5 * (exact + exact.T)
     reweighted = pose_cost(optimum, problem, loss).equations.hessian
     # The exact Hessian is positive definite at a strict minimum. Where the solver stopped short of one the
@@ -206,9 +214,34 @@ def _optimum_shift_jvp(loss: Loss, primals: tuple, tangents: tuple) -> tuple[Arr
     return zero, shift
 
 
-def _report(pose: SE3, problem: PoseProblem, loss: Loss, status: Array, num_steps: Array) -> PoseRefinement:
+class _Figures(NamedTuple):
+    """What is summed over all points at the final pose."""
+
+    cost: Scalar
+    covariance: Float[Array, "6 6"]
+    residual_scale: Scalar
+
+
+def _report(
+    pose: SE3, problem: PoseProblem, idle: PoseProblem, loss: Loss, status: Array, num_steps: Array
+) -> PoseRefinement:
     """Everything that is said of the final pose, evaluated there."""
     at_pose = pose_cost(pose, problem, loss)
+    figures = _figures(at_pose, pose, problem, idle, status, loss)
+    return PoseRefinement(
+        T_world_cam=pose,
+        covariance=figures.covariance,
+        residual_scale=figures.residual_scale,
+        cost=figures.cost,
+        num_valid=jnp.sum(problem.weights * at_pose.robust_weights > 0, dtype=jnp.int32),
+        status=status,
+        num_steps=num_steps,
+        robust_weights=at_pose.robust_weights,
+        chi2=at_pose.chi2,
+    )
+
+
+def _figures_at(at_pose: PoseCost, problem: PoseProblem, status: Array) -> _Figures:
     total = problem.weights * at_pose.robust_weights
     residuals_a_point = jnp.where(problem.precision[2] > 0, 3.0, 2.0)
     freedom = jnp.sum(total * residuals_a_point)
@@ -216,17 +249,28 @@ def _report(pose: SE3, problem: PoseProblem, loss: Loss, status: Array, num_step
     hessian, identity = at_pose.equations.hessian, jnp.eye(6, dtype=total.dtype)
     determined = _is_determined(hessian) & (status <= PoseStatus.NOT_CONVERGED)
     covariance = jnp.where(determined, _solve(hessian, determined, identity), UNKNOWN_VARIANCE * identity)
-    return PoseRefinement(
-        T_world_cam=pose,
-        covariance=covariance,
-        residual_scale=jnp.where(variance > 0, jnp.sqrt(jnp.where(variance > 0, variance, 1.0)), 0.0),
-        cost=at_pose.cost,
-        num_valid=jnp.sum(total > 0, dtype=jnp.int32),
-        status=status,
-        num_steps=num_steps,
-        robust_weights=at_pose.robust_weights,
-        chi2=at_pose.chi2,
-    )
+    residual_scale = jnp.where(variance > 0, jnp.sqrt(jnp.where(variance > 0, variance, 1.0)), 0.0)
+    return _Figures(at_pose.cost, covariance, residual_scale)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(5,))
+def _figures(
+    at_pose: PoseCost, pose: SE3, problem: PoseProblem, idle: PoseProblem, status: Array, loss: Loss
+) -> _Figures:
+    """The figures at the pose, whose derivatives see points of weight zero too."""
+    del pose, idle, loss
+    return _figures_at(at_pose, problem, status)
+
+
+@_figures.defjvp
+def _figures_jvp(loss: Loss, primals: tuple, tangents: tuple) -> tuple[_Figures, _Figures]:
+    _, pose, problem, idle, status = primals
+
+    def figures(pose: SE3, problem: PoseProblem, idle: PoseProblem) -> _Figures:
+        everything = with_idle(problem, idle, pose, loss)
+        return _figures_at(pose_cost(pose, everything, loss), everything, status)
+
+    return _figures(*primals, loss), jax.jvp(figures, (pose, problem, idle), tuple(tangents[1:4]))[1]
 
 
 def usable_pose(T: SE3) -> tuple[SE3, Flag]:

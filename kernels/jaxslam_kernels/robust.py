@@ -22,7 +22,8 @@ Loss: TypeAlias = Literal["squared", "huber", "cauchy", "geman_mcclure"]
 SquaredResiduals: TypeAlias = Float[Array, "*batch"]
 
 _MAD_TO_SIGMA = 1.482602218505602  # 1 / Φ⁻¹(3/4): the deviation of a Gaussian per median absolute deviation
-_LARGEST = 1e16  # its square and its ratios to its inverse are finite in float32
+LARGEST_SQUARED = 1e16
+"""Squared residuals beyond this count as this; its square and its ratios to its inverse are finite in float32."""
 
 
 def loss_value(squared: SquaredResiduals, scale: Scalar | float, loss: Loss) -> SquaredResiduals:
@@ -107,10 +108,10 @@ def robust_scale(residuals: Weights, weights: Weights) -> Scalar:
 def _known(squared: SquaredResiduals) -> tuple[Array, Array]:
     """The squared residuals without what is not finite, kept in the range of single precision."""
     known = jnp.isfinite(squared)
-    return jnp.minimum(jnp.where(known, squared, 0.0), _LARGEST), known
+    return jnp.minimum(jnp.where(known, squared, 0.0), LARGEST_SQUARED), known
 
 
 def _squared_scale(scale: Scalar | float, like: Array) -> Array:
     """`c²`, kept off zero so that a scale of zero, or none at all, gives vanishing weights and no NaN."""
     c = jnp.asarray(scale, like.dtype)
-    return jnp.maximum(jnp.square(jnp.where(jnp.isfinite(c), c, 0.0)), 1.0 / _LARGEST)
+    return jnp.maximum(jnp.square(jnp.where(jnp.isfinite(c), c, 0.0)), 1.0 / LARGEST_SQUARED)

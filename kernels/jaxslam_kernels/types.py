@@ -13,6 +13,9 @@ is (0, 0): `u` along a row, `v` down a column. An image is `image[v, u]`.
 
 Failure: nothing raises inside compiled code. Results are finite, and a status code says what they are worth.
 
+Derivatives: by a weight of exactly 0 the derivative is the one-sided limit from above. Where second derivatives would
+be wrong, asking for one raises `NotImplementedError` while tracing, see `first_order`.
+
 Precision: float32 in the real-time path; every kernel follows the type of its inputs, so float64 works too.
 """
 
