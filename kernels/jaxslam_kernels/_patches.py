@@ -128,3 +128,8 @@ def in_image(position: Pixels, level: Float[Array, "h w"], border: int, window: 
     u = position[0][:, None] + columns.astype(position.dtype)[None, :]
     v = position[1][:, None] + rows.astype(position.dtype)[None, :]
     return window.columns()[None, :] & (u >= 0) & (u <= high[0, 0]) & (v >= 0) & (v <= high[1, 0])
+
+
+def flattened(cut: Float[Array, "n r c"]) -> Float[Array, "n rc"]:
+    """Every patch as one flat row; also where there are none, of which JAX cannot tell a missing size."""
+    return cut.reshape(cut.shape[0], cut.shape[1] * cut.shape[2])

@@ -14,6 +14,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxslam_kernels.checks import checked
+
 Triangles: TypeAlias = Float[Array, "3 3 *h"]
 """Coordinate, corner, and any number of further axes: one triangle an entry, metres."""
 
@@ -25,6 +27,7 @@ _Vector: TypeAlias = list[Array]
 _Axes: TypeAlias = tuple[_Vector, _Vector, _Vector]
 
 
+@checked
 def absolute_orientation(
     source: Triangles, target: Triangles
 ) -> tuple[Float[Array, "3 3 *h"], Float[Array, " 3 *h"], Bool[Array, " *h"]]:

@@ -8,7 +8,7 @@ Source: Umeyama, "Least-Squares Estimation of Transformation Parameters Between 
 """
 
 import enum
-from typing import Literal, NamedTuple, TypeAlias
+from typing import Annotated, Literal, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ from jax import lax
 from jaxlie import SE3, SO3
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxslam_kernels.checks import checked
 from jaxslam_kernels.transform import cross_matrix, lenient_promotion
 from jaxslam_kernels.types import Code, Mask, Points, Scalar, Weights
 
@@ -110,6 +111,7 @@ class RelativeErrors(NamedTuple):
     num_pairs: Code
 
 
+@checked
 def align(estimate_xyz: Points, reference_xyz: Points, weights: Weights, *, with_scale: bool) -> Alignment:
     """The least-squares rigid or similarity transform of estimate to reference (Umeyama, eqs. 34 to 43).
 
@@ -117,7 +119,7 @@ def align(estimate_xyz: Points, reference_xyz: Points, weights: Weights, *, with
     trajectories. Where the rotation is undetermined about an axis, its derivative about that axis is zero.
 
     Args:
-        estimate_xyz: `(3, n)` estimated positions, metres, n at least 1.
+        estimate_xyz: `(3, n)` estimated positions, metres.
         reference_xyz: `(3, n)` true positions at the same times, metres.
         weights: `(n,)` non-negative weights; a mask works as `mask.astype(dtype)`.
         with_scale: Whether to estimate a scale too, static.
@@ -130,6 +132,7 @@ def align(estimate_xyz: Points, reference_xyz: Points, weights: Weights, *, with
     return alignment
 
 
+@checked
 def ate(
     estimate_xyz: Points, reference_xyz: Points, weights: Weights, *, alignment: AlignmentKind = "se3"
 ) -> AbsoluteErrors:
@@ -151,9 +154,10 @@ def ate(
     return AbsoluteErrors(jnp.where(weights > 0, distances, 0.0), statistics, fitted, _count(weights))
 
 
+@checked
 def rpe(
-    estimate: SE3,
-    reference: SE3,
+    estimate: Annotated[SE3, "n"],
+    reference: Annotated[SE3, "n"],
     first: Int[Array, " m"],
     second: Int[Array, " m"],
     mask: Bool[Array, " m"],
@@ -163,10 +167,12 @@ def rpe(
     Args:
         estimate: P, a batch of `n` poses `T_world_cam`; quaternions need not be exactly of unit length.
         reference: Q, a batch of `n` true poses at the same times, in any world frame.
-        first: `(m,)` indices i, m at least 1.
+        first: `(m,)` indices i.
         second: `(m,)` indices j; a pair with an index out of range does not count.
         mask: `(m,)` which pairs count.
     """
+    if estimate.wxyz_xyz.shape[0] == 0:  # one that is none, so that indices have something to look at
+        estimate = reference = SE3(jnp.zeros((1, 7), estimate.wxyz_xyz.dtype))
     P, P_known = usable_poses(estimate)
     Q, Q_known = usable_poses(reference)
     known = P_known & Q_known
@@ -281,6 +287,8 @@ def _centred(xyz: Points, share: Weights) -> tuple[_Vector, Points]:
     Summed relative to one of the positions: if all are equal the result is exactly zero, and distance from
     the origin costs no precision.
     """
+    if xyz.shape[1] == 0:
+        return jnp.zeros(3, xyz.dtype), xyz
     origin = lax.stop_gradient(xyz[:, jnp.argmax(share)])
     local = xyz - origin[:, None]
     mean = jnp.sum(share[None, :] * local, axis=1)
@@ -301,6 +309,8 @@ def _statistics(errors: Weights, weights: Weights) -> Statistics:
 
 def _median(errors: Weights, weights: Weights) -> Scalar:
     """The mean of the two values around half of the weight: NumPy's median if the weights are a mask."""
+    if errors.shape[0] == 0:
+        return jnp.zeros((), errors.dtype)
     order = jnp.argsort(jnp.where(weights > 0, errors, jnp.inf))
     reached = jnp.cumsum(weights[order])
     half = 0.5 * reached[-1]
@@ -308,7 +318,8 @@ def _median(errors: Weights, weights: Weights) -> Scalar:
     return 0.5 * (errors[order[lower]] + errors[order[upper]])
 
 
-def usable_poses(T: SE3) -> tuple[SE3, Mask]:
+@checked
+def usable_poses(T: Annotated[SE3, "n"]) -> tuple[SE3, Mask]:
     """The batch with unit quaternions and the identity for poses that cannot be used, and which ones can."""
     wxyz, xyz = T.wxyz_xyz[:, :4], T.wxyz_xyz[:, 4:]
     largest = jnp.max(jnp.abs(wxyz), axis=1)

@@ -40,6 +40,7 @@ from jaxslam_kernels.bundle_cost import (
 from jaxslam_kernels.bundle_idle import idle_points
 from jaxslam_kernels.bundle_lens import Cameras, Lenses, move_cameras, shift_cameras, usable_lenses
 from jaxslam_kernels.bundle_schur import Reduced, eliminate, is_determined, points_determined, solve_reduced
+from jaxslam_kernels.checks import checked
 from jaxslam_kernels.first_order import first_order
 from jaxslam_kernels.pose_cost import UNKNOWN_CHI2
 from jaxslam_kernels.pose_refine import usable_pose
@@ -94,6 +95,7 @@ class BundleAdjustment(NamedTuple):
     lenses: Lenses | None = None
 
 
+@checked
 def bundle_adjust(
     poses: Poses,
     X_world: Points,

@@ -29,6 +29,7 @@ from jaxslam_kernels.bundle_lens import (
     shift_cameras,
 )
 from jaxslam_kernels.camera import MIN_DEPTH, Intrinsics, normalise
+from jaxslam_kernels.checks import checked
 from jaxslam_kernels.pose_cost import UNKNOWN_CHI2, positive
 from jaxslam_kernels.robust import Loss, loss_value, loss_weight
 from jaxslam_kernels.types import Flag, Mask, Pixels, Points, Scalar, Weights
@@ -66,6 +67,7 @@ class Observations(NamedTuple):
     valid: Bool[Array, " m"]
 
 
+@checked
 def observe(
     camera: Int[Array, " n"],
     point: Int[Array, " n"],

@@ -17,6 +17,7 @@ from jax import lax
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
+from jaxslam_kernels.checks import checked
 from jaxslam_kernels.types import Mask, Pixels, Points, Scalar, Weights
 
 MIN_DEPTH = 0.01
@@ -47,6 +48,7 @@ class Intrinsics(NamedTuple):
     distortion: Float[Array, "5"]
 
 
+@checked
 def make_intrinsics(
     fx: float,
     fy: float,
@@ -61,16 +63,19 @@ def make_intrinsics(
     return Intrinsics(*scalars, distortion=jnp.asarray(coefficients, dtype))
 
 
+@checked
 def without_distortion(intrinsics: Intrinsics) -> Intrinsics:
     """The ideal pinhole camera of the same focal lengths and principal point."""
     return intrinsics._replace(distortion=jnp.zeros_like(intrinsics.distortion))
 
 
+@checked
 def in_front(X_cam: Points) -> Mask:
     """True for finite points at least `MIN_DEPTH` in front of the camera."""
     return jnp.isfinite(X_cam).all(axis=0) & (X_cam[2] > MIN_DEPTH)
 
 
+@checked
 def project(intrinsics: Intrinsics, X_cam: Points) -> Pixels:
     """Pixels of points in camera coordinates (metres), distortion included.
 
@@ -82,6 +87,7 @@ def project(intrinsics: Intrinsics, X_cam: Points) -> Pixels:
     return to_pixels(intrinsics, distort(intrinsics, xy))
 
 
+@checked
 def back_project(intrinsics: Intrinsics, uv: Pixels, depth: Weights) -> Points:
     """Points in camera coordinates (metres) seen at distorted pixels `uv` with `depth` along the optical axis.
 
@@ -92,16 +98,19 @@ def back_project(intrinsics: Intrinsics, uv: Pixels, depth: Weights) -> Points:
     return jnp.concatenate([normalise(intrinsics, uv) * z[None, :], z[None, :]])
 
 
+@checked
 def to_pixels(intrinsics: Intrinsics, xy: Pixels) -> Pixels:
     """Normalised coordinates to pixels by the camera matrix alone, without distortion."""
     return jnp.stack([intrinsics.fx * xy[0] + intrinsics.cx, intrinsics.fy * xy[1] + intrinsics.cy])
 
 
+@checked
 def distort(intrinsics: Intrinsics, xy: Pixels) -> Pixels:
     """Distorted normalised coordinates of undistorted ones."""
     return jnp.stack(_distort(tuple(intrinsics.distortion), xy[0], xy[1]))
 
 
+@checked
 def normalise(intrinsics: Intrinsics, uv: Pixels) -> Pixels:
     """Undistorted normalised coordinates `(x / z, y / z)` of distorted pixels; 0 where `uv` is not finite.
 
@@ -119,16 +128,19 @@ def normalise(intrinsics: Intrinsics, uv: Pixels) -> Pixels:
     return jnp.stack([jnp.where(known, x, 0.0), jnp.where(known, y, 0.0)])
 
 
+@checked
 def undistort_pixels(intrinsics: Intrinsics, uv: Pixels) -> Pixels:
     """Pixels where an ideal camera with the same matrix and no distortion would have seen the same rays."""
     return to_pixels(intrinsics, normalise(intrinsics, uv))
 
 
+@checked
 def depth_from_disparity(disparity: Weights, fx: Scalar, baseline: Scalar | float) -> Weights:
     """Depth in metres of rectified disparities in pixels, `fx * baseline / d`; 0 where there is none."""
     return _reciprocal(disparity, fx, baseline)
 
 
+@checked
 def disparity_from_depth(depth: Weights, fx: Scalar, baseline: Scalar | float) -> Weights:
     """Rectified disparities in pixels of depths in metres, `fx * baseline / z`; 0 where there is none."""
     return _reciprocal(depth, fx, baseline)

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxslam_kernels.checks import checked
 from jaxslam_kernels.types import Image, Mask, Pixels
 
 _WINDOW = 5
@@ -24,6 +25,7 @@ class Corners(NamedTuple):
     score: Float[Array, " c"]
 
 
+@checked
 def corner_score(image: Image) -> Image:
     """Smaller eigenvalue of the gradient matrix averaged over 5x5 pixels, in squared intensity a squared pixel.
 
@@ -53,6 +55,7 @@ def _window_mean(image: Image) -> Float[Array, "_h _w"]:
     return total / _WINDOW**2
 
 
+@checked
 def grid_corners(score: Image, allowed: Bool[Array, "h w"], *, cell: int) -> Corners:
     """The pixel of highest score in every `cell` x `cell` square of a score image.
 
@@ -79,6 +82,7 @@ def grid_corners(score: Image, allowed: Bool[Array, "h w"], *, cell: int) -> Cor
     return Corners(jnp.stack([u, v]).astype(score.dtype), lax.stop_gradient(jnp.maximum(score_of_cell, 0)))
 
 
+@checked
 def occupied_cells(points: Pixels, valid: Mask, shape: tuple[int, int], *, cell: int) -> Bool[Array, " c"]:
     """Which cells of the grid of `grid_corners` already hold one of the valid points.
 

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxslam_kernels.checks import checked
 from jaxslam_kernels.types import Mask, Scalar
 
 
@@ -34,6 +35,7 @@ class Clusters(NamedTuple):
     num: Int[Array, ""]
 
 
+@checked
 def dbscan(
     points: Float[Array, "d n"], mask: Mask, *, radius: Scalar | float, min_points: Int[Array, ""] | int
 ) -> Clusters:

@@ -13,6 +13,7 @@ from jaxlie import SE3
 from jaxtyping import Array, Bool, Int
 
 from jaxslam_kernels.camera import MIN_DEPTH, Intrinsics
+from jaxslam_kernels.checks import checked
 from jaxslam_kernels.transform import to_world
 from jaxslam_kernels.types import DepthImage, Scalar
 
@@ -31,6 +32,7 @@ class DepthChange(NamedTuple):
     then: Int[Array, "h w"]
 
 
+@checked
 def depth_change(
     depth: DepthImage,
     depth_then: DepthImage,

@@ -5,12 +5,14 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxslam_kernels.checks import checked
 from jaxslam_kernels.types import DepthImage, Pixels, Scalar, Weights
 
 _NOISE_M = 0.02
 """A difference that noise alone makes, at any depth."""
 
 
+@checked
 def believable(
     depth: Float[Array, "*shape"], nearest: Scalar | float, farthest: Scalar | float
 ) -> Float[Array, "*shape"]:
@@ -19,6 +21,7 @@ def believable(
     return jnp.where(inside, depth, 0)
 
 
+@checked
 def sample_depth(depth: DepthImage, uv: Pixels, *, reach: int = 1, max_step: float = 0.05) -> Weights:
     """Depth at the nearest pixel, or 0 where its surroundings do not agree.
 

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import lax
 
+from jaxslam_kernels.checks import checked
 from jaxslam_kernels.image import Pyramid
 from jaxslam_kernels.lk_flow import lk_flow_forward_backward
 from jaxslam_kernels.lk_search import FlowPlan, LevelPlan
@@ -35,6 +36,7 @@ class Disparities(NamedTuple):
     residual: Weights
 
 
+@checked
 def row_disparities(
     left: Pyramid,
     right: Pyramid,

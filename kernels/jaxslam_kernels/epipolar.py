@@ -15,6 +15,7 @@ from jaxlie import SE3
 from jaxtyping import Array, Bool, Float
 
 from jaxslam_kernels.camera import Intrinsics
+from jaxslam_kernels.checks import checked
 from jaxslam_kernels.transform import between, cross_matrix
 from jaxslam_kernels.types import Pixels, Weights
 
@@ -25,6 +26,7 @@ LEAST_SLOPE = 1e-12  # squared; second derivatives by it are finite in float32
 Matrices = Float[Array, "3 3 *batch"]
 
 
+@checked
 def epipolar_distances(F: Float[Array, "3 3"], uv_before: Pixels, uv_after: Pixels) -> Weights:
     """How far each second point is from the epipolar line of the first, `|p2ᵀ F p1| / √(X² + Y²)`, `(X, Y, Z) = F p1`.
 
@@ -44,6 +46,7 @@ def epipolar_distances(F: Float[Array, "3 3"], uv_before: Pixels, uv_after: Pixe
     return _ratio(p2[0] * X + p2[1] * Y + Z, X * X + Y * Y, known)
 
 
+@checked
 def sampson_distances(F: Float[Array, "3 3"], uv_before: Pixels, uv_after: Pixels) -> Weights:
     """How far both points have to move, to first order, until they satisfy F: `|p2ᵀ F p1| / |gradient|`, pixels.
 
@@ -56,6 +59,7 @@ def sampson_distances(F: Float[Array, "3 3"], uv_before: Pixels, uv_after: Pixel
     return _ratio(p2[0] * X + p2[1] * Y + Z, X * X + Y * Y + x * x + y * y, known)
 
 
+@checked
 def sampson_squared(F: Matrices, before: Pixels, after: Pixels) -> Float[Array, "*batch n"]:
     """Squares of `sampson_distances` of many matrices at once; points have to be finite."""
     (a, b, c), (d, e, f), (g, h, i) = (tuple(x[..., None] for x in row) for row in F)
@@ -67,6 +71,7 @@ def sampson_squared(F: Matrices, before: Pixels, after: Pixels) -> Float[Array, 
     return error * error / jnp.maximum(X * X + Y * Y + x * x + y * y, LEAST_SLOPE)
 
 
+@checked
 def fundamental_of_poses(T_world_before: SE3, T_world_after: SE3, intrinsics: Intrinsics) -> Float[Array, "3 3"]:
     """The fundamental matrix of two poses of one camera, `K⁻ᵀ [t]ₓ R K⁻¹`; zero where the camera only turned.
 
@@ -86,6 +91,7 @@ def fundamental_of_poses(T_world_before: SE3, T_world_after: SE3, intrinsics: In
     return rays.T @ cross_matrix(T_after_before.translation()) @ T_after_before.rotation().as_matrix() @ rays
 
 
+@checked
 def seven_point(
     uv_before: Float[Array, "2 7 h"], uv_after: Float[Array, "2 7 h"]
 ) -> tuple[Float[Array, "3 3 3 h"], Bool[Array, "3 h"]]:
@@ -116,6 +122,7 @@ def seven_point(
     return jnp.where(real[None, None], F / jnp.where(size > 0, size, 1.0)[None, None], 0.0), real
 
 
+@checked
 def adjugate(F: Matrices) -> Matrices:
     """The transposed cofactors: the inverse times the determinant."""
     (a, b, c), (d, e, f), (g, h, i) = F

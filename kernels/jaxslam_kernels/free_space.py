@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxlie import SE3
 
 from jaxslam_kernels.camera import Intrinsics, in_front, project
+from jaxslam_kernels.checks import checked
 from jaxslam_kernels.transform import to_camera
 from jaxslam_kernels.types import DepthImage, Mask, Points, Scalar
 
@@ -26,6 +27,7 @@ class SeenFrom(NamedTuple):
     past: Mask
 
 
+@checked
 def seen_from(
     X_world: Points,
     T_world_cam: SE3,

@@ -2,8 +2,8 @@
 
 All hypotheses are drawn, solved from seven points and scored at once. The best few are improved on all points under a
 redescending loss that is a smooth form of the score, and the best of these is refined on its inliers. Which points are
-inliers is a constant for differentiation; the last refinement carries the gradient. Views that do not determine the
-matrix are told apart (see `homography`).
+inliers is a constant for differentiation; the last refinement carries the gradient, and second derivatives raise
+`NotImplementedError`. Views that do not determine the matrix are told apart (see `homography`).
 """
 
 from enum import IntEnum
@@ -13,8 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxslam_kernels.checks import checked
 from jaxslam_kernels.epipolar import sampson_squared, seven_point
 from jaxslam_kernels.fundamental_refine import Matrix, TwoViews, refine_matrix, score_matrices, solve_matrix
 from jaxslam_kernels.homography import homography_suffices
@@ -59,6 +61,7 @@ class FundamentalResult(NamedTuple):
     status: Code
 
 
+@checked
 def ransac_fundamental(
     key: Key[Array, ""],
     uv_before: Pixels,
@@ -99,6 +102,8 @@ def ransac_fundamental(
     Returns:
         A `FundamentalResult`; everything in it is finite, and so are its derivatives.
     """
+    if uv_before.shape[1] == 0:
+        return _none_found(uv_before.dtype)
     views, idle, shift, scale = _two_views(uv_before, uv_after, weights, threshold_px)
     fixed = lax.stop_gradient(views)
     draw_key, plane_key = jax.random.split(key)
@@ -140,6 +145,13 @@ def ransac_fundamental(
         score=jnp.where(found, score_matrices(lax.stop_gradient(F), fixed), 0.0),
         status=status,
     )
+
+
+def _none_found(dtype: DTypeLike) -> FundamentalResult:
+    """The result of no matches."""
+    status = jnp.asarray(FundamentalStatus.TOO_FEW_POINTS, jnp.int32)
+    none = jnp.zeros((), jnp.int32)
+    return FundamentalResult(jnp.zeros((3, 3), dtype), jnp.zeros(0, bool), none, jnp.zeros((), dtype), status)
 
 
 def _two_views(

@@ -8,6 +8,8 @@ from jax import lax
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Num
 
+from jaxslam_kernels.checks import checked
+
 _BINOMIAL = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
 
 
@@ -30,6 +32,7 @@ class Pyramid(eqx.Module):
         return height - 2 * self.border, width - 2 * self.border
 
 
+@checked
 def half_size(image: Num[Array, "h w"], dtype: DTypeLike | None = None) -> Float[Array, "_h _w"]:
     """The image smoothed by the 5-tap binomial filter and halved, `cv2.pyrDown` in floating point.
 
@@ -59,6 +62,7 @@ def _floating(image: Num[Array, "_h _w"], dtype: DTypeLike | None) -> DTypeLike:
     return image.dtype if jnp.issubdtype(image.dtype, jnp.floating) else jnp.float32
 
 
+@checked
 def build_pyramid(
     image: Num[Array, "h w"], *, num_levels: int = 4, border: int = 16, dtype: DTypeLike | None = None
 ) -> Pyramid:

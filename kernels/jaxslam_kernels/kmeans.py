@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxslam_kernels.checks import checked
 from jaxslam_kernels.types import Mask, Scalar
 
 _DRAWS = 3  # so many for each center, as in OpenCV
@@ -39,6 +40,7 @@ class KMeans(NamedTuple):
     counts: Int[Array, " k"]
 
 
+@checked
 def kmeans(
     key: Key[Array, ""],
     points: Float[Array, "d n"],

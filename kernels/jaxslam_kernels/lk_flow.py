@@ -9,6 +9,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxslam_kernels._patches import Window
+from jaxslam_kernels.checks import checked
 from jaxslam_kernels.image import Pyramid
 from jaxslam_kernels.implicit import Found, implicit_positions
 from jaxslam_kernels.lk_search import FlowPlan, LevelPlan, difference, look, make_template, mean_absolute, search
@@ -58,6 +59,7 @@ class Flow(NamedTuple):
         return self.status == FlowStatus.OK
 
 
+@checked
 def lk_flow(
     previous: Pyramid,
     current: Pyramid,
@@ -119,6 +121,7 @@ def lk_flow(
     return Flow(position, status, residual, texture)
 
 
+@checked
 def lk_flow_forward_backward(
     previous: Pyramid,
     current: Pyramid,

@@ -135,7 +135,7 @@ def make_template(
     """The templates around `position`; `once` runs the parts that must not be fused, see `patches.at_once`."""
     corner, fraction = patches.corner(position, border, window.half + 1)
     stride, length = window.stride, window.length
-    cut = once(lambda: patches.cut(level, corner, window.side + 4, stride)).reshape(position.shape[1], -1)
+    cut = patches.flattened(once(lambda: patches.cut(level, corner, window.side + 4, stride)))
     smooth = once(lambda: patches.bilinear(cut, fraction, stride, length + 2 * stride + 2))
     counts = patches.in_image(position, level, border, window).astype(smooth.dtype)
     gradient = once(lambda: patches.gradients(smooth, window) * counts[:, None, :])
@@ -182,7 +182,7 @@ def look(position: Pixels, level: Float[Array, "h w"], border: int, window: Wind
 
 def difference(sight: Sight, patch: Float[Array, "n l"], window: Window) -> Float[Array, "n l"]:
     """Current minus previous intensity over the window; columns past it hold something, but have no gradient."""
-    flat = sight.cut.reshape(sight.cut.shape[0], -1)
+    flat = patches.flattened(sight.cut)
     return patches.bilinear(flat, sight.fraction, window.stride, window.length) - patch
 
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxlie import SE3
 from jaxtyping import Array, Float, Int
 
+from jaxslam_kernels.checks import checked
 from jaxslam_kernels.robust import robust_scale, weighted_median
 from jaxslam_kernels.transform import to_camera
 from jaxslam_kernels.types import Mask, Points, Scalar, Weights
@@ -29,6 +30,7 @@ class GroupMotion(NamedTuple):
     number: Float[Array, " k"]
 
 
+@checked
 def scene_flow(X_world: Points, X_cam: Points, T_world_cam: SE3) -> Points:
     """How far points have come from where they would be at rest, in the axes of the camera (equations 4 and 5).
 
@@ -40,6 +42,7 @@ def scene_flow(X_world: Points, X_cam: Points, T_world_cam: SE3) -> Points:
     return X_cam - to_camera(T_world_cam, X_world)
 
 
+@checked
 def flow_length(flow: Points) -> Weights:
     """`(n,)` length of each vector of `(3, n)` (equation 6); with derivative 0 where there is none."""
     squared = jnp.sum(jnp.square(flow), axis=0)
@@ -47,6 +50,7 @@ def flow_length(flow: Points) -> Weights:
     return jnp.where(some, jnp.sqrt(jnp.where(some, squared, 1)), 0)
 
 
+@checked
 def upper_limit(intensity: Weights, weights: Weights, sigmas: Scalar | float, *, robust: bool = True) -> Scalar:
     """What points at rest stay below: mean and so many standard deviations of their motion (equations 7 and 8).
 
@@ -72,6 +76,7 @@ def upper_limit(intensity: Weights, weights: Weights, sigmas: Scalar | float, *,
     return mean + sigmas * jnp.where(some, jnp.sqrt(jnp.where(some, spread, 1)), 0)
 
 
+@checked
 def group_motion(flow: Points, moves: Weights, counts: Mask, group: Int[Array, " n"], num_groups: int) -> GroupMotion:
     """How much of each group of points moves, and how far the whole of it has come on average.
 

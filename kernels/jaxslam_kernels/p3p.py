@@ -26,6 +26,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxslam_kernels.checks import checked
+
 _Vector: TypeAlias = tuple[Array, Array, Array]
 """Three coordinates apart: of λ, or of a line in the plane of its directions."""
 _Pairs: TypeAlias = tuple[Array, Array, Array]
@@ -48,6 +50,7 @@ _NEWTON_STEPS = 4
 _RESIDUAL = 1e-3  # summed, of the mean squared side: a root stands at rounding, a miss at a few per cent or more
 
 
+@checked
 def p3p(
     bearings: Float[Array, "3 3 h"], X_world: Float[Array, "3 3 h"]
 ) -> tuple[Float[Array, "3 4 h"], Bool[Array, "4 h"]]:

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, Num
 
 from jaxslam_kernels import _patches as patches
 from jaxslam_kernels._patches import Window
+from jaxslam_kernels.checks import checked
 from jaxslam_kernels.image import Pyramid
 from jaxslam_kernels.implicit import Found, implicit_positions
 from jaxslam_kernels.lk_search import LevelPlan, Search, Template, in_chunks, iterate, look, template_with
@@ -43,6 +44,7 @@ class PatchMatch(NamedTuple):
     converged: Mask
 
 
+@checked
 def warped_patches(
     pictures: Num[Array, "k h w"],
     picture: Int[Array, " n"],
@@ -149,7 +151,7 @@ def _matched(
 def _there(position: Pixels, inputs: _Inputs, window: Window, border: int, once: _Once) -> Float[Array, "n l"]:
     """What the current image shows around positions."""
     sight = once(lambda: look(position, inputs.current, border, window))
-    flat = sight.cut.reshape(position.shape[1], -1)
+    flat = patches.flattened(sight.cut)
     return patches.bilinear(flat, sight.fraction, window.stride, window.length)
 
 
@@ -215,6 +217,7 @@ def _explain(position: Pixels, inputs: _Inputs, *, plan: LevelPlan, border: int)
     return slope, _correlation(template.patch, there, counts)
 
 
+@checked
 def align_patches(
     pictures: Num[Array, "k h w"],
     picture: Int[Array, " n"],

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxslam_kernels.absolute_orientation import absolute_orientation
 from jaxslam_kernels.camera import MIN_DEPTH, Intrinsics
+from jaxslam_kernels.checks import checked
 from jaxslam_kernels.p3p import p3p
 from jaxslam_kernels.pose_cost import PoseProblem, pose_problem_and_idle
 from jaxslam_kernels.pose_refine import PoseStatus, refine_problem, solve_pose, usable_pose
@@ -54,6 +55,7 @@ class PnpResult(NamedTuple):
     status: Code
 
 
+@checked
 def ransac_pnp(
     key: Key[Array, ""],
     X_world: Points,
@@ -98,6 +100,8 @@ def ransac_pnp(
     Returns:
         A `PnpResult`; everything in it is finite.
     """
+    if X_world.shape[1] == 0:
+        return _none_found(_fallback(initial, X_world.dtype)[0])
     problem, idle = pose_problem_and_idle(
         X_world,
         uv,
@@ -129,6 +133,7 @@ _MOST_COMPARED = 2**15
 """Up to so many weights times samples comparing with all is faster than halving, and twenty times less code."""
 
 
+@checked
 def draw_samples(
     key: Key[Array, ""], weights: Weights, num_samples: int, size: int = SAMPLE_SIZE
 ) -> Int[Array, "size h"]:
@@ -136,7 +141,12 @@ def draw_samples(
 
     Exact sequential sampling without replacement: a draw lands on the line of stacked weights from which the ones
     drawn before have been cut out. With fewer points of positive weight than the sample has, some come twice.
+
+    Raises:
+        ValueError: While tracing, if there is no point at all.
     """
+    if weights.size == 0:
+        raise ValueError("draw_samples: weights: expected at least one, got none")
     search = "compare_all" if weights.size * num_samples <= _MOST_COMPARED else "scan"
     ends = jnp.cumsum(weights)
     starts, total = ends - weights, ends[-1]
@@ -163,6 +173,7 @@ def _inserted(line: list[tuple[Array, Array]], start: Array, weight: Array) -> l
     return [*longer, (start, weight)]
 
 
+@checked
 def score_poses(T_cam_world: _Transforms, problem: PoseProblem, averaged: bool = False) -> Float[Array, " h"]:
     """The score of each pose (see `PnpResult.score`), thresholds being `problem.scale` deviations.
 
@@ -255,6 +266,13 @@ def _result(
         score=jnp.where(found, score, 0.0),
         status=status,
     )
+
+
+def _none_found(fallback: SE3) -> PnpResult:
+    """The result of no points."""
+    dtype = fallback.wxyz_xyz.dtype
+    status = jnp.asarray(PoseStatus.TOO_FEW_POINTS, jnp.int32)
+    return PnpResult(fallback, jnp.zeros(0, bool), jnp.zeros((), jnp.int32), jnp.zeros((), dtype), status)
 
 
 def _fallback(initial: SE3 | None, dtype: DTypeLike) -> tuple[SE3, Flag]:

@@ -15,7 +15,7 @@ section 3.2, for the damping.
 from collections.abc import Callable
 from enum import IntEnum
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +27,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from jaxslam_kernels.block_band import GraphMatrix, Vector, conjugate_gradients, factorise, multiply, solve_factor
+from jaxslam_kernels.checks import checked
 from jaxslam_kernels.first_order import first_order
 from jaxslam_kernels.pose_graph_cost import (
     GraphEquations,
@@ -132,8 +133,9 @@ class _Search(NamedTuple):
     converged: Flag
 
 
+@checked
 def optimise_pose_graph(
-    T_world_cam: SE3,
+    T_world_cam: Annotated[SE3, "k"],
     edges: PoseGraphEdges,
     fixed: Bool[Array, " k"],
     *,
@@ -327,7 +329,8 @@ def _preconditioner(matrix: GraphMatrix, graph: _Graph, solver: _Solver) -> Call
 def _diagonal(equations: GraphEquations, graph: _Graph) -> Steps:
     """What the damping is relative to: the diagonal of the Hessian, one for nodes that stay."""
     diagonal = jnp.diagonal(equations.diagonal, axis1=1, axis2=2)
-    floor = jnp.finfo(diagonal.dtype).eps * jnp.max(diagonal) + jnp.finfo(diagonal.dtype).tiny * 1e8
+    largest = jnp.max(diagonal) if diagonal.size else 0.0
+    floor = jnp.finfo(diagonal.dtype).eps * largest + jnp.finfo(diagonal.dtype).tiny * 1e8
     return jnp.where(graph.free[:, None], jnp.maximum(diagonal, floor), 1.0)
 
 

@@ -12,7 +12,7 @@ with isotropic information, of SE-Sync's objective; g2o's leaves out the 2. The 
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -50,7 +50,7 @@ class PoseGraphEdges(NamedTuple):
 
     source: Int[Array, " m"]
     target: Int[Array, " m"]
-    T_source_target: SE3
+    T_source_target: Annotated[SE3, "m"]
     information: Blocks
     weights: Float[Array, " m"]
     mask: Bool[Array, " m"]

@@ -21,6 +21,7 @@ from jaxlie import SE3
 from jaxtyping import Array, Float, Int
 
 from jaxslam_kernels.camera import Intrinsics
+from jaxslam_kernels.checks import checked
 from jaxslam_kernels.first_order import first_order
 from jaxslam_kernels.levenberg_marquardt import ManifoldLevenbergMarquardt, NormalEquations
 from jaxslam_kernels.pose_cost import (
@@ -94,6 +95,7 @@ class SolverReport(NamedTuple):
     converged: Flag
 
 
+@checked
 def refine_pose(
     T_world_cam: SE3,
     X_world: Points,
@@ -273,6 +275,7 @@ def _figures_jvp(loss: Loss, primals: tuple, tangents: tuple) -> tuple[_Figures,
     return _figures(*primals, loss), jax.jvp(figures, (pose, problem, idle), tuple(tangents[1:4]))[1]
 
 
+@checked
 def usable_pose(T: SE3) -> tuple[SE3, Flag]:
     """The pose with a unit quaternion, or the identity and false if it is not finite."""
     parameters = T.wxyz_xyz

@@ -14,6 +14,7 @@ from typing import Literal, TypeAlias, assert_never
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxslam_kernels.checks import checked
 from jaxslam_kernels.types import Scalar, Weights
 
 Loss: TypeAlias = Literal["squared", "huber", "cauchy", "geman_mcclure"]
@@ -26,6 +27,7 @@ LARGEST_SQUARED = 1e16
 """Squared residuals beyond this count as this; its square and its ratios to its inverse are finite in float32."""
 
 
+@checked
 def loss_value(squared: SquaredResiduals, scale: Scalar | float, loss: Loss) -> SquaredResiduals:
     """The robust cost `rho(s)` of each squared residual; 0 where `squared` is not finite.
 
@@ -52,6 +54,7 @@ def loss_value(squared: SquaredResiduals, scale: Scalar | float, loss: Loss) -> 
     return jnp.where(known, value, 0.0)
 
 
+@checked
 def loss_weight(squared: SquaredResiduals, scale: Scalar | float, loss: Loss) -> SquaredResiduals:
     """The weight `rho'(s)` in [0, 1] of each squared residual; 0 where `squared` is not finite.
 
@@ -76,15 +79,18 @@ def loss_weight(squared: SquaredResiduals, scale: Scalar | float, loss: Loss) ->
     return jnp.where(known, weight, 0.0)
 
 
+@checked
 def weighted_median(values: Weights, weights: Weights) -> Scalar:
     """The smallest value at which half of the weight is reached; 0 if nothing has weight.
 
-    Values that are not finite do not count. `O(n log n)`, one sort.
+    Values that are not finite do not count; of no values at all it is 0. `O(n log n)`, one sort.
 
     Args:
         values: The numbers, any sign.
         weights: Non-negative weights; a mask works as `mask.astype(values.dtype)`.
     """
+    if values.shape[0] == 0:
+        return jnp.zeros((), values.dtype)
     counts = jnp.isfinite(values) & (weights > 0)
     order = jnp.argsort(jnp.where(counts, values, jnp.inf))
     ordered = jnp.where(counts, values, 0.0)[order]
@@ -92,6 +98,7 @@ def weighted_median(values: Weights, weights: Weights) -> Scalar:
     return ordered[jnp.argmax(reached >= 0.5 * reached[-1])]
 
 
+@checked
 def robust_scale(residuals: Weights, weights: Weights) -> Scalar:
     """The standard deviation of the inliers, from the median absolute deviation: 1.4826 med |r - med r|.
 

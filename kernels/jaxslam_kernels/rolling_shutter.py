@@ -8,9 +8,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxslam_kernels.camera import MIN_DEPTH
+from jaxslam_kernels.checks import checked
 from jaxslam_kernels.types import Pixels, Scalar, Weights
 
 
+@checked
 def image_velocity(xy: Pixels, depth: Weights, twist: Float[Array, "6"]) -> Pixels:
     """Velocity in normalised coordinates of static points seen from a moving camera.
 
@@ -37,6 +39,7 @@ def image_velocity(xy: Pixels, depth: Weights, twist: Float[Array, "6"]) -> Pixe
     return jnp.where(seen, jnp.stack([dx, dy]), 0)
 
 
+@checked
 def row_time(v: Float[Array, " n"], height: int, readout_s: Scalar) -> Float[Array, " n"]:
     """When rows are taken, in seconds after the middle row; 0 for a row that is not a number.
 
@@ -49,6 +52,7 @@ def row_time(v: Float[Array, " n"], height: int, readout_s: Scalar) -> Float[Arr
     return jnp.where(jnp.isfinite(v), after, 0) * readout_s
 
 
+@checked
 def as_if_at_once(xy: Pixels, velocity: Pixels, v: Float[Array, " n"], height: int, readout_s: Scalar) -> Pixels:
     """Where points would have been seen had the whole image been taken at the time of its middle row.
 

@@ -73,7 +73,7 @@ def _slopes(
     corner, fraction = patches.corner(patches.hold(position, level, border), border, window.half)
     strips = patches.cut(level, corner - jnp.array([[reach], [0]], corner.dtype), side + 1, side + num - 1)
     rows = strips[:, :-1] + fraction[1][:, None, None] * (strips[:, 1:] - strips[:, :-1])
-    gradient = template.gradient[:, 0].reshape(-1, side, window.stride)
+    gradient = template.gradient[:, 0].reshape(len(template.gradient), side, window.stride)
 
     # 0.16 ms for 512 points, 8 columns; as matrix products, or with points last so that all are vectors, 0.43; as one
     # product of vectors a column 0.97.

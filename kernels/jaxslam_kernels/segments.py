@@ -4,7 +4,7 @@ Source: Geiger, Lenz, Urtasun, "Are we ready for Autonomous Driving? The KITTI V
 the program `evaluate_odometry` of the benchmark's development kit.
 """
 
-from typing import NamedTuple, TypeAlias
+from typing import Annotated, NamedTuple, TypeAlias
 
 import jax.numpy as jnp
 from jax import lax
@@ -12,6 +12,7 @@ from jaxlie import SE3
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam_kernels.alignment import rpe, usable_poses
+from jaxslam_kernels.checks import checked
 from jaxslam_kernels.types import Code, Mask, Scalar
 
 KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
@@ -41,8 +42,14 @@ class SegmentErrors(NamedTuple):
     num_segments: Code
 
 
+@checked
 def segment_errors(
-    estimate: SE3, reference: SE3, mask: Mask, lengths: Float[Array, " k"], *, step: int = KITTI_STEP
+    estimate: Annotated[SE3, "n"],
+    reference: Annotated[SE3, "n"],
+    mask: Mask,
+    lengths: Float[Array, " k"],
+    *,
+    step: int = KITTI_STEP,
 ) -> SegmentErrors:
     """Errors of the motion over segments of given lengths along the reference's path.
 
@@ -53,7 +60,7 @@ def segment_errors(
     In float32 the way along kilometres is off by centimetres, so that a segment may end a pose earlier or later.
 
     Args:
-        estimate: Batch of `n` poses `T_world_cam` in the order of time, n at least 1.
+        estimate: Batch of `n` poses `T_world_cam` in the order of time.
         reference: Batch of `n` true poses at the same times, in any world frame.
         mask: `(n,)` which poses count. Those that cannot be used (see `alignment`) do not; they are left out of
             the path and of the count of steps.
@@ -80,7 +87,7 @@ def _way(xyz: Float[Array, "n 3"], count: Code) -> Float[Array, " n"]:
     xyz = lax.stop_gradient(xyz)
     steps = jnp.linalg.norm(xyz[1:] - xyz[:-1], axis=1)
     steps = jnp.where(jnp.arange(1, len(xyz), dtype=count.dtype) < count, steps, 0.0)
-    return jnp.concatenate([jnp.zeros(1, xyz.dtype), jnp.cumsum(steps)])
+    return jnp.concatenate([jnp.zeros(min(1, len(xyz)), xyz.dtype), jnp.cumsum(steps)])
 
 
 def _segment_ends(

@@ -6,12 +6,14 @@ allowed while it works. Where float64 is enabled it also turns float32 into it; 
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
 from jaxlie import SE3
 from jaxtyping import Array, Float
 
+from jaxslam_kernels.checks import checked
 from jaxslam_kernels.types import Points
 
 
@@ -22,41 +24,48 @@ def lenient_promotion() -> Iterator[None]:
         yield
 
 
+@checked
 def moved(T_a_b: SE3, tangent_b: Float[Array, "6"]) -> SE3:
     """`T_a_b @ exp(tangent_b)`: a pose moved in its own axes, translation first."""
     with lenient_promotion():
         return _typed(T_a_b @ SE3.exp(tangent_b), T_a_b)
 
 
-def composed(T_a_b: SE3, T_b_c: SE3) -> SE3:
+@checked
+def composed(T_a_b: Annotated[SE3, "..."], T_b_c: Annotated[SE3, "..."]) -> SE3:
     """`T_a_c`, its quaternion of unit length."""
     with lenient_promotion():
         return _typed((T_a_b @ T_b_c).normalize(), T_a_b)
 
 
-def between(T_world_a: SE3, T_world_b: SE3) -> SE3:
+@checked
+def between(T_world_a: Annotated[SE3, "..."], T_world_b: Annotated[SE3, "..."]) -> SE3:
     """`T_a_b`: the second pose seen from the first."""
     with lenient_promotion():
         return _typed(T_world_a.inverse() @ T_world_b, T_world_b)
 
 
+@checked
 def displacement(T_world_a: SE3, T_world_b: SE3) -> Float[Array, "6"]:
     """The tangent in the axes of the first pose that leads to the second, translation first."""
     with lenient_promotion():
         return between(T_world_a, T_world_b).log().astype(T_world_b.wxyz_xyz.dtype)
 
 
+@checked
 def to_camera(T_world_cam: SE3, X_world: Points) -> Points:
     """World points in the axes of the camera."""
     R = T_world_cam.rotation().as_matrix()
     return R.T @ (X_world - T_world_cam.translation()[:, None])
 
 
+@checked
 def to_world(T_world_cam: SE3, X_cam: Points) -> Points:
     """Points in the axes of the camera, in the world."""
     return T_world_cam.rotation().as_matrix() @ X_cam + T_world_cam.translation()[:, None]
 
 
+@checked
 def cross_matrix(v: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """The matrix whose product with a vector is the cross product of `v` with it."""
     x, y, z = v

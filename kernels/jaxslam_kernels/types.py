@@ -11,7 +11,9 @@ frame, `T_world_cam @ exp(tangent)`, unless a docstring says otherwise; covarian
 Units: metres, radians, seconds, pixels. A pixel `(u, v)` counts from the centre of the top-left pixel, which
 is (0, 0): `u` along a row, `v` down a column. An image is `image[v, u]`.
 
-Failure: nothing raises inside compiled code. Results are finite, and a status code says what they are worth.
+Failure: nothing raises inside compiled code. Results are finite, and a status code says what they are worth; that goes
+for no points at all too. While tracing, an argument of another type (`TypeError`) or another shape (`ValueError`) than
+annotated raises, see `checks`.
 
 Derivatives: by a weight of exactly 0 the derivative is the one-sided limit from above. Where second derivatives would
 be wrong, asking for one raises `NotImplementedError` while tracing, see `first_order`.

@@ -12,6 +12,7 @@ from jax import lax
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
+from jaxslam_kernels.checks import checked
 from jaxslam_kernels.types import Code, Mask, Points, Scalar, Weights
 from jaxslam_kernels.voxel_hash import (
     NO_ROW,
@@ -65,6 +66,7 @@ class VoxelGrid(NamedTuple):
         return self.sums[:, 7]
 
 
+@checked
 def reduced_cloud(X: Points, colour: Colours, mask: Mask, voxel_m: Scalar, *, capacity: int) -> Voxels:
     """One point for each voxel that has any: the centroid of its points, their mean colour, their number.
 
@@ -93,11 +95,13 @@ def reduced_cloud(X: Points, colour: Colours, mask: Mask, voxel_m: Scalar, *, ca
     return Voxels(centroid, sums[3:6] * share, sums[6], table.num + left_out)
 
 
+@checked
 def empty_grid(capacity: int, dtype: DTypeLike = jnp.float32) -> VoxelGrid:
     """A grid for so many voxels, without any."""
     return VoxelGrid(empty_table(capacity), jnp.zeros((capacity, 8), dtype))
 
 
+@checked
 def with_cloud(
     grid: VoxelGrid, X: Points, colour: Colours, count: Weights, evidence: Weights, voxel_m: Scalar
 ) -> tuple[VoxelGrid, Rows]:
@@ -119,6 +123,7 @@ def with_cloud(
     return changed(grid._replace(table=table), rows, X, colour, count, evidence, voxel_m), rows
 
 
+@checked
 def changed(
     grid: VoxelGrid, rows: Rows, X: Points, colour: Colours, count: Weights, evidence: Weights, voxel_m: Scalar
 ) -> VoxelGrid:
@@ -142,6 +147,7 @@ def changed(
     return grid._replace(sums=_bounded(grid.sums.at[row].add(figures.T, mode="drop"), row))
 
 
+@checked
 def weighed(grid: VoxelGrid, start: Code, evidence: Weights) -> VoxelGrid:
     """The grid with log-odds `(n,)` added to the rows from `start` on; there must be as many."""
     old = lax.dynamic_slice(grid.sums, (start, jnp.full_like(start, 7)), (len(evidence), 1))
@@ -149,6 +155,7 @@ def weighed(grid: VoxelGrid, start: Code, evidence: Weights) -> VoxelGrid:
     return grid._replace(sums=lax.dynamic_update_slice(grid.sums, new, (start, jnp.full_like(start, 7))))
 
 
+@checked
 def centroids(grid: VoxelGrid, start: Code, voxel_m: Scalar, *, size: int) -> Voxels:
     """The points of `size` rows from `start` on, whatever their log-odds; there must be as many.
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Int, UInt32
 
+from jaxslam_kernels.checks import checked
 from jaxslam_kernels.types import Code, Mask, Points, Scalar
 
 Keys: TypeAlias = UInt32[Array, "2 n"]
@@ -58,12 +59,14 @@ class _Search(NamedTuple):
     round: Code
 
 
+@checked
 def empty_table(capacity: int, points: int = 0) -> HashTable:
     """A table without voxels, at most half full when all rows are given, or so many points have come at once."""
     size = 1 << (2 * max(capacity, points) - 1).bit_length()
     return HashTable(jnp.full(size, _FREE, jnp.int32), jnp.zeros((2, capacity), jnp.uint32), jnp.zeros((), jnp.int32))
 
 
+@checked
 def voxel_keys(X: Points, voxel_m: Scalar) -> tuple[Keys, Mask]:
     """The voxel of each point, `floor(X / voxel_m)`, and whether it has one.
 
@@ -75,6 +78,7 @@ def voxel_keys(X: Points, voxel_m: Scalar) -> tuple[Keys, Mask]:
     return jnp.stack([(x << jnp.uint32(16)) | y, z]), inside
 
 
+@checked
 def key_corners(keys: Keys, voxel_m: Scalar) -> Points:
     """`(3, n)` the corners of voxels from which their coordinates count, metres."""
     low, sixteen = jnp.uint32(0xFFFF), jnp.uint32(16)
@@ -82,6 +86,7 @@ def key_corners(keys: Keys, voxel_m: Scalar) -> Points:
     return (index.astype(voxel_m.dtype) - HALF) * voxel_m
 
 
+@checked
 def find_rows(table: HashTable, keys: Keys, mask: Mask) -> tuple[HashTable, Rows, Code]:
     """The row of each key; those that have none get one, while there are any.
 
