@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from command_line import failing
+from made_results import done
 
 from jaxslam.benchmark.accuracy import (
     Accuracy,
@@ -17,7 +19,14 @@ from jaxslam.benchmark.accuracy import (
     measured,
     save_accuracy_baseline,
 )
+from jaxslam.benchmark.plan import fingerprint, plan
+from jaxslam.benchmark.suite import load_suite
+from jaxslam.cli import main
+from jaxslam.config import configs_dir
 from jaxslam.errors import BenchmarkError
+
+fails = failing("bench", "accuracy")
+VERSIONS = ("jaxlib", "opencv-python-headless", "numpy")
 
 SEEDS = 10
 ATES = tuple(0.010 + 0.0002 * seed for seed in range(SEEDS))
@@ -156,3 +165,60 @@ class TestMeasured:
         results = [self.result(tmp_path, 0), self.result(tmp_path, 1, **changes)]
         with pytest.raises(BenchmarkError, match=message):
             measured(results, tmp_path)
+
+
+class TestCommand:
+    """Results of a room that were made by hand; nothing is run."""
+
+    def folder(self, place: Path, scale: float = 1.0) -> Path:
+        """Two runs of the suite, and the suite itself beside them."""
+        place.mkdir()
+        (place / "two.yaml").write_text("runs: 2\nsequences: [{name: a, room: {frames: 90}}]\n")
+        results = []
+        for seed in range(2):
+            run = done("a", "default", seed, frames=90, tracked=90, ate_rmse_m=scale * ATES[seed], data_sha256=None)
+            results.append(run | {"vectors": "avx2", "versions": dict.fromkeys(VERSIONS, "1")})
+            trajectory = place / "a" / "default" / str(seed) / "trajectory.txt"
+            trajectory.parent.mkdir(parents=True)
+            trajectory.write_text(f"{scale} {seed}")
+        (place / "results.json").write_text(json.dumps(results))
+        return place
+
+    def command(self, folder: Path, *more: str) -> list[str]:
+        suite = ["--suite", str(folder / "two.yaml"), "--baseline", str(folder.parent / "baseline.json")]
+        return ["bench", "accuracy", "--results-from", str(folder), *suite, *more]
+
+    def test_compares(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        """The same bytes, then errors a tenth larger, which end with code 1 and say by how much."""
+        before = self.folder(tmp_path / "before")
+        main(self.command(before, "--update", "first"))
+        assert load_accuracy_baseline(tmp_path / "baseline.json").commit == "abc"
+        main(self.command(before))
+        printed = capsys.readouterr().out
+        assert "Geometric mean of the ratios over 1 recordings: 1.000" in printed
+        assert "Verdict: nothing is worse." in printed
+        assert "| a | 90 | 100.00 | 10.10 | 1.01 | 10.10 | 1.000 |" in (before / "accuracy.md").read_text()
+        after = self.folder(tmp_path / "after", 1.1)
+        assert "less accurate than abc: geometric mean of the ratios 1.100" in fails(capsys, *self.command(after)[2:])
+
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            (("--update", "why"), "--update: expected --baseline FILE to write to"),
+            (("--update", " ", "--baseline", "x.json"), "--update: expected a reason"),
+            (("--baseline", "nowhere.json"), "nowhere.json: expected a baseline, cannot be read"),
+            (("--results-from", "nowhere"), "--results-from: expected a folder with results, got 'nowhere'"),
+        ],
+    )
+    def test_wrong_options(self, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], message: str) -> None:
+        assert message in fails(capsys, *arguments)
+
+    def test_baselines_that_come_with_jaxslam(self) -> None:
+        """Each is of ten seeds of the suite's sequences as they are now."""
+        planned = fingerprint(plan(load_suite("accuracy")))
+        files = sorted((configs_dir() / "benchmarks" / "baselines").glob("accuracy-*.json"))
+        assert files
+        for file in files:
+            baseline = load_accuracy_baseline(file)
+            assert baseline.sequences == planned["sequences"]
+            assert {len(runs.ates_m) for runs in baseline.recordings.values()} == {planned["runs"]}
