@@ -48,7 +48,7 @@ def missing(suite: Suite, found: Collection[str]) -> dict[str, str]:
     """
     names = [clip.recording for clip in suite.sequences if clip.recording and clip.recording not in found]
     public = known_recordings()
-    way = lambda name: f"; to get it: jaxslam data get {name}" if name in public else ", and not public; see --root"
+    way = lambda name: f"; to get it: jaxslam data get {name}" if name in public else ", nor in `jaxslam data list`"
     return {name: f"not there{way(name)}" for name in names}
 
 

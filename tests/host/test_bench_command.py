@@ -263,7 +263,7 @@ class TestTrouble:
     def test_recording_that_is_not_there(self, mine: Path, tmp_path: Path) -> None:
         suite = suite_file(tmp_path, SUITE + "  - recording: rgbd_bonn_nowhere\n")
         main(["bench", suite, "--out", str(mine), "--resume"])
-        assert "jaxslam data get rgbd_bonn_nowhere" in (mine / "report.md").read_text()
+        assert "rgbd_bonn_nowhere: not there, nor in `jaxslam data list`" in (mine / "report.md").read_text()
         assert "rgbd_bonn_nowhere" in (mine / "report.html").read_text()
 
     def test_kitti(self, tmp_path: Path, data_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:

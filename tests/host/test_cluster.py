@@ -182,7 +182,7 @@ class TestWorkerThatIsKilled:
         hashes = {run["sequence"]: run["data_sha256"] for run in results_in(outcome.out)}
         assert hashes["room"] is None
         assert hashes["recorded_room"]
-        assert "jaxslam data get room_nobody_has" in (outcome.out / "report.md").read_text()
+        assert "room_nobody_has: not there, nor in `jaxslam data list`" in (outcome.out / "report.md").read_text()
 
     def test_its_job_ends(self, outcome: Outcome) -> None:
         outcome.job.wait(PATIENCE_S)
