@@ -158,10 +158,7 @@ def without_network(results: Sequence[Mapping[str, Any]]) -> list[str]:
     for result in results:
         if result["status"] == "done" and (why := result.get("without_network")) is not None:
             lacking.setdefault(why, []).append(result["label"])
-    return [
-        f"{', '.join(dict.fromkeys(labels))}: without a network ({why}); geometry alone decided"
-        for why, labels in lacking.items()
-    ]
+    return [f"{', '.join(dict.fromkeys(labels))}: without a network ({why})" for why, labels in lacking.items()]
 
 
 def figure_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]) -> list[list[str]]:

@@ -127,7 +127,7 @@ def cell(row: Mapping[str, Any], column: Column) -> str:
 
 def _shown(result: Mapping[str, Any]) -> Mapping[str, Any]:
     folder = str(run_folder(result["sequence"], result["label"], result["seed"]))
-    without = ", without a network" if result.get("lacks_network") else ""
+    without = " (without a network)" if result.get("lacks_network") else ""
     return {**result, "folder": folder, "label": result["label"] + without}
 
 

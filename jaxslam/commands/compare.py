@@ -102,7 +102,7 @@ def figures(preset: str, summaries: list[dict[str, Any]]) -> dict[str, Any]:
 def _cells(row: dict[str, Any]) -> list[str]:
     ates = row["ate_rmse_m_of_runs"]
     return [
-        row["preset"] + (", without a network" if row["lacks_network"] else ""),
+        row["preset"] + (" (without a network)" if row["lacks_network"] else ""),
         f"{row['tracked_percent']:.1f} %",
         f"{row['dropped_percent']:.1f} %",
         number(row["num_matched"], 0),

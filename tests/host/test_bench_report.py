@@ -193,14 +193,12 @@ class TestPublished:
         why = "yolox-nano not on this machine"
         lacking = done(label="ngd", without_network=why, lacks_network=True)
         default = done(label="default", without_network=why)
-        assert without_network([lacking, default, done(label="rts")]) == [
-            f"ngd, default: without a network ({why}); geometry alone decided"
-        ]
+        assert without_network([lacking, default, done(label="rts")]) == [f"ngd, default: without a network ({why})"]
         text = markdown_report(CROWD, [lacking, default], {})
-        assert "| ngd, without a network | 1 of 1 |" in text
+        assert "| ngd (without a network) | 1 of 1 |" in text
         assert "default is |" in text
-        assert "ngd, without a network is |" not in text
-        assert "no verdict for crowd (ngd, without a network): run without the network that the preset needs" in text
+        assert "ngd (without a network) is |" not in text
+        assert "no verdict for crowd (ngd (without a network)): run without the network that the preset needs" in text
         assert "published ATE" not in markdown_report(CROWD, [lacking], {})
 
     def test_nothing_about_parts_and_rooms(self) -> None:

@@ -41,7 +41,7 @@ def test_a_table(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
         assert row["evaluation_problems"] == []
     lines = (tmp_path / "comparison.md").read_text().splitlines()
     assert lines[2].startswith("| static | 100.0 % |")
-    assert lines[3].startswith("| ngd, without a network | 100.0 % |")
+    assert lines[3].startswith("| ngd (without a network) | 100.0 % |")
     assert len({line.count("|") for line in lines[:4]}) == 1
     assert [line for line in lines[4:] if line] == [
         "- static: without a network (semantics.model is null)",
