@@ -12,7 +12,7 @@ from jaxslam.dynamics.cue import Cue
 from jaxslam.dynamics.epipolar import EpipolarParams, make_epipolar_cue
 from jaxslam.dynamics.motion_state import MotionParams, MotionPlan
 from jaxslam.dynamics.regions import RegionPlan
-from jaxslam.dynamics.trajectory import TrajectoryParams, make_trajectory_cue
+from jaxslam.dynamics.trajectory import TrajectoryParams, trajectory_cue
 from jaxslam.floating_dtype import floating_dtype
 from jaxslam.state import TrackParams, TrackPlan
 
@@ -32,7 +32,7 @@ class _Known(NamedTuple):
 
 
 _KNOWN = {
-    "trajectory": _Known(lambda config: make_trajectory_cue(config.trajectory.as_published), TrajectoryParams),
+    "trajectory": _Known(lambda _: trajectory_cue, TrajectoryParams),
     "epipolar": _Known(lambda config: make_epipolar_cue(config.epipolar.num_hypotheses), EpipolarParams),
     "clusters": _Known(
         lambda config: make_cluster_cue(config.clusters.as_published), ClusterParams, needs_regions=True

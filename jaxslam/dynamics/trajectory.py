@@ -4,9 +4,7 @@ Source: RTS-SLAM (Sensors 2026), trajectory consistency, up to formula 14: the d
 against that of the camera, with a tolerance that grows with depth.
 """
 
-from collections.abc import Callable
-from functools import lru_cache
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxslam_kernels.camera import Intrinsics, back_project
@@ -17,25 +15,24 @@ from jaxslam.dynamics.cue import Scene, Verdict, judge
 
 
 class TrajectoryParams(NamedTuple):
-    """Of the trajectory cue; scalars.
+    """Of `trajectory_cue`; scalars.
 
     Attributes:
         tolerance_m: Difference of ways that says nothing, close to the camera: the paper's alpha.
         tolerance_per_m: Its growth with the smaller of both depths: the paper's beta.
+        as_published: 1 compares the lengths of the ways, as in the paper; 0 the ways themselves. A choice without a
+            derivative; a number, not a flag, so that `jax.grad` takes it. One program serves both.
         temperature: See `cue.judge`.
     """
 
     tolerance_m: Scalar
     tolerance_per_m: Scalar
+    as_published: Scalar
     temperature: Scalar
 
 
-TrajectoryCue: TypeAlias = Callable[[Scene, TrajectoryParams], Verdict]
-
-
-@lru_cache  # the same function for the same choice: another one would be compiled anew
-def make_trajectory_cue(as_published: bool = False) -> TrajectoryCue:
-    """The cue that judges the way of each point from frame to frame.
+def trajectory_cue(scene: Scene, params: TrajectoryParams) -> Verdict:
+    """How far each point is from where it would be at rest, in tolerances.
 
     The paper compares the lengths of two ways: that of the point in the axes of the camera, and that of the camera.
     A point far from the axis about which the camera turns is then taken to move, and one that moves along with the
@@ -43,36 +40,21 @@ def make_trajectory_cue(as_published: bool = False) -> TrajectoryCue:
     where it is found is what counts: `|P_t - T P_{t-1}|`.
 
     Args:
-        as_published: Whether lengths of ways are compared, as in the paper, not the ways.
+        scene: What is known of the points; those without depth in one frame are not judged.
+        params: Tolerances.
     """
-
-    def trajectory_cue(scene: Scene, params: TrajectoryParams) -> Verdict:
-        """How far each point is from where it would be at rest, in tolerances.
-
-        Args:
-            scene: What is known of the points; those without depth in one frame are not judged.
-            params: Tolerances.
-        """
-        apart_m, known = _apart(scene, as_published)
-        tolerance_m = params.tolerance_m + params.tolerance_per_m * jnp.minimum(scene.depth_before, scene.depth)
-        return judge(apart_m / jnp.where(known, tolerance_m, 1), known, params.temperature)
-
-    return trajectory_cue
-
-
-def _apart(scene: Scene, as_published: bool) -> tuple[Weights, Mask]:
-    """How far each point is from where it would be at rest, metres, and of which points that is known."""
     seen = jnp.isfinite(scene.uv_before).all(axis=0) & jnp.isfinite(scene.uv).all(axis=0)
     known = scene.followed & seen & (scene.depth_before > 0) & (scene.depth > 0)
     before, now = (
         _in_camera(uv, depth, known, scene.intrinsics)
         for uv, depth in ((scene.uv_before, scene.depth_before), (scene.uv, scene.depth))
     )
-    if as_published:
-        camera_m = _length(between(scene.T_world_before, scene.T_world_cam).translation()[:, None])
-        return jnp.abs(_length(now - before) - camera_m), known
     carried = to_camera(scene.T_world_cam, to_world(scene.T_world_before, before))
-    return _length(now - carried), known
+    camera_m = _length(between(scene.T_world_before, scene.T_world_cam).translation()[:, None])
+    published = jnp.abs(_length(now - before) - camera_m)
+    apart_m = jnp.where(params.as_published > 0.5, published, _length(now - carried))
+    tolerance_m = params.tolerance_m + params.tolerance_per_m * jnp.minimum(scene.depth_before, scene.depth)
+    return judge(apart_m / jnp.where(known, tolerance_m, 1), known, params.temperature)
 
 
 def _in_camera(uv: Pixels, depth: Weights, known: Mask, intrinsics: Intrinsics) -> Points:

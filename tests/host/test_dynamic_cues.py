@@ -15,7 +15,7 @@ from jaxslam_kernels.transform import moved, to_camera, to_world
 
 from jaxslam.dynamics.cue import Verdict, combined, judge
 from jaxslam.dynamics.occlusion import PointState, next_states, occluded_share, occlusion_weights
-from jaxslam.dynamics.trajectory import TrajectoryCue, TrajectoryParams, make_trajectory_cue
+from jaxslam.dynamics.trajectory import TrajectoryParams, trajectory_cue
 
 EVIDENCE = st.lists(st.floats(0, 100, width=32), min_size=1, max_size=20)
 
@@ -26,11 +26,8 @@ def x64() -> Iterator[None]:
         yield
 
 
-trajectory_cue, published_cue = make_trajectory_cue(), make_trajectory_cue(as_published=True)
-
-
-def params(*, temperature: float = 0.0) -> TrajectoryParams:
-    return TrajectoryParams(jnp.array(0.01), jnp.array(0.01), jnp.array(temperature))
+def params(*, as_published: bool = False, temperature: float = 0.0) -> TrajectoryParams:
+    return TrajectoryParams(jnp.array(0.01), jnp.array(0.01), jnp.array(float(as_published)), jnp.array(temperature))
 
 
 class TestJudge:
@@ -71,12 +68,12 @@ class TestTrajectory:
     def test_as_published_is_wrong_where_the_camera_turns(self) -> None:
         """And for what goes along with the camera: here the corrected form is right, and there too."""
         turning = scene(MOTIONS["turning"])
-        assert (np.asarray(published_cue(turning, params()).weight) == 0).mean() > 0.5
+        assert (np.asarray(trajectory_cue(turning, params(as_published=True)).weight) == 0).mean() > 0.5
         assert (np.asarray(trajectory_cue(turning, params()).weight) == 1).all()
         aside = scene(MOTIONS["sideways"])
         ends = np.asarray(to_world(aside.T_world_before, jnp.array([[0.0, 0.1], [0.0, 0.0], [0.0, 0.0]])))
         both = scene(MOTIONS["sideways"], ends[:, 1] - ends[:, 0])
-        assert (np.asarray(published_cue(both, params()).weight)[moves()] == 1).all()
+        assert (np.asarray(trajectory_cue(both, params(as_published=True)).weight)[moves()] == 1).all()
         assert (np.asarray(trajectory_cue(both, params()).weight)[moves()] == 0).all()
 
     def test_as_published(self) -> None:
@@ -88,7 +85,7 @@ class TestTrajectory:
         camera_m = np.linalg.norm(given.T_world_cam.translation() - given.T_world_before.translation())
         apart = np.abs(np.linalg.norm(now - before, axis=0) - camera_m)
         expected = apart / (0.01 + 0.01 * np.minimum(before[2], now[2]))
-        found = published_cue(given, params())
+        found = trajectory_cue(given, params(as_published=True))
         np.testing.assert_allclose(found.evidence, expected, rtol=1e-6, atol=1e-9)
 
     def test_without_depth_nothing_is_said(self) -> None:
@@ -102,19 +99,19 @@ class TestTrajectory:
         assert (np.asarray(found.weight)[:50] == 1).all()
         assert np.isfinite(np.asarray(found.evidence)).all()
 
-    @pytest.mark.parametrize("cue", [trajectory_cue, published_cue], ids=["corrected", "published"])
+    @pytest.mark.parametrize("as_published", [False, True])
     @pytest.mark.parametrize("motion", ["none", "all"])
-    def test_gradient(self, cue: TrajectoryCue, motion: str) -> None:
+    def test_gradient(self, as_published: bool, motion: str) -> None:
         """Of the weights by the tolerances, the pose and the points, at rest too."""
         given = scene(MOTIONS[motion], (0.02, 0.01, 0))
 
         def total(tolerances: Any, tangent: Any, depth: Any) -> Any:
             pose = moved(given.T_world_cam, jnp.asarray(tangent))
             changed = given._replace(T_world_cam=pose, depth=depth)
-            chosen = params(temperature=0.3)
+            chosen = params(as_published=as_published, temperature=0.3)
             near, per_m = jnp.asarray(tolerances)
             chosen = chosen._replace(tolerance_m=near, tolerance_per_m=per_m)
-            return jnp.sum(cue(changed, chosen).weight * jnp.linspace(1, 2, N))
+            return jnp.sum(trajectory_cue(changed, chosen).weight * jnp.linspace(1, 2, N))
 
         arguments = jnp.array([0.01, 0.01]), jnp.full(6, 1e-3), given.depth
         check_finite(jax.grad(total, argnums=(0, 1, 2)), *arguments)
