@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxslam.benchmark.baseline import reading_baseline
 from jaxslam.benchmark.names import run_folder
 from jaxslam.benchmark.plan import plan_differences
 from jaxslam.benchmark.rows import by_sequence
@@ -180,18 +181,12 @@ def load_accuracy_baseline(path: Path) -> AccuracyBaseline:
     Raises:
         BenchmarkError: If it is missing, is no baseline, or one that nothing can be compared with.
     """
-    try:
+    with reading_baseline(path, "bench accuracy --update"):
         content = json.loads(path.read_text())
         recordings = {name: _of_json(name, entry) for name, entry in content.pop("recordings").items()}
         baseline = AccuracyBaseline(recordings=recordings, **content)
-    except OSError as problem:
-        raise BenchmarkError(f"{path}: expected a baseline, cannot be read: {problem.strerror}") from None
-    except (ValueError, KeyError, TypeError, AttributeError) as problem:
-        raise BenchmarkError(
-            f"{path}: expected a baseline as `bench accuracy --update` writes it, got {problem!r}"
-        ) from None
-    if not recordings or not recordings.keys() <= baseline.sequences.keys():
-        raise BenchmarkError(f"{path}: recordings: expected at least one, each in `sequences`, got {list(recordings)}")
+        if not recordings or not recordings.keys() <= baseline.sequences.keys():
+            raise BenchmarkError(f"recordings: expected at least one, each in `sequences`, got {list(recordings)}")
     return baseline
 
 

@@ -2,7 +2,8 @@
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -73,21 +74,34 @@ def load_baseline(path: Path) -> Baseline:
     Raises:
         BenchmarkError: If it is missing, no baseline, or one that nothing can be held to.
     """
-    try:
+    with reading_baseline(path, "bench gate --update"):
         content = json.loads(path.read_text())
         presets = tuple(str(preset) for preset in content["presets"])
         rows = {str(row): {str(k): float(v) for k, v in figures.items()} for row, figures in content["rows"].items()}
         suite, reason, machine, versions = (str(content[key]) for key in ("suite", "reason", "machine", "versions"))
         noise = {str(label): float(share) for label, share in content["noise"].items()}
         return Baseline(suite, presets, int(content["runs"]), reason, machine, versions, noise, rows, _plan_of(content))
+
+
+@contextmanager
+def reading_baseline(path: Path, written_by: str) -> Iterator[None]:
+    """Turn what goes wrong while a baseline is read into errors that name the file.
+
+    Args:
+        path: The file.
+        written_by: Command that writes such files.
+
+    Raises:
+        BenchmarkError: If the file is missing, is no baseline, or one that nothing can be compared with.
+    """
+    try:
+        yield
     except OSError as problem:
         raise BenchmarkError(f"{path}: expected a baseline, cannot be read: {problem.strerror}") from None
     except BenchmarkError as problem:
         raise BenchmarkError(f"{path}: {problem}") from None
     except (ValueError, KeyError, TypeError, AttributeError) as problem:
-        raise BenchmarkError(
-            f"{path}: expected a baseline as `bench gate --update` writes it, got {problem!r}"
-        ) from None
+        raise BenchmarkError(f"{path}: expected a baseline as `{written_by}` writes it, got {problem!r}") from None
 
 
 def _plan_of(content: Mapping[str, Any]) -> dict[str, Any]:

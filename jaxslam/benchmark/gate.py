@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from jaxslam.benchmark.baseline import ATE, Baseline
+from jaxslam.benchmark.machines import machine_name, machine_of, versions_of
 from jaxslam.benchmark.rows import by_sequence, row_name, rows_of
 from jaxslam.errors import BenchmarkError
 from jaxslam.results import machine
@@ -27,8 +28,6 @@ _WORSE_ATE, _WORSE_TIME = 0.02, 0.2
 _NOISE, _ROUNDING = 4.0, 0.05
 """Where rounding differs: so many standard deviations of the errors over seeds, or this share of them. With XLA held to
 AVX2, AVX and SSE4.2 on one processor, errors of `smoke` differ by 0.02, 0.8 and 2.2 % at most."""
-_VERSIONS = ("jaxlib", "opencv-python-headless", "numpy")
-"""What rounds."""
 _LEAST_ATE_M = 1e-5
 """Smaller differences are of no interest to anybody."""
 _LEAST_PERCENT = 1e-6
@@ -113,7 +112,7 @@ def differences(baseline: Baseline, results: Sequence[Mapping[str, Any]]) -> str
 
 def runs_at_once(baseline: Baseline) -> int:
     """How many runs this machine has room for: one where times will be compared, else one on each core."""
-    return 1 if _name(machine()) == baseline.machine else usable_cores()
+    return 1 if machine_name(machine()) == baseline.machine else usable_cores()
 
 
 def complaints(baseline: Baseline, results: Sequence[Mapping[str, Any]]) -> list[Complaint]:
@@ -192,18 +191,3 @@ def _noise_of(results: Sequence[Mapping[str, Any]]) -> dict[str, float]:
         if len(ates) > 1:
             shares.setdefault(row["label"], []).append(float(np.std(ates, ddof=1) / np.mean(ates)))
     return {label: round(float(np.sqrt(np.mean(np.square(of_it)))), 4) for label, of_it in shares.items()}
-
-
-def machine_of(results: Sequence[Mapping[str, Any]]) -> str:
-    """CPU, vector instructions and cores on which runs were made."""
-    return "; ".join(sorted({_name(result) for result in results if result["status"] == "done"}))
-
-
-def _name(machine: Mapping[str, Any]) -> str:
-    return f"{machine['cpu']} ({machine['vectors']}), {machine['cores']} cores"
-
-
-def versions_of(results: Sequence[Mapping[str, Any]]) -> str:
-    """Versions of the libraries that round, with which runs were made."""
-    done = (result for result in results if result["status"] == "done")
-    return "; ".join(sorted({", ".join(f"{name} {run['versions'][name]}" for name in _VERSIONS) for run in done}))

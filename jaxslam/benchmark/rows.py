@@ -84,6 +84,11 @@ def with_shown_labels(results: Sequence[Mapping[str, Any]]) -> list[Mapping[str,
     return [_shown(result) for result in results]
 
 
+def shown_label(label: str, *, lacks_network: bool) -> str:
+    """A label as tables show it: with the remark that runs went without the network that their preset needs."""
+    return f"{label} (without a network)" if lacks_network else label
+
+
 def by_sequence(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
     """Rows or results, by the name of the sequence they are of, in their order."""
     groups: dict[str, list[Mapping[str, Any]]] = {}
@@ -127,8 +132,8 @@ def cell(row: Mapping[str, Any], column: Column) -> str:
 
 def _shown(result: Mapping[str, Any]) -> Mapping[str, Any]:
     folder = str(run_folder(result["sequence"], result["label"], result["seed"]))
-    without = " (without a network)" if result.get("lacks_network") else ""
-    return {**result, "folder": folder, "label": result["label"] + without}
+    label = shown_label(result["label"], lacks_network=bool(result.get("lacks_network")))
+    return {**result, "folder": folder, "label": label}
 
 
 def _row(sequence: str, label: str, group: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -21,7 +21,8 @@ from jaxslam.benchmark.accuracy import (
     save_accuracy_baseline,
 )
 from jaxslam.benchmark.collected import read_results
-from jaxslam.benchmark.gate import check_reason, machine_of, versions_of
+from jaxslam.benchmark.gate import check_reason
+from jaxslam.benchmark.machines import cpu_name, machine_of, versions_of
 from jaxslam.benchmark.plan import fingerprint
 from jaxslam.benchmark.report import table
 from jaxslam.commands.bench import RunsOfSuite
@@ -118,8 +119,7 @@ def _baseline_for(here: Mapping[str, Any]) -> Path:
     files = sorted((configs_dir() / "benchmarks" / "baselines").glob(f"{_SUITE}-*.json"))
     if not files:
         raise BenchmarkError("bench accuracy: expected a baseline that comes with jaxslam, got none; give --baseline")
-    made_here = f"{here['cpu']} ({here['vectors']})"
-    return next((file for file in files if load_accuracy_baseline(file).machine.startswith(made_here)), files[0])
+    return next((file for file in files if load_accuracy_baseline(file).machine.startswith(cpu_name(here))), files[0])
 
 
 def _report(reading: Accuracy, baseline: AccuracyBaseline, words: Sequence[str], out: Path) -> None:

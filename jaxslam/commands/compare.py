@@ -9,6 +9,7 @@ from typing import Any
 from rich.table import Table
 
 from jaxslam.benchmark.report import table
+from jaxslam.benchmark.rows import shown_label
 from jaxslam.commands.console import console, plain_console
 from jaxslam.commands.run import OfRecording, number, track
 from jaxslam.config import presets
@@ -102,7 +103,7 @@ def figures(preset: str, summaries: list[dict[str, Any]]) -> dict[str, Any]:
 def _cells(row: dict[str, Any]) -> list[str]:
     ates = row["ate_rmse_m_of_runs"]
     return [
-        row["preset"] + (" (without a network)" if row["lacks_network"] else ""),
+        shown_label(row["preset"], lacks_network=row["lacks_network"]),
         f"{row['tracked_percent']:.1f} %",
         f"{row['dropped_percent']:.1f} %",
         number(row["num_matched"], 0),
