@@ -26,16 +26,17 @@ def plan(
     Args:
         suite: What is run.
         presets: Instead of its own, if there are any.
-        runs: How often each, instead of as often as it says.
+        runs: How often each, instead of as often as the suite and its sequences say.
         settings: `key=value` each, applied last: they beat those of the suite and of its variants.
     """
     variants = suite.variants or {"": ()}
     return [
-        Job(clip, preset, variant, (*suite.settings, *of_variant, *settings), seed)
+        # Without `runs`: a run is the same run, however many others there are.
+        Job(replace(clip, runs=None), preset, variant, (*suite.settings, *of_variant, *settings), seed)
         for clip in suite.sequences
         for preset in dict.fromkeys(presets or suite.presets)
         for variant, of_variant in variants.items()
-        for seed in range(suite.runs if runs is None else runs)
+        for seed in range(runs or clip.runs or suite.runs)
     ]
 
 
@@ -119,12 +120,17 @@ def fingerprint(jobs: Sequence[Job]) -> dict[str, Any]:
         jobs: From `plan`, or those of some presets or sequences of it.
 
     Returns:
-        `sequences` by name, `presets` by label with their settings, and `runs` of each.
+        `sequences` by name, `presets` by label with their settings, and `runs` of each; a sequence with more runs than
+        the others says how many.
     """
     labels = {job.label: {"preset": job.preset, "settings": list(job.settings)} for job in jobs}
-    clips = {job.clip.name: _plain_clip(job.clip) for job in jobs}
     rows = Counter((job.clip.name, job.label) for job in jobs)
-    return {"sequences": clips, "presets": labels, "runs": max(rows.values(), default=0)}
+    least = min(rows.values(), default=0)
+    clips = {}
+    for job in jobs:
+        number = rows[job.clip.name, job.label]
+        clips[job.clip.name] = _plain_clip(job.clip) | ({"runs": number} if number > least else {})
+    return {"sequences": clips, "presets": labels, "runs": least}
 
 
 def plan_differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:

@@ -12,6 +12,7 @@ sequences:
     room: {frames: 90, people: 2}    # rendered, see `SyntheticConfig`; `baseline_m: 0.1` makes stereo pairs of it
   - recording: kitti_00
     sensor: stereo                   # or rgbd: what the recording must be; whichever it is if not given
+    runs: 20                         # how often this one, if not as often as the others
 ablation: false                      # true shows published figures of parts of systems too
 variants:                            # every preset with each of these settings too
   few-points: [track.num_points=256]
@@ -48,6 +49,7 @@ class Sequence(Checked):
         every: All frames, or every nth, as if the camera were slower.
         camera: Known camera of the recording, or a camera file, seen from the suite's; `None` if its folder tells.
         sensor: What it must have been taken with; `None` for whichever it was.
+        runs: How often it is run; `None` for as often as the suite says.
     """
 
     _error: ClassVar[type[JaxSlamError]] = BenchmarkError
@@ -60,6 +62,7 @@ class Sequence(Checked):
     every: Annotated[int, _Positive] = 1
     camera: str | None = None
     sensor: Literal["rgbd", "stereo"] | None = None
+    runs: Annotated[int, _Positive] | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -88,7 +91,7 @@ class Suite:
         about: One line.
         sequences: What is tracked.
         presets: With what.
-        runs: How often each, with the seeds 0, 1, 2, ...
+        runs: How often each sequence that does not say it itself, with the seeds 0, 1, 2, ...
         settings: `key=value` of all runs.
         variants: More settings by name; every preset is run with each, and not without.
         ablation: Whether published figures of parts of systems are shown too.
@@ -213,7 +216,7 @@ def check_masks(sequences: Iterable[Sequence], config: Config) -> None:
 
 
 def _sequence(place: str, entry: object, folder: Path) -> Sequence:
-    known = ("name", "recording", "room", "start", "stop", "every", "camera", "sensor")
+    known = ("name", "recording", "room", "start", "stop", "every", "camera", "sensor", "runs")
     if not isinstance(entry, Mapping):
         raise BenchmarkError(f"{place}: expected `recording: NAME` or `room: ...`, got {entry!r}")
     fields = dict(entry)

@@ -1,6 +1,7 @@
 """Suites: what is in their files, what is wrong with them, and the runs they come to."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -155,6 +156,22 @@ class TestPlan:
     def test_chosen(self, tmp_path: Path) -> None:
         jobs = plan(load_suite(suite_file(tmp_path, SUITE)), presets=("ngd",), runs=1)
         assert [str(job.folder) for job in jobs] == ["room/ngd/0", "start/ngd/0"]
+
+    def test_runs_of_one_sequence(self, tmp_path: Path) -> None:
+        suite = load_suite(suite_file(tmp_path, SUITE))
+        often = replace(suite, sequences=(replace(suite.sequences[0], runs=4), *suite.sequences[1:]), runs=2)
+        jobs = plan(often, presets=("ngd",))
+        assert [(job.clip.name, job.seed) for job in jobs] == [
+            *(("room", n) for n in range(4)),
+            ("start", 0),
+            ("start", 1),
+        ]
+        planned = fingerprint(jobs)
+        assert planned["runs"] == 2
+        assert planned["sequences"]["room"]["runs"] == 4
+        assert "runs" not in planned["sequences"]["start"]
+        assert jobs[0] == plan(suite, presets=("ngd",))[0]  # the same run, to go on with
+        assert len(plan(often, presets=("ngd",), runs=1)) == 2
 
     def test_sweep(self, tmp_path: Path) -> None:
         suite = swept(load_suite(suite_file(tmp_path, SUITE)), ["track.num_points=256,512", "run.prefetch_frames=2,3"])
