@@ -30,6 +30,7 @@ from jaxslam.dynamics.point_mask import mask_around, moving_points
 from jaxslam.errors import DatasetError, FrameError, JaxSlamError, MapFileError
 from jaxslam.frame import Frame, check_frame
 from jaxslam.frame_arrays import FrameArrays, FrameMemory
+from jaxslam.input_warnings import InputWarnings
 from jaxslam.map import Map
 from jaxslam.map_file import load_map, save_map
 from jaxslam.map_link import Hung
@@ -256,7 +257,7 @@ class Slam:
             self._masks.look(self._frame, frame.image)
         self._frame += 1
         watch.ends("hand over")
-        return replace(tracked, track_ms=(time.perf_counter() - began) * 1e3)
+        return replace(tracked, track_ms=(time.perf_counter() - began) * 1e3, warnings=self._warnings.taken())
 
     def run(
         self, dataset: Dataset, on_frame: Callable[[Frame | None, Tracked | Rejected], None] | None = None
@@ -307,6 +308,11 @@ class Slam:
         return self._back.map
 
     @property
+    def warnings(self) -> tuple[str, ...]:
+        """What looks wrong about the input so far, a sentence each."""
+        return self._warnings.all
+
+    @property
     def dense(self) -> DenseCloud | None:
         """The dense map as it is now: points, colours and counts; `None` without `dense.enabled`."""
         return None if self.dense_mapping is None else self.dense_mapping.cloud()
@@ -344,6 +350,7 @@ class Slam:
 
     def _begin(self) -> None:
         self.times = StageTimes()
+        self._warnings = InputWarnings()
         run, semantics, dynamics = self.config.run, self.config.semantics, self.config.dynamics
         every = self._detector if semantics.frames == "every" else None
         self.dense_mapping = self._new_dense_mapping()

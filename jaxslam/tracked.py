@@ -39,6 +39,8 @@ class Tracked:
         track_ms: Time it took, in milliseconds.
         occluded_share: Share of the points of the keyframe it hangs on that something passed before and that were seen
             again; `None` if the settings do not ask for it, it was lost, or the map had no keyframe yet.
+        warnings: What looks wrong about the input, a sentence each, where it was noticed at this frame; each is said
+            once. `Slam.warnings` has all of them.
     """
 
     timestamp_ns: int
@@ -63,6 +65,7 @@ class Tracked:
     detector_error: str
     track_ms: float
     occluded_share: float | None = None
+    warnings: tuple[str, ...] = ()
 
     @property
     def dynamic_ratio(self) -> float:
