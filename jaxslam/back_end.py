@@ -16,7 +16,7 @@ from jaxlie import SE3
 from jaxslam.camera import Camera
 from jaxslam.config import Config
 from jaxslam.dense.mapping import DenseMapping
-from jaxslam.essential_graph import compile_graph
+from jaxslam.essential_graph import GraphCompiler
 from jaxslam.feature_pose import MIN_INLIERS
 from jaxslam.features import Features, features_of, no_features
 from jaxslam.frame_arrays import FrameArrays
@@ -154,6 +154,7 @@ class BackEnd:
         self._to_places: Worker[_PlaceJob, _PlaceResult] = self._worker(self._place_job, "places", 2)
         self._semantics = None if detector is None else self._semantics_of(detector)
         self._dense = dense
+        self._graphs = GraphCompiler()
         self._link = MapLink(plan, start)
         most = config.mapping.num_features + self._num_tracks
         occlusion = config.dynamics.occlusion
@@ -210,7 +211,7 @@ class BackEnd:
         if self._dense is not None:
             self._dense.compile()
         if not self._config.run.in_turn:
-            compile_graph()  # while frames come, it would take seconds from them
+            self._graphs.compile_now()  # while frames come, it would take seconds from them
 
     def update(self, state: TrackState, frame: int) -> tuple[TrackState, np.ndarray]:
         """Take in what is ready by a frame: carry the tracker along with the map, and give it keyframes back.
@@ -318,8 +319,7 @@ class BackEnd:
             predicted: `(7,)` where the camera may be, if it was lost just now.
 
         Returns:
-            Where; and if nowhere, whether the frame may begin a new submap: it may if it shows enough to tell that it
-            is another place, and the map may grow.
+            Where; and if nowhere, whether the frame shows enough to tell that its place is not in the map.
         """
         features = features_of(arrays, np.zeros(6, np.float32), self._params, self._plan.features)
         near = None if predicted is None else self._in_local_map(features, predicted)
@@ -334,7 +334,7 @@ class BackEnd:
         finally:
             self._lock.release()
         if found is None:
-            return None, not self._localize_only
+            return None, True
         return Placed(Hung(found.keyframe, found.T_keyframe_cam), found.num_inliers, found.covariance), False
 
     def relocated(self, state: TrackState, recognised: Hung) -> TrackState:
@@ -365,6 +365,15 @@ class BackEnd:
     def pose(self, hung: Hung) -> np.ndarray:
         """`(7,)` where it is in the map now."""
         return self._link.pose(hung)
+
+    def submap_of(self, hung: Hung) -> int:
+        """Number of the submap that a pose is in now."""
+        return self._link.submap_of(hung.keyframe)
+
+    @property
+    def submap_now(self) -> int:
+        """Number of the submap that the present frame is in."""
+        return self._link.submap_now()
 
     def finish(self, state: TrackState) -> TrackState:
         """Wait until everything handed over is in the map; once closed, take what was done until then.
@@ -465,6 +474,7 @@ class BackEnd:
             self._arrived = update.map
             self._loops_closed += update.loops
             self._removed += update.removed
+            self._graphs.keep_ahead(len(update.map.ids))
             if self._dense is not None and not self._closed:
                 self._dense.map_made(update.map, update.keyframe, frame)
             self._states_in_map = max(self._states_in_map, update.states)

@@ -68,21 +68,17 @@ class Frame:
         return self.image.shape[1], self.image.shape[0]
 
 
-def check_frame(
-    frame: Frame, width: int, height: int, last_timestamp_ns: int | None = None, *, pair: bool = False
-) -> None:
-    """Refuse a frame that does not fit the camera or the time already reached.
+def check_frame(frame: Frame, width: int, height: int, *, pair: bool = False) -> None:
+    """Refuse a frame that does not fit the camera.
 
     Args:
         frame: The frame to check.
         width: The camera's width in pixels.
         height: The camera's height in pixels.
-        last_timestamp_ns: Time of the frame before this one; `None` for the first.
         pair: Whether the camera takes stereo pairs.
 
     Raises:
-        FrameError: If the size differs from the camera's, it is a pair and should not be, or the other way round, or
-            time stands still or goes backwards.
+        FrameError: If the size differs from the camera's, it is a pair and should not be, or the other way round.
     """
     if frame.size != (width, height):
         raise FrameError(f"image: expected the camera's {_by((width, height))} pixels, got {_by(frame.size)}")
@@ -91,11 +87,6 @@ def check_frame(
     if not pair and frame.depth_m is None:
         raise FrameError(
             "depth_m: expected depth, as the camera is no stereo pair (baseline_m), got a right image alone"
-        )
-    if last_timestamp_ns is not None and frame.timestamp_ns <= last_timestamp_ns:
-        raise FrameError(
-            f"timestamp_ns: expected more than the last frame's {last_timestamp_ns}, got {frame.timestamp_ns}"
-            f" ({(last_timestamp_ns - frame.timestamp_ns) / 1e9:.6f} s back)"
         )
 
 

@@ -143,6 +143,11 @@ class Map(NamedTuple):
     next_keyframe: int
     next_point: int
 
+    @property
+    def world_submap(self) -> int:
+        """Number of the submap whose frame is the map's own: the earliest, into which the others are carried."""
+        return int(self.submap.min()) if len(self.submap) else 0
+
     def row(self, keyframe_id: int) -> int:
         """Row of a keyframe that is in the map."""
         return int(rows(self.ids, np.array([keyframe_id]))[0])

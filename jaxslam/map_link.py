@@ -54,6 +54,7 @@ class MapLink:
         self._made = 0
         self._believed: dict[int, np.ndarray] = {}
         self._on_the_way: dict[int, Hung] = {}
+        self._new_submaps: dict[int, int] = {}  # of keyframes on the way that begin one
         self._next = map.next_keyframe
         self._submap = int(map.submap.max(initial=-1)) + 1
 
@@ -102,8 +103,15 @@ class MapLink:
 
     def submap_now(self) -> int:
         """Number of the submap that the frames are in."""
-        hung = self.in_map(IDENTITY)
-        return self._submap if hung is None else int(self.map.submap[self.map.row(hung.keyframe)])
+        return self._submap if self.reference == NONE else self.submap_of(self.reference)
+
+    def submap_of(self, keyframe_id: int) -> int:
+        """Number of the submap that a keyframe is in, also of one that is on its way to the map."""
+        while (above := self._on_the_way.get(keyframe_id)) is not None:
+            if above.keyframe == NONE:
+                return self._new_submaps[keyframe_id]
+            keyframe_id = above.keyframe
+        return int(self.map.submap[self.map.row(int(standing(self.map, np.array([keyframe_id]))[0]))])
 
     @property
     def num_on_the_way(self) -> int:
@@ -131,6 +139,8 @@ class MapLink:
         self._next += 1
         self._believed[id] = pose
         self._on_the_way[id] = Hung(parent, seen_from)
+        if parent == NONE:
+            self._new_submaps[id] = self._submap
         self._slots[self._made % self._plan.num_keyframes] = id
         self._made += 1
         self.reference = id
@@ -145,6 +155,7 @@ class MapLink:
         """
         self.map = map
         self._on_the_way = {id: hung for id, hung in self._on_the_way.items() if id >= map.next_keyframe}
+        self._new_submaps = {id: submap for id, submap in self._new_submaps.items() if id in self._on_the_way}
         wanted = {id for id in (*self._slots, self.reference, *self._on_the_way) if id != NONE}
         new = {id: self._in_map(id) for id in wanted}
         change = {id: compose(new[id], inverse(self._believed[id])) for id in wanted}

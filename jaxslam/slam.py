@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.back_end import BackEnd, Placed
+from jaxslam.background_check import BackgroundCheck
 from jaxslam.camera import Camera
 from jaxslam.config import Config
 from jaxslam.datasets import Dataset, prefetch
@@ -30,6 +31,7 @@ from jaxslam.dynamics.point_mask import mask_around, moving_points
 from jaxslam.errors import DatasetError, FrameError, JaxSlamError, MapFileError
 from jaxslam.frame import Frame, check_frame
 from jaxslam.frame_arrays import FrameArrays, FrameMemory
+from jaxslam.frame_clock import FrameClock
 from jaxslam.input_warnings import InputWarnings
 from jaxslam.map import Map
 from jaxslam.map_file import load_map, save_map
@@ -57,6 +59,8 @@ _PATIENT_S = 0.5
 of the camera there was one every tenth of a second, and the threads held each other up."""
 _ALL_IS_NEW = 2.0
 """More than the whole of a keyframe's points: a frame that shows them all is kept too."""
+_MASKED = 0.95
+"""Share of the picture under a mask beyond which that is why a frame is lost."""
 _PREDICTED_S = 1.0
 """Longest time for which a constant velocity is believed."""
 
@@ -130,7 +134,8 @@ class Slam:
                 f"map: expected one of a camera of {camera.width}x{camera.height} pixels,"
                 f" got {map.camera.width}x{map.camera.height}"
             )
-        self._start_map, self._localize_only = map, localize_only
+        # An empty map knows no place: with it, no frame would ever be tracked.
+        self._start_map, self._localize_only = map if map is not None and len(map.ids) else None, localize_only
         params = track_params(camera, with_dense_keyframes(self.config))._replace(restart_after=jnp.float32(_NEVER))
         self._params = with_cue_params(params, self.config.dynamics)
         # ORB-SLAM's local mapping does not accept keyframes either while it is busy.
@@ -218,11 +223,12 @@ class Slam:
             RuntimeError: After `close`.
             Exception: What went wrong in a thread of the map, if something did.
         """
-        check_frame(frame, self.camera.width, self.camera.height, self._last_ns, pair=self.camera.is_stereo)
+        check_frame(frame, self.camera.width, self.camera.height, pair=self.camera.is_stereo)
+        self._clock.check(frame.timestamp_ns, frame.depth_timestamp_ns)
         self.warm_up()
         began, watch = time.perf_counter(), self.times.stopwatch()
         self._state, correction = self._back.update(self._state, self._frame)
-        dt_s = 1 / self.camera.fps if self._last_ns is None else (frame.timestamp_ns - self._last_ns) * 1e-9
+        dt_s = self._clock.elapsed_s(frame.timestamp_ns)
         arrays = self._memory.hold(frame, dt_s, depth_follows=frame.depth_m is None)
         watch.ends("take over")
         # Neither needs the other, and on two cores masks are ready before flow is; so is the rough depth of a pair.
@@ -250,8 +256,9 @@ class Slam:
             self._back.keyframe_made(frame.timestamp_ns, frame.image, arrays, output, self._frame, hung)
         if self.dense_mapping is not None and int(output.status) != TrackStatus.LOST:
             self.dense_mapping.frame_tracked(self._frame, frame.image, arrays, output)
-        tracked = tracked_of(frame.timestamp_ns, output, correction, num_matched, mask, share)
-        self._last_ns = frame.timestamp_ns
+        tracked = self._in_submap(tracked_of(frame.timestamp_ns, output, correction, num_matched, mask, share))
+        tracked = self._doubted(tracked, arrays)
+        self._clock.advance(frame.timestamp_ns)
         tracked = self._recorded(tracked, dt_s, float(arrays.depth_delay_s))
         if self._masks is not None:
             self._masks.look(self._frame, frame.image)
@@ -337,16 +344,30 @@ class Slam:
 
     @property
     def online_trajectory(self) -> Trajectory:
-        """Every pose as it was given out; frames that were lost have none."""
-        poses = np.array(self._poses).reshape(-1, 7)
-        poses[:, :4] /= np.linalg.norm(poses[:, :4], axis=1, keepdims=True)
-        return Trajectory(np.array(self._times_ns, np.int64), poses)
+        """Every pose that was in the map's frame when it was given out, as it was; frames that were lost have none."""
+        return self._poses_of(np.array(self._poses).reshape(-1, 7), np.array(self._in_map_frame, bool))
 
     @property
     def trajectory(self) -> Trajectory:
-        """Every pose as it is known now: where its keyframe is in the map, and from there as it was tracked."""
+        """Every pose in the map's frame as it is known now: from where its keyframe is, as it was tracked.
+
+        Poses in submaps that nothing links to it are left out; `trajectories` has them.
+        """
+        return self.trajectories.get(self.map.world_submap) or Trajectory(np.zeros(0, np.int64), np.zeros((0, 7)))
+
+    @property
+    def trajectories(self) -> dict[int, Trajectory]:
+        """Every pose as it is known now, in the frame of the submap it is in, by the number of the submap."""
         poses = np.array([self._back.pose(hung) for hung in self._hung]).reshape(-1, 7)
-        return Trajectory(np.array(self._times_ns, np.int64), poses)
+        submaps = np.array([self._back.submap_of(hung) for hung in self._hung], np.int64)
+        return {number: self._poses_of(poses, submaps == number) for number in np.unique(submaps).tolist()}
+
+    def _poses_of(self, poses: np.ndarray, chosen: np.ndarray) -> Trajectory:
+        """Chosen ones of all poses `(n, 7)`, in the order of time."""
+        times_ns, poses = np.array(self._times_ns, np.int64)[chosen], poses[chosen]
+        order = np.argsort(times_ns, kind="stable")  # the clock may have been set back
+        poses[:, :4] /= np.linalg.norm(poses[:, :4], axis=1, keepdims=True)
+        return Trajectory(times_ns[order], poses[order])
 
     def _begin(self) -> None:
         self.times = StageTimes()
@@ -391,13 +412,17 @@ class Slam:
         )
         self._state = self._fresh_state()
         if self._start_map is not None:
-            self._state = self._state._replace(lost_frames=jnp.zeros((), jnp.int32))
+            self._state = _to_be_placed(self._state)
         self._frame = self._unrecognised = 0
-        self._last_ns: int | None = None
+        self._clock = FrameClock(self.camera.fps, self._warnings)
+        limits = float(self._params.min_depth_m), float(self._params.max_depth_m)
+        self._background = None if self.camera.is_stereo else BackgroundCheck(self.camera, *limits)
         self._last_pose, self._last_twist, self._lost_s = np.array(IDENTITY), np.zeros(6), 0.0
         self._times_ns: list[int] = []
         self._poses: list[np.ndarray] = []
         self._hung: list[Hung] = []
+        self._in_map_frame: list[bool] = []
+        self._status = TrackStatus.OK
 
     def _new_dense_mapping(self) -> DenseMapping | None:
         """What makes the dense map, if the settings ask for one and the map may grow."""
@@ -507,24 +532,60 @@ class Slam:
         """The frame once more, from where the map shows it; or from the pose held, if the settings say so."""
         lost_s = self._lost_s + dt_s
         predicted = moved(self._last_pose, self._last_twist * lost_s) if self._poses and lost_s < _PREDICTED_S else None
-        placed, shows_enough = self._back.regain(arrays, predicted)
-        self._unrecognised += shows_enough
+        placed, unknown = self._back.regain(arrays, predicted)
+        self._unrecognised += unknown
         if placed is not None:
             self._state = self._back.relocated(self._state, placed.hung)
-        elif (
-            self.config.run.on_loss == "submap" and self._unrecognised > self.config.track.restart_after and self._poses
-        ):
+        elif self._may_begin_submap and self._unrecognised > self.config.track.restart_after:
             self._state = self._back.restarted(self._state, np.asarray(lost.T_world_cam.wxyz_xyz))
+        elif unknown and len(self.map.ids) and (self._status == TrackStatus.LOST or not self._poses):
+            # Nothing was followed into the frame: that is not why.
+            return lost._replace(reason=np.int32(TrackReason.PLACE_NOT_IN_MAP)), None
         else:
             return lost, None
         output = self._advance(arrays, _follow_points(self._state, arrays, self._params, self._plan))
         if int(output.status) != TrackStatus.STARTED:
-            self._state = self._state._replace(lost_frames=jnp.zeros((), jnp.int32))  # not to start by itself
+            self._state = _to_be_placed(self._state)  # not to start by itself
         if placed is None:
             return output, None
         # If nothing here has a depth from which to go on, what the map shows is a pose all the same.
         covariance = placed.covariance.astype(np.float32)
-        return output._replace(status=TrackStatus.RELOCALISED, reason=TrackReason.NONE, covariance=covariance), placed
+        return output._replace(status=TrackStatus.RELOCALISED, reason=lost.reason, covariance=covariance), placed
+
+    @property
+    def _may_begin_submap(self) -> bool:
+        """Whether a place that is not in the map may become a part of it."""
+        known = bool(self._poses or len(self.map.ids))  # else the tracker starts by itself
+        return known and self.config.run.on_loss == "submap" and not self._localize_only
+
+    def _in_submap(self, tracked: Tracked) -> Tracked:
+        """The result with the submap that its pose is in; changes of its status go to the log, once each."""
+        submap = self._back.submap_now
+        if tracked.status == TrackStatus.LOST and tracked.dynamic_mask.mean() > _MASKED:
+            tracked = replace(tracked, reason=TrackReason.MASKED.text)
+        before, self._status = self._status, tracked.status
+        if tracked.status == TrackStatus.LOST and before != TrackStatus.LOST:
+            _log.info("frame %d: lost: %s", self._frame, tracked.reason)
+        elif tracked.status == TrackStatus.RELOCALISED:
+            _log.info("frame %d: relocalized in submap %d after %.2f s", self._frame, submap, self._lost_s)
+        elif tracked.status == TrackStatus.STARTED:
+            _log.info("frame %d: submap %d begins", self._frame, submap)
+        return replace(tracked, submap=submap, in_map_frame=submap == self.map.world_submap)
+
+    def _doubted(self, tracked: Tracked, arrays: FrameArrays) -> Tracked:
+        """The result with what the background says of its pose, where too little has depth to have a vote there."""
+        if self._background is None or tracked.status == TrackStatus.LOST:
+            return tracked
+        if tracked.status in (TrackStatus.STARTED, TrackStatus.RELOCALISED):
+            self._background.forget()
+        grey, depth, ignore = np.asarray(arrays.image), np.asarray(arrays.depth), np.asarray(arrays.ignore)
+        doubt = self._background.look(grey, depth, ignore, tracked.T_world_cam, tracked.correction)
+        if not doubt.unsure_m:
+            return tracked
+        covariance = tracked.covariance + np.diag(np.repeat(np.array([doubt.unsure_m**2, 0], np.float32), 3))
+        if not doubt.is_weak or tracked.status != TrackStatus.OK:
+            return replace(tracked, covariance=covariance)
+        return replace(tracked, covariance=covariance, status=TrackStatus.WEAK, reason=TrackReason.UNCONFIRMED.text)
 
     def _recorded(self, tracked: Tracked, dt_s: float, depth_delay_s: float) -> Tracked:
         """The result as it is given out, and remembered."""
@@ -539,13 +600,14 @@ class Slam:
             return tracked
         if self._masks is not None:
             pose = moved(tracked.T_world_cam, tracked.twist * depth_delay_s)
-            when = self._frame, tracked.timestamp_ns * 1e-9
+            when = self._frame, self._clock.continuous_ns(tracked.timestamp_ns) * 1e-9
             moved_on = partial(self._masks.tracked, *when, pose, _turn(tracked.twist))
             self._beside.offer(("masks", moved_on), self._frame)
         self._unrecognised, self._lost_s = 0, 0.0
         self._last_pose, self._last_twist = tracked.T_world_cam, tracked.twist
         self._back.localize(tracked.T_world_cam, self._frame)
         self._hung.append(self._back.hang(tracked.T_world_cam))
+        self._in_map_frame.append(tracked.in_map_frame)
         self._times_ns.append(tracked.timestamp_ns)
         self._poses.append(tracked.T_world_cam)
         return tracked
@@ -560,6 +622,12 @@ def _no_old_garbage() -> Iterator[None]:
         yield
     finally:
         gc.unfreeze()
+
+
+def _to_be_placed(state: TrackState) -> TrackState:
+    """A state that waits for its place to be recognized instead of starting by itself."""
+    # Where the others are: with `jnp.zeros`, which is on no device for certain, the step was compiled anew.
+    return state._replace(lost_frames=jax.device_put(np.int32(0), *state.twist.devices()))
 
 
 def _turn(twist: np.ndarray) -> float:

@@ -26,11 +26,11 @@ class TrackStatus(enum.IntEnum):
     LOST = 2
     """No pose was found; the one given is the last one, held."""
     STARTED = 3
-    """Tracking begins here, or begins anew at the pose held while lost."""
+    """Tracking begins here, or begins anew in a new submap, at the pose held while lost."""
     REJECTED = 4
     """The frame could not be read or does not fit; it never reached the tracker."""
     RELOCALISED = 5
-    """After a loss, tracking goes on where the map shows this place: the same world as before."""
+    """After a loss, tracking goes on where the map shows this place, in the submap that `Tracked.submap` names."""
     DROPPED = 6
     """In a run in real time: the next frame was there before the tracker had time for this one."""
 
@@ -65,6 +65,9 @@ class TrackReason(enum.IntEnum):
     NO_DEPTH = 5
     BAD_TIME = 6
     NO_CORNERS = 7
+    PLACE_NOT_IN_MAP = 8
+    MASKED = 9
+    UNCONFIRMED = 10
 
     @property
     def text(self) -> str:
@@ -82,6 +85,9 @@ _REASON_TEXT = {
     TrackReason.BAD_TIME: "the time since the last frame is not positive",
     TrackReason.NO_CORNERS: "too few corners were found in the image to start from"
     " (dark, blurred, covered, all to be ignored, or grey values not from 0 to 255)",
+    TrackReason.PLACE_NOT_IN_MAP: "the place was not recognized: it is not in the map",
+    TrackReason.MASKED: "nearly all of the image is masked",
+    TrackReason.UNCONFIRMED: "the background, which has no depth, does not move as the pose says",
 }
 
 

@@ -54,7 +54,9 @@ _MAX_FUSED, _MAX_FUSED_OF_PAIR = 4, 16
 """Measurements of depth that a point counts as at most, so that an early error of the pose is forgotten. Those of a
 pair are less sure: with 4, three rooms along a half sphere have 3.3, 6.4 and 4.0 mm of error, with 16 1.6, 1.9 and 1.3,
 with 64 1.5, 1.5 and 1.2."""
-_UNKNOWN_VARIANCE = 1e2
+_UNKNOWN_VARIANCE, _NO_VARIANCE = 1e2, 1e-12
+"""m^2 and rad^2. The pose at which a map or submap begins is its origin by definition; not 0, which some programs take
+for unknown and which has no inverse."""
 _LOOK_EVERY = 3
 """Frames from one search for points on things that have too few to the next."""
 
@@ -522,7 +524,11 @@ def _conclude(
     found = looked_up._replace(weight=jnp.where(verdict.lost, 0, looked_up.weight))
     output = TrackOutput(
         T_world_cam=pose,
-        covariance=jnp.where(verdict.lost, jnp.eye(6, dtype=twist.dtype) * _UNKNOWN_VARIANCE, refined.covariance),
+        covariance=jnp.where(
+            verdict.lost,
+            jnp.eye(6, dtype=twist.dtype) * jnp.where(started, _NO_VARIANCE, _UNKNOWN_VARIANCE),
+            refined.covariance,
+        ),
         status=status,
         reason=reason,
         num_inliers=jnp.where(verdict.lost, 0, jnp.sum(kept.tracked)),

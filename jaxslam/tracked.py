@@ -16,9 +16,12 @@ class Tracked:
     Attributes:
         timestamp_ns: Its time.
         T_world_cam: `(7,)` float64 pose of the camera as `wxyz_xyz`; the last one where `status` is `LOST`.
-        covariance: `(6, 6)` of the pose, in the tangent space at the camera: translation (m), then rotation (rad).
+        covariance: `(6, 6)` of the pose in its submap, in the tangent space at the camera: translation (m), then
+            rotation (rad). It says how well the image fixes the pose among the points around; not how far the map has
+            drifted since it began, nor where the world of another submap is. At the first frame of a submap, which is
+            its origin by definition, 1e-12 on the diagonal; 100 where `status` is `LOST`.
         status: What the pose is worth.
-        reason: Why it is not worth more; empty if it is `OK`.
+        reason: Why it is not worth more, and of `RELOCALISED` why flow had lost it; empty if it is `OK`.
         twist: `(6,)` velocity of the camera in its own axes: m/s, then rad/s.
         num_inliers: Followed points that agree with the pose.
         inlier_ratio: Their share of the points that could be followed.
@@ -41,6 +44,9 @@ class Tracked:
             again; `None` if the settings do not ask for it, it was lost, or the map had no keyframe yet.
         warnings: What looks wrong about the input, a sentence each, where it was noticed at this frame; each is said
             once. `Slam.warnings` has all of them.
+        submap: Number of the submap that the pose is in. Poses of different submaps are in different worlds, which
+            have nothing to do with each other until a place of both is recognized and they become one.
+        in_map_frame: Whether that is the submap that the map began with, so that the pose is in the frame of the map.
     """
 
     timestamp_ns: int
@@ -66,6 +72,8 @@ class Tracked:
     track_ms: float
     occluded_share: float | None = None
     warnings: tuple[str, ...] = ()
+    submap: int = 0
+    in_map_frame: bool = True
 
     @property
     def dynamic_ratio(self) -> float:
@@ -120,6 +128,7 @@ class FrameRecord:
     detector_error: str = ""
     track_ms: float | None = None
     occluded_share: float | None = None
+    submap: int | None = None
 
     @classmethod
     def of(cls, result: "Tracked | Rejected") -> "FrameRecord":

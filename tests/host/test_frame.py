@@ -79,16 +79,10 @@ class TestStructure:
 class TestCheckFrame:
     def test_accepts_what_fits(self) -> None:
         check_frame(make(), WIDTH, HEIGHT)
-        check_frame(make(), WIDTH, HEIGHT, last_timestamp_ns=4)
 
     def test_refuses_another_size(self) -> None:
         with pytest.raises(FrameError, match="image: expected the camera's 12x16 pixels, got 16x12"):
             check_frame(make(), HEIGHT, WIDTH)
-
-    @pytest.mark.parametrize("last", [5, 6])
-    def test_refuses_time_that_does_not_go_forward(self, last: int) -> None:
-        with pytest.raises(FrameError, match=f"timestamp_ns: expected more than the last frame's {last}, got 5"):
-            check_frame(make(), WIDTH, HEIGHT, last_timestamp_ns=last)
 
 
 class TestToGrey:

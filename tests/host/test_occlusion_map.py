@@ -626,7 +626,7 @@ class TestRoomWithPeople:
             for frame in clip.frames:
                 with contextlib.suppress(MappingError):
                     slam.track(frame)
-                if slam._last_ns != frame.timestamp_ns:
+                if slam._clock.last_ns != frame.timestamp_ns:
                     slam.track(frame)
             slam.finish()
             assert len(failed) == 1

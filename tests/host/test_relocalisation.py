@@ -24,7 +24,7 @@ from jaxslam.map_check import problems
 from jaxslam.map_file import load_map, save_map
 from jaxslam.pose import IDENTITY, angle, between, moved
 from jaxslam.slam import Slam
-from jaxslam.state import TrackStatus
+from jaxslam.state import TrackReason, TrackStatus
 from jaxslam.tracked import Tracked
 from jaxslam.trajectory import Trajectory
 from jaxslam.trajectory import read as read_trajectory
@@ -43,7 +43,7 @@ class Played:
     def __init__(self, slam: Slam, dataset: Dataset, order: Order, fps: float, gap_s: float = 0.0) -> None:
         """Track them; after a frame that is not followed by the next one or a black one come `gap_s` seconds."""
         self.slam, self.order, self.results = slam, order, list[Tracked]()
-        time_ns, before = slam._last_ns or 0, None
+        time_ns, before = slam._clock.last_ns or 0, None
         for index in order:
             cut = before is not None and index is not None and index != before + 1
             time_ns += int(1e9 / fps + (gap_s * 1e9 if cut else 0))
@@ -144,7 +144,7 @@ class TestKidnap:
             after = Played(slam, frames, range(41, 46), FPS)
         assert after.statuses == [*[TrackStatus.RELOCALISED] * 2, *[TrackStatus.OK] * 3]
         found = after.results[0]
-        assert not found.reason
+        assert found.reason == TrackReason.NO_DEPTH.text  # why flow had lost it
         assert found.num_matched >= 30
         assert np.sqrt(np.diag(found.covariance)).max() < 0.03
         true = [between(before.truth.T_world_cam[0], pose) for pose in after.truth.T_world_cam]
