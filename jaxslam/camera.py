@@ -48,7 +48,7 @@ class Camera(Checked):
         distortion: `(k1, k2, p1, p2, k3)` as in OpenCV; zeros for rectified images.
         depth_scale_per_m: Counts of the integer depth image a metre: 5000.0 for TUM and Bonn, 1000.0 for
             millimetres; `None` for a camera whose depth comes in metres or from stereo.
-        fps: Nominal frames a second. Motion models use timestamps, never this.
+        fps: Nominal frames a second. Motion models use timestamps; this only where those fit no rate, and at first.
         baseline_m: Distance between left and right camera in metres; `None` if not stereo.
         far_depth_m: Depth in metres beyond which a measured depth is not trusted on its own (in ORB-SLAM,
             `ThDepth` times the baseline); `None` if not known.

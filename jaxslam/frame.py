@@ -20,13 +20,14 @@ class Frame:
     while jaxslam works on the frame.
 
     Attributes:
-        timestamp_ns: Time of exposure, int nanoseconds on any clock that only goes forward.
+        timestamp_ns: Time of exposure, int nanoseconds on any clock that goes forward. Stamps of arrival will do: where
+            they fit no frame rate, the tracker counts frames instead.
         image: `(height, width, 3)` RGB or `(height, width)` grey, uint8.
         depth_m: `(height, width)` float32 depth along the optical axis in metres; 0 or NaN where missing. `None` for
             a pair.
         dynamic_mask: `(height, width)` bool, true where something moves or may move; `None` if unknown.
-        depth_timestamp_ns: Time of the depth image where the sensor takes it apart from the colour image; `None` if
-            both are of one time.
+        depth_timestamp_ns: Time of the depth image where the sensor takes it apart from the colour image, within a
+            second of it; `None` if both are of one time.
         right: What the right camera of a rectified pair saw, as `image`, the left one, of the same size; `None` for a
             camera that measures depth. With it `depth_m` is no more than where matching begins.
 

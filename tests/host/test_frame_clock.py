@@ -1,5 +1,6 @@
 """Seconds between frames from time stamps: regular, of arrival, in other units, of clocks that were set."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,8 +8,12 @@ import pytest
 
 from jaxslam.datasets import open_dataset
 from jaxslam.errors import FrameError
+from jaxslam.evaluation import evaluate
 from jaxslam.frame_clock import FrameClock
 from jaxslam.input_warnings import InputWarnings
+from jaxslam.slam import Slam
+from jaxslam.state import TrackStatus
+from jaxslam.trajectory import Trajectory
 
 MS = 1_000_000
 PERIOD_NS = 33_333_333
@@ -170,3 +175,30 @@ class TestClockThatWasSet:
         for _ in range(5):
             with pytest.raises(FrameError):
                 clock.check(10**17)
+
+
+class TestTracking:
+    def test_recording_with_stamps_of_arrival(self, data_dir: Path) -> None:
+        """In pairs 1 ms apart and with jitter of 10 ms, poses are as with the times of exposure, and none is lost."""
+        dataset = open_dataset(data_dir / "tum/rgbd_dataset_freiburg1_rpy_excerpt")
+        frames = [dataset[index] for index in range(120)]
+        times_ns = np.array([frame.timestamp_ns for frame in frames])
+        pairs = times_ns.copy()
+        pairs[0:-1:2] = times_ns[1::2] - MS
+        jitter = times_ns + np.random.default_rng(1).integers(-10 * MS, 10 * MS, len(frames))
+        found: dict[str, tuple[float, int]] = {}
+        for name, stamps in {"clean": times_ns, "pairs": pairs, "jitter": np.maximum.accumulate(jitter)}.items():
+            with Slam(dataset.camera) as slam:
+                results = [
+                    slam.track(replace(frame, timestamp_ns=int(stamp) + place, depth_timestamp_ns=None))
+                    for place, (frame, stamp) in enumerate(zip(frames, stamps, strict=True))
+                ]
+                slam.finish()
+                assert {result.status for result in results[1:]} == {TrackStatus.OK}
+                estimate = Trajectory(times_ns, slam.trajectory.T_world_cam)
+                assert dataset.ground_truth is not None
+                found[name] = evaluate(estimate, dataset.ground_truth).ate_rmse_m, len(slam.map.ids)
+        print({name: f"{1e3 * ate:.1f} mm, {keyframes} keyframes" for name, (ate, keyframes) in found.items()})
+        for name in ("pairs", "jitter"):
+            assert found[name][0] < 1.3 * found["clean"][0]
+            assert found[name][1] <= 1.1 * found["clean"][1] + 0.5
