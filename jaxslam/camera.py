@@ -16,6 +16,9 @@ from jaxslam.config import configs_dir
 from jaxslam.errors import CameraError, JaxSlamError, nearest
 from jaxslam.files import write_atomically
 
+MOST_BASELINE_M = 10.0
+"""Longest baseline of a pair; more is rather millimeters."""
+
 _UNITS = {
     "width": "pixels",
     "height": "pixels",
@@ -70,7 +73,7 @@ class Camera(Checked):
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
     depth_scale_per_m: Annotated[float, Range(above=0)] | None = None
     fps: Annotated[float, Range(above=0, at_most=100_000)] = 30.0
-    baseline_m: Annotated[float, Range(above=0, at_most=100)] | None = None
+    baseline_m: Annotated[float, Range(above=0)] | None = None
     far_depth_m: Annotated[float, Range(above=0)] | None = None
     readout_s: Annotated[float, Range(at_least=0, at_most=0.1)] = 0.0
     color_order: Literal["rgb", "bgr"] = "rgb"
@@ -81,6 +84,8 @@ class Camera(Checked):
         super().__post_init__()
         check_axis("Camera", "x", self.fx, self.cx, self.width)
         check_axis("Camera", "y", self.fy, self.cy, self.height)
+        if self.baseline_m is not None:
+            check_baseline("Camera.baseline_m", self.baseline_m)
 
     @classmethod
     def load(cls, source: str | Path) -> "Camera":
@@ -146,6 +151,18 @@ def check_axis(whose: str, axis: str, focal: float, centre: float, extent: int) 
         )
     if not 0 < centre < extent:
         raise CameraError(f"{whose}.c{axis}: expected a pixel inside the image, 0 to {extent}, got {centre:g}")
+
+
+def check_baseline(field: str, baseline_m: float) -> None:
+    """Refuse a distance between two cameras that is rather in millimeters.
+
+    Raises:
+        CameraError: If so.
+    """
+    if baseline_m > MOST_BASELINE_M:
+        raise CameraError(
+            f"{field}: expected a baseline in meters, at most {MOST_BASELINE_M:g}, got {baseline_m:g} (millimeters?)"
+        )
 
 
 def _line(key: str, value: object) -> str:

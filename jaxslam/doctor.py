@@ -7,14 +7,15 @@ from enum import StrEnum
 from itertools import pairwise
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from jaxslam.camera import Camera
 from jaxslam.datasets import Associated, Dataset, open_dataset
-from jaxslam.doctor_pair import look_over
+from jaxslam.depth_checks import contradiction_of_depth, is_plausible
 from jaxslam.errors import JaxSlamError
 from jaxslam.frame import Frame, to_grey
+from jaxslam.image_checks import image_fault
+from jaxslam.pair_checks import look_over
 from jaxslam.trajectory import associate
 
 _SAMPLED_PAIRS = 8
@@ -176,20 +177,12 @@ def _images(frames: Sequence[Frame]) -> Iterator[Finding]:
     greys = [to_grey(frame.image) for frame in frames]
     if not greys:
         return
-    faults = Counter(fault for fault in map(_fault, greys) if fault)
+    faults = Counter(fault for fault in map(image_fault, greys) if fault)
     if repeated := sum(np.array_equal(one, other) for one, other in pairwise(greys)):
         faults["the same as the one before"] = repeated
     odd = [f"{count} {fault}" for fault, count in faults.items()]
     text = f"{', '.join(odd) or 'sharp and well lit'}, of {len(greys)} sampled"
     yield _graded(bool(odd), "images", text, "such frames give the tracker few points or none")
-
-
-def _fault(grey: np.ndarray) -> str | None:
-    if grey.mean() < 25:
-        return "dark"
-    if grey.mean() > 230:
-        return "overexposed"
-    return "blurred or blank" if cv2.Laplacian(grey, cv2.CV_32F).var() < 25 else None
 
 
 def _depth(depths: Sequence[np.ndarray], scale: float | None) -> Iterator[Finding]:
@@ -206,21 +199,19 @@ def _depth(depths: Sequence[np.ndarray], scale: float | None) -> Iterator[Findin
     text = f"median {median:.2f} m, 96 % between {near:.2f} and {far:.2f} m"
     if scale is not None:
         text += f", at {scale:g} counts a metre"
+    contradiction = next(filter(None, map(contradiction_of_depth, depths)), "")
     yield _graded(
-        not _is_plausible(near, median, far),
+        bool(contradiction) or not is_plausible(near, median, far),
         "depth scale",
         text,
-        f"odd for an RGB-D camera; {_likely_scale(near, median, far, scale)}the map gets the wrong size",
+        f"{contradiction or 'odd for an RGB-D camera'}; {_likely_scale(near, median, far, scale)}the map gets the"
+        " wrong size",
     )
-
-
-def _is_plausible(near: float, median: float, far: float) -> bool:
-    return near >= 0.25 and 0.2 <= median <= 10 and far <= 12
 
 
 def _likely_scale(near: float, median: float, far: float, scale: float | None) -> str:
     ratios = {usual: scale / usual for usual in _USUAL_DEPTH_SCALES} if scale is not None else {}
-    likely = [f"{u:g}" for u, ratio in ratios.items() if _is_plausible(near * ratio, median * ratio, far * ratio)]
+    likely = [f"{u:g}" for u, ratio in ratios.items() if is_plausible(near * ratio, median * ratio, far * ratio)]
     return f"depth_scale_per_m is rather {' or '.join(likely)}; " if likely else ""
 
 

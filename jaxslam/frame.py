@@ -44,9 +44,10 @@ class Frame:
     right: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        _check_timestamp("timestamp_ns", self.timestamp_ns)
+        object.__setattr__(self, "timestamp_ns", _timestamp("timestamp_ns", self.timestamp_ns))
         if self.depth_timestamp_ns is not None:
-            _check_timestamp("depth_timestamp_ns", self.depth_timestamp_ns)
+            depth_timestamp_ns = _timestamp("depth_timestamp_ns", self.depth_timestamp_ns)
+            object.__setattr__(self, "depth_timestamp_ns", depth_timestamp_ns)
         _check_image("image", self.image)
         if self.depth_m is not None:
             _check_plane("depth_m", self.depth_m, np.float32, self.size)
@@ -79,8 +80,12 @@ def check_frame(frame: Frame, width: int, height: int, *, pair: bool = False) ->
         pair: Whether the camera takes stereo pairs.
 
     Raises:
-        FrameError: If the size differs from the camera's, it is a pair and should not be, or the other way round.
+        FrameError: If it is no `Frame`, the size differs from the camera's, it is a pair and should not be, or the
+            other way round.
     """
+    if not isinstance(frame, Frame):
+        got = f"{type(frame).__name__}; make one: Frame(timestamp_ns, image, depth_m)"
+        raise FrameError(f"frame: expected a jaxslam.Frame, got {got}")
     if frame.size != (width, height):
         raise FrameError(f"image: expected the camera's {_by((width, height))} pixels, got {_by(frame.size)}")
     if pair and frame.right is None:
@@ -106,12 +111,14 @@ def to_grey(image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
     return out
 
 
-def _check_timestamp(field: str, timestamp_ns: object) -> None:
+def _timestamp(field: str, timestamp_ns: object) -> int:
+    """A time as Python's `int`, whose differences do not overflow as NumPy's do."""
     if isinstance(timestamp_ns, bool) or not isinstance(timestamp_ns, numbers.Integral):
         hint = " seconds? (use round(seconds * 1e9))" if isinstance(timestamp_ns, float) else ""
         raise FrameError(f"{field}: expected an int in nanoseconds, got {timestamp_ns!r}{hint}")
     if not _INT64.min <= int(timestamp_ns) <= _INT64.max:
         raise FrameError(f"{field}: expected an int that fits 64 bits, got {timestamp_ns}")
+    return int(timestamp_ns)
 
 
 def _check_image(field: str, image: object) -> None:

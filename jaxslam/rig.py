@@ -5,7 +5,7 @@ from typing import Annotated, ClassVar, Literal, TypeAlias
 
 import numpy as np
 
-from jaxslam.camera import check_axis
+from jaxslam.camera import check_axis, check_baseline
 from jaxslam.checked import Checked, Range
 from jaxslam.errors import CameraError, JaxSlamError
 
@@ -118,6 +118,7 @@ class Rig(Checked):
         x, y, z = self.T_left_right[4:]
         if np.linalg.norm((x, y, z)) < _LEAST_BASELINE_M:
             raise CameraError(f"rig '{self.name}': T_left_right: expected a baseline in metres, got {x:g} {y:g} {z:g}")
+        check_baseline(f"rig '{self.name}': T_left_right", float(np.linalg.norm((x, y, z))))
         if x <= max(abs(y), abs(z)):
             raise CameraError(
                 f"rig '{self.name}': T_left_right: expected the right camera to the right of the left one (x of"

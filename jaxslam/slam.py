@@ -2,6 +2,7 @@
 
 import gc
 import logging
+import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -16,6 +17,7 @@ import numpy as np
 
 from jaxslam.back_end import BackEnd, Placed
 from jaxslam.background_check import BackgroundCheck
+from jaxslam.call_guard import one_at_a_time, refuse_after_fork
 from jaxslam.camera import Camera
 from jaxslam.config import Config
 from jaxslam.datasets import Dataset, prefetch
@@ -28,17 +30,20 @@ from jaxslam.detector_choice import detector_of, key_detector_of, why_no_network
 from jaxslam.dynamic_masks import DynamicMasks, FrameMask, MaskSource
 from jaxslam.dynamics.known import with_cue_params, with_cues
 from jaxslam.dynamics.point_mask import mask_around, moving_points
-from jaxslam.errors import DatasetError, FrameError, JaxSlamError, MapFileError
+from jaxslam.errors import DatasetError, FrameError, JaxSlamError
 from jaxslam.frame import Frame, check_frame
 from jaxslam.frame_arrays import FrameArrays, FrameMemory
 from jaxslam.frame_clock import FrameClock
 from jaxslam.input_warnings import InputWarnings
+from jaxslam.input_watch import InputWatch
 from jaxslam.map import Map
 from jaxslam.map_file import load_map, save_map
 from jaxslam.map_link import Hung
 from jaxslam.masks.objects import ObjectFinder
 from jaxslam.pose import IDENTITY, compose, moved
 from jaxslam.semantics import Detector
+from jaxslam.semantics.watched import WatchedDetector
+from jaxslam.slam_arguments import check_arguments, check_recording, warn_of_other_camera
 from jaxslam.stage_times import StageTimes
 from jaxslam.state import TrackOutput, TrackParams, TrackPlan, TrackReason, TrackState, TrackStatus
 from jaxslam.stereo import RoughDepth
@@ -82,9 +87,10 @@ def _track_followed(
 class Slam:
     """Tracks a camera through a scene, frame by frame, and maps it.
 
-    The world is the camera's place at the first frame, or that of the map it starts with. Calls must come from one
-    thread at a time. With `run.deterministic` everything happens in that thread, on a fixed schedule; without it,
-    mapping and loop closing have threads of their own, and `close` (or `with`) ends them.
+    The world is the camera's place at the first frame, or that of the map it starts with. Calls from several threads
+    wait for each other; in a process made by `fork` they are an error, use `spawn`. With `run.deterministic` everything
+    happens in the calling thread, on a fixed schedule; without it, mapping and loop closing have threads of their own,
+    and `close` (or `with`) ends them.
 
     Attributes:
         camera: That takes the frames.
@@ -120,20 +126,22 @@ class Slam:
             key_detector: Finds what a dense map has at full density, instead of the network with `dense.key_classes`.
 
         Raises:
+            TypeError: If an argument has the wrong type, such as the name of a camera or preset.
+            ConfigError: If `localize_only` is set without a map.
             MapFileError: If the map is of a camera of another size.
+            RuntimeError: In a process made by `fork`.
             MissingModelError: If the network of the settings is not on this machine and `semantics.missing_model` does
                 not allow that, as in presets of systems that need one (`ngd`, `rts`, `usd`, `occlusion`). By default
                 the default network may be missing: a warning is logged, and geometry alone decides.
             ModelError: If the network of the settings cannot be used.
         """
+        refuse_after_fork()
+        detectors = {"detector": detector, "key_detector": key_detector}
+        check_arguments(camera, config, map, detectors, localize_only=localize_only)
+        self.call_lock = threading.RLock()
         self.camera = camera
         self.config = config or Config()
         self.compile_s = 0.0
-        if map is not None and (map.camera.width, map.camera.height) != (camera.width, camera.height):
-            raise MapFileError(
-                f"map: expected one of a camera of {camera.width}x{camera.height} pixels,"
-                f" got {map.camera.width}x{map.camera.height}"
-            )
         # An empty map knows no place: with it, no frame would ever be tracked.
         self._start_map, self._localize_only = map if map is not None and len(map.ids) else None, localize_only
         params = track_params(camera, with_dense_keyframes(self.config))._replace(restart_after=jnp.float32(_NEVER))
@@ -143,9 +151,9 @@ class Slam:
         self._patient_params = self._params._replace(keyframe_weak_after_s=jnp.float32(patient))
         self._eager_params = self._params._replace(keyframe_below=jnp.float32(_ALL_IS_NEW))
         self._plan = with_cues(track_plan(self.config.track), self.config.dynamics, pairs=camera.is_stereo)
-        self._detector = detector or detector_of(self.config.semantics)
+        self._detector = _watched(detector or detector_of(self.config.semantics))
         self.without_network = None if self._detector is not None else why_no_network(self.config.semantics)
-        self._key_detector = key_detector or key_detector_of(self.config)
+        self._key_detector = _watched(key_detector or key_detector_of(self.config))
         self._rough_depth = RoughDepth(camera) if camera.is_stereo else None
         motion = self._plan.motion
         self._memory = FrameMemory(camera.height, camera.width, pairs=camera.is_stereo, movable=motion is not None)
@@ -172,6 +180,7 @@ class Slam:
         map = load_map(path)
         return cls(camera or map.camera, config, map=map, localize_only=localize_only)
 
+    @one_at_a_time
     def save(self, path: PathLike) -> None:
         """Write the map, with all that was handed over to it, to a file that `load` reads.
 
@@ -181,11 +190,13 @@ class Slam:
         self.finish()
         save_map(path, self.map)
 
+    @one_at_a_time
     def reset(self) -> None:
         """Forget everything since the beginning; the next frame starts anew."""
         self.close()
         self._begin()
 
+    @one_at_a_time
     def warm_up(self) -> float:
         """Compile all that is needed, or load it from the cache of an earlier run; gives the seconds it took, once."""
         if not self._ready:
@@ -207,6 +218,7 @@ class Slam:
             self._ready = True
         return self.compile_s
 
+    @one_at_a_time
     def track(self, frame: Frame) -> Tracked:
         """Track one frame.
 
@@ -226,6 +238,7 @@ class Slam:
         check_frame(frame, self.camera.width, self.camera.height, pair=self.camera.is_stereo)
         self._clock.check(frame.timestamp_ns, frame.depth_timestamp_ns)
         self.warm_up()
+        self._watch.look(frame)
         began, watch = time.perf_counter(), self.times.stopwatch()
         self._state, correction = self._back.update(self._state, self._frame)
         dt_s = self._clock.elapsed_s(frame.timestamp_ns)
@@ -277,7 +290,11 @@ class Slam:
         Args:
             dataset: The recording; its camera must be this one.
             on_frame: Called after every frame, for progress and pictures; the frame is `None` if it was unreadable.
+
+        Raises:
+            DatasetError: If it is no recording, or one of another camera.
         """
+        check_recording(dataset, self.camera)
         self.warm_up()
         records: list[FrameRecord] = []
         with _no_old_garbage():
@@ -289,6 +306,7 @@ class Slam:
         self.finish()
         return records
 
+    @one_at_a_time
     def finish(self) -> None:
         """Wait until mapping has caught up, so that `map` and `trajectory` hold all that was seen.
 
@@ -343,11 +361,13 @@ class Slam:
         return self._back.keyframes_passed_over
 
     @property
+    @one_at_a_time
     def online_trajectory(self) -> Trajectory:
         """Every pose that was in the map's frame when it was given out, as it was; frames that were lost have none."""
         return self._poses_of(np.array(self._poses).reshape(-1, 7), np.array(self._in_map_frame, bool))
 
     @property
+    @one_at_a_time
     def trajectory(self) -> Trajectory:
         """Every pose in the map's frame as it is known now: from where its keyframe is, as it was tracked.
 
@@ -356,6 +376,7 @@ class Slam:
         return self.trajectories.get(self.map.world_submap) or Trajectory(np.zeros(0, np.int64), np.zeros((0, 7)))
 
     @property
+    @one_at_a_time
     def trajectories(self) -> dict[int, Trajectory]:
         """Every pose as it is known now, in the frame of the submap it is in, by the number of the submap."""
         poses = np.array([self._back.pose(hung) for hung in self._hung]).reshape(-1, 7)
@@ -372,6 +393,11 @@ class Slam:
     def _begin(self) -> None:
         self.times = StageTimes()
         self._warnings = InputWarnings()
+        if self._detector is not None:
+            self._detector.begin()
+        self._watch = InputWatch(self.camera, self._warnings, self._detector)
+        if self._start_map is not None:
+            warn_of_other_camera(self._start_map.camera, self.camera, self._warnings)
         run, semantics, dynamics = self.config.run, self.config.semantics, self.config.dynamics
         every = self._detector if semantics.frames == "every" else None
         self.dense_mapping = self._new_dense_mapping()
@@ -613,6 +639,10 @@ class Slam:
         return tracked
 
 
+def _watched(detector: Detector | None) -> WatchedDetector | None:
+    return None if detector is None else WatchedDetector(detector)
+
+
 @contextmanager
 def _no_old_garbage() -> Iterator[None]:
     """Have the garbage collector leave alone what was there before: to look through it all takes 0.3 s of a frame."""
@@ -646,9 +676,12 @@ class _Tolerant:
 
     def __getitem__(self, index: int) -> Frame | JaxSlamError:
         try:
-            return self._dataset[index]
+            frame: object = self._dataset[index]
         except (DatasetError, FrameError) as error:
             return error
+        if not isinstance(frame, Frame):
+            return DatasetError(f"frame {index}: expected a jaxslam.Frame, got {type(frame).__name__}")
+        return frame
 
 
 def _frames_of(dataset: Dataset, config: Config) -> Iterator[Frame | JaxSlamError | None]:

@@ -1,4 +1,4 @@
-"""`doctor` on stereo pairs: sound ones, and what was broken on purpose."""
+"""Checks of stereo pairs: sound ones, and what was broken on purpose."""
 
 import dataclasses
 from pathlib import Path
@@ -9,8 +9,8 @@ import pytest
 from jaxslam.datasets import open_dataset
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.doctor import Level, diagnose
-from jaxslam.doctor_pair import look_over
 from jaxslam.frame import Frame
+from jaxslam.pair_checks import look_over
 
 ROOM = SyntheticDataset(SyntheticConfig(frames=1, people=0, baseline_m=0.1))
 
