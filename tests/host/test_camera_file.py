@@ -263,7 +263,7 @@ class TestPlausible:
             ("distortion", (0.0, 0.0, 0.0, 0.0, float("inf")), "expected a list of 5"),
             ("depth_scale_per_m", 0, "expected a finite number > 0 or null, got 0"),
             ("fps", 0, "expected a finite number > 0"),
-            ("baseline_m", 500.0, "<= 100 or null, got 500.0"),
+            ("baseline_m", 500.0, "in meters, at most 10, got 500 (millimeters?)"),
             ("color_order", "rbg", "expected one of 'rgb', 'bgr', got 'rbg'"),
             ("name", 3, "expected text, got 3"),
         ],

@@ -12,6 +12,7 @@ from tiny_recording import CAMERA, HEIGHT, WIDTH, times, write_ground_truth, wri
 
 from jaxslam.camera import Camera
 from jaxslam.cli import main
+from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset, write_tum
 from jaxslam.doctor import Diagnosis, Finding, Level, diagnose
 from jaxslam.errors import DatasetError
 
@@ -140,6 +141,13 @@ class TestWarnings:
         camera = dataclasses.replace(CAMERA, depth_scale_per_m=scale)
         self.check(sound, "depth scale", "depth_scale_per_m is rather 5000;", camera)
 
+    def test_depth_that_no_room_shows_but_the_sensor(self, tmp_path: Path) -> None:
+        """Depth five times too small is as plausible as any, but for the steps of the sensor."""
+        room = SyntheticDataset(SyntheticConfig(frames=2, width=160, height=120, people=0))
+        write_tum(room, tmp_path / "room")
+        camera = dataclasses.replace(room.camera, depth_scale_per_m=25_000.0)
+        self.check(tmp_path / "room", "depth scale", "looks like depth 5 times too small", camera)
+
     def test_much_depth_missing(self, sound: Path) -> None:
         counts = np.zeros((HEIGHT, WIDTH), np.uint16)
         counts[:, :8] = 5000
@@ -153,6 +161,12 @@ class TestWarnings:
     def test_images(self, sound: Path, level: int, count: int, words: str) -> None:
         repaint(sound / "rgb", np.full((HEIGHT, WIDTH, 3), level, np.uint8), count)
         self.check(sound, "images", words)
+
+    def test_images_scaled_to_one(self, sound: Path) -> None:
+        picture = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+        picture[:, WIDTH // 2 :] = 1
+        repaint(sound / "rgb", picture)
+        self.check(sound, "images", "8 with values of 0 and 1 only")
 
     def test_frozen_images(self, sound: Path) -> None:
         first, *others = sorted((sound / "rgb").iterdir())

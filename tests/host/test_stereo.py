@@ -154,6 +154,10 @@ class TestRoom:
         with Slam(dataset.camera, _settings()) as slam:
             records = slam.run(dataset)
             error_m = evaluate(slam.trajectory, dataset.ground_truth).ate_rmse_m
+            assert slam.warnings == ()
+            slam.reset()
+            swapped = dataclasses.replace(dataset[0], image=dataset[0].right, right=dataset[0].image)
+            assert "left and right are swapped" in slam.track(swapped).warnings[0]
         assert [record.status for record in records[1:]] == [TrackStatus.OK] * (len(dataset) - 1)
         assert error_m < 0.002
 
@@ -271,6 +275,7 @@ class TestKitti:
         with Slam(dataset.camera, _settings()) as slam:
             records = slam.run(dataset)
             estimate = slam.trajectory
+            assert slam.warnings == ()
         assert {record.status for record in records[1:]} == {TrackStatus.OK}
         assert dataset.ground_truth is not None
         lengths = [np.linalg.norm(t.positions[-1] - t.positions[0]) for t in (estimate, dataset.ground_truth)]
