@@ -224,7 +224,7 @@ class BackEnd:
             Exception: What went wrong in a thread. The state is as it was, and nothing else is lost.
         """
         if self._closed:
-            raise RuntimeError("the back end is closed")
+            raise RuntimeError("the tracker is closed; Slam.reset() begins anew")
         self._features = None
         if self._semantics is not None:
             self._take_movers(*self._semantics.take(frame), frame)

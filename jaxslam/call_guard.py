@@ -11,17 +11,25 @@ from jax._src import xla_bridge  # nothing public tells whether JAX has begun to
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
+_parent_computes = False
+"""Whether JAX had begun to compute when this process was last about to fork."""
 _forked = False
 """Whether this process was forked from one in which JAX had begun to compute."""
 
 
-def _mark_forked() -> None:
+def _before_fork() -> None:
+    """Ask JAX in the parent: it takes a lock, which another thread may hold, and in the child forever."""
+    global _parent_computes  # noqa: PLW0603 - a fact about the process
+    _parent_computes = xla_bridge.backends_are_initialized()
+
+
+def _in_child() -> None:
     global _forked  # noqa: PLW0603 - a fact about the process
-    _forked = _forked or xla_bridge.backends_are_initialized()
+    _forked = _forked or _parent_computes
 
 
 if hasattr(os, "register_at_fork"):  # Windows has no fork
-    os.register_at_fork(after_in_child=_mark_forked)
+    os.register_at_fork(before=_before_fork, after_in_child=_in_child)
 
 
 def refuse_after_fork() -> None:

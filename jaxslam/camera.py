@@ -52,7 +52,7 @@ class Camera(Checked):
         depth_scale_per_m: Counts of the integer depth image a metre: 5000.0 for TUM and Bonn, 1000.0 for
             millimetres; `None` for a camera whose depth comes in metres or from stereo.
         fps: Nominal frames a second. Motion models use timestamps; this only where those fit no rate, and at first.
-        baseline_m: Distance between left and right camera in metres; `None` if not stereo.
+        baseline_m: Distance between left and right camera in metres, at most 10; `None` if not stereo.
         far_depth_m: Depth in metres beyond which a measured depth is not trusted on its own (in ORB-SLAM,
             `ThDepth` times the baseline); `None` if not known.
         readout_s: Time in seconds a rolling shutter takes from the first row of a colour image to the last; 0 for a

@@ -87,10 +87,10 @@ def _track_followed(
 class Slam:
     """Tracks a camera through a scene, frame by frame, and maps it.
 
-    The world is the camera's place at the first frame, or that of the map it starts with. Calls from several threads
-    wait for each other; in a process made by `fork` they are an error, use `spawn`. With `run.deterministic` everything
-    happens in the calling thread, on a fixed schedule; without it, mapping and loop closing have threads of their own,
-    and `close` (or `with`) ends them.
+    The world is the camera's place at the first frame, or that of the map it starts with. Methods called from several
+    threads wait for each other; in a process made by `fork` they are an error, use `spawn`. With `run.deterministic`
+    everything happens in the calling thread, on a fixed schedule; without it, mapping and loop closing have threads of
+    their own, and `close` (or `with`) ends them.
 
     Attributes:
         camera: That takes the frames.
@@ -238,8 +238,8 @@ class Slam:
         check_frame(frame, self.camera.width, self.camera.height, pair=self.camera.is_stereo)
         self._clock.check(frame.timestamp_ns, frame.depth_timestamp_ns)
         self.warm_up()
-        self._watch.look(frame)
         began, watch = time.perf_counter(), self.times.stopwatch()
+        self._watch.look(frame)
         self._state, correction = self._back.update(self._state, self._frame)
         dt_s = self._clock.elapsed_s(frame.timestamp_ns)
         arrays = self._memory.hold(frame, dt_s, depth_follows=frame.depth_m is None)
@@ -361,13 +361,11 @@ class Slam:
         return self._back.keyframes_passed_over
 
     @property
-    @one_at_a_time
     def online_trajectory(self) -> Trajectory:
         """Every pose that was in the map's frame when it was given out, as it was; frames that were lost have none."""
         return self._poses_of(np.array(self._poses).reshape(-1, 7), np.array(self._in_map_frame, bool))
 
     @property
-    @one_at_a_time
     def trajectory(self) -> Trajectory:
         """Every pose in the map's frame as it is known now: from where its keyframe is, as it was tracked.
 

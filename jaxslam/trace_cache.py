@@ -180,7 +180,17 @@ def _write(file: Path, kept: _Kept) -> None:
         _remove_old(file.parent)
         write_atomically(file, hashlib.sha256(data).digest() + data)
     except (OSError, JaxSlamError) as problem:
-        _log.warning("%s: cannot be kept: %s", file, problem)
+        _warn_unwritable(file.parent, str(problem))
+
+
+_unwritable: set[Path] = set()
+
+
+def _warn_unwritable(folder: Path, problem: str) -> None:
+    """Warn once a process that a folder takes no programs, not once for each of some dozen programs."""
+    if folder not in _unwritable:
+        _unwritable.add(folder)
+        _log.warning("%s: compiled programs cannot be kept, every start compiles anew: %s", folder, problem)
 
 
 @functools.cache

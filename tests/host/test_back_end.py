@@ -195,7 +195,7 @@ class TestClose:
             slam.track(frame)
         slam.close()
         slam.close()
-        with pytest.raises(RuntimeError, match="closed"):
+        with pytest.raises(RuntimeError, match=r"the tracker is closed; Slam\.reset\(\) begins anew"):
             slam.track(_frames()[40])
         slam.save(tmp_path / "map")
         assert len(slam.trajectory) == 40
