@@ -1,6 +1,7 @@
 """The errors jaxslam raises at its edge: every one is a `JaxSlamError` and prints as one line."""
 
 import difflib
+import reprlib
 from collections.abc import Iterable
 
 
@@ -46,6 +47,11 @@ class DownloadError(JaxSlamError):
 
 class BenchmarkError(JaxSlamError):
     """A suite, a baseline or the results of a benchmark that are missing, damaged or do not fit together."""
+
+
+def brief_repr(value: object) -> str:
+    """A value in one short line for a message, whatever it is."""
+    return " ".join(reprlib.repr(value).split())
 
 
 def nearest(name: str, valid: Iterable[str]) -> str:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from jaxslam.errors import FrameError
+from jaxslam.errors import FrameError, brief_repr
 
 _INT64 = np.iinfo(np.int64)
 
@@ -115,9 +115,10 @@ def _timestamp(field: str, timestamp_ns: object) -> int:
     """A time as Python's `int`, whose differences do not overflow as NumPy's do."""
     if isinstance(timestamp_ns, bool) or not isinstance(timestamp_ns, numbers.Integral):
         hint = " seconds? (use round(seconds * 1e9))" if isinstance(timestamp_ns, float) else ""
-        raise FrameError(f"{field}: expected an int in nanoseconds, got {timestamp_ns!r}{hint}")
+        raise FrameError(f"{field}: expected an int in nanoseconds, got {brief_repr(timestamp_ns)}{hint}")
     if not _INT64.min <= int(timestamp_ns) <= _INT64.max:
-        raise FrameError(f"{field}: expected an int that fits 64 bits, got {timestamp_ns}")
+        bits = int(timestamp_ns).bit_length() + 1
+        raise FrameError(f"{field}: expected an int that fits 64 bits, got one of {bits} bits")
     return int(timestamp_ns)
 
 

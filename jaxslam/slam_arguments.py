@@ -31,7 +31,7 @@ def check_arguments(
     Raises:
         TypeError: If an argument has the wrong type.
         MapFileError: If the map is of a camera of another image size.
-        ConfigError: If `localize_only` is set without a map.
+        ConfigError: If `localize_only` is set without a map, or with an empty one.
     """
     camera = _require("camera", camera, Camera, _hint_of_camera(camera))
     if config is not None:
@@ -42,8 +42,11 @@ def check_arguments(
     if map is not None:
         map = _require("map", map, Map, "; Slam.load(path) reads a map file")
         _check_size(map.camera, camera)
-    elif localize_only:
-        raise ConfigError("localize_only: needs the map to localize in: map=, or Slam.load(path, localize_only=True)")
+    if localize_only and (map is None or not len(map.ids)):
+        got = "no map" if map is None else "a map without keyframes"
+        raise ConfigError(
+            f"localize_only: needs the map to localize in: map=, or Slam.load(path, localize_only=True); got {got}"
+        )
 
 
 def warn_of_other_camera(map_camera: Camera, camera: Camera, warnings: InputWarnings) -> None:

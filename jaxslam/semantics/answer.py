@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxslam.errors import ModelError
+from jaxslam.errors import ModelError, brief_repr
 from jaxslam.semantics.detections import Detections
 
 
@@ -29,7 +29,7 @@ def check_answer(found: object, height: int, width: int) -> None:
     _check_values(found)
     labels: Any = found.labels
     if isinstance(labels, str) or not isinstance(labels, Sequence) or not all(isinstance(each, str) for each in labels):
-        raise ModelError(f"detector: labels: expected a tuple of names, got {labels!r:.60}")
+        raise ModelError(f"detector: labels: expected a tuple of names, got {brief_repr(labels)}")
     if len(labels) != count:
         raise ModelError(f"detector: labels: expected {count}, one a box, got {len(labels)}")
     if found.masks is not None:

@@ -22,7 +22,7 @@ from jaxslam.frame import Frame
 from jaxslam.image_checks import scaled_to_one
 from jaxslam.input_warnings import InputWarnings
 from jaxslam.input_watch import InputWatch
-from jaxslam.map import Map
+from jaxslam.map import Map, empty_map
 from jaxslam.rig import Lens, Rig
 from jaxslam.semantics import load_detector
 from jaxslam.semantics.watched import WatchedDetector
@@ -172,7 +172,13 @@ WRONG: dict[str, tuple[Callable[[Trackers], str], str]] = {
     ),
     "localize_only without a map": (
         lambda _: raised(ConfigError, lambda: Slam(clip().camera, CONFIG, localize_only=True)),
-        "localize_only: needs the map to localize in",
+        "localize_only: needs the map to localize in.* got no map",
+    ),
+    "localize_only in an empty map": (
+        lambda _: raised(
+            ConfigError, lambda: Slam(clip().camera, CONFIG, map=empty_map(clip().camera), localize_only=True)
+        ),
+        "localize_only: needs the map to localize in.* got a map without keyframes",
     ),
 }
 
@@ -189,6 +195,19 @@ def test_wrong_input_is_named(trackers: Trackers, kind: str) -> None:
 def test_right_input_is_not_named(trackers: Trackers) -> None:
     assert trackers.tracked(clip().frames[:FRAMES]) == ""
     assert trackers.of_map() == ""
+
+
+def test_only_first_frames_and_every_hundredth_are_looked_at() -> None:
+    """Each look takes time; a sensor that changes its unit on the way is noticed all the same."""
+    frame = clip().frames[0]
+    wrong = replace(frame, depth_m=1000 * depth_of(frame))
+    warnings = InputWarnings()
+    watch = InputWatch(clip().camera, warnings, None)
+    named_at = []
+    for number in range(101):
+        watch.look(frame if number < FRAMES else wrong)
+        named_at += [number] * len(warnings.taken())
+    assert named_at == [100]
 
 
 def test_small_changes_of_a_map_camera_are_not_named(trackers: Trackers) -> None:
