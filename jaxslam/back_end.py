@@ -19,7 +19,6 @@ from jaxslam.dense.mapping import DenseMapping
 from jaxslam.essential_graph import GraphCompiler
 from jaxslam.feature_pose import MIN_INLIERS
 from jaxslam.features import Features, features_of, no_features
-from jaxslam.frame_arrays import FrameArrays
 from jaxslam.keyframe_semantics import KeyframeSemantics
 from jaxslam.local_map import keyframes_in_view, match_local_map
 from jaxslam.local_mapping import LocalMapping, NewKeyframe, mapping_plan, point_ids, with_new_keyframe
@@ -36,6 +35,7 @@ from jaxslam.semantics import Detector
 from jaxslam.stage_times import StageTimes
 from jaxslam.state import TrackOutput, TrackParams, TrackPlan, TrackReason, TrackState, TrackStatus
 from jaxslam.state_edit import relocated
+from jaxslam.step_input import FrameArrays
 from jaxslam.trace_cache import traced_once
 from jaxslam.worker import Worker, close_all, make_worker
 

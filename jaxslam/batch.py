@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxslam.errors import ConfigError, FrameError
-from jaxslam.frame_arrays import FrameArrays, check_grey_range
 from jaxslam.state import TrackParams, TrackPlan, TrackState
+from jaxslam.step_input import FrameArrays, check_grey_range
 from jaxslam.trace_cache import traced_once
 from jaxslam.track import DEFAULT_PLAN, init_state, track_step
 from jaxslam.xla import IN_ITS_THREAD, SOON_COMPILED

@@ -12,10 +12,10 @@ from jaxslam_kernels.image import build_pyramid
 from jaxslam_kernels.types import Pixels, Weights
 from jaxtyping import Array, Bool, Float, Float32, UInt8
 
-from jaxslam.frame_arrays import FrameArrays
 from jaxslam.observe import RIGHT_LEVELS, View, match_depth, observe
 from jaxslam.padding import padded
 from jaxslam.state import TrackParams
+from jaxslam.step_input import FrameArrays
 from jaxslam.trace_cache import traced_once
 
 DESCRIPTOR_BYTES = 32

@@ -20,7 +20,6 @@ from jaxslam.camera import Camera
 from jaxslam.config import Config
 from jaxslam.culling import CONFIRM_WITHIN, without_redundant, without_unconfirmed
 from jaxslam.features import FeaturePlan, Features, features_of
-from jaxslam.frame_arrays import FrameArrays
 from jaxslam.local_adjustment import AdjustPlan, adjust_all, adjust_around, compile_adjustment
 from jaxslam.local_map import LOCAL_KEYFRAMES, local_keyframes
 from jaxslam.loop_closing import LoopClosure
@@ -35,6 +34,7 @@ from jaxslam.observe import observe
 from jaxslam.point_states import StateChanges, with_changes
 from jaxslam.pose import compose, transform
 from jaxslam.state import TrackParams
+from jaxslam.step_input import FrameArrays
 from jaxslam.trace_cache import traced_once
 from jaxslam.track_settings import depth_noise
 

@@ -9,7 +9,6 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from jaxslam.frame_arrays import FrameArrays
 from jaxslam.local_mapping import NewKeyframe, Tracks
 from jaxslam.map import NONE, Map, has, standing
 from jaxslam.padding import padded
@@ -17,6 +16,7 @@ from jaxslam.pose import IDENTITY, angle, between, compose, inverse, to_local, t
 from jaxslam.recall import Recalled
 from jaxslam.state import TrackOutput, TrackPlan, TrackState, TrackStatus
 from jaxslam.state_edit import carried, forgotten, recalled
+from jaxslam.step_input import FrameArrays
 from jaxslam.trace_cache import traced_once
 
 _LEAST_MOVE_M, _LEAST_TURN = 1e-6, 1e-6

@@ -14,8 +14,8 @@ from jaxslam_kernels.transform import to_camera
 from jaxslam_kernels.types import DepthImage, Mask, Pixels, Points, Scalar, Weights
 from jaxtyping import Array, Bool, Float
 
-from jaxslam.frame_arrays import FrameArrays
 from jaxslam.state import TrackParams
+from jaxslam.step_input import FrameArrays
 
 RIGHT_LEVELS = 2
 """Of the pyramid of the right image: where matching begins is known to a few pixels."""

@@ -22,13 +22,13 @@ from jaxtyping import Array, Bool, Float, Float32, Float64, Int8, Int64
 
 from jaxslam.config import OcclusionConfig
 from jaxslam.dynamics.occlusion import PointState, States, next_states, occluded_share, state_weights
-from jaxslam.frame_arrays import FrameArrays
 from jaxslam.map import NONE, Map, has, rows, visibility
 from jaxslam.map_edit import with_states
 from jaxslam.observe import depth_sigma, observe, predict_pixels
 from jaxslam.padding import padded
 from jaxslam.pose import IDENTITY, to_local
 from jaxslam.state import TrackParams
+from jaxslam.step_input import FrameArrays
 from jaxslam.trace_cache import traced_once
 from jaxslam.xla import IN_ITS_THREAD
 

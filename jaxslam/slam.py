@@ -32,7 +32,6 @@ from jaxslam.dynamics.known import with_cue_params, with_cues
 from jaxslam.dynamics.point_mask import mask_around, moving_points
 from jaxslam.errors import DatasetError, FrameError, JaxSlamError
 from jaxslam.frame import Frame, check_frame
-from jaxslam.frame_arrays import FrameArrays, FrameMemory
 from jaxslam.frame_clock import FrameClock
 from jaxslam.input_warnings import InputWarnings
 from jaxslam.input_watch import InputWatch
@@ -46,6 +45,7 @@ from jaxslam.semantics.watched import WatchedDetector
 from jaxslam.slam_arguments import check_arguments, check_recording, warn_of_other_camera
 from jaxslam.stage_times import StageTimes
 from jaxslam.state import TrackOutput, TrackParams, TrackPlan, TrackReason, TrackState, TrackStatus
+from jaxslam.step_input import FrameArrays, FrameMemory
 from jaxslam.stereo import RoughDepth
 from jaxslam.trace_cache import traced_once
 from jaxslam.track import Followed, follow_points, init_state, track_followed

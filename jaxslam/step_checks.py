@@ -15,8 +15,8 @@ from jaxlie import SE3
 
 from jaxslam.dynamics.cue import Verdict
 from jaxslam.dynamics.motion_state import MotionParams
-from jaxslam.frame_arrays import FrameArrays, check_grey_range
 from jaxslam.state import TrackParams, TrackPlan, TrackState
+from jaxslam.step_input import FrameArrays, check_grey_range
 
 _STATE_DTYPE = " as the state"
 _FINEST = float(jnp.finfo(jnp.float32).eps)

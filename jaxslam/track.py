@@ -28,7 +28,6 @@ from jaxtyping import Array, Float, Int
 from jaxslam.dynamics.motion_state import labels_at, no_motion
 from jaxslam.dynamics.regions import Regions, even_votes, find_regions, no_regions
 from jaxslam.floating_dtype import floating_dtype
-from jaxslam.frame_arrays import FrameArrays
 from jaxslam.frame_pose import coarse_pose, fits, refined_pose, worse_status
 from jaxslam.judging import Judged, PointsSeen, judge_points
 from jaxslam.keyframe_choice import Candidate, keyframe_reason
@@ -46,6 +45,7 @@ from jaxslam.state import (
     TrackStatus,
 )
 from jaxslam.step_checks import check_cues, check_followed, check_plan, check_pose, check_state, check_step
+from jaxslam.step_input import FrameArrays
 
 DEFAULT_PLAN = TrackPlan()
 _MAX_PREDICTION_S = 0.1

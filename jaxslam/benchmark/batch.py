@@ -14,9 +14,9 @@ from jaxslam.batch import TrackedClips, track_clips
 from jaxslam.config import TrackConfig
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.evaluation import evaluate
-from jaxslam.frame_arrays import FrameArrays, stack_frames
 from jaxslam.results import peak_rss_mb
 from jaxslam.state import TrackParams, TrackPlan, TrackStatus
+from jaxslam.step_input import FrameArrays, stack_frames
 from jaxslam.trace_cache import traced_once
 from jaxslam.track import init_state, track_step
 from jaxslam.track_settings import track_params, track_plan

@@ -16,13 +16,13 @@ from jaxslam.dense.dense_map import DenseFigures, DenseMap, Look, Shown
 from jaxslam.dense.key_regions import Neighbours
 from jaxslam.dense.occupancy import Occupancy
 from jaxslam.dense.seen_area import SeenArea
-from jaxslam.frame_arrays import FrameArrays
 from jaxslam.local_mapping import NewKeyframe
 from jaxslam.map import NONE, Map
 from jaxslam.map_link import pose_of
 from jaxslam.map_movers import Movers
 from jaxslam.pose import IDENTITY, moved
 from jaxslam.state import TrackOutput
+from jaxslam.step_input import FrameArrays
 from jaxslam.worker import Worker, make_worker
 
 _MOST_WAITING = 8

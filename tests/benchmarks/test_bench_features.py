@@ -13,11 +13,11 @@ from host.room_views import STILL, features, params, picture
 from jaxslam.benchmark.timing import compare
 from jaxslam.features import Features, extract, features_of
 from jaxslam.frame import to_grey
-from jaxslam.frame_arrays import frame_arrays
 from jaxslam.map import Keyframe
 from jaxslam.matching import hamming, match_by_projection, match_descriptors
 from jaxslam.place_index import PlaceIndex
 from jaxslam.place_recognition import verify
+from jaxslam.step_input import frame_arrays
 
 pytestmark = pytest.mark.benchmark
 

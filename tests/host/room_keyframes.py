@@ -6,10 +6,10 @@ import numpy as np
 from room_views import features, params, picture, room
 
 from jaxslam.config import Config
-from jaxslam.frame_arrays import FrameArrays, frame_arrays
 from jaxslam.local_mapping import LocalMapping, MappingPlan, NewKeyframe, Tracks, mapping_plan
 from jaxslam.map import NONE, Map
 from jaxslam.pose import between, moved, to_local, transform
+from jaxslam.step_input import FrameArrays, frame_arrays
 
 PLAN: MappingPlan = mapping_plan(room().camera, Config())
 STEP = 24

@@ -9,10 +9,10 @@ from jaxslam.config import TrackConfig
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.features import Features, features_of
 from jaxslam.frame import Frame
-from jaxslam.frame_arrays import frame_arrays
 from jaxslam.map import NONE, Keyframe, Map, empty_map
 from jaxslam.map_edit import with_keyframe
 from jaxslam.state import TrackParams
+from jaxslam.step_input import frame_arrays
 from jaxslam.track_settings import track_params
 
 STILL = np.zeros(6)

@@ -12,9 +12,9 @@ import numpy as np
 from jaxslam.config import Config, TrackConfig
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.frame import Frame
-from jaxslam.frame_arrays import FrameArrays, stack_frames
 from jaxslam.slam import Slam
 from jaxslam.state import TrackParams, TrackState
+from jaxslam.step_input import FrameArrays, stack_frames
 from jaxslam.track import init_state
 from jaxslam.track_settings import track_params, track_plan
 from jaxslam.trajectory import Trajectory

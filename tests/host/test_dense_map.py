@@ -24,7 +24,6 @@ from jaxslam.dense.picture import picture
 from jaxslam.dense.results import DENSE_FILES
 from jaxslam.dense.seen_area import SeenArea
 from jaxslam.errors import ConfigError, MapFileError
-from jaxslam.frame_arrays import FrameArrays
 from jaxslam.local_mapping import NewKeyframe, Tracks
 from jaxslam.map import Map, empty_map
 from jaxslam.map_movers import Movers
@@ -32,6 +31,7 @@ from jaxslam.pose import IDENTITY, moved
 from jaxslam.results import RunInfo, write_results
 from jaxslam.semantics import Detections
 from jaxslam.slam import Slam
+from jaxslam.step_input import FrameArrays
 
 EVERY = 12
 SMALL = DenseConfig(enabled=True, max_points=150_000, keyframe_points=16_384)

@@ -12,8 +12,8 @@ from jaxslam import features as module
 from jaxslam.config import TrackConfig
 from jaxslam.features import FeaturePlan, extract, features_of
 from jaxslam.frame import Frame, to_grey
-from jaxslam.frame_arrays import FrameArrays, frame_arrays
 from jaxslam.matching import match_descriptors
+from jaxslam.step_input import FrameArrays, frame_arrays
 
 HEIGHT, WIDTH = 480, 640
 

@@ -14,13 +14,13 @@ from jaxslam.config import Config
 from jaxslam.feature_pose import MIN_CELLS
 from jaxslam.features import Features, features_of
 from jaxslam.frame import Frame
-from jaxslam.frame_arrays import frame_arrays
 from jaxslam.local_map import keyframes_in_view, local_keyframes, match_local_map
 from jaxslam.local_mapping import mapping_plan
 from jaxslam.map import Map, empty_map, sightings_at
 from jaxslam.pose import IDENTITY, angle, between, compose, inverse, moved
 from jaxslam.slam import Slam
 from jaxslam.state import TrackReason, TrackStatus
+from jaxslam.step_input import frame_arrays
 from jaxslam.track_settings import track_params
 from jaxslam.tracked import Tracked
 

@@ -12,7 +12,6 @@ from jaxslam import loop_closing as module
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.essential_graph import poses_with_loop
 from jaxslam.features import DEFAULT_PLAN, Features, features_of
-from jaxslam.frame_arrays import frame_arrays
 from jaxslam.loop_closing import LoopClosing, LoopClosure
 from jaxslam.loop_correction import with_loop_closed
 from jaxslam.map import NONE, Keyframe, Map, standing
@@ -20,6 +19,7 @@ from jaxslam.map_check import problems
 from jaxslam.map_edit import transformed, with_keyframe, without_keyframe
 from jaxslam.place_index import PlaceIndex
 from jaxslam.pose import IDENTITY, between, compose, moved, to_local
+from jaxslam.step_input import frame_arrays
 from jaxslam.surroundings import seen_through
 
 STEP = 48

@@ -10,7 +10,6 @@ from small_map import CAMERA, features, png, small_map
 from small_map import pose as random_pose
 
 from jaxslam.frame import Frame
-from jaxslam.frame_arrays import FrameArrays, frame_arrays
 from jaxslam.local_mapping import NewKeyframe, recalled_id
 from jaxslam.map import NONE, Keyframe, Map, empty_map
 from jaxslam.map_edit import moved, transformed, with_keyframe, without_keyframe
@@ -18,6 +17,7 @@ from jaxslam.map_link import Hung, MapLink
 from jaxslam.pose import IDENTITY, between, compose, to_local, transform
 from jaxslam.recall import recall
 from jaxslam.state import LookedUp, TrackOutput, TrackPlan, TrackState, TrackStatus
+from jaxslam.step_input import FrameArrays, frame_arrays
 from jaxslam.track import init_state
 
 PLAN = TrackPlan(num_points=8, num_levels=2, num_keyframes=3, num_recalled=2, num_sources=1, points_per_source=4)

@@ -21,8 +21,8 @@ from jaxslam.dynamics.motion_state import (
     no_motion,
 )
 from jaxslam.frame import Frame
-from jaxslam.frame_arrays import frame_arrays
 from jaxslam.masks.objects import ObjectFinder, object_labels
+from jaxslam.step_input import frame_arrays
 from jaxslam.track import init_state, track_step
 from jaxslam.track_settings import track_params, track_plan
 

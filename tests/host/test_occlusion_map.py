@@ -27,7 +27,6 @@ from jaxslam.errors import MapFileError
 from jaxslam.feature_pose import FeaturePose
 from jaxslam.features import FeaturePlan, Features
 from jaxslam.frame import Frame
-from jaxslam.frame_arrays import FrameArrays
 from jaxslam.local_adjustment import AdjustPlan, adjust_all, adjust_around
 from jaxslam.local_map import match_local_map
 from jaxslam.local_mapping import LocalMapping, NewKeyframe, mapping_plan
@@ -43,6 +42,7 @@ from jaxslam.pose import IDENTITY, between, to_local
 from jaxslam.results import RunInfo, write_results
 from jaxslam.slam import Slam
 from jaxslam.state import TrackStatus
+from jaxslam.step_input import FrameArrays
 from jaxslam.track_settings import track_params
 from jaxslam.tracked import Tracked
 

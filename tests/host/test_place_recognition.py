@@ -15,12 +15,12 @@ from jaxslam.config import TrackConfig
 from jaxslam.datasets import Dataset, open_dataset
 from jaxslam.feature_pose import MAX_SIGMA_M, MIN_INLIERS
 from jaxslam.features import Features, features_of
-from jaxslam.frame_arrays import frame_arrays
 from jaxslam.map import NONE, Keyframe, Map, empty_map
 from jaxslam.map_edit import with_keyframe, without_keyframe
 from jaxslam.place_index import PlaceIndex
 from jaxslam.place_recognition import Recognition, recognise, verify
 from jaxslam.pose import angle, between
+from jaxslam.step_input import frame_arrays
 from jaxslam.track_settings import track_params
 
 ROUND = range(0, FRAMES, 120)

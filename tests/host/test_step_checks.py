@@ -18,10 +18,10 @@ from jaxslam.config import load_config
 from jaxslam.dynamics.known import with_cue_params, with_cues
 from jaxslam.dynamics.motion_state import MotionPlan
 from jaxslam.errors import ConfigError, FrameError
-from jaxslam.frame_arrays import FrameArrays, check_grey_range
 from jaxslam.state import TrackPlan, TrackState
 from jaxslam.state_edit import carried, forgotten, recalled, relocated
 from jaxslam.step_checks import check_verdict
+from jaxslam.step_input import FrameArrays, check_grey_range
 from jaxslam.track import track_step
 from jaxslam.track_settings import track_params
 

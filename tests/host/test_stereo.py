@@ -15,8 +15,8 @@ from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset, write_
 from jaxslam.errors import CameraError, DatasetError, FrameError
 from jaxslam.evaluation import evaluate
 from jaxslam.features import features_of
-from jaxslam.frame_arrays import FrameMemory, frame_arrays
 from jaxslam.local_mapping import mapping_plan
+from jaxslam.step_input import FrameMemory, frame_arrays
 from jaxslam.stereo import RoughDepth
 from jaxslam.track_settings import track_params
 

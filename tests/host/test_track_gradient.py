@@ -16,8 +16,8 @@ from jaxtyping import Array
 from quick_compile import quick_compile
 from small_scene import PLAN, Clip, at, clip, new_state, params, stacked, truth_from_start
 
-from jaxslam.frame_arrays import FrameArrays
 from jaxslam.state import TrackState
+from jaxslam.step_input import FrameArrays
 from jaxslam.track import track_step
 
 BEFORE, STEPS = 10, 10

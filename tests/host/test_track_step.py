@@ -23,7 +23,6 @@ from small_scene import HEIGHT, PLAN, TRACK, WIDTH, at, clip, new_state, params,
 
 from jaxslam import FlowPlan, frame_pose, observe
 from jaxslam.config import Config, DynamicsConfig, SemanticsConfig, load_config
-from jaxslam.frame_arrays import FrameArrays
 from jaxslam.frame_pose import refined_pose, worse_status
 from jaxslam.observe import View
 from jaxslam.semantics import Detections, no_detections
@@ -38,6 +37,7 @@ from jaxslam.state import (
     TrackState,
     TrackStatus,
 )
+from jaxslam.step_input import FrameArrays
 from jaxslam.track import init_state, track_step
 from jaxslam.tracked import Tracked
 

@@ -24,12 +24,12 @@ from jaxslam.dynamics.known import with_cue_params, with_cues
 from jaxslam.dynamics.occlusion import PointState
 from jaxslam.dynamics.regions import RegionMemory, RegionPlan, find_regions, moving_pixels, no_regions
 from jaxslam.features import DESCRIPTOR_BYTES, Features
-from jaxslam.frame_arrays import FrameMemory
 from jaxslam.map import NONE, Keyframe, Map, MapPoints, Sightings, empty_map
 from jaxslam.map_edit import with_keyframe, with_points, with_sightings
 from jaxslam.point_states import PointStates
 from jaxslam.pose import between, to_local, transform
 from jaxslam.state import TrackPlan
+from jaxslam.step_input import FrameMemory
 from jaxslam.track_settings import track_params
 
 _SETTLING_STEPS = 20
