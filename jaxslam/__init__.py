@@ -92,7 +92,7 @@ _NAMES_OF_MODULE = {
     "jaxslam.xla": ("enable_compile_cache", "prefer_one_thread"),
 }
 _MODULE_OF = {name: module for module, names in _NAMES_OF_MODULE.items() for name in names}
-__all__ = [*_MODULE_OF]  # pyright: ignore[reportUnsupportedDunderAll] - of the table, which tests compare
+__all__ = [*_MODULE_OF]  # noqa: PLE0604 # pyright: ignore[reportUnsupportedDunderAll] - strings, of the table
 
 
 def __getattr__(name: str) -> Any:

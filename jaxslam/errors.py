@@ -1,6 +1,5 @@
 """The errors jaxslam raises at its edge: every one is a `JaxSlamError` and prints as one line."""
 
-import difflib
 import reprlib
 from collections.abc import Iterable
 
@@ -56,6 +55,8 @@ def brief_repr(value: object) -> str:
 
 def nearest(name: str, valid: Iterable[str]) -> str:
     """A hint for a misspelt name: ` (did you mean 'x'?)` or, when nothing is close, the valid names."""
+    import difflib  # noqa: PLC0415 - used only where a name is wrong
+
     choices = sorted(valid)
     close = difflib.get_close_matches(name, choices, n=1)
     if close:

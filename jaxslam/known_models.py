@@ -6,7 +6,7 @@ from pathlib import Path
 
 import platformdirs
 
-from jaxslam.errors import ModelError, nearest
+from jaxslam.errors import MissingModelError, ModelError, nearest
 
 DEFAULT_MODEL = "yolox-nano"
 _YOLOX = "https://github.com/Megvii-BaseDetection/YOLOX"
@@ -305,7 +305,8 @@ def find_model(name_or_path: str | os.PathLike[str] = DEFAULT_MODEL) -> Path:
             names, then in the user's cache folder, under the name it is published with and as `NAME.onnx`.
 
     Raises:
-        ModelError: If there is no such file; it says how to come by it.
+        MissingModelError: If a known network is not on this machine; it says how to come by it.
+        ModelError: If there is no such file, and no known network of that name.
     """
     text = os.fspath(name_or_path)
     if Path(text).is_file():
@@ -317,5 +318,7 @@ def find_model(name_or_path: str | os.PathLike[str] = DEFAULT_MODEL) -> Path:
     found = local_file(model)
     if found is None:
         way = f"to download it: jaxslam models get {text}" if model.url else model.how
-        raise ModelError(f"{text} is not on this machine; {way}. To place it by hand: {models_dir() / model.file}")
+        raise MissingModelError(
+            f"{text} is not on this machine; {way}. To place it by hand: {models_dir() / model.file}"
+        )
     return found

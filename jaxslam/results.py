@@ -1,14 +1,9 @@
 """What a run leaves behind: trajectories, a log of its frames, a summary, the settings in effect, and pictures."""
 
 import json
-import platform
-import resource
-import subprocess
-import sys
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +16,7 @@ from jaxslam.errors import TrajectoryError
 from jaxslam.evaluation import Evaluation, evaluate
 from jaxslam.files import write_atomically
 from jaxslam.frame_log import write_errors, write_frames
+from jaxslam.machine import machine, peak_rss_mb
 from jaxslam.map_export import write_keyframe_trajectory
 from jaxslam.mask_pictures import write_mask_pictures
 from jaxslam.point_states import occluded_shares
@@ -30,9 +26,7 @@ from jaxslam.state import TrackStatus
 from jaxslam.tracked import FrameRecord
 from jaxslam.trajectory import write_kitti_frames, write_tum
 from jaxslam.visualize import Snapshot, plot_map, plot_snapshots, plot_trajectory
-from jaxslam.xla import threads, usable_cores
 
-_PACKAGES = ("jaxslam", "jax", "jaxlib", "jaxlie", "equinox", "optimistix", "numpy", "opencv-python-headless")
 _ALWAYS = ("trajectory.txt", "trajectory_online.txt", "frames.csv", "summary.json", "config.yaml")
 _OF_THE_PATH = ("plot.png", "trajectory_kitti.txt")
 _OF_THE_MAP = ("trajectory_keyframes.txt", "map.png")
@@ -196,18 +190,6 @@ def _occluded_shares(slam: Slam) -> list[float]:
     return occluded_shares(slam.map).tolist() if slam.config.dynamics.occlusion.enabled else []
 
 
-def machine() -> dict[str, Any]:
-    """What computed: versions of packages, the processor, cores and threads of this process, the commit."""
-    return {
-        "versions": {"python": platform.python_version(), **{name: version(name) for name in _PACKAGES}},
-        "cpu": _cpu_model(),
-        "vectors": _vectors(),
-        "cores": usable_cores(),
-        "threads": threads(),
-        "commit": _commit(),
-    }
-
-
 def _distribution(figures: Sequence[float]) -> dict[str, float] | None:
     if not figures:
         return None
@@ -219,42 +201,3 @@ def _distribution(figures: Sequence[float]) -> dict[str, float] | None:
         "max": values.max(),
     }
     return {name: round(float(value), 3) for name, value in measures.items()}
-
-
-def peak_rss_mb() -> float:
-    """The most memory this process has had, megabytes."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (1e6 if sys.platform == "darwin" else 1e3)  # bytes there, kilobytes elsewhere
-
-
-def _cpu_model() -> str:
-    info = Path("/proc/cpuinfo")
-    if info.is_file():
-        for line in info.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
-
-
-def _vectors() -> str:
-    """The widest instructions of the processor that matter to rounding and speed; its architecture if unknown."""
-    info = Path("/proc/cpuinfo")
-    flags = set(info.read_text().split()) if info.is_file() else set()
-    return next((name for name in ("avx512f", "avx2", "avx", "sse4_2") if name in flags), platform.machine())
-
-
-def _commit() -> str | None:
-    """The commit of the checkout jaxslam runs from, `+` behind it if the checkout has changes; `None` if installed."""
-    root = Path(__file__).resolve().parent.parent
-    if not (root / ".git").exists():
-        return None
-
-    def git(*words: str) -> str:
-        return subprocess.run(
-            ["git", "-C", str(root), *words], capture_output=True, text=True, check=True
-        ).stdout.strip()
-
-    try:
-        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--untracked-files=no") else "")
-    except (OSError, subprocess.CalledProcessError):
-        return None

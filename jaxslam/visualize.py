@@ -4,8 +4,13 @@ import io
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
 
+import matplotlib as mpl
 import numpy as np
+from matplotlib import font_manager
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
@@ -16,11 +21,15 @@ from jaxslam.errors import TrajectoryError
 from jaxslam.evaluation import Evaluation
 from jaxslam.files import write_atomically
 from jaxslam.map import NONE, Map, rows
+from jaxslam.rotation import matrices
 from jaxslam.trajectory import Trajectory
 
 PNG_LEVEL = 1
 """Pictures of a run are written in 0.17 s instead of 0.74 with Pillow's own level of 6, and are 12 % larger."""
 
+PICTURE_FORMATS = ("png", "pdf", "svg")
+"""Endings of files that pictures can be written to."""
+_UNDATED = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}  # equal pictures are equal files
 _BREAK_INTERVALS = 3.0
 _TRUTH_COLOR, _PATH_COLOR, _LOST_COLOR = "0.6", "tab:blue", "tab:red"
 _FOLLOWED_COLOR, _NEW_COLOR = "lime", "orange"
@@ -54,7 +63,7 @@ def plot_trajectory(
     *,
     title: str = "",
 ) -> None:
-    """Write one PNG: the path and, if it was evaluated, the error over time and the figures; below, some frames.
+    """Write one picture: the path and, if it was evaluated, the error over time and the figures; below, some frames.
 
     The path is seen along its flattest axis, at one scale. With an evaluation the estimate is drawn aligned and
     coloured by error, and times without estimated poses are shaded; otherwise both paths are drawn as they are.
@@ -63,7 +72,7 @@ def plot_trajectory(
         estimate: What was estimated.
         reference: The truth, if known.
         evaluation: `evaluate(estimate, reference, ...)`, if it was done.
-        path: Where the picture goes.
+        path: Where the picture goes; its ending, of `PICTURE_FORMATS`, says as what.
         snapshots: Frames to show with their points.
         title: One line to write above the picture; empty for none.
 
@@ -88,19 +97,19 @@ def plot_trajectory(
         _draw_evaluated_paths(seen, reference, evaluation)
         _draw_errors(over_time, evaluation)
         plots.suptitle(f"{above}{evaluation}", fontsize=8, family="monospace", x=0.02, ha="left", wrap=True)
-    _write_png(figure, path)
+    _write_picture(figure, path)
 
 
 def plot_map(map: Map, trajectory: Trajectory, path: str | os.PathLike[str]) -> None:
-    """Write one PNG: points of the map by how many keyframes saw them, keyframes with their spanning tree, loops, path.
+    """Write one picture: points of the map by how many keyframes saw them, keyframes with their tree, loops, path.
 
-    Two views, from above and from the side as gravity is not known: along the flattest axis of the points, and along
-    the next one.
+    Two views, along the flattest axis of the points and along the next one. Gravity is not known: up is where the
+    first keyframe has it.
 
     Args:
         map: With a keyframe at least.
         trajectory: Of the camera in the frame of the map.
-        path: Where the picture goes.
+        path: Where the picture goes; its ending, of `PICTURE_FORMATS`, says as what.
 
     Raises:
         TrajectoryError: If there is no keyframe, or the file cannot be written.
@@ -111,19 +120,22 @@ def plot_map(map: Map, trajectory: Trajectory, path: str | os.PathLike[str]) -> 
     order = np.argsort(seen, kind="stable")
     centres, X = map.T_world_cam[:, 4:], map.points.X_world[:, order].T
     low, high = np.percentile(np.concatenate([X, centres]), [1, 99], axis=0)
-    by_extent = np.argsort(high - low, kind="stable")
+    by_extent = np.argsort(high - low, kind="stable").tolist()
+    room = 0.05 * (high - low) + 0.1
     figure = Figure(figsize=(12, 6), layout="constrained")
     points = None
     for axes, hidden in zip(figure.subplots(1, 2), by_extent[:2], strict=True):
-        plane = [axis for axis in range(3) if axis != hidden]
+        view = _view(map.T_world_cam[0], hidden)
+        plane = [view.across, view.up]
         points = axes.scatter(*X[:, plane].T, s=1.5, c=seen[order], cmap="viridis", vmin=1, vmax=8, label="points")
         _draw_links(axes, map, plane)
         _draw_path(axes, trajectory, plane, color=_PATH_COLOR, label="path")
         axes.plot(*centres[:, plane].T, "^", color="black", markersize=4, label="keyframes")
-        room = 0.05 * (high - low)[plane] + 0.1
-        axes.set(xlabel=f"{'xyz'[plane[0]]} [m]", ylabel=f"{'xyz'[plane[1]]} [m]")
-        (left, bottom), (right, top) = (low[plane] - room).tolist(), (high[plane] + room).tolist()
-        axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
+        (left, bottom), (right, top) = (low - room)[plane].tolist(), (high + room)[plane].tolist()
+        axes.set(xlim=(right, left) if view.across_falls else (left, right), xlabel=f"{'xyz'[view.across]} [m]")
+        axes.set(ylim=(top, bottom) if view.up_falls else (bottom, top), ylabel=f"{'xyz'[view.up]} [m]")
+        axes.set(aspect="equal")
+        axes.set_title(view.title, fontsize=9)
         axes.legend(fontsize=8)
     assert points is not None
     figure.colorbar(points, ax=figure.axes, label="keyframes that saw the point", shrink=0.8)
@@ -132,26 +144,78 @@ def plot_map(map: Map, trajectory: Trajectory, path: str | os.PathLike[str]) -> 
         f" {len(map.loops.source)} loops, {len(np.unique(map.submap))} submaps",
         fontsize=10,
     )
-    _write_png(figure, path)
+    _write_picture(figure, path)
+
+
+class _View(NamedTuple):
+    """How the world is seen along one of its axes.
+
+    Attributes:
+        title: From where, as the first keyframe has it.
+        across: World axis, 0 to 2, that goes from left to right.
+        up: World axis that goes from bottom to top.
+        across_falls: Whether coordinates of the first one fall from left to right.
+        up_falls: Whether coordinates of the other one fall from bottom to top.
+    """
+
+    title: str
+    across: int
+    up: int
+    across_falls: bool
+    up_falls: bool
+
+
+def _view(T_world_cam: np.ndarray, hidden: int) -> _View:
+    """The upright view along a world axis, for a camera with OpenCV's axes.
+
+    Args:
+        T_world_cam: `(7,)` pose of the camera that says where up is.
+        hidden: World axis to look along, 0 to 2.
+    """
+    right, down, ahead = matrices(T_world_cam[:4]).T
+    of_up = int(np.argmax(np.abs(down)))
+    of_ahead = max({0, 1, 2} - {of_up}, key=lambda axis: abs(float(ahead[axis])))
+    (of_right,) = {0, 1, 2} - {of_up, of_ahead}
+    falls = {of_right: right[of_right] < 0, of_up: down[of_up] > 0, of_ahead: ahead[of_ahead] < 0}
+    views = {
+        of_up: ("from above", of_right, of_ahead),
+        of_ahead: ("from behind", of_right, of_up),
+        of_right: ("from the right", of_ahead, of_up),
+    }
+    title, across, up = views[hidden]
+    return _View(title, across, up, bool(falls[across]), bool(falls[up]))
 
 
 def plot_snapshots(snapshots: Sequence[Snapshot], path: str | os.PathLike[str]) -> None:
-    """Write one PNG: frames with their points, two side by side.
+    """Write one picture: frames with their points, two side by side.
 
     Args:
         snapshots: One at least.
-        path: Where the picture goes.
+        path: Where the picture goes; its ending, of `PICTURE_FORMATS`, says as what.
 
     Raises:
         TrajectoryError: If the file cannot be written.
     """
     figure = Figure(figsize=(8, 3.2 * ((len(snapshots) + 1) // 2)), layout="constrained")
     _draw_snapshots(figure, snapshots)
-    _write_png(figure, path)
+    _write_picture(figure, path)
+
+
+def picture_format(path: str | os.PathLike[str]) -> str:
+    """As what a picture is written, by the ending of its file.
+
+    Raises:
+        TrajectoryError: If it is none of `PICTURE_FORMATS`.
+    """
+    ending = Path(path).suffix.lower().removeprefix(".")
+    if ending not in PICTURE_FORMATS:
+        raise TrajectoryError(f"{os.fspath(path)}: expected a file that ends in .png, .pdf or .svg, got '.{ending}'")
+    return ending
 
 
 def png(figure: Figure) -> bytes:
     """A figure as a picture."""
+    _add_own_fonts()
     picture = io.BytesIO()
     FigureCanvasAgg(figure).print_png(picture, pil_kwargs={"compress_level": PNG_LEVEL})
     return picture.getvalue()
@@ -162,8 +226,32 @@ def with_breaks(timestamps_ns: np.ndarray, rows: np.ndarray) -> np.ndarray:
     return np.insert(rows, np.flatnonzero(_breaks(timestamps_ns)) + 1, np.nan, axis=0)
 
 
-def _write_png(figure: Figure, path: str | os.PathLike[str]) -> None:
-    write_atomically(path, png(figure), TrajectoryError)
+@cache
+def _add_own_fonts() -> None:
+    """Have Matplotlib know the fonts that come with it, whatever the list says that it keeps in the user's cache folder.
+
+    All Matplotlibs of a version share that list. One whose own fonts were out of reach when it made the list, as in an
+    environment being removed, leaves it without them, and every label of a logarithmic axis is then a warning.
+    """
+    known = {Path(font.fname) for font in font_manager.fontManager.ttflist}
+    for path in sorted(Path(mpl.get_data_path(), "fonts", "ttf").glob("*.ttf")):
+        if path not in known:
+            font_manager.fontManager.addfont(path)
+
+
+def _picture(figure: Figure, kind: str) -> bytes:
+    """A figure as a file of one of `PICTURE_FORMATS`."""
+    if kind == "png":
+        return png(figure)
+    _add_own_fonts()
+    picture = io.BytesIO()
+    with mpl.rc_context({"svg.hashsalt": "jaxslam"}):
+        figure.savefig(picture, format=kind, metadata=_UNDATED[kind])
+    return picture.getvalue()
+
+
+def _write_picture(figure: Figure, path: str | os.PathLike[str]) -> None:
+    write_atomically(path, _picture(figure, picture_format(path)), TrajectoryError)
 
 
 def _draw_links(axes: Axes, map: Map, plane: list[int]) -> None:

@@ -3,7 +3,6 @@
 import os
 from pathlib import Path
 
-import jax
 import platformdirs
 
 
@@ -18,16 +17,25 @@ _LEAST_COMPILE_S = 0.05
 every time; with JAX's own limit, a second, even more."""
 
 
+def compile_cache_dir() -> Path:
+    """Where compiled code is kept: the user's own folder where one was chosen in JAX's settings, else `cache_dir()`."""
+    import jax  # noqa: PLC0415 - `usable_cores` and `cache_dir` need none
+
+    chosen: str | None = jax.config.values["jax_compilation_cache_dir"]
+    return Path(chosen) if chosen else cache_dir()
+
+
 def enable_compile_cache() -> Path:
     """Keep compiled code between processes, so that only the first start on a machine waits for the compiler.
 
     `Slam` does it when it begins; what is compiled before, such as the renderer of rooms, is kept if this comes first.
 
     Returns:
-        The folder: the user's own where one was chosen in JAX's settings, else `cache_dir()`.
+        The folder, `compile_cache_dir()`.
     """
-    chosen: str | None = jax.config.values["jax_compilation_cache_dir"]
-    folder = Path(chosen) if chosen else cache_dir()
+    import jax  # noqa: PLC0415
+
+    folder = compile_cache_dir()
     jax.config.update("jax_compilation_cache_dir", str(folder))
     least_s: float = jax.config.values[_LEAST_COMPILE]
     if least_s == _LEAST_COMPILE_OF_JAX_S:
@@ -63,6 +71,8 @@ def prefer_one_thread() -> None:
     all of Python's; without asynchronous dispatch each computes by itself: beside a thread that is always computing,
     a call of 2 ms takes 2 ms instead of 30.
     """
+    import jax  # noqa: PLC0415
+
     os.environ.setdefault("NPROC", "1")
     jax.config.update("jax_cpu_enable_async_dispatch", False)
 

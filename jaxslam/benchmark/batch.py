@@ -14,7 +14,7 @@ from jaxslam.batch import TrackedClips, track_clips
 from jaxslam.config import TrackConfig
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.evaluation import evaluate
-from jaxslam.results import peak_rss_mb
+from jaxslam.machine import peak_rss_mb
 from jaxslam.state import TrackParams, TrackPlan, TrackStatus
 from jaxslam.step_input import FrameArrays, stack_frames
 from jaxslam.trace_cache import traced_once

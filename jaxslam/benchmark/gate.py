@@ -20,7 +20,7 @@ from jaxslam.benchmark.baseline import ATE, Baseline
 from jaxslam.benchmark.machines import machine_name, machine_of, versions_of
 from jaxslam.benchmark.rows import by_sequence, row_name, rows_of
 from jaxslam.errors import BenchmarkError
-from jaxslam.results import machine
+from jaxslam.machine import machine
 from jaxslam.xla import usable_cores
 
 _WORSE_ATE, _WORSE_TIME = 0.02, 0.2

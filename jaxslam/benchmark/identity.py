@@ -14,8 +14,8 @@ from jaxslam.config import Config, SemanticsConfig, configs_dir
 from jaxslam.detector_choice import network_files
 from jaxslam.download import sha256_of
 from jaxslam.errors import BenchmarkError, ModelError
+from jaxslam.machine import machine
 from jaxslam.recordings import find_recording
-from jaxslam.results import machine
 from jaxslam.trace_cache import source_files
 
 _MOST_HASHED_BYTES = 5_000_000

@@ -12,7 +12,7 @@ def machine_of(results: Sequence[Mapping[str, Any]]) -> str:
 
 
 def machine_name(machine: Mapping[str, Any]) -> str:
-    """CPU, vector instructions and cores of one machine, as `jaxslam.results.machine` or a result has them."""
+    """CPU, vector instructions and cores of one machine, as `jaxslam.machine.machine` or a result has them."""
     return f"{cpu_name(machine)}, {machine['cores']} cores"
 
 

@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import tyro
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.table import Table
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 
-from jaxslam.benchmark.collected import RESULTS, Collected, read_results
+from jaxslam.benchmark.collected import RESULTS, Collected, as_table, read_results
 from jaxslam.benchmark.job import DONE, FAILED, NOT_RUN, Job, about
 from jaxslam.benchmark.page import html_report
 from jaxslam.benchmark.plan import missing, plan, replaced_settings, swept
@@ -20,8 +19,8 @@ from jaxslam.benchmark.report import markdown_report
 from jaxslam.benchmark.rows import row_name
 from jaxslam.benchmark.runner import Executor, local, run_jobs
 from jaxslam.benchmark.suite import Suite, check_masks, checked_presets, load_suite, suites
-from jaxslam.commands.console import console, plain_console
-from jaxslam.commands.settings import ALLOW_MISSING_MODEL, Settings, flat
+from jaxslam.commands.console import console, make_table, plain_console, print_json, text_column
+from jaxslam.commands.settings import ALLOW_MISSING_MODEL, Settings, WithJson, flat
 from jaxslam.config import load_config
 from jaxslam.detector_choice import network_files
 from jaxslam.errors import BenchmarkError
@@ -47,7 +46,7 @@ class SuitePlan(NamedTuple):
 
 
 @dataclass(frozen=True)
-class RunsOfSuite:
+class RunsOfSuite(WithJson):
     """How a suite is run, and where its results go."""
 
     root: Path | None = None
@@ -169,7 +168,7 @@ class RunsOfSuite:
 
     def _run(self, jobs: Sequence[Job], executor: Executor, report: "_Report") -> None:
         columns = (
-            TextColumn("Runs"),
+            text_column("Runs"),
             BarColumn(),
             MofNCompleteColumn(),
             TimeElapsedColumn(),
@@ -193,12 +192,7 @@ class RunsOfSuite:
 
 @dataclass(frozen=True)
 class Bench(RunsOfSuite):
-    """Run a suite: recordings or rendered rooms, presets, several seeds. Without a suite, list those there are.
-
-    Four more have a --help of their own: `jaxslam bench gate` fails if a suite has become worse than its baseline,
-    `jaxslam bench accuracy` if tracking has become less accurate on recordings and rooms than a frozen one,
-    `jaxslam bench kernels` measures the kernels, `jaxslam bench batch` the tracker on many clips at once.
-    """
+    """Options of `jaxslam bench`."""
 
     suite: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="SUITE")] = None
     """A known suite, a YAML file, or a folder of recordings."""
@@ -206,9 +200,11 @@ class Bench(RunsOfSuite):
     def main(self) -> None:
         """Run the command."""
         if self.suite is None:
-            _list()
+            _list(as_json=self.json)
             return
         results = self.results(self.suite)
+        if self.json:
+            print_json(as_table(results))
         failed = sum(result["status"] != DONE for result in results)
         if failed or not results:
             raise BenchmarkError(f"{failed} of {len(results)} runs failed" if results else "nothing could be run")
@@ -267,9 +263,23 @@ def _line(result: Mapping[str, Any]) -> str:
     return f"{_name(result)}: {known}, {result['tracked_percent']:.1f} % tracked"
 
 
-def _list() -> None:
-    table = Table("suite", "sequences", "presets", "runs", "about", title="Suites", title_justify="left")
-    for name in suites():
-        suite = load_suite(name)
-        table.add_row(name, str(len(suite.sequences)), ", ".join(suite.presets), str(suite.runs), suite.about)
+def _list(*, as_json: bool) -> None:
+    """Print the suites that come with jaxslam."""
+    known = [
+        {
+            "suite": name,
+            "sequences": len(suite.sequences),
+            "presets": list(suite.presets),
+            "runs": suite.runs,
+            "about": suite.about,
+        }
+        for name, suite in ((name, load_suite(name)) for name in suites())
+    ]
+    if as_json:
+        print_json(known)
+        return
+    table = make_table("Suites", "suite", "sequences,\nruns", "presets", "about", left=4)
+    for suite in known:
+        counts = f"{suite['sequences']}, {suite['runs']}"
+        table.add_row(suite["suite"], counts, ", ".join(suite["presets"]), suite["about"])
     console.print(table)

@@ -1,13 +1,12 @@
 """`jaxslam bench accuracy`: whether tracking has become less accurate than the frozen baseline."""
 
+import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from rich.box import SIMPLE_HEAD
-from rich.table import Table
 
 from jaxslam.benchmark.accuracy import (
     MOST_MEAN,
@@ -26,11 +25,11 @@ from jaxslam.benchmark.machines import cpu_name, machine_of, versions_of
 from jaxslam.benchmark.plan import fingerprint
 from jaxslam.benchmark.report import table
 from jaxslam.commands.bench import RunsOfSuite
-from jaxslam.commands.console import plain_console
+from jaxslam.commands.console import make_table, plain_console, print_json
 from jaxslam.config import configs_dir
 from jaxslam.errors import BenchmarkError
 from jaxslam.files import write_atomically
-from jaxslam.results import machine
+from jaxslam.machine import machine
 from jaxslam.xla import usable_cores
 
 _SUITE, _REPORT = "accuracy", "accuracy.md"
@@ -43,14 +42,7 @@ _Results = Sequence[Mapping[str, Any]]
 
 @dataclass(frozen=True)
 class AccuracyRuler(RunsOfSuite):
-    """Measure accuracy and compare it with a frozen baseline: real recordings that are at hand, and rendered rooms.
-
-    Ten seeds or more each with the preset `default`, in two processes, in 10 to 20 minutes. What counts is the
-    geometric mean over recordings of the ratios of median errors, at most 1.04; no recording above 1.15; no fewer
-    frames tracked. In the table, "worst" is the largest ATE of a seed over the median, "by chance" is where 95 % of the
-    ratios lie if nothing but the seeds has changed, which is also what the rounding of another CPU does, and "equal"
-    counts seeds whose trajectory has the very bytes of the baseline.
-    """
+    """Options of `jaxslam bench accuracy`."""
 
     baseline: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Baseline to compare with. If not given: of those that come with jaxslam, the one made on this CPU, or else the
@@ -78,9 +70,13 @@ class AccuracyRuler(RunsOfSuite):
         if baseline is None:
             save_accuracy_baseline(file, self._made(results, sequences, now))
             plain_console.print(f"Baseline: {file}")
+            if self.json:
+                print_json(json.loads(file.read_text(encoding="utf-8")))
             return
         reading = compare_accuracy(now, sequences, baseline)
         _report(reading, baseline, _words(reading, baseline, results, file), out)
+        if self.json:
+            print_json(_figures(reading))
         if reading.worse:
             raise BenchmarkError(f"less accurate than {baseline.commit}: {'; '.join(reading.worse)}")
 
@@ -126,11 +122,7 @@ def _report(reading: Accuracy, baseline: AccuracyBaseline, words: Sequence[str],
     """Print the reading, and write it beside the results."""
     cells = [_cells(row) for row in reading.recordings]
     title = f"Accuracy of {baseline.preset} against {baseline.commit}"
-    shown = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 0, 0, 1))
-    for heading in _COLUMNS:
-        shown.add_column(
-            heading.replace(" ", "\n"), justify="left" if heading == _COLUMNS[0] else "right", no_wrap=True
-        )
+    shown = make_table(title, *_COLUMNS)
     for row in cells:
         shown.add_row(*row)
     plain_console.print(shown)
@@ -139,6 +131,21 @@ def _report(reading: Accuracy, baseline: AccuracyBaseline, words: Sequence[str],
     text = "\n".join([table(_COLUMNS, cells), *(f"- {line}" for line in words), ""])
     write_atomically(out / _REPORT, text.encode(), BenchmarkError)
     plain_console.print(f"Report: {out / _REPORT}")
+
+
+def _figures(reading: Accuracy) -> dict[str, Any]:
+    """The reading, with the medians and ratios of its table."""
+    rows = [
+        {
+            **asdict(row),
+            "tracked_percent": row.now.tracked_percent,
+            "median_m": row.now.median_m,
+            "median_before_m": None if row.before is None else row.before.median_m,
+            "ratio": row.ratio,
+        }
+        for row in reading.recordings
+    ]
+    return asdict(reading) | {"recordings": rows}
 
 
 def _cells(row: Compared) -> list[str]:

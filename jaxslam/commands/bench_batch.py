@@ -8,16 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from rich import box
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn
 from rich.table import Table
 
 from jaxslam.benchmark.batch import DIFFERENT, make_task, measure
 from jaxslam.benchmark.batch_report import COLUMNS, cells, how, markdown_report, picture
-from jaxslam.commands.console import console, plain_console
+from jaxslam.commands.console import console, make_table, plain_console, print_json, text_column
+from jaxslam.commands.settings import WithJson
 from jaxslam.errors import BenchmarkError
 from jaxslam.files import make_folder, write_atomically
-from jaxslam.results import machine
+from jaxslam.machine import machine
 
 _JSON, _MARKDOWN, _PICTURE = "batch.json", "batch.md", "batch.png"
 _LEFT_OUT = ("loop", "worst, m")
@@ -26,12 +26,8 @@ _FEWEST_FRAMES, _LEAST_PX, _MOST_PX = 3, 64, 8192
 
 
 @dataclass(frozen=True)
-class Batch:
-    """Track 1 to 64 clips at once with `vmap`: frames a second, beside a loop, on the GPU where JAX has one.
-
-    Nothing else should run on the machine meanwhile; some minutes. `NPROC=1` before the command holds XLA to one
-    thread.
-    """
+class Batch(WithJson):
+    """Options of `jaxslam bench batch`."""
 
     clips: tuple[int, ...] = (1, 4, 16, 64)
     """Numbers of clips."""
@@ -61,8 +57,11 @@ class Batch:
             "different": different,
             "rows": rows,
         }
-        console.print(_table(rows))
-        plain_console.print(how(content))
+        if self.json:
+            print_json(content)
+        else:
+            console.print(_table(rows))
+            plain_console.print(how(content))
         files = {
             _JSON: (json.dumps(content, indent=1) + "\n").encode(),
             _MARKDOWN: markdown_report(content).encode(),
@@ -91,7 +90,7 @@ class Batch:
         return sides[0], sides[1]
 
     def _measured(self, counts: Sequence[int], different: int, width: int, height: int) -> list[dict[str, Any]]:
-        columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+        columns = text_column("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
         rows: list[dict[str, Any]] = []
         # Drawn between measurements only: a thread that draws would run on a core where they are taken.
         with Progress(*columns, console=console, auto_refresh=False) as progress:
@@ -108,11 +107,8 @@ class Batch:
 
 
 def _table(rows: Sequence[dict[str, Any]]) -> Table:
-    drawn = Table(title="Clips at once", title_justify="left", box=box.SIMPLE_HEAD, padding=0)
     shown = [index for index, column in enumerate(COLUMNS) if column not in _LEFT_OUT]
-    for index in shown:
-        is_text = COLUMNS[index] == "how"
-        drawn.add_column(COLUMNS[index], justify="left" if is_text else "right", no_wrap=is_text)
+    drawn = make_table("Clips at once", *(COLUMNS[index] for index in shown), left=2)
     for row in rows:
         texts = cells(row)
         drawn.add_row(*(texts[index] for index in shown))

@@ -1,17 +1,19 @@
 """`jaxslam bench gate`: whether a suite has become worse than its baseline."""
 
+import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
 from jaxslam.benchmark.baseline import Baseline, check_same_plan, load_baseline, save_baseline
+from jaxslam.benchmark.collected import as_table
 from jaxslam.benchmark.gate import check_reason, complaints, differences, make_baseline, runs_at_once
 from jaxslam.benchmark.plan import fingerprint
 from jaxslam.commands.bench import RunsOfSuite
-from jaxslam.commands.console import plain_console
+from jaxslam.commands.console import plain_console, print_json
 from jaxslam.errors import BenchmarkError
 
 _MOST_AGAIN = 2
@@ -20,7 +22,7 @@ _OUT = Path("results") / "bench" / "gate"
 
 @dataclass(frozen=True)
 class Gate(RunsOfSuite):
-    """Run the suite of a baseline, and fail if errors, coverage or times have become worse."""
+    """Options of `jaxslam bench gate`."""
 
     baseline: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """What to keep to."""
@@ -64,6 +66,9 @@ class Gate(RunsOfSuite):
             worse = complaints(before, results)
         for complaint in worse:
             plain_console.print(f"worse: {complaint}")
+        if self.json:
+            complained = [asdict(complaint) | {"text": str(complaint)} for complaint in worse]
+            print_json({"results": as_table(results), "here": other, "worse": complained})
         if worse:
             raise BenchmarkError(f"{len(worse)} figures are worse than in {self.baseline} ({before.reason})")
         plain_console.print(f"Nothing is worse than in {self.baseline}.")
@@ -90,6 +95,8 @@ class Gate(RunsOfSuite):
         presets = tuple(dict.fromkeys(of_label["preset"] for of_label in planned["presets"].values()))
         save_baseline(path, make_baseline(suite, presets, planned["runs"], reason, results, planned))
         plain_console.print(f"Baseline: {path}")
+        if options.json:
+            print_json(json.loads(path.read_text(encoding="utf-8")))
 
 
 def _check(path: Path, before: Baseline, planned: Mapping[str, Any]) -> None:

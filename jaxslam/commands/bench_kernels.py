@@ -1,24 +1,24 @@
 """`jaxslam bench kernels`: how long each kernel takes, beside other libraries and over sizes."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from rich import box
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn
 from rich.table import Table
 
 from jaxslam.benchmark.kernels.case import Case
 from jaxslam.benchmark.kernels.cases import chosen, versions
 from jaxslam.benchmark.kernels.measure import devices, measure
 from jaxslam.benchmark.kernels.report import COLUMNS, about, cells, markdown_report, picture, slopes
-from jaxslam.commands.console import console, plain_console
+from jaxslam.commands.console import console, make_table, plain_console, print_json, text_column
+from jaxslam.commands.settings import WithJson
 from jaxslam.errors import BenchmarkError
 from jaxslam.files import make_folder, write_atomically
-from jaxslam.results import machine
+from jaxslam.machine import machine
 from jaxslam.xla import prefer_one_thread
 
 _ROUNDS, _QUICK_ROUNDS, _QUICK_SIZES = 30, 5, 2
@@ -26,11 +26,8 @@ _JSON, _MARKDOWN, _PICTURE = "kernels.json", "kernels.md", "kernels.png"
 
 
 @dataclass(frozen=True)
-class Kernels:
-    """Measure each kernel beside OpenCV, SciPy, Ceres, gtsam or scikit-learn, over sizes; on a GPU too if there is one.
-
-    Nothing else should run on the machine meanwhile; some minutes.
-    """
+class Kernels(WithJson):
+    """Options of `jaxslam bench kernels`."""
 
     only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
     """Kernels, instead of all of them."""
@@ -50,30 +47,43 @@ class Kernels:
         prefer_one_thread()  # before the first array
         rounds = self.rounds or (_QUICK_ROUNDS if self.quick else _ROUNDS)
         rows = _measured(cases, rounds, _QUICK_SIZES if self.quick else None)
-        for case in cases:
-            of_it = [row for row in rows if row["kernel"] == case.name]
-            console.print(_table(case, of_it))
-            longest = max(row["compile_s"] for row in of_it)
-            plain_console.print(f"{case.name} {about(case, of_it)}; compiled in {longest:.1f} s at most")
-        self._write(cases, rows, rounds)
+        content = _content(cases, rows, rounds, quick=self.quick)
+        if self.json:
+            print_json(content)
+        else:
+            _print_tables(cases, rows)
+        self._write(cases, content)
         console.print(f"Table and picture: {self.out / _MARKDOWN}, {self.out / _PICTURE}; figures: {self.out / _JSON}")
 
-    def _write(self, cases: Sequence[Case], rows: Sequence[dict[str, Any]], rounds: int) -> None:
-        on = machine()
-        on["versions"] |= versions()
-        content = {**on, "rounds": rounds, "quick": self.quick, "kernels": _described(cases, rows), "rows": rows}
+    def _write(self, cases: Sequence[Case], content: Mapping[str, Any]) -> None:
+        rows: Sequence[dict[str, Any]] = content["rows"]
         files = {
             _JSON: (json.dumps(content, indent=1) + "\n").encode(),
-            _MARKDOWN: markdown_report(cases, rows, on).encode(),
+            _MARKDOWN: markdown_report(cases, rows, content).encode(),
             _PICTURE: picture(cases, rows),
         }
         for name, data in files.items():
             write_atomically(self.out / name, data, BenchmarkError)
 
 
+def _content(cases: Sequence[Case], rows: Sequence[dict[str, Any]], rounds: int, *, quick: bool) -> dict[str, Any]:
+    """What the file of figures holds."""
+    on = machine()
+    on["versions"] |= versions()
+    return {**on, "rounds": rounds, "quick": quick, "kernels": _described(cases, rows), "rows": rows}
+
+
+def _print_tables(cases: Sequence[Case], rows: Sequence[dict[str, Any]]) -> None:
+    for case in cases:
+        of_it = [row for row in rows if row["kernel"] == case.name]
+        console.print(_table(case, of_it))
+        longest = max(row["compile_s"] for row in of_it)
+        plain_console.print(f"{case.name} {about(case, of_it)}; compiled in {longest:.1f} s at most")
+
+
 def _measured(cases: Sequence[Case], rounds: int, num_sizes: int | None) -> list[dict[str, Any]]:
     jobs = [(case, size, device) for case in cases for size in case.sizes[:num_sizes] for device in devices()]
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    columns = text_column("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     rows = []
     # Drawn between measurements only: a thread that draws would run on the core where they are taken.
     with Progress(*columns, console=console, auto_refresh=False) as progress:
@@ -102,9 +112,7 @@ def _described(cases: Sequence[Case], rows: Sequence[dict[str, Any]]) -> dict[st
 
 def _table(case: Case, rows: Sequence[dict[str, Any]]) -> Table:
     """In a terminal, without the name and the time of compiling."""
-    drawn = Table(title=case.name, title_justify="left", box=box.SIMPLE_HEAD, padding=0)
-    for column in COLUMNS[1:-1]:
-        drawn.add_column(column, justify="right", no_wrap=True)
+    drawn = make_table(case.name, *COLUMNS[1:-1])
     for row in rows:
         drawn.add_row(*cells(row)[1:-1])
     return drawn

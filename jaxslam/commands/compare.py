@@ -6,11 +6,9 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
-from rich.table import Table
-
 from jaxslam.benchmark.report import table
 from jaxslam.benchmark.rows import shown_label
-from jaxslam.commands.console import console, plain_console
+from jaxslam.commands.console import console, make_table, plain_console, print_json
 from jaxslam.commands.run import OfRecording, number, track
 from jaxslam.config import presets
 from jaxslam.detector_choice import network_files, preset_needs_network
@@ -19,20 +17,17 @@ from jaxslam.files import write_atomically
 from jaxslam.slam import Slam
 from jaxslam.xla import prefer_one_thread
 
-_ERRORS = (
+_COLUMNS = (
     *("preset", "tracked", "dropped", "matched poses", "ATE, m", "from - to", "ATE Sim(3), m"),
-    *("RPE, m/s", "RPE, deg/s"),
+    *("RPE, m/s", "RPE, deg/s", "mean ms", "median ms", "p95 ms"),
 )
-_COLUMNS = (*_ERRORS, "mean ms", "median ms", "p95 ms")
+_ERRORS = ("preset", "ATE, m", "from - to", "ATE Sim(3), m", "RPE, m/s", "RPE, deg/s")
+_COVERAGE_AND_TIMES = tuple(column for column in _COLUMNS if column not in _ERRORS[1:])
 
 
 @dataclass(frozen=True)
 class Compare(OfRecording):
-    """Track a recording with several presets and put their figures into one table.
-
-    With the presets given, it is Table V of NGD-SLAM: a static world, a detector whose every mask is waited for, masks
-    propagated to the present, and flow between keyframes.
-    """
+    """Options of `jaxslam compare`."""
 
     presets: tuple[str, ...] = ("static", "ngd-detector", "ngd-propagation", "ngd")
     """What to compare."""
@@ -60,10 +55,11 @@ class Compare(OfRecording):
                 folder = out / preset / str(seed)
                 summaries.append(track(dataset, slam, preset, folder, quiet=True))
             rows.append(figures(preset, summaries))
-        console.print(_table(dataset.name, rows))
         lines = [line for row in rows for line in remarks(row)]
-        for line in lines:
-            plain_console.print(line)
+        if self.json:
+            print_json(rows)
+        else:
+            _print_tables(dataset.name, rows, lines)
         write_atomically(out / "comparison.json", (json.dumps(rows, indent=2) + "\n").encode())
         text = table(_COLUMNS, [_cells(row) for row in rows]) + "".join(f"\n- {line}\n" for line in lines)
         write_atomically(out / "comparison.md", text.encode())
@@ -125,8 +121,13 @@ def remarks(row: dict[str, Any]) -> list[str]:
     return lines + [f"{row['preset']}: note: {note}" for note in row["notes"]]
 
 
-def _table(title: str, rows: list[dict[str, Any]]) -> Table:
-    drawn = Table(*_COLUMNS, title=title, title_justify="left")
-    for row in rows:
-        drawn.add_row(*_cells(row))
-    return drawn
+def _print_tables(title: str, rows: list[dict[str, Any]], lines: list[str]) -> None:
+    """Print two tables, since one with all columns would not fit 80 columns, and what there is to say about them."""
+    for name, columns in ((title, _ERRORS), ("", _COVERAGE_AND_TIMES)):
+        table = make_table(name, *columns)
+        for row in rows:
+            cells = dict(zip(_COLUMNS, _cells(row), strict=True))
+            table.add_row(*(cells[column] for column in columns))
+        console.print(table)
+    for line in lines:
+        plain_console.print(line)

@@ -3,8 +3,56 @@
 No text is read as markup of rich, in tables neither: names of runs, files and settings may hold brackets.
 """
 
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
+from rich.progress import TextColumn
+from rich.table import Table
+
+from jaxslam.commands.settings import WithJson
 
 console = Console(soft_wrap=True, markup=False)
 plain_console = Console(soft_wrap=True, markup=False, highlight=False)
 """For texts in which numbers should not be colored."""
+
+
+@contextmanager
+def messages_for(command: object) -> Iterator[None]:
+    """While a command runs with `--json`, both consoles print to standard error: the document stands alone."""
+    before = console.stderr, plain_console.stderr
+    if isinstance(command, WithJson) and command.json:
+        console.stderr = plain_console.stderr = True
+    try:
+        yield
+    finally:
+        console.stderr, plain_console.stderr = before
+
+
+def print_json(document: Any) -> None:
+    """Print a document to standard output, as the JSON files of results are written."""
+    print(json.dumps(document, indent=2))
+
+
+def make_table(title: str, *headings: str, left: int = 1) -> Table:
+    """A table that fits 80 columns: a word too long for its cell goes on in the next line instead of being cut off.
+
+    Args:
+        title: What stands above it; empty for none.
+        headings: Of the columns; words one below the other.
+        left: How many columns, from the first, hold texts. The others hold figures, which stand at the right.
+    """
+    table = Table(title=title or None, title_justify="left", box=SIMPLE_HEAD, padding=(0, 0, 0, 1))
+    for index, heading in enumerate(headings):
+        is_text = index < left
+        text = heading if is_text else heading.replace(" ", "\n")
+        table.add_column(text, justify="left" if is_text else "right", overflow="fold", no_wrap=not is_text)
+    return table
+
+
+def text_column(text: str) -> TextColumn:
+    """A column of a progress bar, whose text may hold brackets."""
+    return TextColumn(text, markup=False)

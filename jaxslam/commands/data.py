@@ -2,17 +2,16 @@
 
 import shlex
 import shutil
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import Annotated, Any
 
 import tyro
-from rich import box
-from rich.console import Console
-from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
-from rich.table import Table
+from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColumn, TransferSpeedColumn
 
-from jaxslam.commands.console import plain_console
+from jaxslam.commands.console import make_table, plain_console, print_json, text_column
+from jaxslam.commands.settings import WithJson
 from jaxslam.download import download, sha256_of
 from jaxslam.errors import DatasetError
 from jaxslam.recordings import (
@@ -27,12 +26,11 @@ from jaxslam.unpack import unpack
 
 _UNPACKED_PER_ARCHIVE = 1.2
 """Images hardly get smaller in an archive: two of TUM unpack to 1.07 and 1.08 times its size."""
-_WIDEST = 4000
 
 
 @dataclass(frozen=True)
-class ListRecordings:
-    """Print the known public recordings: dataset, size of the download, licence, and where they lie here."""
+class ListRecordings(WithJson):
+    """Options of `jaxslam data list`."""
 
     missing: bool = False
     """Only those that are not on this machine, with their addresses."""
@@ -41,24 +39,19 @@ class ListRecordings:
         """Run the command."""
         found, known = found_recordings(), known_recordings()
         shown = [recording for recording in known.values() if not (self.missing and recording.name in found)]
-        last = "source" if self.missing else "here"
-        table = Table("name", "dataset", "size", "licence", last, box=box.SIMPLE)
-        for recording in shown:
-            place = (recording.url or recording.page) if self.missing else str(found.get(recording.name, "no"))
-            table.add_row(recording.name, recording.dataset, _size(recording), recording.licence, place)
-        # As wide as its longest path, whatever the terminal: names and paths are there to be copied.
-        Console(width=_WIDEST, markup=False, highlight=False, soft_wrap=True).print(table)
+        if self.json:
+            print_json([_listed(recording, found.get(recording.name)) for recording in shown])
+            return
+        for dataset in dict.fromkeys(recording.dataset for recording in shown):
+            _print_dataset([recording for recording in shown if recording.dataset == dataset], found, urls=self.missing)
         here = sum(name in found for name in known)
         plain_console.print(f"{here} of {len(known)} are on this machine. To download one: jaxslam data get NAME")
-        pages = dict.fromkeys((recording.dataset, recording.page) for recording in shown)
-        for dataset, page in pages:
-            plain_console.print(f"{dataset}: {page}")
         plain_console.print(f"Downloads go to {recordings_dir()}; a folder named by JAXSLAM_DATA is looked at first.")
 
 
 @dataclass(frozen=True)
 class GetRecording:
-    """Download a recording and unpack it, or go on with a download that was cut."""
+    """Options of `jaxslam data get`."""
 
     name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]
     """Name of a known recording, as `data list` prints it."""
@@ -89,20 +82,24 @@ class GetRecording:
         _print_next(recording, target)
 
 
-_Command: TypeAlias = (
-    Annotated[ListRecordings, tyro.conf.subcommand("list")] | Annotated[GetRecording, tyro.conf.subcommand("get")]
-)
+def _listed(recording: Recording, folder: Path | None) -> dict[str, Any]:
+    """A known recording for `--json`."""
+    return {**asdict(recording), "here": None if folder is None else str(folder)}
 
 
-@dataclass(frozen=True)
-class Data:
-    """Public recordings to track: list them, get one."""
-
-    command: tyro.conf.OmitSubcommandPrefixes[_Command]
-
-    def main(self) -> None:
-        """Run the command."""
-        self.command.main()
+def _print_dataset(shown: Sequence[Recording], found: Mapping[str, Path], *, urls: bool) -> None:
+    """Print the recordings of one dataset, and in lines of their own, to be copied, where they are or come from."""
+    licences = " or ".join(dict.fromkeys(recording.licence for recording in shown))
+    pages = " or ".join(dict.fromkeys(recording.page for recording in shown))
+    table = make_table(f"{shown[0].dataset}, licence: {licences}, see {pages}", "name", "size", "here", left=3)
+    for recording in shown:
+        table.add_row(recording.name, _size(recording), "yes" if recording.name in found else "no")
+    plain_console.print(table)
+    for recording in shown:
+        if urls:
+            plain_console.print(f"{recording.name}: {recording.url or recording.how}")
+        elif recording.name in found:
+            plain_console.print(f"{recording.name}: {found[recording.name]}")
 
 
 def _size(recording: Recording) -> str:
@@ -116,7 +113,7 @@ def _print_next(recording: Recording, folder: Path) -> None:
 
 def _fetch_and_unpack(recording: Recording, url: str, archive: Path, target: Path) -> None:
     columns = (
-        TextColumn("{task.description}"),
+        text_column("{task.description}"),
         BarColumn(),
         DownloadColumn(),
         TransferSpeedColumn(),

@@ -1,19 +1,20 @@
 """`jaxslam doctor`: whether a recording is fit to be tracked."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from jaxslam.commands.console import console
-from jaxslam.doctor import diagnose
+from jaxslam.commands.console import console, print_json
+from jaxslam.commands.settings import WithJson
+from jaxslam.doctor import Level, diagnose
 from jaxslam.errors import DatasetError
 
 
 @dataclass(frozen=True)
-class Doctor:
-    """Look a recording over before tracking it: files, times, calibration, depth scale, picture quality."""
+class Doctor(WithJson):
+    """Options of `jaxslam doctor`."""
 
     recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
     """Folder of the recording."""
@@ -25,6 +26,10 @@ class Doctor:
     def main(self) -> None:
         """Run the command."""
         diagnosis = diagnose(self.recording, self.dataset, self.camera)
-        console.print(str(diagnosis), highlight=False, markup=False)
+        if self.json:
+            counts = {"errors": len(diagnosis.at(Level.ERROR)), "warnings": len(diagnosis.at(Level.WARNING))}
+            print_json({"findings": [asdict(finding) for finding in diagnosis.findings], **counts})
+        else:
+            console.print(str(diagnosis), highlight=False, markup=False)
         if not diagnosis.ok:
-            raise DatasetError(f"{self.recording}: not fit to be tracked, see above")
+            raise DatasetError(f"{self.recording}: not fit to be tracked, see the findings")

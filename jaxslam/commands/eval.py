@@ -1,24 +1,21 @@
 """`jaxslam eval`: an estimated trajectory against the truth."""
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import tyro
 
-from jaxslam.commands.console import plain_console
+from jaxslam.commands.console import plain_console, print_json
+from jaxslam.commands.settings import WithJson
 from jaxslam.evaluation import evaluate
 from jaxslam.trajectory_pair import read_pair
-from jaxslam.visualize import plot_trajectory
+from jaxslam.visualize import picture_format, plot_trajectory
 
 
 @dataclass(frozen=True)
-class Eval:
-    """Compare an estimated trajectory with the truth: ATE, RPE, and KITTI's t_rel and r_rel if it is 100 m long.
-
-    Formats (TUM, KITTI, EuRoC's ground truth) are recognised.
-    """
+class Eval(WithJson):
+    """Options of `jaxslam eval`."""
 
     estimate: tyro.conf.Positional[Path]
     """The estimate."""
@@ -34,13 +31,13 @@ class Eval:
     """Stamps of rows of KITTI, one a line: a file for either or both sides, or one for each."""
     frames: Path | None = None
     """Frames of the recording, for the coverage: rgb.txt of TUM or a stamp a line; else found beside the truth."""
-    json: bool = False
-    """Print all figures as JSON, and nothing else."""
     plot: Path | None = None
-    """Also draw both to this PNG."""
+    """Also draw both to this file: .png, .pdf or .svg."""
 
     def main(self) -> None:
         """Run the command."""
+        if self.plot is not None:
+            picture_format(self.plot)  # an error now, not after the figures
         pair = read_pair(self.estimate, self.groundtruth, self.times, self.frames)
         evaluation = evaluate(
             pair.estimate,
@@ -52,10 +49,9 @@ class Eval:
         )
         evaluation = replace(evaluation, notes=pair.notes + evaluation.notes)
         if self.json:
-            print(json.dumps(evaluation.summary(), indent=2))
+            print_json(evaluation.summary())
         else:
             plain_console.print(str(evaluation))
         if self.plot is not None:
             plot_trajectory(pair.estimate, pair.reference, evaluation, self.plot)
-            if not self.json:
-                plain_console.print(f"Plot: {self.plot}")
+            plain_console.print(f"Plot: {self.plot}")

@@ -6,15 +6,16 @@ from typing import Annotated
 
 import tyro
 
-from jaxslam.commands.console import console
+from jaxslam.commands.console import console, print_json
+from jaxslam.commands.settings import WithJson
 from jaxslam.errors import ConfigError
 from jaxslam.map_export import write_colmap, write_keyframe_trajectory, write_ply
 from jaxslam.map_file import load_map
 
 
 @dataclass(frozen=True)
-class Export:
-    """Write a map for other programs: points as PLY, all of it as a COLMAP model, keyframes as a trajectory."""
+class Export(WithJson):
+    """Options of `jaxslam export`."""
 
     map: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MAP")]
     """Map file, as `run --save-map` writes it."""
@@ -37,6 +38,8 @@ class Export:
             write_colmap(self.colmap, map)
         if self.trajectory is not None:
             write_keyframe_trajectory(self.trajectory, map)
-        console.print(
-            f"{len(map.ids)} keyframes, {len(map.points.ids)} points: {', '.join(str(path) for path in wanted)}"
-        )
+        keyframes, points, paths = len(map.ids), len(map.points.ids), [str(path) for path in wanted]
+        if self.json:
+            print_json({"keyframes": keyframes, "map_points": points, "files": paths})
+        else:
+            console.print(f"{keyframes} keyframes, {points} points: {', '.join(paths)}")

@@ -3,17 +3,17 @@
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
 import tyro
-from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
-from rich.table import Column, Table
+from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColumn, TransferSpeedColumn
 
-from jaxslam.commands.console import plain_console
+from jaxslam.commands.console import make_table, plain_console, print_json, text_column
+from jaxslam.commands.settings import WithJson
 from jaxslam.config import SemanticsConfig
 from jaxslam.datasets.image_file import read_color
 from jaxslam.detector_choice import detector_of
@@ -37,17 +37,19 @@ _NONE = "none"
 
 
 @dataclass(frozen=True)
-class ListModels:
-    """Print the known public networks: size, licence, adapter, and where they lie on this machine."""
+class ListModels(WithJson):
+    """Options of `jaxslam models list`."""
 
     details: bool = False
     """Also print what they are, where they come from, and their SHA-256."""
 
     def main(self) -> None:
         """Run the command."""
-        name = Column("name", no_wrap=True)  # to be copied, on a narrow screen too
-        table = Table(name, "size", "licence", "adapter", "here", title="Known models", title_justify="left")
         files = {model.name: local_file(model) for model in KNOWN_MODELS.values()}
+        if self.json:
+            print_json([_listed(model, files[model.name]) for model in KNOWN_MODELS.values()])
+            return
+        table = make_table("Known models", "name", "size", "licence", "adapter", "here", left=5)
         for model in KNOWN_MODELS.values():
             size = "-" if model.size_bytes is None else f"{model.size_bytes / 1e6:.1f} MB"
             mark = " (default)" if model.name == DEFAULT_MODEL else ""
@@ -64,7 +66,7 @@ class ListModels:
 
 @dataclass(frozen=True)
 class GetModel:
-    """Download a network into the user's cache folder, or go on with a download that was cut."""
+    """Options of `jaxslam models get`."""
 
     name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]
     """Name of a known model, as `models list` prints it."""
@@ -91,8 +93,8 @@ class GetModel:
 
 
 @dataclass(frozen=True)
-class CheckModel:
-    """Run a network on an image: print what it finds and how long it takes, and draw it."""
+class CheckModel(WithJson):
+    """Options of `jaxslam models check`."""
 
     file: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
     """Model file (ONNX), or the name of a known model; with `--prompt-encoder` its boxes are prompts, and `none` is for
@@ -126,7 +128,11 @@ class CheckModel:
         image = read_color(self.image)
         detector, files = self._detector(labels)
         found, first_ms, median_ms = _timed(detector, image)
-        _print_found(found, labels, self.min_score)
+        if self.json:
+            times = {"median_ms": median_ms, "first_ms": first_ms}
+            print_json({**_figures(found), **times, "files": list(map(str, files)), "picture": str(self.out)})
+        else:
+            _print_found(found, labels, self.min_score)
         plain_console.print(f"{median_ms:.1f} ms an image, the first {first_ms:.1f} ms ({', '.join(map(str, files))})")
         bgr = cv2.cvtColor(draw_detections(image, found), cv2.COLOR_RGB2BGR)
         write_atomically(self.out, cv2.imencode(".png", bgr)[1].tobytes())
@@ -155,22 +161,10 @@ class CheckModel:
         return detector, files
 
 
-_Command: TypeAlias = (
-    Annotated[ListModels, tyro.conf.subcommand("list")]
-    | Annotated[GetModel, tyro.conf.subcommand("get")]
-    | Annotated[CheckModel, tyro.conf.subcommand("check")]
-)
-
-
-@dataclass(frozen=True)
-class Models:
-    """Networks that find people: list them, get one, check what one finds in an image."""
-
-    command: tyro.conf.OmitSubcommandPrefixes[_Command]
-
-    def main(self) -> None:
-        """Run the command."""
-        self.command.main()
+def _listed(model: KnownModel, file: Path | None) -> dict[str, Any]:
+    """A known model for `--json`."""
+    here = None if file is None else str(file)
+    return {**asdict(model), "default": model.name == DEFAULT_MODEL, "here": here}
 
 
 def _print_details() -> None:
@@ -183,7 +177,7 @@ def _print_details() -> None:
 
 
 def _download(model: KnownModel, url: str, target: Path) -> None:
-    columns = (TextColumn(model.name), BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
+    columns = (text_column(model.name), BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=plain_console) as progress:
         task = progress.add_task("download", total=model.size_bytes)
         show: Callable[[int, int | None], None] = lambda done, total: progress.update(task, completed=done, total=total)
@@ -201,9 +195,21 @@ def _timed(detector: Callable[[np.ndarray], Detections], image: np.ndarray) -> t
     return found, times_ms[0], statistics.median(times_ms[1:])
 
 
+def _figures(found: Detections) -> dict[str, Any]:
+    """What was found, for `--json`: boxes in pixels, masks as shares of the image."""
+    shares = [None] * len(found.labels) if found.masks is None else found.masks.mean((1, 2)).tolist()
+    rows = zip(found.labels, found.scores.tolist(), found.boxes.tolist(), shares, strict=True)
+    return {
+        "found": [
+            {"label": label, "score": score, "box": box, "mask_share": share} for label, score, box, share in rows
+        ],
+        "class_map_share": None if found.class_mask is None else float(found.class_mask.mean()),
+    }
+
+
 def _print_found(found: Detections, labels: tuple[str, ...], min_score: float) -> None:
     if len(found.labels):
-        table = Table("label", "score", "left", "top", "right", "bottom", "mask", title="Found", title_justify="left")
+        table = make_table("Found", "label", "score", "left", "top", "right", "bottom", "mask")
         shares = (
             ["-"] * len(found.labels)
             if found.masks is None

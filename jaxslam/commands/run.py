@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import tyro
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
-from jaxslam.commands.console import console
-from jaxslam.commands.settings import ALLOW_MISSING_MODEL, Settings, flat
+from jaxslam.commands.console import console, make_table, print_json, text_column
+from jaxslam.commands.settings import ALLOW_MISSING_MODEL, Settings, WithJson, flat
 from jaxslam.config import Config, load_config
 from jaxslam.datasets import Dataset, Subset, dataset_kinds, open_dataset
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset, with_true_masks
@@ -34,11 +33,8 @@ _OnFrame: TypeAlias = Callable[[Frame | None, Tracked | Rejected], None]
 
 
 @dataclass(frozen=True)
-class Demo:
-    """Render a room with walking people, track the camera through it, and evaluate.
-
-    Needs no data. Leaves the files of `run` in `--out`.
-    """
+class Demo(WithJson):
+    """Options of `jaxslam demo`."""
 
     out: Path = Path("results/demo")
     """Folder for the results."""
@@ -81,7 +77,9 @@ class Demo:
         dataset, truth = with_true_masks(SyntheticDataset(scene), config.semantics)
         slam = Slam(dataset.camera, config, detector=truth)
         viewer = _viewer(slam, dataset, live=self.viz, path=self.rrd)
-        track(dataset, slam, "default", self.out, viewer)
+        summary = track(dataset, slam, "default", self.out, viewer, quiet=self.json)
+        if self.json:
+            print_json(summary)
 
     def _who(self) -> str:
         boxes = f", {self.boxes} boxes carried about" if self.boxes else ""
@@ -90,7 +88,7 @@ class Demo:
 
 
 @dataclass(frozen=True)
-class OfRecording:
+class OfRecording(WithJson):
     """What the commands that track recordings share."""
 
     recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
@@ -143,10 +141,7 @@ class OfRecording:
 
 @dataclass(frozen=True)
 class Run(OfRecording):
-    """Track a recording and, if it has ground truth, evaluate.
-
-    The dataset kind and the cameras of TUM (fr1, fr2, fr3) and Bonn are recognised from the folder.
-    """
+    """Options of `jaxslam run`."""
 
     preset: str = "default"
     """Preset to start from."""
@@ -174,10 +169,12 @@ class Run(OfRecording):
         start = None if self.map is None else load_map(self.map)
         slam = Slam(dataset.camera, config, map=start, localize_only=self.localize_only)
         viewer = _viewer(slam, dataset, live=self.viz, path=self.rrd)
-        track(dataset, slam, self.preset, self.folder(), viewer)
+        summary = track(dataset, slam, self.preset, self.folder(), viewer, quiet=self.json)
         if self.save_map is not None:
             slam.save(self.save_map)
             console.print(f"Map in {self.save_map}: {len(slam.map.ids)} keyframes, {len(slam.map.points.ids)} points")
+        if self.json:
+            print_json(summary)
 
 
 def _dense(wanted: bool) -> tuple[str, ...]:
@@ -221,11 +218,11 @@ def track(
     if not quiet:
         console.print(f"Tracker ready after {slam.compile_s:.1f} s.")
     columns = (
-        TextColumn("Tracking"),
+        text_column("Tracking"),
         BarColumn(),
         MofNCompleteColumn(),
         TimeRemainingColumn(),
-        TextColumn("{task.fields[status]}"),
+        text_column("{task.fields[status]}"),
     )
     pictures = RunPictures(len(dataset))
     watchers = [pictures] if viewer is None else [pictures, viewer]
@@ -240,7 +237,7 @@ def track(
 
 
 def _print_summary(summary: dict[str, Any], evaluation: Evaluation | None, out: Path) -> None:
-    table = Table("figure", "value", "unit", title=summary["dataset"], title_justify="left")
+    table = make_table(summary["dataset"], "figure", "value", "unit", left=3)
     statuses = ", ".join(f"{name} {count}" for name, count in summary["status_counts"].items())
     table.add_row("tracked", f"{summary['tracked']} of {summary['frames']}", f"frames ({statuses})")
     table.add_row("network", *_network(summary))

@@ -1,6 +1,7 @@
-"""Options that hold settings, and may be given several times."""
+"""Options that several commands share."""
 
 import itertools
+from dataclasses import dataclass
 from typing import Annotated, TypeAlias
 
 import tyro
@@ -10,6 +11,14 @@ Settings: TypeAlias = Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppend
 
 ALLOW_MISSING_MODEL = "semantics.missing_model=allow"
 """The setting behind `--allow-missing-model`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WithJson:
+    """What the commands that print figures or lists share."""
+
+    json: bool = False
+    """Print one JSON document to standard output, and nothing else there; messages go to standard error."""
 
 
 def flat(settings: Settings) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ from jaxslam.benchmark.plan import fingerprint, plan
 from jaxslam.benchmark.suite import load_suite
 from jaxslam.commands.bench_gate import Gate
 from jaxslam.errors import BenchmarkError
-from jaxslam.results import machine
+from jaxslam.machine import machine
 from jaxslam.xla import usable_cores
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -22,7 +22,7 @@ from jaxslam.benchmark.kernels.report import cells, markdown_report, picture, sl
 from jaxslam.benchmark.kernels.two_views import make_two_views
 from jaxslam.benchmark.timing import call_times, compare, pinned_to_one_core
 from jaxslam.cli import main
-from jaxslam.results import machine
+from jaxslam.machine import machine
 
 fails = failing("bench", "kernels")
 
