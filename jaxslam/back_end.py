@@ -20,6 +20,7 @@ from jaxslam.essential_graph import GraphCompiler
 from jaxslam.feature_pose import MIN_INLIERS
 from jaxslam.features import Features, features_of, no_features
 from jaxslam.keyframe_semantics import KeyframeSemantics
+from jaxslam.late_imports import import_scipy
 from jaxslam.local_map import keyframes_in_view, match_local_map
 from jaxslam.local_mapping import LocalMapping, NewKeyframe, mapping_plan, point_ids, with_new_keyframe
 from jaxslam.loop_closing import LoopClosing, LoopClosure
@@ -203,6 +204,7 @@ class BackEnd:
 
     def compile(self, frame: FrameArrays, state: TrackState) -> None:
         """Compile all that is needed while frames of this kind come, with a state that is not needed any more."""
+        import_scipy()
         self._mapping.compile(frame, self._num_tracks)
         if self._states is not None:
             self._states.compile(frame)

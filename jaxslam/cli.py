@@ -36,11 +36,10 @@ def _run(words: list[str]) -> None:
         from jaxslam.commands.version import version_text  # noqa: PLC0415 - it imports JAX
 
         print(version_text())
-        return
+        sys.exit(ExitCode.DONE)
     command = find_command(words)
     if command is None or command.place is None:
         _list_commands(command, words)
-        return
     import tyro  # noqa: PLC0415 - not needed to list commands, and neither is rich
 
     from jaxslam.commands.console import messages_for  # noqa: PLC0415
@@ -53,7 +52,7 @@ def _run(words: list[str]) -> None:
         called.main()
 
 
-def _list_commands(group: Command | None, words: list[str]) -> None:
+def _list_commands(group: Command | None, words: list[str]) -> NoReturn:
     """Print the help of `jaxslam`, or of a group of commands; an error if it was not asked for.
 
     Args:
@@ -66,7 +65,7 @@ def _list_commands(group: Command | None, words: list[str]) -> None:
         _end(ExitCode.USAGE, "expected a command", text)
     if words[0] in _HELP:
         print(text)
-        return
+        sys.exit(ExitCode.DONE)
     names = dict.fromkeys(command.words[0 if group is None else len(group.words)] for command in commands)
     options = ("--help", "--version") if group is None else ("--help",)
     _end(ExitCode.USAGE, f"expected a command, got '{words[0]}'{nearest(words[0], (*names, *options))}")

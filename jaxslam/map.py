@@ -6,15 +6,17 @@ and without waiting, whatever other threads do. Rows are sorted by id, and an id
 Arrays are NumPy's and as long as needed; what the kernels get is cut out and padded to a few sizes where it is used.
 """
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int8, Int32, Int64, UInt8
-from scipy.sparse import csr_array
 
 from jaxslam.camera import Camera
 from jaxslam.features import DESCRIPTOR_BYTES, Features
 from jaxslam.pose import IDENTITY, compose
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 NONE = -1
 """No keyframe, no point, no feature."""
@@ -233,8 +235,10 @@ def rows(ids: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     return np.searchsorted(ids, wanted)
 
 
-def visibility(map: Map) -> csr_array:
+def visibility(map: Map) -> "csr_array":
     """`(k, p)` matrix of ones where a keyframe saw a point, rows and columns as in the map."""
+    from scipy.sparse import csr_array  # noqa: PLC0415 - see `late_imports`
+
     at = (rows(map.ids, map.sightings.keyframe), rows(map.points.ids, map.sightings.point))
     return csr_array((np.ones(len(at[0]), np.int32), at), shape=(len(map.ids), len(map.points.ids)))
 

@@ -5,8 +5,6 @@ read what they always read. Ids that are not in the map are a `KeyError`: a mist
 """
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from jaxslam.dynamics.occlusion import PointState
 from jaxslam.map import (
@@ -339,6 +337,9 @@ def _is_first(groups: np.ndarray) -> np.ndarray:
 
 def _representatives(map: Map, keep: np.ndarray, drop: np.ndarray) -> np.ndarray:
     """`(p,)` the row of the point that each becomes, its own for most."""
+    from scipy.sparse import coo_array  # noqa: PLC0415 - see `late_imports`
+    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
+
     count = len(map.points.ids)
     links = coo_array((np.ones(len(keep), np.int8), (keep, drop)), shape=(count, count))
     group = connected_components(links, directed=False)[1]

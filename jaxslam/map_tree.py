@@ -1,8 +1,6 @@
 """The spanning tree of a submap's keyframes, and how it closes over one that goes."""
 
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import breadth_first_order
 
 from jaxslam.map import NONE, Map, covisible, rows
 
@@ -14,6 +12,9 @@ def children(map: Map, keyframe_id: int) -> np.ndarray:
 
 def subtree(map: Map, keyframe_id: int) -> np.ndarray:
     """Ids, ascending, of a keyframe and of all that hang on it, directly or not."""
+    from scipy.sparse import csr_array  # noqa: PLC0415 - see `late_imports`
+    from scipy.sparse.csgraph import breadth_first_order  # noqa: PLC0415
+
     hangs = np.flatnonzero(map.parent != NONE)
     above = rows(map.ids, map.parent[hangs])
     below = csr_array((np.ones(len(hangs), np.int8), (above, hangs)), shape=(len(map.ids), len(map.ids)))

@@ -2,7 +2,6 @@
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int64, UInt8, UInt16
-from scipy.spatial import KDTree
 
 from jaxslam.features import DEFAULT_PLAN, FeaturePlan, Features
 
@@ -137,6 +136,8 @@ def _near(
     predicted_uv: np.ndarray, octave: np.ndarray, features: Features, radius_px: float, plan: FeaturePlan
 ) -> tuple[np.ndarray, np.ndarray]:
     """Pairs of points and features of like octave within the radius of it."""
+    from scipy.spatial import KDTree  # noqa: PLC0415 - see `late_imports`
+
     finite = np.isfinite(predicted_uv).all(axis=0)
     pairs = [np.zeros((2, 0), np.int64)]
     for level in range(plan.num_levels):

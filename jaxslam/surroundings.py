@@ -1,7 +1,6 @@
 """Whether two keyframes can have been where they are said to be, by what is around what they have in common."""
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from jaxslam.camera import Camera
 from jaxslam.features import Features
@@ -29,6 +28,8 @@ def seen_through(camera: Camera, source: Features, target: Features, T_source_ta
     Returns:
         0 to 1; 0 where too few can be compared to tell.
     """
+    from scipy.spatial import KDTree  # noqa: PLC0415 - see `late_imports`
+
     focal, centre = np.array([[camera.fx], [camera.fy]]), np.array([[camera.cx], [camera.cy]])
     known, measured = source.depth > 0, target.depth > 0
     if not known.any() or not measured.any():

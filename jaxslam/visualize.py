@@ -228,7 +228,7 @@ def with_breaks(timestamps_ns: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 @cache
 def _add_own_fonts() -> None:
-    """Have Matplotlib know the fonts that come with it, whatever the list says that it keeps in the user's cache folder.
+    """Have Matplotlib know the fonts that come with it, whatever the list in the user's cache folder says.
 
     All Matplotlibs of a version share that list. One whose own fonts were out of reach when it made the list, as in an
     environment being removed, leaves it without them, and every label of a logarithmic axis is then a warning.

@@ -124,7 +124,7 @@ def remarks(row: dict[str, Any]) -> list[str]:
 def _print_tables(title: str, rows: list[dict[str, Any]], lines: list[str]) -> None:
     """Print two tables, since one with all columns would not fit 80 columns, and what there is to say about them."""
     for name, columns in ((title, _ERRORS), ("", _COVERAGE_AND_TIMES)):
-        table = make_table(name, *columns)
+        table = make_table(name, *columns, wrap_first=True)
         for row in rows:
             cells = dict(zip(_COLUMNS, _cells(row), strict=True))
             table.add_row(*(cells[column] for column in columns))

@@ -53,7 +53,7 @@ class ListModels(WithJson):
         for model in KNOWN_MODELS.values():
             size = "-" if model.size_bytes is None else f"{model.size_bytes / 1e6:.1f} MB"
             mark = " (default)" if model.name == DEFAULT_MODEL else ""
-            absent = "no" if model.url else "no, to be made by hand"
+            absent = "no" if model.url else "to be made"
             table.add_row(model.name + mark, size, model.licence, model.adapter, "yes" if files[model.name] else absent)
         plain_console.print(table)
         for name, file in files.items():

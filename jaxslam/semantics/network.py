@@ -3,14 +3,11 @@
 import ast
 import os
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-
-os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # read when it is imported, which else leaves files for that
-import onnxruntime
-from onnxruntime.capi import onnxruntime_pybind11_state as _ort  # pyright: ignore[reportAttributeAccessIssue]
 
 from jaxslam.errors import ModelError
 from jaxslam.semantics.class_names import stored_names
@@ -20,10 +17,9 @@ FREE_SIZE = 416
 """Width and height in pixels of an input that leaves them open: a multiple of 32, and small enough for a CPU."""
 
 _WARNINGS_OFF = 3  # errors and worse are logged
-_ORT_ERRORS: tuple[type[Exception], ...] = (
-    *(kind for kind in vars(_ort).values() if isinstance(kind, type) and issubclass(kind, Exception)),
-    RuntimeError,  # onnxruntime's errors have no base of their own
-)
+
+if TYPE_CHECKING:
+    import onnxruntime
 
 _DTYPES: dict[str, str] = {"float": "float32", "double": "float64"}
 
@@ -67,7 +63,7 @@ class Network:
         """
         try:
             return list(self._session.run(None, dict(inputs)))
-        except _ORT_ERRORS as error:
+        except _ort_errors() as error:
             raise ModelError(f"{self.path}: the network does not run: {_first_line(error)}") from error
 
     def _look(self, free_size: int) -> Graph:
@@ -103,9 +99,23 @@ def check_outputs(outputs: list[np.ndarray], ports: tuple[Port, ...], varying: b
             raise ModelError(f"output {port.name}: expected finite numbers, got {_count_bad(value)} that are not")
 
 
-def _open(path: Path, num_threads: int) -> onnxruntime.InferenceSession:
+@cache
+def _ort_errors() -> tuple[type[Exception], ...]:
+    """What onnxruntime raises: its errors have no base of their own."""
+    from onnxruntime.capi import (  # noqa: PLC0415
+        onnxruntime_pybind11_state as state,  # pyright: ignore[reportAttributeAccessIssue]
+    )
+
+    own = (kind for kind in vars(state).values() if isinstance(kind, type) and issubclass(kind, Exception))
+    return (*own, RuntimeError)
+
+
+def _open(path: Path, num_threads: int) -> "onnxruntime.InferenceSession":
     if not path.is_file():
         raise ModelError(f"{path}: expected an ONNX file, got {'a folder' if path.is_dir() else 'nothing there'}")
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # read when it is imported, which else leaves files for that
+    import onnxruntime  # noqa: PLC0415 - half as large as JAX, and only for runs with a network
+
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.inter_op_num_threads = num_threads, 1
     options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
@@ -113,7 +123,7 @@ def _open(path: Path, num_threads: int) -> onnxruntime.InferenceSession:
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # waiting must not cost a core
     try:
         return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    except _ORT_ERRORS as error:
+    except _ort_errors() as error:
         size = path.stat().st_size
         raise ModelError(
             f"{path}: expected an ONNX file, got {size} bytes that are none: {_first_line(error)}"

@@ -23,8 +23,6 @@ import numpy as np
 from jax import lax
 from jaxlie import SE3
 from jaxtyping import Array, Bool, Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from jaxslam_kernels.block_band import GraphMatrix, Vector, conjugate_gradients, factorise, multiply, solve_factor
 from jaxslam_kernels.checks import checked
@@ -230,6 +228,9 @@ def band_rank(source: np.ndarray, target: np.ndarray, num_nodes: int) -> np.ndar
     Returns:
         `(k,)` each node's place.
     """
+    from scipy.sparse import coo_array  # noqa: PLC0415 - only for graphs, on the host
+    from scipy.sparse.csgraph import reverse_cuthill_mckee  # noqa: PLC0415
+
     graph = coo_array((np.ones(len(source)), (source, target)), shape=(num_nodes, num_nodes))
     order = reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True)
     rank = np.empty(num_nodes, np.int32)

@@ -16,8 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array
-from scipy.sparse import coo_array
-from scipy.sparse.linalg import splu
 
 from jaxslam_kernels.block_band import GraphMatrix, Vector
 
@@ -63,6 +61,8 @@ def _numbers(words: np.ndarray, dtype: np.dtype) -> np.ndarray:
 def _solve(
     diagonal: np.ndarray, coupling: np.ndarray, right: np.ndarray, source: np.ndarray, target: np.ndarray
 ) -> np.ndarray:
+    from scipy.sparse.linalg import splu  # noqa: PLC0415 - only for graphs, on the host
+
     if not all(np.isfinite(values).all() for values in (diagonal, coupling, right)):
         return np.full_like(right, np.nan)
     used = coupling.any(axis=(1, 2))
@@ -79,6 +79,9 @@ def _solve(
 
 def _elimination_order(source: np.ndarray, target: np.ndarray, num_nodes: int) -> np.ndarray:
     """Minimum degree, by nodes: SuperLU finds it on its way to factorising any matrix of this structure."""
+    from scipy.sparse import coo_array  # noqa: PLC0415 - only for graphs, on the host
+    from scipy.sparse.linalg import splu  # noqa: PLC0415
+
     nodes = np.arange(num_nodes)
     rows, columns = np.concatenate([nodes, source, target]), np.concatenate([nodes, target, source])
     degree = np.bincount(rows, minlength=num_nodes)
@@ -88,6 +91,8 @@ def _elimination_order(source: np.ndarray, target: np.ndarray, num_nodes: int) -
 
 
 def _assemble(diagonal: np.ndarray, coupling: np.ndarray, source: np.ndarray, target: np.ndarray) -> Any:
+    from scipy.sparse import coo_array  # noqa: PLC0415 - only for graphs, on the host
+
     k, d, _ = diagonal.shape
     nodes = np.arange(k)
     blocks = np.concatenate([diagonal, coupling, coupling.swapaxes(1, 2)]).astype(np.float64)

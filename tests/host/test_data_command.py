@@ -156,9 +156,9 @@ class TestList:
         out = capsys.readouterr().out
         for name, known in recordings.known_recordings().items():
             row = self.row(out, name)
-            assert known.licence in row
-            assert known.dataset in row
-            assert (str(here) if name == BONN else " no ") in row + " "
+            assert f"{known.dataset}, licence: {known.licence}, see {known.page}" in out
+            assert row.split()[-1] == ("yes" if name == BONN else "no")
+        assert f"{BONN}: {here}" in out.splitlines()
         assert "0.53 GB" in self.row(out, TUM)
         assert "about 0.4 GB" in self.row(out, BONN)
         assert f"1 of {len(recordings.known_recordings())} are on this machine" in out
@@ -169,8 +169,8 @@ class TestList:
         main(["data", "list", "--missing"])
         out = capsys.readouterr().out
         assert f"{BONN} " not in out
-        assert recordings.known_recording(TUM).url in self.row(out, TUM).split()
-        assert recordings.known_recording("kitti_05").page in self.row(out, "kitti_05").split()
+        assert f"{TUM}: {recordings.known_recording(TUM).url}" in out.splitlines()
+        assert f"kitti_05: {recordings.known_recording('kitti_05').how}" in out.splitlines()
 
     def test_bad_folder(
         self, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path

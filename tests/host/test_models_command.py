@@ -244,7 +244,7 @@ class TestCheck:
         assert "words.png: cannot be read" in fails(
             capsys, "check", str(tmp_path / "net.onnx"), str(tmp_path / "words.png")
         )
-        assert "models get yolox-nano" in fails(capsys, "check", "yolox-nano", str(image))
+        assert "models get yolox-nano" in failing("models", code=2)(capsys, "check", "yolox-nano", str(image))
 
     def test_known_networks(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Those that are here are of the family that the table says."""
