@@ -59,7 +59,7 @@ class Compare(OfRecording):
         if self.json:
             print_json(rows)
         else:
-            _print_tables(dataset.name, rows, lines)
+            print_tables(dataset.name, rows, lines)
         write_atomically(out / "comparison.json", (json.dumps(rows, indent=2) + "\n").encode())
         text = table(_COLUMNS, [_cells(row) for row in rows]) + "".join(f"\n- {line}\n" for line in lines)
         write_atomically(out / "comparison.md", text.encode())
@@ -121,7 +121,7 @@ def remarks(row: dict[str, Any]) -> list[str]:
     return lines + [f"{row['preset']}: note: {note}" for note in row["notes"]]
 
 
-def _print_tables(title: str, rows: list[dict[str, Any]], lines: list[str]) -> None:
+def print_tables(title: str, rows: list[dict[str, Any]], lines: list[str]) -> None:
     """Print two tables, since one with all columns would not fit 80 columns, and what there is to say about them."""
     for name, columns in ((title, _ERRORS), ("", _COVERAGE_AND_TIMES)):
         table = make_table(name, *columns, wrap_first=True)

@@ -199,6 +199,11 @@ class TestCommand:
         assert "Verdict: nothing is worse." in printed
         assert "| a | 100.00 | 10.10 | 1.01 | 10.10 | 1.000 |" in (before / "accuracy.md").read_text()
         after = self.folder(tmp_path / "after", 1.1)
+        with pytest.raises(SystemExit):
+            main(self.command(after, "--json"))
+        reading = json.loads(capsys.readouterr().out)
+        assert reading["recordings"][0]["ratio"] == pytest.approx(1.1)
+        assert reading["worse"]
         assert "less accurate than abc: geometric mean of the ratios 1.100" in fails(capsys, *self.command(after)[2:])
 
     @pytest.mark.parametrize(

@@ -313,8 +313,11 @@ def command(out: Path, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
 
 class TestGate:
     def test_nothing_is_worse(self, command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-        main(command)
-        assert "Nothing is worse" in capsys.readouterr().out
+        main([*command, "--json"])
+        out, err = capsys.readouterr()
+        assert "Nothing is worse" in err
+        told = json.loads(out)
+        assert (told["worse"], told["results"][0]["status"]) == ([], "done")
 
     @pytest.mark.parametrize(("figure", "factor"), [("ate_rmse_m", 0.95), ("time_of_flows", 1 / 1.5)])
     def test_planted_loss(

@@ -23,7 +23,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_table(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Two presets, twice each: every run has its folder, every preset its row, which says what it lacks."""
-    chosen = ["--presets", "static", "ngd", "--runs", "2", "--allow-missing-model", "--set", *SETTINGS]
+    chosen = ["--presets", "static", "ngd", "--runs", "2", "--allow-missing-model", "--json", "--set", *SETTINGS]
     main(["compare", str(recording), "--out", str(tmp_path), *chosen])
     rows = json.loads((tmp_path / "comparison.json").read_text())
     assert [row["preset"] for row in rows] == ["static", "ngd"]
@@ -47,8 +47,9 @@ def test_a_table(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
         "- static: without a network (semantics.model is null)",
         "- ngd: without a network (yolox-nano not on this machine)",
     ]
-    printed = capsys.readouterr().out
-    assert "ngd, run 2 of 2" in printed
+    printed, told = capsys.readouterr()
+    assert json.loads(printed) == rows
+    assert "ngd, run 2 of 2" in told
     seeds = [(tmp_path / "ngd" / seed / "config.yaml").read_text().count(f"seed: {seed}\n") for seed in "01"]
     assert seeds == [1, 1]
 
