@@ -1,14 +1,23 @@
 """The command line: help, one-line errors with hints, and `eval` and `doctor` on small files."""
 
+import dataclasses
+import shlex
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
+import cv2
+import jax
 import numpy as np
 import pytest
 from command_line import failing
 from tiny_recording import CAMERA, write_recording
 
+import jaxslam
 from jaxslam.cli import main
+from jaxslam.commands.index import COMMANDS, Command, ExitCode
+from jaxslam.machine import cpu_model
 from jaxslam.trajectory import Trajectory, write_tum
 
 fails = failing()
@@ -44,7 +53,27 @@ class TestHelp:
             main(["--help"])
         assert stop.value.code == 0
         out = capsys.readouterr().out
-        assert all(command in out for command in ("demo", "run", "eval", "doctor"))
+        assert all(f"  {command.name} " in out and command.about.split()[0] in out for command in COMMANDS)
+        assert all(f"  {int(code)} " in out for code in ExitCode)
+        assert all(len(line) <= 80 for line in out.splitlines())
+
+    @pytest.mark.parametrize("command", [command for command in COMMANDS if command.place], ids=lambda c: c.name)
+    def test_table_leads_to_options(self, command: Command) -> None:
+        """Each name of the table is a dataclass with `main`, whose docstring names it."""
+        options = command.options()
+        assert dataclasses.is_dataclass(options)
+        assert callable(options.main)
+        assert f"`jaxslam {command.name}`" in (options.__doc__ or "")
+
+    def test_version(self, capsys: pytest.CaptureFixture[str]) -> None:
+        with pytest.raises(SystemExit) as stop:
+            main(["--version"])
+        assert stop.value.code == ExitCode.DONE
+        out = capsys.readouterr().out
+        for text in (f"jaxslam {jaxslam.__version__}", f"JAX {jax.__version__}", f"OpenCV {cv2.__version__}"):
+            assert text in out
+        assert f"CPU: {cpu_model()}" in out
+        assert f"compiled code: {jax.config.values['jax_compilation_cache_dir']}" in out
 
 
 class TestErrors:
@@ -92,10 +121,42 @@ class TestErrors:
         (tmp_path / "words.txt").write_text("once upon a time\n")
         assert "words.txt" in fails(capsys, "eval", str(tmp_path / "words.txt"), trajectories[1])
 
-    def test_unknown_option_is_a_usage_error(self, recording: Path) -> None:
+    def test_unknown_option_is_a_usage_error(self, capsys: pytest.CaptureFixture[str], recording: Path) -> None:
         with pytest.raises(SystemExit) as stop:
             main(["run", str(recording), "--presett", "default"])
-        assert stop.value.code == 2
+        assert stop.value.code == ExitCode.USAGE == 2
+        assert "Perhaps you meant" in (err := capsys.readouterr().err)
+        assert "--preset STR" in err
+
+    @pytest.mark.parametrize(
+        ("words", "message"),
+        [
+            (["rnu"], "expected a command, got 'rnu' (did you mean 'run'?)"),
+            (["--verion"], "expected a command, got '--verion' (did you mean '--version'?)"),
+            (["models", "lst"], "expected a command, got 'lst' (did you mean 'list'?)"),
+            (["data", "gte"], "expected a command, got 'gte' (did you mean 'get'?)"),
+        ],
+    )
+    def test_unknown_command_is_a_usage_error(
+        self, capsys: pytest.CaptureFixture[str], words: list[str], message: str
+    ) -> None:
+        assert failing(code=ExitCode.USAGE)(capsys, *words) == message
+
+    @pytest.mark.parametrize("words", [[], ["models"], ["data"]])
+    def test_no_command_is_a_usage_error(self, capsys: pytest.CaptureFixture[str], words: list[str]) -> None:
+        with pytest.raises(SystemExit) as stop:
+            main(words)
+        assert stop.value.code == ExitCode.USAGE
+        err = capsys.readouterr().err
+        assert err.startswith("usage: jaxslam")
+        assert err.endswith("error: expected a command\n")
+
+    def test_output_that_nobody_reads(self) -> None:
+        """As with `| head -1`: no traceback."""
+        code = "from jaxslam.cli import main; main(['models', 'list', '--json'])"
+        command = f"{sys.executable} -c {shlex.quote(code)} | head -c 1"
+        done = subprocess.run(command, shell=True, capture_output=True, text=True, check=False)
+        assert (done.stdout, done.stderr) == ("[", "")
 
 
 class TestEval:
@@ -104,6 +165,21 @@ class TestEval:
         out = capsys.readouterr().out
         assert "ATE w.r.t. translation (without alignment, gap 20 ms)" in out
         assert "0.007071" in out  # 1 cm on every second pose
+
+    @pytest.mark.parametrize(("ending", "begins"), [("pdf", b"%PDF"), ("svg", b"<?xml"), ("PNG", b"\x89PNG")])
+    def test_draws_as_its_ending_says(self, trajectories: tuple[str, str], tmp_path: Path, ending: str, begins) -> None:
+        files = [tmp_path / f"{name}.{ending}" for name in ("one", "other")]
+        for file in files:
+            main(["eval", *trajectories, "--plot", str(file)])
+        assert files[0].read_bytes().startswith(begins)
+        assert files[0].read_bytes() == files[1].read_bytes()
+
+    def test_plot_of_another_ending(
+        self, capsys: pytest.CaptureFixture[str], trajectories: tuple[str, str], tmp_path: Path
+    ) -> None:
+        file = tmp_path / "plot.tiff"
+        expected = f"{file}: expected a file that ends in .png, .pdf or .svg, got '.tiff'"
+        assert fails(capsys, "eval", *trajectories, "--plot", str(file)) == expected
 
     def test_draws(self, capsys: pytest.CaptureFixture[str], trajectories: tuple[str, str], tmp_path: Path) -> None:
         main(["eval", *trajectories, "--plot", str(tmp_path / "both.png")])

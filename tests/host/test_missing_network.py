@@ -101,4 +101,7 @@ class TestCommands:
         main(["run", str(recording), "--out", str(tmp_path), *chosen])
         summary = json.loads((tmp_path / "summary.json").read_text())
         assert (summary["model"], summary["without_network"]) == ("yolox-nano", "yolox-nano not on this machine")
-        assert "yolox-nano not on this machine" in capsys.readouterr().out
+        out = capsys.readouterr().out
+        assert "yolox-nano not on this machine" in out
+        assert "…" not in out
+        assert all(len(line) <= 80 for line in out.splitlines() if line.startswith("  "))

@@ -1,6 +1,7 @@
 """`jaxslam models`: the table, a download from this machine, and a picture of what a detector finds."""
 
 import hashlib
+import json
 import os
 from collections.abc import Callable
 from dataclasses import replace
@@ -192,6 +193,17 @@ class TestCheck:
         assert (picture[80, 60] != 100).any()
         assert found["images"][0].shape == (HEIGHT, WIDTH, 3)
         assert found["settings"] == {"labels": ("person",), "min_score": 0.3, "adapter": None}
+
+    def test_json(self, capsys: pytest.CaptureFixture[str], tmp_path: Path, image: Path, found: dict[str, Any]) -> None:
+        self.run(tmp_path, image, "--json")
+        told = json.loads(capsys.readouterr().out)
+        assert [(row["label"], row["score"]) for row in told["found"]] == [
+            ("person", pytest.approx(0.9)),
+            ("dog", pytest.approx(0.4)),
+        ]
+        assert len(told["found"][0]["box"]) == 4
+        assert told["median_ms"] > 0
+        assert len(found["images"]) > 1
 
     def test_settings(self, tmp_path: Path, image: Path, found: dict[str, Any]) -> None:
         self.run(tmp_path, image, "--labels", "person, dog", "--adapter", "yolox", "--min-score", "0.5")

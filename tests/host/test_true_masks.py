@@ -144,9 +144,11 @@ class TestSuite:
 
 def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     small = ["--frames", "3", "--people", "0", "--boxes", "1", "--seated", "1", "--out", str(tmp_path)]
-    main(["demo", *small, "--set", "semantics.model=scene", "--set", "semantics.labels=[person, box]"])
-    assert "0 people, 1 boxes carried about, 1 people at the desk" in " ".join(capsys.readouterr().out.split())
+    main(["demo", *small, "--set", "semantics.model=scene", "--set", "semantics.labels=[person, box]", "--json"])
+    out, err = capsys.readouterr()
+    assert "0 people, 1 boxes carried about, 1 people at the desk" in " ".join(err.split())
     assert "model: scene" in (tmp_path / "config.yaml").read_text()
     summary = json.loads((tmp_path / "summary.json").read_text())
+    assert json.loads(out) == summary
     assert summary["tracked"] == 3
     assert "0people_1boxes_1seated" in summary["dataset"]

@@ -1,16 +1,19 @@
 """Pictures of trajectories: that they are drawn, hold what they should, and need no screen."""
 
+import matplotlib as mpl
 import numpy as np
 import pytest
+from matplotlib import font_manager
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.image import imread
+from small_map import small_map
 
 from jaxslam import visualize
 from jaxslam.errors import TrajectoryError
 from jaxslam.evaluation import evaluate
 from jaxslam.trajectory import Trajectory
-from jaxslam.visualize import plot_trajectory
+from jaxslam.visualize import plot_map, plot_trajectory, png
 
 STEP_NS = 100_000_000
 
@@ -82,6 +85,53 @@ def test_draws_one_perfect_pose(tmp_path):
     plot_trajectory(one, one, evaluate(one, one, "none"), tmp_path / "plot.png")
     plot_trajectory(one, None, evaluate(one, one, "none"), tmp_path / "plot.png")
     assert imread(tmp_path / "plot.png").size
+
+
+HALF = 0.5**0.5
+
+
+@pytest.mark.parametrize(
+    ("wxyz", "views"),
+    [
+        # The world has the camera's own axes: y down, z ahead.
+        ((1, 0, 0, 0), [("from above", "x", "z", False, False), ("from the right", "z", "y", False, True)]),
+        # The camera stands on its head: the world's y is up for it, and z behind it.
+        ((0, 1, 0, 0), [("from above", "x", "z", False, True), ("from the right", "z", "y", True, False)]),
+        # z of the world is up, and the camera looks along y.
+        ((HALF, -HALF, 0, 0), [("from behind", "x", "z", False, False), ("from the right", "y", "z", False, False)]),
+    ],
+)
+def test_map_stands_upright(tmp_path, figures, wxyz, views):
+    """Up is where the first keyframe has it, and what is ahead of it is at the top of a picture from above."""
+    map = small_map()
+    map = map._replace(T_world_cam=np.concatenate([np.tile(wxyz, (len(map.ids), 1)), map.T_world_cam[:, 4:]], axis=1))
+    plot_map(map, Trajectory(STEP_NS * np.arange(len(map.ids)), map.T_world_cam), tmp_path / "map.svg")
+    assert (tmp_path / "map.svg").read_bytes().startswith(b"<?xml")
+    drawn = [
+        (axes.get_title(), axes.get_xlabel()[0], axes.get_ylabel()[0], axes.xaxis_inverted(), axes.yaxis_inverted())
+        for axes in figures[0].axes[:2]
+    ]
+    assert drawn == views
+    seen = np.concatenate([map.points.X_world.T, map.T_world_cam[:, 4:]])
+    for axes in figures[0].axes[:2]:
+        low, high = sorted(axes.get_ylim())
+        values = seen[:, "xyz".index(axes.get_ylabel()[0])]
+        assert low < values.min()
+        assert high > values.max()
+
+
+def test_fonts_of_matplotlib_are_found_whatever_its_list_holds(monkeypatch, caplog):
+    """The list in the user's cache folder may have been made where Matplotlib's own fonts were out of reach."""
+    known = font_manager.fontManager
+    foreign = [font for font in known.ttflist if not font.fname.startswith(mpl.get_data_path())]
+    monkeypatch.setattr(known, "ttflist", foreign)
+    visualize._add_own_fonts.cache_clear()
+    figure = Figure()
+    figure.add_subplot().loglog([1, 1000], [1, 1000])
+    with caplog.at_level("WARNING"):
+        png(figure)
+    assert not caplog.records
+    assert "STIXGeneral" in {font.name for font in known.ttflist}
 
 
 def test_refuses(tmp_path):
