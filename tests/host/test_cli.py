@@ -151,6 +151,7 @@ class TestErrors:
         assert err.startswith("usage: jaxslam")
         assert err.endswith("error: expected a command\n")
 
+    @pytest.mark.skipif(sys.platform == "win32", reason="there is no `head`")
     def test_output_that_nobody_reads(self) -> None:
         """As with `| head -1`: no traceback."""
         code = "from jaxslam.cli import main; main(['models', 'list', '--json'])"
