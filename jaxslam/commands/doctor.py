@@ -8,7 +8,6 @@ import tyro
 
 from jaxslam.commands.console import console, print_json
 from jaxslam.commands.settings import WithJson
-from jaxslam.doctor import Level, diagnose
 from jaxslam.errors import DatasetError
 
 
@@ -25,6 +24,8 @@ class Doctor(WithJson):
 
     def main(self) -> None:
         """Run the command."""
+        from jaxslam.doctor import Level, diagnose  # noqa: PLC0415 - not for `--help`
+
         diagnosis = diagnose(self.recording, self.dataset, self.camera)
         if self.json:
             counts = {"errors": len(diagnosis.at(Level.ERROR)), "warnings": len(diagnosis.at(Level.WARNING))}

@@ -8,9 +8,6 @@ import tyro
 
 from jaxslam.commands.console import plain_console, print_json
 from jaxslam.commands.settings import WithJson
-from jaxslam.evaluation import evaluate
-from jaxslam.trajectory_pair import read_pair
-from jaxslam.visualize import picture_format, plot_trajectory
 
 
 @dataclass(frozen=True)
@@ -36,6 +33,10 @@ class Eval(WithJson):
 
     def main(self) -> None:
         """Run the command."""
+        from jaxslam.evaluation import evaluate  # noqa: PLC0415 - not for `--help`
+        from jaxslam.trajectory_pair import read_pair  # noqa: PLC0415
+        from jaxslam.visualize import picture_format, plot_trajectory  # noqa: PLC0415
+
         if self.plot is not None:
             picture_format(self.plot)  # an error now, not after the figures
         pair = read_pair(self.estimate, self.groundtruth, self.times, self.frames)

@@ -9,8 +9,6 @@ import tyro
 from jaxslam.commands.console import console, print_json
 from jaxslam.commands.settings import WithJson
 from jaxslam.errors import ConfigError
-from jaxslam.map_export import write_colmap, write_keyframe_trajectory, write_ply
-from jaxslam.map_file import load_map
 
 
 @dataclass(frozen=True)
@@ -28,6 +26,9 @@ class Export(WithJson):
 
     def main(self) -> None:
         """Run the command."""
+        from jaxslam.map_export import write_colmap, write_keyframe_trajectory, write_ply  # noqa: PLC0415 - not for `--help`
+        from jaxslam.map_file import load_map  # noqa: PLC0415
+
         map = load_map(self.map)
         wanted = [path for path in (self.ply, self.colmap, self.trajectory) if path is not None]
         if not wanted:

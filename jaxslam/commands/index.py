@@ -146,7 +146,9 @@ COMMANDS = (
     ),
     Command(("models",), None, "Networks that find people: list them, get one, check one."),
     Command(
-        ("models", "check"), "models:CheckModel", "Run a network on an image: what it finds, how long it takes, drawn."
+        ("models", "check"),
+        "models_check:CheckModel",
+        "Run a network on an image: what it finds, how long it takes, drawn.",
     ),
     Command(("models", "get"), "models:GetModel", "Download a network, or go on with a download that was cut."),
     Command(

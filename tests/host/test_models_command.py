@@ -16,6 +16,7 @@ from command_line import failing
 from jaxslam import known_models
 from jaxslam.cli import main
 from jaxslam.commands import models as models_command
+from jaxslam.commands import models_check
 from jaxslam.draw_detections import draw_detections
 from jaxslam.errors import DownloadError
 from jaxslam.known_models import KNOWN_MODELS, known_model
@@ -172,7 +173,7 @@ class TestCheck:
             known["path"], known["settings"] = path, settings
             return lambda image: known["images"].append(image) or known["gives"]
 
-        monkeypatch.setattr(models_command, "load_detector", load)
+        monkeypatch.setattr(models_check, "load_detector", load)
         return known
 
     def run(self, tmp_path: Path, image: Path, *more: str) -> np.ndarray:
@@ -266,7 +267,7 @@ class TestCheck:
         files = {model.adapter: known_models.local_file(model) for model in KNOWN_MODELS.values()}
         for adapter, file in files.items():
             if file is not None:
-                assert models_command.load_detector(file).adapter == adapter
+                assert models_check.load_detector(file).adapter == adapter
 
 
 class TestDrawing:
