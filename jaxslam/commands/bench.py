@@ -20,10 +20,11 @@ from jaxslam.benchmark.rows import row_name
 from jaxslam.benchmark.runner import Executor, local, run_jobs
 from jaxslam.benchmark.suite import Suite, check_masks, checked_presets, load_suite, suites
 from jaxslam.commands.console import console, make_table, plain_console, print_json, text_column
+from jaxslam.commands.index import COMMANDS
 from jaxslam.commands.settings import ALLOW_MISSING_MODEL, Settings, WithJson, flat
 from jaxslam.config import load_config
 from jaxslam.detector_choice import network_files
-from jaxslam.errors import BenchmarkError
+from jaxslam.errors import BenchmarkError, nearest
 from jaxslam.files import make_folder, write_atomically
 
 _REPORT, _PAGE = "report.md", "report.html"
@@ -202,6 +203,7 @@ class Bench(RunsOfSuite):
         if self.suite is None:
             _list(as_json=self.json)
             return
+        _check_suite(self.suite)
         results = self.results(self.suite)
         if self.json:
             print_json(as_table(results))
@@ -261,6 +263,16 @@ def _line(result: Mapping[str, Any]) -> str:
     ate = result["ate_rmse_m"]
     known = f"ATE {ate:.4f} m" if ate is not None else f"no ATE ({result['evaluation_problem']})"
     return f"{_name(result)}: {known}, {result['tracked_percent']:.1f} % tracked"
+
+
+def _check_suite(name: str) -> None:
+    """Refuse what is no suite, and may be a misspelt command below `bench` as well."""
+    if name in suites() or Path(name).exists():
+        return
+    commands = [command.words[1] for command in COMMANDS if command.words[0] == "bench" and len(command.words) > 1]
+    raise BenchmarkError(
+        f"suite: expected a known one, a YAML file or a folder, got '{name}'{nearest(name, [*suites(), *commands])}"
+    )
 
 
 def _list(*, as_json: bool) -> None:

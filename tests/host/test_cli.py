@@ -142,6 +142,10 @@ class TestErrors:
     ) -> None:
         assert failing(code=ExitCode.USAGE)(capsys, *words) == message
 
+    @pytest.mark.parametrize(("word", "meant"), [("gaet", "gate"), ("smkoe", "smoke")])
+    def test_unknown_suite_or_command_of_bench(self, capsys: pytest.CaptureFixture[str], word: str, meant: str) -> None:
+        assert fails(capsys, "bench", word).endswith(f"got '{word}' (did you mean '{meant}'?)")
+
     @pytest.mark.parametrize("words", [[], ["models"], ["data"]])
     def test_no_command_is_a_usage_error(self, capsys: pytest.CaptureFixture[str], words: list[str]) -> None:
         with pytest.raises(SystemExit) as stop:
