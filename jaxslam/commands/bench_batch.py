@@ -60,7 +60,7 @@ class Batch(WithJson):
         if self.json:
             print_json(content)
         else:
-            console.print(_table(rows))
+            console.print(clips_table(rows))
             plain_console.print(how(content))
         files = {
             _JSON: (json.dumps(content, indent=1) + "\n").encode(),
@@ -106,9 +106,10 @@ class Batch(WithJson):
         return rows
 
 
-def _table(rows: Sequence[dict[str, Any]]) -> Table:
+def clips_table(rows: Sequence[dict[str, Any]]) -> Table:
+    """The rows of `measure` for a terminal, but for columns for which there is no room."""
     shown = [index for index, column in enumerate(COLUMNS) if column not in _LEFT_OUT]
-    drawn = make_table("Clips at once", *(COLUMNS[index] for index in shown), left=2)
+    drawn = make_table("Clips at once", *(COLUMNS[index] for index in shown), left=2, gap=1)
     for row in rows:
         texts = cells(row)
         drawn.add_row(*(texts[index] for index in shown))

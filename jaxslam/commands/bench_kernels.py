@@ -76,7 +76,7 @@ def _content(cases: Sequence[Case], rows: Sequence[dict[str, Any]], rounds: int,
 def _print_tables(cases: Sequence[Case], rows: Sequence[dict[str, Any]]) -> None:
     for case in cases:
         of_it = [row for row in rows if row["kernel"] == case.name]
-        console.print(_table(case, of_it))
+        console.print(case_table(case, of_it))
         longest = max(row["compile_s"] for row in of_it)
         plain_console.print(f"{case.name} {about(case, of_it)}; compiled in {longest:.1f} s at most")
 
@@ -110,9 +110,9 @@ def _described(cases: Sequence[Case], rows: Sequence[dict[str, Any]]) -> dict[st
     }
 
 
-def _table(case: Case, rows: Sequence[dict[str, Any]]) -> Table:
+def case_table(case: Case, rows: Sequence[dict[str, Any]]) -> Table:
     """In a terminal, without the name and the time of compiling."""
-    drawn = make_table(case.name, *COLUMNS[1:-1])
+    drawn = make_table(case.name, *COLUMNS[1:-1], gap=1)
     for row in rows:
         drawn.add_row(*cells(row)[1:-1])
     return drawn

@@ -37,7 +37,7 @@ def print_json(document: Any) -> None:
     print(json.dumps(document, indent=2))
 
 
-def make_table(title: str, *headings: str, left: int = 1, wrap_first: bool = False) -> Table:
+def make_table(title: str, *headings: str, left: int = 1, wrap_first: bool = False, gap: int = 2) -> Table:
     """A table that fits 80 columns: a word too long for its cell goes on in the next line instead of being cut off.
 
     Args:
@@ -45,11 +45,12 @@ def make_table(title: str, *headings: str, left: int = 1, wrap_first: bool = Fal
         headings: Of the columns; words one below the other.
         left: How many columns, from the first, hold texts. The others hold figures, which stand at the right.
         wrap_first: Whether the first column, whose names are mostly there to be copied, may be broken too.
+        gap: Spaces between columns, 1 or more.
     """
-    table = Table(title=title or None, title_justify="left", box=SIMPLE_HEAD, padding=(0, 0, 0, 1))
+    table = Table(title=title or None, title_justify="left", box=SIMPLE_HEAD, padding=(0, 0, 0, gap - 1))
     for index, heading in enumerate(headings):
         is_text = index < left
-        whole = not is_text or (index == 0 and not wrap_first)
+        whole = index == 0 and not wrap_first
         text = heading if is_text else heading.replace(" ", "\n")
         table.add_column(text, justify="left" if is_text else "right", overflow="fold", no_wrap=whole)
     return table

@@ -11,7 +11,10 @@ from rich.console import Console
 from rich.progress import Progress
 from tiny_recording import CAMERA, write_recording
 
+from jaxslam.benchmark.kernels.cases import chosen
 from jaxslam.cli import main
+from jaxslam.commands.bench_batch import clips_table
+from jaxslam.commands.bench_kernels import case_table
 from jaxslam.commands.compare import figures, print_tables
 from jaxslam.commands.console import console, make_table, messages_for, plain_console, print_json, text_column
 from jaxslam.commands.settings import WithJson
@@ -65,6 +68,39 @@ class TestTable:
         for text in ("walking [xyz]", "[odd]", "12.3456 - 12.3456", "100.0 %", "927", "0.0300", "0.700", "123.4"):
             assert text in out
         assert "rts-semantics-epipolar" in out
+
+    def test_of_clips(self, capsys: pytest.CaptureFixture[str]) -> None:
+        row: dict[str, Any] = {
+            **{"clips": 64, "way": "32 threads of 16", "frames_per_s": 1206.3, "cores": 31.98, "compile_s": 123.4},
+            **{
+                "frames_per_s_per_core": 104.1,
+                "loop_frames_per_s": 72.3,
+                "ratio_to_loop": 22.9,
+                "peak_rss_mb": 12345.0,
+            },
+            **{"peak_device_mb": None, "ate_rmse_m": 0.01234, "ate_rmse_m_of_clips": [0.2], "off_alone_m": 1e-5},
+        }
+        console.print(clips_table([row | {"same_statuses": same} for same in (True, False)]))
+        out = capsys.readouterr().out
+        assert all(len(line) <= WIDTH for line in rows_of(out))
+        assert CUT not in out
+        for text in ("1206", "31.98", "22.90", "123.4", "12345", "0.01234", "1.0e-05", "statuses"):
+            assert text in out
+
+    def test_of_kernels(self, capsys: pytest.CaptureFixture[str]) -> None:
+        (case,) = chosen(("bundle_adjust",))
+        row: dict[str, Any] = {
+            **{"kernel": case.name, "label": "12 keyframes, 1500 points", "backend": "cpu", "compile_s": 3.0},
+            **{"ours_ms": 12345.0, "ours_p95_ms": 12345.0, "theirs_ms": 12345.0, "theirs_p95_ms": 12345.0},
+            **{"ratio": 0.00123, "difference": 0.000123, "agrees": False, "problem": ""},
+        }
+        console.print(case_table(case, [row]))
+        out = capsys.readouterr().out
+        assert all(len(line) <= WIDTH for line in rows_of(out))
+        assert CUT not in out
+        for text in ("12 keyframes, 1500 points", "0.00123", "0.000123, too"):
+            assert text in out
+        assert out.count("12345") == 4
 
     @pytest.mark.parametrize("words", [["models", "list"], ["data", "list"], ["bench"]])
     def test_of_what_is_known(self, capsys: pytest.CaptureFixture[str], words: list[str]) -> None:
