@@ -3,14 +3,20 @@
 JAX finds compiled code on the disk by the program it has traced, so that every start traces. With traces kept too, the
 tracker and its map are ready after 1.3 s instead of 5.1 (AMD EPYC, two cores). `jax.export` writes a trace; it is found
 by what it was made from: function, sizes, static arguments, settings of JAX, and all sources.
+
+A trace is a program, so that only folders of the user's own are read from. A file holds the SHA-256 of the rest, a line
+of JSON with the structure of the result, and the program. Nothing in it is unpickled.
 """
 
+import contextlib
+import dataclasses
 import functools
 import hashlib
 import inspect
+import json
 import logging
-import pickle
 import platform
+import sys
 import time
 from collections.abc import Callable, Iterable
 from enum import Enum
@@ -26,6 +32,7 @@ from jax.core import Tracer
 
 from jaxslam.errors import JaxSlamError
 from jaxslam.files import write_atomically
+from jaxslam.own_folder import OWN_MODE, why_not_own
 
 _log = logging.getLogger(__name__)
 
@@ -126,7 +133,8 @@ def _file(program: str) -> Path | None:
     sources = _sources()
     if not folder or not jax.config.values["jax_enable_compilation_cache"] or sources is None or " at 0x" in program:
         return None
-    settings = {name: getattr(jax.config, name, None) for name in sorted(jax.config.values)}
+    names = (name for name in sorted(jax.config.values) if not name.startswith("jax_persistent_cache"))
+    settings = {name: getattr(jax.config, name, None) for name in names}
     text = f"{sources}\n{jax.default_backend()}\n{settings}\n{program}"
     return Path(folder) / "traces" / hashlib.sha256(text.encode()).hexdigest()
 
@@ -159,38 +167,106 @@ def source_files() -> dict[Path, Path] | None:
 
 
 def _read(file: Path) -> _Kept | None:
+    if not file.parent.is_dir() or not _trusted(file.parent):
+        return None
     try:
         data = file.read_bytes()
-        file.touch()
     except FileNotFoundError:
         return None
     except OSError as problem:
         _log.warning("%s: cannot be read: %s", file, problem)
         return None
+    with contextlib.suppress(OSError):  # of a disk that is read-only nothing is removed either
+        file.touch()
     if hashlib.sha256(data[32:]).digest() != data[:32]:
         _log.warning("%s: damaged; it is written again", file)
         return None
-    return pickle.loads(data[32:])
+    structure, program = data[32:].split(b"\n", 1)
+    try:
+        return bytearray(program), _structure_from_json(json.loads(structure))
+    except LookupError:
+        return None  # a class of the result is not loaded: traced again
 
 
 def _write(file: Path, kept: _Kept) -> None:
-    data = pickle.dumps(kept)
+    program, skeleton = kept
+    structure = _structure_to_json(skeleton)
+    reads_only = jax.config.values["jax_persistent_cache_min_compile_time_secs"] == float(
+        "inf"
+    )  # `jaxslam.xla` said so
+    if structure is None or file.parent in _unwritable or reads_only:
+        return
+    data = json.dumps(structure).encode() + b"\n" + program
     try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        _remove_old(file.parent)
-        write_atomically(file, hashlib.sha256(data).digest() + data)
+        file.parent.mkdir(mode=OWN_MODE, parents=True, exist_ok=True)
+        if _trusted(file.parent):
+            _remove_old(file.parent)
+            write_atomically(file, hashlib.sha256(data).digest() + data)
     except (OSError, JaxSlamError) as problem:
-        _warn_unwritable(file.parent, str(problem))
+        _unwritable.add(file.parent)
+        _log.warning("%s: traces cannot be kept, so that every start takes longer: %s", file.parent, problem)
 
 
 _unwritable: set[Path] = set()
+"""Folders that a trace could not be written to: said once for each, and not tried again."""
 
 
-def _warn_unwritable(folder: Path, problem: str) -> None:
-    """Warn once a process that a folder takes no programs, not once for each of some dozen programs."""
-    if folder not in _unwritable:
-        _unwritable.add(folder)
-        _log.warning("%s: compiled programs cannot be kept, every start compiles anew: %s", folder, problem)
+@functools.cache
+def _trusted(folder: Path) -> bool:
+    """Whether only the user can have written what is in a folder; if not, a warning says why, once a process."""
+    why = why_not_own(folder)
+    if why is not None:
+        _log.warning("%s: not used to keep traces, so that every start takes longer: %s", folder, why)
+    return why is None
+
+
+def _structure_to_json(value: Any) -> Any:
+    """The nested containers of a result as JSON; `None` if it holds one of another kind than a tuple, a named tuple,
+    a list, a dictionary with text as keys, or a dataclass.
+    """
+    parts: dict[str, Any]
+    if value is None or isinstance(value, bool | int | str):
+        return [value]
+    if isinstance(value, dict) and all(isinstance(key, str) for key in value):
+        parts = value
+    elif type(value) in (tuple, list):
+        parts = {str(index): part for index, part in enumerate(value)}
+    elif isinstance(value, tuple) and (names := getattr(value, "_fields", None)) is not None:
+        parts = dict(zip(names, value, strict=True))
+    elif dataclasses.is_dataclass(value):
+        parts = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    else:
+        return None
+    inner = {name: _structure_to_json(part) for name, part in parts.items()}
+    return None if None in inner.values() else [f"{type(value).__module__}:{type(value).__qualname__}", inner]
+
+
+def _structure_from_json(written: list[Any]) -> Any:
+    """What `_structure_to_json` wrote. No code of the classes is called.
+
+    Raises:
+        LookupError: If a class is not loaded in this process, or is none of those.
+    """
+    if len(written) == 1:
+        return written[0]
+    name, inner = written
+    parts = {key: _structure_from_json(part) for key, part in inner.items()}
+    module, _, qualified = name.partition(":")
+    kind: Any = sys.modules[module]
+    for attribute in qualified.split("."):
+        if attribute not in vars(kind):
+            raise LookupError(name)
+        kind = vars(kind)[attribute]
+    if kind in (dict, list):
+        return parts if kind is dict else list(parts.values())
+    if issubclass(kind, tuple):
+        return tuple.__new__(kind, parts.values())
+    if not dataclasses.is_dataclass(kind):
+        raise LookupError(name)
+    made: Any = object.__new__(cast(type, kind))
+    for key, part in parts.items():
+        object.__setattr__(made, key, part)
+    return made
 
 
 @functools.cache

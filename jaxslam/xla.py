@@ -1,9 +1,16 @@
 """How XLA, JAX's compiler, works for jaxslam: what it keeps between processes, and how many threads it uses."""
 
+import functools
+import logging
 import os
+import tempfile
 from pathlib import Path
 
 import platformdirs
+
+from jaxslam.own_folder import OWN_MODE, why_not_own
+
+_log = logging.getLogger(__name__)
 
 
 def cache_dir() -> Path:
@@ -11,6 +18,7 @@ def cache_dir() -> Path:
     return Path(platformdirs.user_cache_dir("jaxslam", appauthor=False)) / "xla"
 
 
+_CACHE_ENABLED = "jax_enable_compilation_cache"
 _LEAST_COMPILE, _LEAST_COMPILE_OF_JAX_S = "jax_persistent_cache_min_compile_time_secs", 1.0
 _LEAST_COMPILE_S = 0.05
 """Programs that take less are compiled anew, unless the user chose otherwise. With 0.5 some 25 of a run's 40 were,
@@ -25,22 +33,56 @@ def compile_cache_dir() -> Path:
     return Path(chosen) if chosen else cache_dir()
 
 
-def enable_compile_cache() -> Path:
+def enable_compile_cache() -> Path | None:
     """Keep compiled code between processes, so that only the first start on a machine waits for the compiler.
 
     `Slam` does it when it begins; what is compiled before, such as the renderer of rooms, is kept if this comes first.
+    A folder that cannot be written to is read from only; where there is none and none can be made, or `cache_dir()` is
+    not the user's own, nothing is kept. One warning says so.
 
     Returns:
-        The folder, `compile_cache_dir()`.
+        The folder: the user's own where one was chosen in JAX's settings, else `cache_dir()`; `None` if nothing is
+        kept.
     """
     import jax  # noqa: PLC0415
 
+    if not jax.config.values[_CACHE_ENABLED]:
+        return None
     folder = compile_cache_dir()
+    if not _is_usable(folder, chosen=bool(jax.config.values["jax_compilation_cache_dir"])):
+        jax.config.update(_CACHE_ENABLED, False)
+        return None
     jax.config.update("jax_compilation_cache_dir", str(folder))
     least_s: float = jax.config.values[_LEAST_COMPILE]
-    if least_s == _LEAST_COMPILE_OF_JAX_S:
+    if not _is_writable(folder):
+        jax.config.update(_LEAST_COMPILE, float("inf"))  # JAX warns of every program otherwise
+    elif least_s == _LEAST_COMPILE_OF_JAX_S:
         jax.config.update(_LEAST_COMPILE, _LEAST_COMPILE_S)
     return folder
+
+
+@functools.cache
+def _is_usable(folder: Path, *, chosen: bool) -> bool:
+    """Whether a folder can be used for compiled code; if not, that is logged. Looked at once a process."""
+    try:
+        folder.mkdir(mode=OWN_MODE, parents=True, exist_ok=True)
+        why = None if chosen else why_not_own(folder)
+    except OSError as problem:
+        why = f"it cannot be made: {problem.strerror}"
+    if why is not None:
+        _log.warning("%s: not used to keep compiled code, so that every start takes longer: %s", folder, why)
+    return why is None
+
+
+@functools.cache
+def _is_writable(folder: Path) -> bool:
+    """Whether files can be written in a folder; if not, that is logged. Looked at once a process."""
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError as problem:
+        _log.warning("%s: compiled code cannot be kept, so that starts take longer: %s", folder, problem.strerror)
+        return False
 
 
 SOON_COMPILED: dict[str, bool | str] = {"xla_cpu_use_fusion_emitters": False}

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 from types import FunctionType
@@ -74,6 +75,16 @@ def of_jaxslam(function: Any) -> Callable[..., Any]:
 
 def outside() -> None:
     """A function of a user."""
+
+
+@dataclass
+class Strict:
+    """Cannot be made by calling it."""
+
+    x: int
+
+    def __post_init__(self) -> None:
+        raise AssertionError
 
 
 @functools.wraps(trace_cache.traced_once)
@@ -303,6 +314,33 @@ class TestDisk:
         called(plan=Plan(4.0))
         assert used in kept(folder)
         assert unused not in kept(folder)
+
+
+class TestOthers:
+    """Who can write to a folder could have the user run anything."""
+
+    def test_folder_that_others_may_write_to_is_not_read(self, folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+        called()
+        (file,) = kept(folder)
+        folder.chmod(0o777)
+        trace_cache._trusted.cache_clear()
+        before = file.stat().st_mtime_ns
+        called()
+        assert len(traces) == 2  # traced anew, and had it been read it would be younger
+        assert file.stat().st_mtime_ns == before
+        assert len([record for record in caplog.records if "other users may write" in record.getMessage()]) == 1
+
+    def test_no_code_of_a_class_is_called(self) -> None:
+        """Nor is a class loaded that is not there."""
+        name = f"{__name__}:Strict"
+        assert trace_cache._structure_from_json([name, {"x": [1]}]).x == 1
+        for name in ("not_loaded:Thing", "pathlib:no", "pathlib:Path.no", "pathlib:Path", "subprocess:Popen"):
+            with pytest.raises(LookupError):
+                trace_cache._structure_from_json([name, {}])
+
+    def test_result_of_another_kind_is_not_kept(self) -> None:
+        assert trace_cache._structure_to_json((1, {2: 3})) is None
+        assert trace_cache._structure_to_json([object()]) is None
 
 
 _RUN = """
