@@ -38,11 +38,20 @@ RESULT_FILES = (*_ALWAYS, *_OF_THE_PATH, *_OF_THE_MAP, _ERRORS, _FAILURES, *_OF_
 
 @dataclass(frozen=True)
 class RunInfo:
-    """What the results of a run cannot tell by themselves."""
+    """What the results of a run cannot tell by themselves.
+
+    Attributes:
+        dataset: The recording.
+        preset: Name of the preset.
+        wall_s: Duration of the run, seconds.
+        cut_short: Why the run ended before the recording did: "interrupted", "terminated", or an error; `None` if it
+            did not.
+    """
 
     dataset: Dataset
     preset: str
     wall_s: float
+    cut_short: str | None = None
 
 
 def write_results(
@@ -150,6 +159,7 @@ def _summary(
         "dataset": info.dataset.name,
         "camera": info.dataset.camera.name,
         "preset": info.preset,
+        "cut_short": info.cut_short,
         "model": slam.config.semantics.model,
         "without_network": slam.without_network,
         "deterministic": slam.config.run.in_turn,

@@ -1,5 +1,6 @@
 """`jaxslam demo` and `jaxslam run`: track, show how it goes, and leave the results behind."""
 
+import logging
 import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
@@ -11,6 +12,7 @@ import tyro
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
 from jaxslam.commands.console import console, make_table, print_json, text_column
+from jaxslam.commands.interruption import Interruption
 from jaxslam.commands.settings import ALLOW_MISSING_MODEL, Settings, WithJson, flat
 from jaxslam.config import Config, load_config
 from jaxslam.datasets import Dataset, Subset, dataset_kinds, open_dataset
@@ -18,16 +20,22 @@ from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset, with_t
 from jaxslam.datasets.synthetic.camera_path import CameraPathKind
 from jaxslam.errors import ConfigError, nearest
 from jaxslam.evaluation import Evaluation
+from jaxslam.files import check_writable, make_folder
 from jaxslam.frame import Frame
 from jaxslam.map_file import load_map
 from jaxslam.results import RESULT_FILES, RunInfo, write_results
 from jaxslam.run_pictures import RunPictures
 from jaxslam.slam import Slam
-from jaxslam.tracked import Rejected, Tracked
+from jaxslam.tracked import FrameRecord, Rejected, Tracked
 from jaxslam.xla import prefer_one_thread
 
 if TYPE_CHECKING:
     from jaxslam.viewer import Viewer
+
+_log = logging.getLogger(__name__)
+
+_MOST_REASON = 200
+"""Characters of an error that stand in a summary."""
 
 _OnFrame: TypeAlias = Callable[[Frame | None, Tracked | Rejected], None]
 
@@ -169,10 +177,9 @@ class Run(OfRecording):
         start = None if self.map is None else load_map(self.map)
         slam = Slam(dataset.camera, config, map=start, localize_only=self.localize_only)
         viewer = _viewer(slam, dataset, live=self.viz, path=self.rrd)
-        summary = track(dataset, slam, self.preset, self.folder(), viewer, quiet=self.json)
-        if self.save_map is not None:
-            slam.save(self.save_map)
-            console.print(f"Map in {self.save_map}: {len(slam.map.ids)} keyframes, {len(slam.map.points.ids)} points")
+        summary = track(
+            dataset, slam, self.preset, self.folder(), viewer, save_map=self.save_map, quiet=self.json
+        )
         if self.json:
             print_json(summary)
 
@@ -184,19 +191,23 @@ def _dense(wanted: bool) -> tuple[str, ...]:
 
 @dataclass
 class _Meter:
-    """A progress bar that also says how tracking goes."""
+    """A progress bar that also says how tracking goes, keeps the records of frames, and stops on Ctrl-C."""
 
     progress: Progress
     task: Any
     watchers: Sequence[_OnFrame]
+    interruption: Interruption
+    records: list[FrameRecord] = field(default_factory=list)
     statuses: dict[str, int] = field(default_factory=dict)
 
     def __call__(self, frame: Frame | None, result: Tracked | Rejected) -> None:
+        self.records.append(FrameRecord.of(result))
         for watcher in self.watchers:
             watcher(frame, result)
         self.statuses[result.status.name] = self.statuses.get(result.status.name, 0) + 1
         text = "  ".join(f"{name.lower()} {count}" for name, count in self.statuses.items())
         self.progress.update(self.task, advance=1, status=text)
+        self.interruption.check()
 
 
 def _viewer(slam: Slam, dataset: Dataset, *, live: bool, path: Path | None) -> "Viewer | None":
@@ -209,14 +220,65 @@ def _viewer(slam: Slam, dataset: Dataset, *, live: bool, path: Path | None) -> "
 
 
 def track(
-    dataset: Dataset, slam: Slam, preset: str, out: Path, viewer: "Viewer | None" = None, *, quiet: bool = False
+    dataset: Dataset,
+    slam: Slam,
+    preset: str,
+    out: Path,
+    viewer: "Viewer | None" = None,
+    *,
+    save_map: Path | None = None,
+    quiet: bool = False,
 ) -> dict[str, Any]:
-    """Track with a progress bar, write the results, and print them unless `quiet`; gives the summary."""
+    """Track with a progress bar, write the results, and print them unless `quiet`.
+
+    Ctrl-C, SIGTERM or an error ends tracking early. The results so far are written then as well, marked as cut short,
+    before it is raised again; another Ctrl-C while they are written ends that at once.
+
+    Args:
+        dataset: The recording.
+        slam: Tracks it.
+        preset: Name of the preset, for the summary.
+        out: Folder for the results.
+        viewer: Shows the run.
+        save_map: File to write the map to.
+        quiet: Print nothing but the progress bar.
+
+    Returns:
+        The summary.
+
+    Raises:
+        ConfigError: Before anything is done, if results cannot be written to `out` or `save_map`.
+        KeyboardInterrupt: After Ctrl-C or SIGTERM.
+    """
+    make_folder(out, ConfigError)
+    if save_map is not None:
+        check_writable(save_map, "--save-map", ConfigError)
     began = time.perf_counter()
-    with console.status("Compiling the tracker (some 20 s at the first start on a machine, then 1) ..."):
-        slam.warm_up()
-    if not quiet:
-        console.print(f"Tracker ready after {slam.compile_s:.1f} s.")
+    pictures = RunPictures(len(dataset))
+    with Interruption() as interruption, slam, viewer or nullcontext():
+        watchers = [pictures] if viewer is None else [pictures, viewer]
+        records, failure = _tracked(dataset, slam, watchers, interruption, quiet=quiet)
+        cut_short = None if failure is None else _why_cut_short(failure, interruption)
+        if cut_short is not None:
+            console.print(f"Cut short ({cut_short}): writing what was computed. Ctrl-C ends at once.", markup=False)
+        info = RunInfo(dataset, preset, time.perf_counter() - began, cut_short)
+        summary, evaluation = write_results(out, slam, records, info, pictures)
+        if save_map is not None:
+            slam.save(save_map)
+        if not quiet:
+            _print_summary(summary, evaluation, out)
+            if save_map is not None:
+                console.print(f"Map in {save_map}: {len(slam.map.ids)} keyframes, {len(slam.map.points.ids)} points")
+        if failure is not None:
+            raise failure
+        interruption.check()
+    return summary
+
+
+def _tracked(
+    dataset: Dataset, slam: Slam, watchers: Sequence[_OnFrame], interruption: Interruption, *, quiet: bool
+) -> tuple[list[FrameRecord], BaseException | None]:
+    """The records of all frames, or of those until something ended the run, and what that was."""
     columns = (
         text_column("Tracking"),
         BarColumn(),
@@ -224,21 +286,42 @@ def track(
         TimeRemainingColumn(),
         text_column("{task.fields[status]}"),
     )
-    pictures = RunPictures(len(dataset))
-    watchers = [pictures] if viewer is None else [pictures, viewer]
-    with slam, viewer or nullcontext(), Progress(*columns, console=console) as progress:
-        meter = _Meter(progress, progress.add_task("track", total=len(dataset), status=""), watchers)
-        records = slam.run(dataset, meter)
-    info = RunInfo(dataset, preset, time.perf_counter() - began)
-    summary, evaluation = write_results(out, slam, records, info, pictures)
-    if not quiet:
-        _print_summary(summary, evaluation, out)
-    return summary
+    records: list[FrameRecord] = []
+    try:
+        with console.status("Compiling the tracker (some 20 s at the first start on a machine, then 1) ..."):
+            slam.warm_up()
+        if not quiet:
+            console.print(f"Tracker ready after {slam.compile_s:.1f} s.")
+        interruption.check()
+        with Progress(*columns, console=console) as progress:
+            task = progress.add_task("track", total=len(dataset), status="")
+            slam.run(dataset, _Meter(progress, task, watchers, interruption, records))
+    except (Exception, KeyboardInterrupt) as failure:  # raised again when the results are written
+        _catch_up(slam)
+        return records, failure
+    return records, None
+
+
+def _catch_up(slam: Slam) -> None:
+    """Have mapping do what was handed over to it before a run was cut short."""
+    try:
+        slam.finish()
+    except Exception as problem:
+        _log.warning("the map lacks what was mapped last: %s: %s", type(problem).__name__, problem)
+
+
+def _why_cut_short(failure: BaseException, interruption: Interruption) -> str:
+    """One short line."""
+    if isinstance(failure, KeyboardInterrupt):
+        return interruption.reason or "interrupted"
+    return f"{type(failure).__name__}: {' '.join(str(failure).split())}"[:_MOST_REASON]
 
 
 def _print_summary(summary: dict[str, Any], evaluation: Evaluation | None, out: Path) -> None:
     table = make_table(summary["dataset"], "figure", "value", "unit", left=3)
     statuses = ", ".join(f"{name} {count}" for name, count in summary["status_counts"].items())
+    if summary["cut_short"] is not None:
+        table.add_row("cut short", f"after {summary['frames']} frames", summary["cut_short"])
     table.add_row("tracked", f"{summary['tracked']} of {summary['frames']}", f"frames ({statuses})")
     table.add_row("network", *_network(summary))
     if summary["realtime"]:
