@@ -62,3 +62,9 @@ def nearest(name: str, valid: Iterable[str]) -> str:
     if close:
         return f" (did you mean '{close[0]}'?)"
     return f" (valid: {', '.join(choices)})" if choices else ""
+
+
+def one_line(text: object, most: int = 160) -> str:
+    """What a file or another library says, as a part of an error message: in one line and not longer than `most`."""
+    line = " ".join(str(text).split())
+    return line if len(line) <= most else f"{line[: most - 3]}..."

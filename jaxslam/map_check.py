@@ -16,6 +16,10 @@ _UNIT = 1e-6
 """How far from 1 the length of a quaternion may be."""
 
 
+_FARTHEST_M = 1e12
+"""Coordinates beyond it are damage: the square of a distance would soon overflow the float32 of the tracker."""
+
+
 class ArrayField(NamedTuple):
     """What an array of a record is declared to be.
 
@@ -125,9 +129,14 @@ def _numbers(map: Map) -> Iterator[str]:
     for prefix, record in _records(map).items():
         yield from number_problems(record, prefix)
     poses = {"T_world_cam": map.T_world_cam, "loops.T_source_target": map.loops.T_source_target}
-    for name, T in (poses | {"culled.T_anchor_keyframe": map.culled.T_anchor_keyframe}).items():
+    poses["culled.T_anchor_keyframe"] = map.culled.T_anchor_keyframe
+    for name, T in poses.items():
         if (np.abs(np.linalg.norm(T[:, :4], axis=1) - 1) > _UNIT).any():
             yield f"{name}: a quaternion is not of unit length"
+    places = {name: T[:, 4:] for name, T in poses.items()} | {"points.X_world": map.points.X_world}
+    for name, X in places.items():
+        if (np.abs(X) > _FARTHEST_M).any():
+            yield f"{name}: expected coordinates of at most {_FARTHEST_M:g} m, got {np.abs(X).max():g}"
 
 
 def _tree(map: Map) -> Iterator[str]:

@@ -52,6 +52,7 @@ The others are arrays, each `NAME.npy`, little-endian, in C order:
 Any change of these is a new version.
 """
 
+import ast
 import dataclasses
 import json
 import math
@@ -64,7 +65,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 
 from jaxslam.camera import Camera
-from jaxslam.errors import CameraError, MapFileError
+from jaxslam.errors import CameraError, MapFileError, one_line
 from jaxslam.features import Features
 from jaxslam.files import replacing
 from jaxslam.map import Culled, Keyframe, Loops, Map, MapPoints, Sightings
@@ -90,6 +91,9 @@ _COUNTS = {
 _RECORDS = {"features": Features, "points": MapPoints, "sightings": Sightings, "loops": Loops, "culled": Culled}
 _HEADER = "header.json"
 _MOST_HEADER_BYTES = 1 << 16
+_MOST_ARRAY_HEADER_BYTES = 1 << 10
+_END_BYTES = 22
+"""Of the record at the end of an archive without a comment."""
 _DAMAGE = (zipfile.BadZipFile, EOFError, ValueError, KeyError, RuntimeError, struct.error)
 """What reading an archive of arbitrary bytes may raise, besides `OSError`."""
 
@@ -128,15 +132,16 @@ def load_map(path: str | os.PathLike[str]) -> Map:
     """
     try:
         with zipfile.ZipFile(path) as archive:
+            _check_ends(archive, Path(path))
             header = _read_header(archive)
             arrays = _read_arrays(archive, header, Path(path).stat().st_size)
         return _assembled(header, arrays)
     except MapFileError as error:
-        raise MapFileError(f"{path}: {error}") from None
+        raise MapFileError(f"{path}: {one_line(error)}") from None
     except OSError as error:
         raise MapFileError(f"{path}: cannot be read: {error.strerror or error}") from error
     except _DAMAGE as error:
-        raise MapFileError(f"{path}: {_damage(Path(path), error)}") from error
+        raise MapFileError(f"{path}: {one_line(_damage(Path(path), error))}") from error
 
 
 def _layout() -> dict[str, ArrayField]:
@@ -204,6 +209,16 @@ def _joined(features: list[Features]) -> dict[str, np.ndarray]:
 
 def _offsets(lengths: list[int]) -> np.ndarray:
     return np.cumsum([0, *lengths], dtype=np.int64)
+
+
+def _check_ends(archive: zipfile.ZipFile, path: Path) -> None:
+    """Refuse a file with something before or behind the archive, which `zipfile` passes over."""
+    with path.open("rb") as file:
+        file.seek(-_END_BYTES, os.SEEK_END)
+        end = file.read()
+    first = min((member.header_offset for member in archive.infolist()), default=0)
+    if not end.startswith(b"PK\5\6") or end[-2:] != b"\0\0" or first != 0:
+        raise MapFileError("is damaged: holds bytes before or behind the archive")
 
 
 def _read_header(archive: zipfile.ZipFile) -> _Header:
@@ -274,13 +289,23 @@ def _read_array(archive: zipfile.ZipFile, name: str, dtype: np.dtype, shape: tup
     with _opened(archive, f"{name}.npy") as file:
         if np.lib.format.read_magic(file) != (1, 0):
             raise MapFileError(f"{name}: expected an array in version 1.0 of NumPy's format")
-        found_shape, by_column, found_dtype = np.lib.format.read_array_header_1_0(file)
+        found_shape, by_column, found_dtype = _read_array_header(file, name)
         data = file.read()  # to the end, where the checksum is compared
     if (found_shape, found_dtype) != (shape, dtype) or (by_column and len(shape) > 1):
         raise MapFileError(f"{name}: expected {dtype} {shape}, got {found_dtype} {found_shape}")
     if len(data) != dtype.itemsize * math.prod(shape):
         raise MapFileError(f"{name}: expected {dtype} {shape}, got {len(data)} bytes")
     return np.frombuffer(data, dtype).reshape(shape).copy()
+
+
+def _read_array_header(file: IO[bytes], name: str) -> tuple[Any, Any, np.dtype]:
+    """Shape, order of Fortran, and type, as NumPy's format 1.0 says; NumPy itself would first try to repair them."""
+    text = file.read(int.from_bytes(file.read(2), "little"))
+    try:
+        header = ast.literal_eval(text.decode("ascii")) if len(text) <= _MOST_ARRAY_HEADER_BYTES else {}
+        return header["shape"], header["fortran_order"], np.dtype(str(header["descr"]))
+    except (ValueError, SyntaxError, TypeError, KeyError, MemoryError, RecursionError):
+        raise MapFileError(f"{name}: expected the header of a NumPy array, got {text!r:.40}") from None
 
 
 def _opened(archive: zipfile.ZipFile, name: str) -> IO[bytes]:

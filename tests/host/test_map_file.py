@@ -133,6 +133,15 @@ class TestForeign:
 
 
 class TestDamaged:
+    @pytest.mark.parametrize("more", [b"x", b"\0" * 22, b"more" * 10_000])
+    def test_bytes_before_or_behind(self, saved, tmp_path, more):
+        path = tmp_path / "a.map"
+        assert refused(path, saved + more).startswith("is damaged")
+        assert refused(path, more + saved).startswith(("is damaged", "not a jaxslam map"))
+        assert refused(path, saved + saved) == "is damaged: holds bytes before or behind the archive"
+        commented = saved[:-2] + len(more).to_bytes(2, "little") + more
+        assert refused(path, commented) == "is damaged: holds bytes before or behind the archive"
+
     def test_cut_short_anywhere(self, saved, tmp_path):
         path = tmp_path / "a.map"
         for length in [*range(1, 200), *range(200, len(saved), 97), *range(len(saved) - 200, len(saved))]:
@@ -237,6 +246,27 @@ class TestArrays:
         members = unpacked(saved)
         members[f"{name}.npy"] = npy(change(array_of(members, name)))
         assert message in refused(tmp_path / "a.map", packed(members))
+
+    @pytest.mark.parametrize("X", [1e200, -1e13])
+    @pytest.mark.parametrize("name", ["points.X_world", "keyframes.T_world_cam"])
+    def test_refuses_places_that_overflow(self, name, X, saved, tmp_path):
+        members = unpacked(saved)
+        array = array_of(members, name)
+        array[2, -1] = X
+        members[f"{name}.npy"] = npy(array)
+        message = f"the map is not whole: {name.removeprefix('keyframes.')}: expected coordinates of at most 1e+12 m"
+        assert message in refused(tmp_path / "a.map", packed(members))
+
+    @pytest.mark.parametrize(
+        "header",
+        [b"{'descr': (", b"x" * 60, b"(" * 600, b"1" * 60_000, b"{}", b"[1]", b"{'descr': 3}", b"\xff\0", b"(\n)'"],
+    )
+    def test_refuses_headers_that_are_none(self, header, saved, tmp_path):
+        members = unpacked(saved)
+        members["points.ids.npy"] = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header
+        message = refused(tmp_path / "a.map", packed(members))
+        assert message.startswith("points.ids: expected the header of a NumPy array, got b")
+        assert len(message) < 200
 
     def test_refuses_pickles(self, saved, tmp_path):
         objects = np.array([print] * 10, object)
