@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from jaxslam.errors import CameraError, nearest
+from jaxslam.errors import CameraError, nearest, one_line
 from jaxslam.yaml_file import read_mapping
 
 NEEDED = ("width", "height", "fx", "fy", "cx", "cy")
@@ -61,7 +61,7 @@ def read_camera_fields(path: Path, fields: list[str]) -> dict[str, Any]:
 def _own(raw: Mapping[str, Any], fields: list[str], path: Path) -> dict[str, Any]:
     for key in raw:
         if key not in fields:
-            raise CameraError(f"{path}: unknown key '{key}'{nearest(key, fields)}")
+            raise CameraError(f"{path}: unknown key '{one_line(key, 40)}'{nearest(key, fields)}")
     _check_needed(raw, {field: field for field in NEEDED}, path)
     return dict(raw)
 
@@ -98,7 +98,7 @@ def _lengths(given: Mapping[str, Any], keys: Mapping[str, str], path: Path) -> d
 
 def _number(value: object, key: str, path: Path) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
-        raise CameraError(f"{path}: {key}: expected a number > 0, got {value!r}")
+        raise CameraError(f"{path}: {key}: expected a number > 0, got {value!r:.80}")
     return float(value)
 
 

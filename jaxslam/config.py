@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import yaml
 
 from jaxslam.checked import Checked, Range, checked_value, field_hints, section_of
-from jaxslam.errors import ConfigError, nearest
+from jaxslam.errors import ConfigError, nearest, one_line
 from jaxslam.yaml_file import parse_yaml, read_mapping
 
 _Section = TypeVar("_Section")
@@ -423,7 +423,7 @@ def updated(section: _Section, changes: Mapping[str, Any], path: str = "") -> _S
     for key, value in changes.items():
         name = f"{path}.{key}" if path else str(key)
         if key not in hints:
-            raise ConfigError(f"{name}: unknown key{nearest(str(key), hints)}")
+            raise ConfigError(f"{one_line(name, 80)}: unknown key{nearest(str(key), hints)}")
         values[key] = _updated_value(hints[key], getattr(section, key), value, name)
     return dataclasses.replace(section, **values)  # type: ignore[type-var]
 
@@ -458,7 +458,7 @@ def _preset_layers(name: str, heirs: tuple[str, ...] = ()) -> list[tuple[str, di
         raise ConfigError(f"preset {heirs[0]}: inherits itself: {' -> '.join((*heirs, name))}")
     if name not in presets():
         by = f"preset {heirs[-1]}: inherit: " if heirs else "preset: "
-        raise ConfigError(f"{by}expected a known preset, got '{name}'{nearest(name, presets())}")
+        raise ConfigError(f"{by}expected a known preset, got '{name:.24}'{nearest(name, presets())}")
     return _file_layers(configs_dir() / "presets" / f"{name}.yaml", (*heirs, name))
 
 

@@ -4,6 +4,7 @@ import hashlib
 import http.client
 import json
 import os
+import shutil
 import ssl
 import time
 import urllib.error
@@ -14,12 +15,16 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from jaxslam.errors import DownloadError
+from jaxslam.paced_http import TooSlowError, paced_opener
 
 Progress: TypeAlias = Callable[[int, int | None], None]
 """Is told the bytes that are there and the bytes there will be, if that is known."""
 
 _CHUNK_BYTES = 1 << 16
 _TRANSIENT = frozenset({408, 425, 429, 500, 502, 503, 504})  # HTTP statuses that may be others in a moment
+_TIMEOUT_S = 20.0
+_MOST_BYTES = 1 << 36
+"""Of a file whose length neither the server nor the caller knows; it could have no end."""
 _CHANGED = "the file on the server has changed"
 
 
@@ -72,7 +77,7 @@ def download(
     sha256: str | None = None,
     size: int | None = None,
     progress: Progress | None = None,
-    timeout_s: float = 20.0,
+    timeout_s: float = _TIMEOUT_S,
     waits_s: Sequence[float] = (0.5, 2.0, 6.0),
 ) -> None:
     """Fetch a file; an old one of that name is replaced once the new one is whole and has been checked.
@@ -87,7 +92,7 @@ def download(
         sha256: Of the whole file, 64 hexadecimal digits, if known.
         size: Bytes of the whole file, if known.
         progress: Called after each piece.
-        timeout_s: Longest silence of the server, seconds.
+        timeout_s: Longest silence of the server, seconds; and how long it may give less than 1 kB/s.
         waits_s: Seconds before each further try after a passing failure; a try that got further starts them anew.
 
     Raises:
@@ -152,6 +157,7 @@ def _fetch(wanted: _Wanted) -> None:
             offset = 0
             wanted.forget()
             wanted.note.write_text(json.dumps(asdict(now)), encoding="utf-8")
+        _check_space(wanted, offset, wanted.size if now.total is None else now.total)
         _append(wanted, response, offset, wanted.size if now.total is None else now.total)
 
 
@@ -176,7 +182,7 @@ def _open(wanted: _Wanted, offset: int, validator: str | None) -> Any:
         headers |= {"Range": f"bytes={offset}-"} | ({"If-Range": validator} if validator else {})
     try:
         request = urllib.request.Request(wanted.url, headers=headers)
-        response = urllib.request.urlopen(request, timeout=wanted.timeout_s)
+        response = paced_opener().open(request, timeout=wanted.timeout_s)
     except urllib.error.HTTPError as refusal:
         refusal.close()
         if refusal.code == http.HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE and offset:
@@ -184,6 +190,8 @@ def _open(wanted: _Wanted, offset: int, validator: str | None) -> Any:
             raise _TransientError(_CHANGED) from refusal
         kind = _TransientError if refusal.code in _TRANSIENT else DownloadError
         raise kind(f"the server answers {refusal.code} {refusal.reason}") from refusal
+    except TooSlowError as failure:
+        raise DownloadError(f"{failure}") from failure
     except (http.client.InvalidURL, ValueError) as failure:
         raise DownloadError(f"{failure}") from failure
     except (OSError, http.client.HTTPException) as failure:
@@ -196,6 +204,12 @@ def _open(wanted: _Wanted, offset: int, validator: str | None) -> Any:
     return response
 
 
+def _check_space(wanted: _Wanted, offset: int, total: int | None) -> None:
+    free = shutil.disk_usage(wanted.part.parent).free
+    if total is not None and total - offset > free:
+        raise DownloadError(f"needs {total - offset} more bytes on the disk, where {free} are free")
+
+
 def _append(wanted: _Wanted, response: Any, offset: int, total: int | None) -> None:
     done = offset
     with wanted.part.open("ab" if offset else "wb") as file:
@@ -204,8 +218,11 @@ def _append(wanted: _Wanted, response: Any, offset: int, total: int | None) -> N
             done += len(chunk)
             if wanted.progress is not None:
                 wanted.progress(done, total)
-            if total is not None and done > total:
+            if done > (_MOST_BYTES if total is None else total):
                 break
+    if total is None and done > _MOST_BYTES:
+        wanted.forget()
+        raise DownloadError(f"the server gives more than {_MOST_BYTES} bytes and does not say how many there are")
     if total is not None and done > total:
         wanted.forget()
         raise DownloadError(f"expected {total} bytes, the server gives more")
@@ -217,6 +234,8 @@ def _read(response: Any) -> bytes:
     """What has come, nothing at the end; a function of its own, for a failing disk is another matter."""
     try:
         return response.read1(_CHUNK_BYTES)
+    except TooSlowError as failure:
+        raise DownloadError(f"{failure}; the next call goes on from there") from failure
     except (OSError, http.client.HTTPException) as failure:
         raise _TransientError(f"the connection was cut: {failure}") from failure
 

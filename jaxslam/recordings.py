@@ -13,7 +13,7 @@ import platformdirs
 from jaxslam.checked import Checked, Range, field_hints
 from jaxslam.config import configs_dir
 from jaxslam.errors import DatasetError, JaxSlamError
-from jaxslam.yaml_file import check_keys, parse_yaml
+from jaxslam.yaml_file import check_keys, read_yaml
 
 _DEPTH = 3
 _NEEDED = ("dataset", "kind", "licence", "page", "about")
@@ -65,13 +65,13 @@ class Recording(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not _NAME.match(self.name):
-            raise DatasetError(f"name: expected small letters, digits and _, got '{self.name}'")
+            raise DatasetError(f"name: expected small letters, digits and _, got {self.name!r:.80}")
         if self.url is None and not self.how:
             raise DatasetError("url: expected an address, or `how` to come by it, got neither")
         if self.url is not None and not (self.url.startswith("http") and self.url.endswith((".tgz", ".zip"))):
-            raise DatasetError(f"url: expected http, and .tgz or .zip at the end, got '{self.url}'")
+            raise DatasetError(f"url: expected http, and .tgz or .zip at the end, got {self.url!r:.80}")
         if self.sha256 is not None and not _SHA256.match(self.sha256):
-            raise DatasetError(f"sha256: expected 64 small hexadecimal digits, got '{self.sha256}'")
+            raise DatasetError(f"sha256: expected 64 small hexadecimal digits, got {self.sha256!r:.80}")
 
     @property
     def archive(self) -> str:
@@ -89,10 +89,7 @@ def known_recordings(path: Path | None = None) -> dict[str, Recording]:
         DatasetError: If it is unreadable, or an entry is incomplete, has an unknown key or stands twice.
     """
     path = path or configs_dir() / "recordings.yaml"
-    try:
-        groups = parse_yaml(path.read_text(encoding="utf-8"), str(path), DatasetError)
-    except OSError as problem:
-        raise DatasetError(f"{path}: cannot be read: {problem.strerror}") from None
+    groups = read_yaml(path, DatasetError)
     if not isinstance(groups, list):
         raise DatasetError(f"{path}: expected a list of datasets, got {type(groups).__name__}")
     known: dict[str, Recording] = {}

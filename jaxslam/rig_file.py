@@ -8,6 +8,7 @@ T_left_right: [[1, 0, 0, 0.11], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]  # or 
 fps: 20
 """
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,7 @@ _LENS_OF_KALIBR: dict[str, LensModel] = {
     "equidistant": "equidistant",
     "none": "radtan",
 }
+_FARTHEST_M = 1e6
 _ROTATION_OFF = 0.01
 
 
@@ -69,10 +71,10 @@ def lens_of_kalibr(raw: Mapping[str, Any], place: str) -> Lens:
     intrinsics = numbers(raw, "intrinsics", place, 4)
     width, height = numbers(raw, "resolution", place, 2)
     if raw.get("camera_model", "pinhole") != "pinhole":
-        raise CameraError(f"{place}camera_model: expected 'pinhole', got {raw['camera_model']!r}")
+        raise CameraError(f"{place}camera_model: expected 'pinhole', got {raw['camera_model']!r:.80}")
     model = str(raw.get("distortion_model", "none"))
     if model not in _LENS_OF_KALIBR:
-        raise CameraError(f"{place}distortion_model: expected one of {', '.join(_LENS_OF_KALIBR)}, got '{model}'")
+        raise CameraError(f"{place}distortion_model: expected one of {', '.join(_LENS_OF_KALIBR)}, got '{model:.80}'")
     key = "distortion_coefficients" if "distortion_coefficients" in raw else "distortion_coeffs"
     terms = numbers(raw, key, place) if model != "none" else []
     fx, fy, cx, cy = intrinsics
@@ -90,10 +92,11 @@ def transform_of(value: object, place: str) -> np.ndarray:
         given = np.asarray(content, np.float64).ravel()
     except (TypeError, ValueError):
         given = np.zeros(0)
-    if given.size == 7:
+    usable = bool((np.abs(given) < _FARTHEST_M).all())  # nor is NaN
+    if given.size == 7 and usable:
         return given
-    if given.size != 16 or not np.isfinite(given).all():
-        raise CameraError(f"{place}: expected a 4 x 4 matrix or qw qx qy qz x y z, got {content!r}")
+    if given.size != 16 or not usable:
+        raise CameraError(f"{place}: expected a 4 x 4 matrix or qw qx qy qz x y z, got {content!r:.80}")
     M = given.reshape(4, 4)
     R = M[:3, :3]
     off = max(np.abs(R @ R.T - np.eye(3)).max(), np.abs(M[3] - [0, 0, 0, 1]).max())
@@ -109,10 +112,11 @@ def numbers(raw: Mapping[str, Any], key: str, place: str, count: int | None = No
         CameraError: If there is none, or it is of another length.
     """
     value = raw.get(key)
-    fits = isinstance(value, list) and all(isinstance(x, int | float) and not isinstance(x, bool) for x in value)
+    is_number = lambda x: isinstance(x, int | float) and not isinstance(x, bool) and math.isfinite(x)
+    fits = isinstance(value, list) and all(map(is_number, value))
     if not fits or (count is not None and len(raw[key]) != count):
         what = "a list of numbers" if count is None else f"{count} numbers"
-        raise CameraError(f"{place}{key}: expected {what}, got {value!r}")
+        raise CameraError(f"{place}{key}: expected {what}, got {value!r:.80}")
     return [float(x) for x in raw[key]]
 
 
@@ -121,7 +125,7 @@ def _own(raw: Mapping[str, Any]) -> dict[str, Any]:
     fields = dict(raw)
     for side in ("left", "right"):
         if not isinstance(raw[side], dict):
-            raise CameraError(f"{side}: expected `key: value` lines, got {raw[side]!r}")
+            raise CameraError(f"{side}: expected `key: value` lines, got {raw[side]!r:.80}")
         check_keys(raw[side], field_hints(Lens), ("width", "height", *_PINHOLE), side, CameraError)
         try:
             fields[side] = Lens(**raw[side])
@@ -131,9 +135,9 @@ def _own(raw: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _of_orb_slam3(raw: Mapping[str, Any]) -> dict[str, Any]:
-    kind = raw.get("Camera.type", "PinHole")
+    kind = str(raw.get("Camera.type", "PinHole"))
     if kind not in _LENS_OF_ORB_SLAM3:
-        raise CameraError(f"Camera.type: expected one of {', '.join(_LENS_OF_ORB_SLAM3)}, got {kind!r}")
+        raise CameraError(f"Camera.type: expected one of {', '.join(_LENS_OF_ORB_SLAM3)}, got {kind!r:.80}")
     model, terms = _LENS_OF_ORB_SLAM3[kind]
     size = ("Camera.width", "Camera.height")
     pinholes = [f"{camera}.{name}" for camera in ("Camera1", "Camera2") for name in _PINHOLE]
@@ -154,7 +158,7 @@ def _of_orb_slam3(raw: Mapping[str, Any]) -> dict[str, Any]:
 def _of_kalibr(raw: Mapping[str, Any]) -> dict[str, Any]:
     for camera in ("cam0", "cam1"):
         if not isinstance(raw.get(camera), dict):
-            raise CameraError(f"{camera}: expected `key: value` lines, got {raw.get(camera)!r}")
+            raise CameraError(f"{camera}: expected `key: value` lines, got {raw.get(camera)!r:.80}")
     if "T_cn_cnm1" not in raw["cam1"]:
         raise CameraError("cam1.T_cn_cnm1: expected a 4 x 4 matrix, got none")
     T_right_left = transform_of(raw["cam1"]["T_cn_cnm1"], "cam1.T_cn_cnm1")

@@ -23,7 +23,7 @@ def nanoseconds(text: str, place: str, error: type[JaxSlamError], *, least_s: in
         JaxSlamError: Of class `error`, if the text is not a number, not finite, too early, or too late for int64;
             the message guesses another unit.
     """
-    problem = f"{place}: expected a timestamp in seconds, got '{text}'"
+    problem = f"{place}: expected a timestamp in seconds, got '{text:.80}'"
     try:
         seconds = Decimal(text)
     except InvalidOperation:  # also an exponent of twenty digits, which a float reads as zero

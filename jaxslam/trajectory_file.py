@@ -9,7 +9,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxslam.errors import JaxSlamError, TrajectoryError
+from jaxslam.errors import JaxSlamError, TrajectoryError, one_line
 from jaxslam.rotation import quaternions
 from jaxslam.timestamp import nanoseconds
 
@@ -101,9 +101,9 @@ def read_euroc_rows(path: PathLike) -> PoseRows:
                 f" got {len(words)}"
             )
         try:
-            stamps.append(int(words[0]))
+            stamps.append(int(np.int64(int(words[0]))))
             x, y, z, *wxyz = (float(word) for word in words[1:_EUROC_COLUMNS])
-        except ValueError:
+        except (ValueError, OverflowError):
             raise TrajectoryError(f"{path}:{number}: expected nanoseconds, x y z and qw qx qy qz") from None
         poses.append([*wxyz, x, y, z])
     return PoseRows(Path(path), "EuRoC", _lines(rows), np.array(stamps, np.int64), np.array(poses))
@@ -140,7 +140,7 @@ def _text(path: PathLike, error: type[JaxSlamError]) -> str:
     try:
         return Path(path).read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as problem:
-        raise error(f"{path}: cannot be read: {problem}") from problem
+        raise error(f"{path}: cannot be read: {one_line(problem)}") from problem
 
 
 def _is_euroc(path: PathLike) -> bool:
@@ -187,7 +187,9 @@ def _table(path: PathLike, rows: _Rows, columns: int, meaning: str) -> Float[np.
         try:
             values.append([float(word) for word in words])
         except ValueError as error:
-            raise TrajectoryError(f"{path}:{number}: expected {columns} numbers ({meaning}): {error}") from None
+            raise TrajectoryError(
+                f"{path}:{number}: expected {columns} numbers ({meaning}): {one_line(error, 80)}"
+            ) from None
     table = np.array(values)
     wrong = ~np.isfinite(table).all(axis=1)
     if wrong.any():

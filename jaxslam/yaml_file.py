@@ -7,8 +7,10 @@ from typing import Any
 
 import yaml
 
-from jaxslam.errors import JaxSlamError, nearest
+from jaxslam.errors import JaxSlamError, nearest, one_line
 
+_MOST_CHARACTERS = 1 << 17
+"""Of a file: more take PyYAML longer than a second. What people write by hand has a tenth of it."""
 _OPENCV_HEADER = re.compile(r"\A%YAML:[^\n]*")
 _FLOAT_TAG, _BOOL_TAG = "tag:yaml.org,2002:float", "tag:yaml.org,2002:bool"
 _NUMBER = r"[-+]?(?:\d+\.\d*|\.\d+|\d+(?=[eE]))(?:[eE][-+]?\d+)?"
@@ -24,8 +26,23 @@ class _Loader(yaml.SafeLoader):
         for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
     }
 
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
+        """A value; what PyYAML's constructors raise for a tag that does not fit, such as `!!bool z`, has a line."""
+        try:
+            value = super().construct_object(node, deep)
+            if isinstance(value, int):
+                float(value)  # 400 digits are no number that anything here could use
+        except (ValueError, LookupError, TypeError, AttributeError, OverflowError):
+            kind = node.tag.rpartition(":")[2]
+            problem = f"expected a value of type {kind}, got {node.value!r:.40}"
+            raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark) from None
+        return value
+
+    def construct_mapping(self, node: yaml.Node, deep: bool = False) -> dict[Any, Any]:
         """A mapping, refused when a key stands twice (PyYAML would keep the last)."""
+        if not isinstance(node, yaml.MappingNode):
+            problem = f"expected `key: value` lines, got {node.value!r:.40}"
+            raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark)
         keys = [key for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
         names = [key.value for key in keys]
         for position, key in enumerate(keys):
@@ -47,15 +64,57 @@ def parse_yaml(text: str, origin: str, error: type[JaxSlamError]) -> Any:
     """What `text` holds: a scalar, list or mapping, or `None` if it is empty.
 
     Raises:
-        JaxSlamError: Of class `error`, naming `origin` and the line, if it is no YAML or a key stands twice.
+        JaxSlamError: Of class `error`, naming `origin` and the line, if it is no YAML, a key stands twice, or it is too
+            long or nested too deep.
     """
+    if len(text) > _MOST_CHARACTERS:
+        raise error(f"{origin}: expected at most {_MOST_CHARACTERS} characters of YAML, got {len(text)}")
     try:
-        return yaml.load(_OPENCV_HEADER.sub("", text), Loader=_Loader)
+        content = yaml.load(_OPENCV_HEADER.sub("", text), Loader=_Loader)
+        num_values = _num_values(content, {})
     except yaml.MarkedYAMLError as problem:
         line = f":{problem.problem_mark.line + 1}" if problem.problem_mark else ""
-        raise error(f"{origin}{line}: not readable as YAML: {problem.problem}") from None
+        raise error(f"{origin}{line}: not readable as YAML: {one_line(problem.problem)}") from None
     except (yaml.YAMLError, ValueError) as problem:
-        raise error(f"{origin}: not readable as YAML: {' '.join(str(problem).split())}") from None
+        raise error(f"{origin}: not readable as YAML: {one_line(problem)}") from None
+    except RecursionError:
+        raise error(f"{origin}: not readable as YAML: nested too deep, or holds itself") from None
+    if num_values > _MOST_CHARACTERS:
+        raise error(f"{origin}: expected at most {_MOST_CHARACTERS} values, got {num_values:.3g} by aliases")
+    return content
+
+
+def _num_values(content: Any, known: dict[int, int]) -> int:
+    """How many values there are if each alias counts as what it stands for.
+
+    Args:
+        content: A scalar, list or mapping.
+        known: The result for lists and mappings already seen, by their `id`.
+
+    Raises:
+        RecursionError: If it holds itself.
+    """
+    if not isinstance(content, dict | list | tuple | set):
+        return 1
+    if id(content) not in known:
+        parts = (part for pair in content.items() for part in pair) if isinstance(content, dict) else content
+        known[id(content)] = 1 + sum(_num_values(part, known) for part in parts)
+    return known[id(content)]
+
+
+def read_yaml(path: Path, error: type[JaxSlamError]) -> Any:
+    """What a YAML file holds: a scalar, list or mapping, or `None` if it is empty.
+
+    Raises:
+        JaxSlamError: Of class `error`, naming the file, if it is missing, no text or no YAML.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as problem:
+        raise error(f"{path}: cannot be read: {problem.strerror}") from None
+    except UnicodeDecodeError:
+        raise error(f"{path}: expected a text file in UTF-8, got something else") from None
+    return parse_yaml(text, str(path), error)
 
 
 def read_mapping(path: Path, error: type[JaxSlamError]) -> dict[str, Any]:
@@ -64,13 +123,7 @@ def read_mapping(path: Path, error: type[JaxSlamError]) -> dict[str, Any]:
     Raises:
         JaxSlamError: Of class `error`, naming the file, if it is missing, no text, no YAML or no mapping.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as problem:
-        raise error(f"{path}: cannot be read: {problem.strerror}") from None
-    except UnicodeDecodeError:
-        raise error(f"{path}: expected a text file in UTF-8, got something else") from None
-    content = parse_yaml(text, str(path), error)
+    content = read_yaml(path, error)
     if content is None:
         return {}
     if not isinstance(content, dict):
@@ -88,7 +141,7 @@ def check_keys(
     """
     for key in content:
         if key not in known:
-            raise error(f"{place}: unknown key '{key}'{nearest(key, known)}")
+            raise error(f"{place}: unknown key '{one_line(key, 40)}'{nearest(str(key), known)}")
     missing = [key for key in needed if key not in content]
     if missing:
         raise error(f"{place}: missing {', '.join(map(repr, missing))}")

@@ -3,7 +3,9 @@
 import hashlib
 import socket
 import threading
+import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -35,6 +37,7 @@ class Site:
     etag: str | None = TAG
     ranges: bool = True
     looks_at_if_range: bool = True
+    drips: str = ""  # or "headers", "content", "chunks": what is sent byte for byte
     length: str = "given"  # or "chunked", "none"
     cuts: list[int] = field(default_factory=list)  # bytes after which the next answers end
     refusals: list[int] = field(default_factory=list)  # statuses of the next answers
@@ -52,7 +55,9 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         site = self.site
         site.asked.append(dict(self.headers))
-        if self.path == "/moved":
+        if site.drips:
+            self._drip(site.drips)
+        elif self.path == "/moved":
             self.send_response(302)
             self.send_header("Location", "/file")
             self.end_headers()
@@ -60,6 +65,18 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_error(site.refusals.pop(0))
         else:
             self._give(site)
+
+    def _drip(self, what: str) -> None:
+        start = {
+            "headers": b"HTTP/1.1 200 OK\r\nX-More: ",
+            "content": b"HTTP/1.1 200 OK\r\nContent-Length: 1000000\r\n\r\n",
+            "chunks": b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n",
+        }
+        with suppress(OSError):  # until nobody listens
+            self.wfile.write(start[what])
+            for _ in range(200):
+                self.wfile.write(b"0")
+                time.sleep(0.02)
 
     def _give(self, site: Site) -> None:
         start = int(self.headers.get("Range", "bytes=0-").removeprefix("bytes=").removesuffix("-"))
@@ -293,13 +310,37 @@ class TestErrors:
             silent.listen()
             self.fails(f"http://127.0.0.1:{silent.getsockname()[1]}/file", target, "timed out", timeout_s=0.05)
 
+    @pytest.mark.parametrize("drip", ["headers", "content", "chunks"])
+    def test_server_that_drips(self, site: Site, target: Path, drip: str) -> None:
+        """Byte for byte, each in time; what came is kept where it is worth something."""
+        site.drips = drip
+        began = time.monotonic()
+        self.fails(site.url, target, "the server gave", timeout_s=0.3)
+        assert time.monotonic() - began < 2
+        assert len(site.asked) == 1
+
+    def test_no_end(self, monkeypatch: pytest.MonkeyPatch, site: Site, target: Path) -> None:
+        """Nobody knows the length."""
+        monkeypatch.setattr(module, "_MOST_BYTES", len(FIRST) - 1)
+        site.length = "chunked"
+        self.fails(site.url, target, f"the server gives more than {len(FIRST) - 1} bytes")
+        assert not list(target.parent.iterdir())
+        download(site.url, target, size=len(FIRST))
+        assert_whole(target, FIRST)
+
+    def test_disk_without_space(self, monkeypatch: pytest.MonkeyPatch, site: Site, target: Path) -> None:
+        monkeypatch.setattr(module.shutil, "disk_usage", lambda _: SimpleNamespace(free=CUT))
+        self.fails(site.url, target, f"needs {len(FIRST)} more bytes on the disk, where {CUT} are free")
+        assert len(site.asked) == 1
+
     @pytest.mark.parametrize("url", ["ftp://127.0.0.1/file", "file:///etc/hostname", "net.onnx", "http://127.0.0.1:x/"])
     def test_no_address(self, target: Path, url: str) -> None:
         self.fails(url, target)
 
     def test_leads_away_from_encryption(self, monkeypatch: pytest.MonkeyPatch, target: Path) -> None:
         answer = SimpleNamespace(url="http://elsewhere/file", close=lambda: None)
-        monkeypatch.setattr(module.urllib.request, "urlopen", lambda *_, **__: answer)
+        opener = SimpleNamespace(open=lambda *_, **__: answer)
+        monkeypatch.setattr(module, "paced_opener", lambda: opener)
         self.fails("https://here/file", target, "http://elsewhere/file, which is not encrypted")
 
     def test_folder_cannot_be_made(self, site: Site, tmp_path: Path) -> None:
