@@ -250,12 +250,12 @@ def track(
         ConfigError: Before anything is done, if results cannot be written to `out` or `save_map`.
         KeyboardInterrupt: After Ctrl-C or SIGTERM.
     """
-    make_folder(out, ConfigError)
-    if save_map is not None:
-        check_writable(save_map, "--save-map", ConfigError)
     began = time.perf_counter()
     pictures = RunPictures(len(dataset))
     with Interruption() as interruption, slam, viewer or nullcontext():
+        make_folder(out, ConfigError)
+        if save_map is not None:
+            check_writable(save_map, "--save-map", ConfigError)
         watchers = [pictures] if viewer is None else [pictures, viewer]
         records, failure = _tracked(dataset, slam, watchers, interruption, quiet=quiet)
         cut_short = None if failure is None else _why_cut_short(failure, interruption)

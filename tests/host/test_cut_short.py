@@ -3,7 +3,11 @@
 import json
 import os
 import signal
-from collections.abc import Callable
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -196,6 +200,70 @@ class TestOutputs:
         (line,) = capsys.readouterr().err.strip().splitlines()
         assert words in line
         assert len(line) < 300
+
+
+_SIGNALS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
+_COMMANDS = {"demo": ["demo", "--frames", "60"], "run": ["run", "RECORDING", "--max-frames", "60"]}
+
+
+@pytest.fixture(scope="module", params=_COMMANDS)
+def command(request: pytest.FixtureRequest, data_dir: Path) -> list[str]:
+    recording = str(data_dir / "tum/rgbd_dataset_freiburg1_rpy_excerpt")
+    words = [recording if word == "RECORDING" else word for word in _COMMANDS[request.param]]
+    return [sys.executable, "-m", "jaxslam", *words, "--set", "semantics.model=null"]
+
+
+@pytest.fixture(scope="module")
+def duration_s(command: list[str], tmp_path_factory: pytest.TempPathFactory) -> float:
+    """Of the whole; the second time, when all is compiled."""
+    durations = []
+    for _ in range(2):
+        out = tmp_path_factory.mktemp("whole") / "out"
+        with started(command, out) as process:
+            began = time.monotonic()
+            assert process.wait(300) == 0
+            durations.append(time.monotonic() - began)
+        assert check_results(out, None, 60)["frames"] == 60
+    return durations[1]
+
+
+@pytest.mark.benchmark
+class TestAnyMoment:
+    """Of the command as a process of its own: from where it begins to compile until it ends by itself."""
+
+    @pytest.mark.parametrize("moment", range(20))
+    def test_results_are_on_disk(self, tmp_path: Path, command: list[str], duration_s: float, moment: int) -> None:
+        number = list(_SIGNALS)[moment % 2]
+        with started(command, tmp_path / "out") as process:
+            time.sleep(duration_s * moment / 20)
+            process.send_signal(number)
+            code = process.wait(60)
+        summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+        check_results(tmp_path / "out", summary["cut_short"], 60)
+        print(f"moment {moment}: {summary['cut_short']} after {summary['frames']} frames, exit code {code}")
+        if summary["cut_short"] is None:  # it came while results were written, or too late
+            assert summary["frames"] == 60
+            assert code in (130, 0)
+        else:
+            assert summary["cut_short"] == _SIGNALS[number]
+            assert summary["frames"] <= 60
+            assert code == 130
+
+
+@contextmanager
+def started(command: list[str], out: Path) -> Iterator[subprocess.Popen[str]]:
+    """The process from the time its folder is there."""
+    process = subprocess.Popen(
+        [*command, "--out", str(out)], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
+    try:
+        while not out.is_dir():
+            assert process.poll() is None, process.stderr and process.stderr.read()
+            time.sleep(0.01)
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
 
 
 class TestSlam:

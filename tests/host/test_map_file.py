@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 import textwrap
+import time
 import tracemalloc
 import zipfile
 from collections.abc import Callable
@@ -305,7 +306,51 @@ KILLED = """
 """
 
 
+SAVING = """
+    import itertools, sys
+    sys.path[:0] = sys.argv[2:]
+    from small_map import small_map
+    from jaxslam.map_file import save_map
+
+    maps = [small_map(12, 200, seed) for seed in (1, 2)]
+    for number in itertools.count():
+        save_map(sys.argv[1], maps[number % 2])
+        print("saved", flush=True)
+"""
+
+
+def killed_while_saving(path: Path, times: int) -> int:
+    """Kill -9 at moments of a save: one of the two maps is there as a whole, and the next save leaves nothing else.
+
+    Returns:
+        How many kills were within a save: a temporary file was there.
+    """
+    maps = [small_map(12, 200, seed) for seed in (1, 2)]
+    script = [sys.executable, "-c", textwrap.dedent(SAVING), str(path), str(Path(__file__).parent)]
+    left = 0
+    for number in range(times):
+        with subprocess.Popen(script, stdout=subprocess.PIPE) as process:
+            assert process.stdout is not None
+            began = [process.stdout.readline() and time.monotonic() for _ in range(3)]
+            time.sleep((began[2] - began[1]) * number / times)
+            process.kill()
+        assert any(same(load_map(path), map) for map in maps)
+        left += len(list(path.parent.iterdir())) - 1
+        save_map(path, maps[0])
+        assert list(path.parent.iterdir()) == [path]
+    return left
+
+
 class TestAtomic:
+    def test_kills_leave_a_good_map_and_no_litter(self, tmp_path):
+        killed_while_saving(tmp_path / "a.map", 2)
+
+    @pytest.mark.benchmark
+    def test_many_kills_leave_a_good_map_and_no_litter(self, tmp_path):
+        within = killed_while_saving(tmp_path / "a.map", 50)
+        print(f"{within} of 50 kills within a save")
+        assert within > 10
+
     def test_a_kill_leaves_the_old_file(self, saved, tmp_path):
         path = tmp_path / "a.map"
         path.write_bytes(saved)
@@ -317,6 +362,8 @@ class TestAtomic:
         assert process.returncode != 0
         assert len(list(tmp_path.iterdir())) == 2  # what was written so far lies beside it
         assert path.read_bytes() == saved
+        save_map(path, small_map())
+        assert list(tmp_path.iterdir()) == [path]
 
     def test_failure_leaves_the_old_file_and_nothing_else(self, saved, tmp_path, monkeypatch):
         def full(*_: object) -> None:
