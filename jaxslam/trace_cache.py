@@ -15,6 +15,7 @@ import hashlib
 import inspect
 import json
 import logging
+import math
 import platform
 import sys
 import time
@@ -191,9 +192,7 @@ def _read(file: Path) -> _Kept | None:
 def _write(file: Path, kept: _Kept) -> None:
     program, skeleton = kept
     structure = _structure_to_json(skeleton)
-    reads_only = jax.config.values["jax_persistent_cache_min_compile_time_secs"] == float(
-        "inf"
-    )  # `jaxslam.xla` said so
+    reads_only = jax.config.values["jax_persistent_cache_min_compile_time_secs"] == math.inf  # by `jaxslam.xla`
     if structure is None or file.parent in _unwritable or reads_only:
         return
     data = json.dumps(structure).encode() + b"\n" + program

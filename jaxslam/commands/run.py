@@ -18,7 +18,7 @@ from jaxslam.config import Config, load_config
 from jaxslam.datasets import Dataset, Subset, dataset_kinds, open_dataset
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset, with_true_masks
 from jaxslam.datasets.synthetic.camera_path import CameraPathKind
-from jaxslam.errors import ConfigError, nearest
+from jaxslam.errors import ConfigError, nearest, one_line
 from jaxslam.evaluation import Evaluation
 from jaxslam.files import check_writable, make_folder
 from jaxslam.frame import Frame
@@ -33,9 +33,6 @@ if TYPE_CHECKING:
     from jaxslam.viewer import Viewer
 
 _log = logging.getLogger(__name__)
-
-_MOST_REASON = 200
-"""Characters of an error that stand in a summary."""
 
 _OnFrame: TypeAlias = Callable[[Frame | None, Tracked | Rejected], None]
 
@@ -262,13 +259,14 @@ def track(
         if cut_short is not None:
             console.print(f"Cut short ({cut_short}): writing what was computed. Ctrl-C ends at once.", markup=False)
         info = RunInfo(dataset, preset, time.perf_counter() - began, cut_short)
-        summary, evaluation = write_results(out, slam, records, info, pictures)
-        if save_map is not None:
-            slam.save(save_map)
+        try:
+            summary, evaluation = write_results(out, slam, records, info, pictures)
+        except Exception:  # a second Ctrl-C ends at once, but a picture that fails costs no map
+            _save_map(slam, save_map)
+            raise
         if not quiet:
             _print_summary(summary, evaluation, out)
-            if save_map is not None:
-                console.print(f"Map in {save_map}: {len(slam.map.ids)} keyframes, {len(slam.map.points.ids)} points")
+        _save_map(slam, save_map)
         if failure is not None:
             raise failure
         interruption.check()
@@ -302,6 +300,13 @@ def _tracked(
     return records, None
 
 
+def _save_map(slam: Slam, path: Path | None) -> None:
+    """Write the map to a file, if there is to be one, and say so."""
+    if path is not None:
+        slam.save(path)
+        console.print(f"Map in {path}: {len(slam.map.ids)} keyframes, {len(slam.map.points.ids)} points")
+
+
 def _catch_up(slam: Slam) -> None:
     """Have mapping do what was handed over to it before a run was cut short."""
     try:
@@ -314,7 +319,7 @@ def _why_cut_short(failure: BaseException, interruption: Interruption) -> str:
     """One short line."""
     if isinstance(failure, KeyboardInterrupt):
         return interruption.reason or "interrupted"
-    return f"{type(failure).__name__}: {' '.join(str(failure).split())}"[:_MOST_REASON]
+    return f"{type(failure).__name__}: {one_line(failure)}"
 
 
 def _print_summary(summary: dict[str, Any], evaluation: Evaluation | None, out: Path) -> None:

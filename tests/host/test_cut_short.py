@@ -113,6 +113,18 @@ def test_before_the_first_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert check_results(tmp_path, "interrupted", 0)["frames"] == 0
 
 
+def test_map_outlives_a_picture_that_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: Any) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("jaxslam.results._write_pictures", fail)
+    recording = Stopping(lambda: None)
+    with pytest.raises(MemoryError):
+        track(recording, Slam(recording.camera, CONFIG), "default", tmp_path, save_map=tmp_path / "a.map")
+    assert {path.name for path in tmp_path.iterdir()} >= ALWAYS
+    assert len(load_map(tmp_path / "a.map").ids) > 0
+
+
 def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Exit code 130, and the table says it."""
     monkeypatch.setattr(run_module, "open_dataset", lambda *_: Stopping(send(signal.SIGTERM)))
