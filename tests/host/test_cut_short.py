@@ -253,9 +253,9 @@ class TestAnyMoment:
         summary = json.loads((tmp_path / "out" / "summary.json").read_text())
         check_results(tmp_path / "out", summary["cut_short"], 60)
         print(f"moment {moment}: {summary['cut_short']} after {summary['frames']} frames, exit code {code}")
-        if summary["cut_short"] is None:  # it came while results were written, or too late
+        if summary["cut_short"] is None:  # it came while results were written, or when Python was ending, or too late
             assert summary["frames"] == 60
-            assert code in (130, 0)
+            assert code in (130, -number, 0)
         else:
             assert summary["cut_short"] == _SIGNALS[number]
             assert summary["frames"] <= 60
