@@ -48,7 +48,7 @@ def write_ply(path: PathLike, map: Map, submap: int | None = None, *, keyframes:
     Raises:
         MapFileError: If the file cannot be written, there is no such submap, or an image cannot be decoded.
     """
-    part = _part(map, submap)
+    part = one_submap(map, submap)
     vertices = np.zeros(len(part.points.ids), _VERTEX)
     vertices["x"], vertices["y"], vertices["z"] = part.points.X_world
     vertices["red"] = vertices["green"] = vertices["blue"] = _greys(part)
@@ -82,7 +82,7 @@ def write_colmap(folder: PathLike, map: Map, submap: int | None = None) -> None:
     Raises:
         MapFileError: If a file cannot be written, there is no such submap, or an image cannot be decoded.
     """
-    part = _part(map, submap)
+    part = one_submap(map, submap)
     part = part._replace(points=points_at(part.points, np.isin(part.points.ids, part.sightings.point)))
     order = np.lexsort((part.sightings.point, part.sightings.keyframe))
     part = part._replace(sightings=sightings_at(part.sightings, order))
@@ -110,14 +110,22 @@ def write_keyframe_trajectory(path: PathLike, map: Map, submap: int | None = Non
         MapFileError: If there is no such submap.
         TrajectoryError: If the file cannot be written.
     """
-    part = _part(map, submap)
+    part = one_submap(map, submap)
     stamps = np.array([keyframe.timestamp_ns for keyframe in part.keyframes], np.int64)
     order = np.argsort(stamps, kind="stable")
     write_tum(path, Trajectory(stamps[order], part.T_world_cam[order]))
 
 
-def _part(map: Map, submap: int | None) -> Map:
-    """One submap, and of its points and sightings all; an empty map stays as it is."""
+def one_submap(map: Map, submap: int | None = None) -> Map:
+    """The part of a map that is in one world; an empty map stays as it is.
+
+    Args:
+        map: The map.
+        submap: Number of the submap; by default the one with most keyframes.
+
+    Raises:
+        MapFileError: If there is no such submap.
+    """
     numbers, counts = np.unique(map.submap, return_counts=True)
     if submap is None:
         if not len(numbers):

@@ -31,6 +31,7 @@ _ALWAYS = ("trajectory.txt", "trajectory_online.txt", "frames.csv", "summary.jso
 _OF_THE_PATH = ("plot.png", "trajectory_kitti.txt")
 _OF_THE_MAP = ("trajectory_keyframes.txt", "map.png")
 _ERRORS, _FAILURES = "errors.csv", "failures.png"
+_OTHER_SUBMAP = "trajectory_submap_{}.txt"
 _OF_MASKS = ("masks.png", "masks.gif")
 RESULT_FILES = (*_ALWAYS, *_OF_THE_PATH, *_OF_THE_MAP, _ERRORS, _FAILURES, *_OF_MASKS, *DENSE_FILES)
 """All that a run can leave behind: no path, no keyframes, no truth, no masks, no dense map, none of their files."""
@@ -75,16 +76,20 @@ def write_results(
         The summary, and the evaluation if there is ground truth to compare with.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    truth = info.dataset.ground_truth
+    truth, trajectory = info.dataset.ground_truth, slam.trajectory
     evaluation, problem = None, None if truth is not None else "no ground truth"
     if truth is not None:
         try:
-            evaluation = evaluate(slam.trajectory, truth, frames_ns=info.dataset.timestamps_ns)
+            evaluation = evaluate(trajectory, truth, frames_ns=info.dataset.timestamps_ns)
         except TrajectoryError as error:
             problem = str(error)
-    dense, dense_files = write_dense(folder, slam.dense_mapping, slam.trajectory, slam.times.ms)
-    summary = _summary(slam, records, info, evaluation) | {"evaluation_problem": problem, "dense": dense}
-    write_tum(folder / "trajectory.txt", slam.trajectory)
+    dense, dense_files = write_dense(folder, slam.dense_mapping, trajectory, slam.times.ms)
+    summary = _summary(slam, records, info, evaluation) | {
+        "evaluation_problem": problem,
+        "dense": dense,
+        "poses_in_other_submaps": _write_other_submaps(folder, slam),
+    }
+    write_tum(folder / "trajectory.txt", trajectory)
     write_tum(folder / "trajectory_online.txt", slam.online_trajectory)
     write_frames(folder / "frames.csv", records)
     write_atomically(folder / "config.yaml", to_yaml(slam.config).encode())
@@ -96,6 +101,16 @@ def write_results(
     for name in there.symmetric_difference(RESULT_FILES):
         (folder / name).unlink(missing_ok=True)
     return summary, evaluation
+
+
+def _write_other_submaps(folder: Path, slam: Slam) -> dict[str, int]:
+    """Write the trajectory of every submap that nothing links to the map's frame; gives files with numbers of poses."""
+    for file in folder.glob(_OTHER_SUBMAP.format("*")):
+        file.unlink()
+    others = {n: path for n, path in slam.trajectories.items() if n != slam.map.world_submap}
+    for number, path in others.items():
+        write_tum(folder / _OTHER_SUBMAP.format(number), path)
+    return {_OTHER_SUBMAP.format(number): len(path) for number, path in others.items()}
 
 
 def _write_pictures(
@@ -115,7 +130,7 @@ def _write_pictures(
         write_kitti_frames(folder / _OF_THE_PATH[1], slam.trajectory, info.dataset.timestamps_ns)
         written += _OF_THE_PATH
     if len(slam.map.ids):
-        write_keyframe_trajectory(folder / _OF_THE_MAP[0], slam.map)
+        write_keyframe_trajectory(folder / _OF_THE_MAP[0], slam.map, slam.map.world_submap)
         plot_map(slam.map, slam.trajectory, folder / _OF_THE_MAP[1])
         written += _OF_THE_MAP
     failures = [*pictures.losses, *_worst(info.dataset, evaluation)]

@@ -4,12 +4,12 @@ import gc
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -365,7 +365,7 @@ class Slam:
     @property
     def online_trajectory(self) -> Trajectory:
         """Every pose that was in the map's frame when it was given out, as it was; frames that were lost have none."""
-        return self._poses_of(np.array(self._poses).reshape(-1, 7), np.array(self._in_map_frame, bool))
+        return _in_order([(given.timestamp_ns, given.T_world_cam) for given in self._given if given.in_map_frame])
 
     @property
     def trajectory(self) -> Trajectory:
@@ -373,22 +373,17 @@ class Slam:
 
         Poses in submaps that nothing links to it are left out; `trajectories` has them.
         """
-        return self.trajectories.get(self.map.world_submap) or Trajectory(np.zeros(0, np.int64), np.zeros((0, 7)))
+        return self.trajectories.get(self.map.world_submap) or _in_order([])
 
     @property
     @one_at_a_time
     def trajectories(self) -> dict[int, Trajectory]:
         """Every pose as it is known now, in the frame of the submap it is in, by the number of the submap."""
-        poses = np.array([self._back.pose(hung) for hung in self._hung]).reshape(-1, 7)
-        submaps = np.array([self._back.submap_of(hung) for hung in self._hung], np.int64)
-        return {number: self._poses_of(poses, submaps == number) for number in np.unique(submaps).tolist()}
-
-    def _poses_of(self, poses: np.ndarray, chosen: np.ndarray) -> Trajectory:
-        """Chosen ones of all poses `(n, 7)`, in the order of time."""
-        times_ns, poses = np.array(self._times_ns, np.int64)[chosen], poses[chosen]
-        order = np.argsort(times_ns, kind="stable")  # the clock may have been set back
-        poses[:, :4] /= np.linalg.norm(poses[:, :4], axis=1, keepdims=True)
-        return Trajectory(times_ns[order], poses[order])
+        by_submap: dict[int, list[tuple[int, np.ndarray]]] = {}
+        for given in self._given:
+            pose = given.timestamp_ns, self._back.pose(given.hung)
+            by_submap.setdefault(self._back.submap_of(given.hung), []).append(pose)
+        return {submap: _in_order(by_submap[submap]) for submap in sorted(by_submap)}
 
     def _begin(self) -> None:
         self.times = StageTimes()
@@ -444,10 +439,7 @@ class Slam:
         limits = float(self._params.min_depth_m), float(self._params.max_depth_m)
         self._background = None if self.camera.is_stereo else BackgroundCheck(self.camera, *limits)
         self._last_pose, self._last_twist, self._lost_s = np.array(IDENTITY), np.zeros(6), 0.0
-        self._times_ns: list[int] = []
-        self._poses: list[np.ndarray] = []
-        self._hung: list[Hung] = []
-        self._in_map_frame: list[bool] = []
+        self._given: list[_GivenPose] = []
         self._status = TrackStatus.OK
 
     def _new_dense_mapping(self) -> DenseMapping | None:
@@ -557,14 +549,14 @@ class Slam:
     def _regain(self, arrays: FrameArrays, lost: TrackOutput, dt_s: float) -> tuple[TrackOutput, Placed | None]:
         """The frame once more, from where the map shows it; or from the pose held, if the settings say so."""
         lost_s = self._lost_s + dt_s
-        predicted = moved(self._last_pose, self._last_twist * lost_s) if self._poses and lost_s < _PREDICTED_S else None
+        predicted = moved(self._last_pose, self._last_twist * lost_s) if self._given and lost_s < _PREDICTED_S else None
         placed, unknown = self._back.regain(arrays, predicted)
         self._unrecognised += unknown
         if placed is not None:
             self._state = self._back.relocated(self._state, placed.hung)
         elif self._may_begin_submap and self._unrecognised > self.config.track.restart_after:
             self._state = self._back.restarted(self._state, np.asarray(lost.T_world_cam.wxyz_xyz))
-        elif unknown and len(self.map.ids) and (self._status == TrackStatus.LOST or not self._poses):
+        elif unknown and len(self.map.ids) and (self._status == TrackStatus.LOST or not self._given):
             # Nothing was followed into the frame: that is not why.
             return lost._replace(reason=np.int32(TrackReason.PLACE_NOT_IN_MAP)), None
         else:
@@ -581,7 +573,7 @@ class Slam:
     @property
     def _may_begin_submap(self) -> bool:
         """Whether a place that is not in the map may become a part of it."""
-        known = bool(self._poses or len(self.map.ids))  # else the tracker starts by itself
+        known = bool(self._given or len(self.map.ids))  # else the tracker starts by itself
         return known and self.config.run.on_loss == "submap" and not self._localize_only
 
     def _in_submap(self, tracked: Tracked) -> Tracked:
@@ -632,15 +624,38 @@ class Slam:
         self._unrecognised, self._lost_s = 0, 0.0
         self._last_pose, self._last_twist = tracked.T_world_cam, tracked.twist
         self._back.localize(tracked.T_world_cam, self._frame)
-        self._hung.append(self._back.hang(tracked.T_world_cam))
-        self._in_map_frame.append(tracked.in_map_frame)
-        self._times_ns.append(tracked.timestamp_ns)
-        self._poses.append(tracked.T_world_cam)
+        hung = self._back.hang(tracked.T_world_cam)
+        self._given.append(_GivenPose(tracked.timestamp_ns, tracked.T_world_cam, hung, tracked.in_map_frame))
         return tracked
 
 
 def _watched(detector: Detector | None) -> WatchedDetector | None:
     return None if detector is None else WatchedDetector(detector)
+
+
+class _GivenPose(NamedTuple):
+    """A pose that was given out.
+
+    Attributes:
+        timestamp_ns: Time of its frame.
+        T_world_cam: `(7,)` as it was given out.
+        hung: The same tied to a keyframe, with which it moves.
+        in_map_frame: As of `Tracked`.
+    """
+
+    timestamp_ns: int
+    T_world_cam: np.ndarray
+    hung: Hung
+    in_map_frame: bool
+
+
+def _in_order(stamped: Sequence[tuple[int, np.ndarray]]) -> Trajectory:
+    """Poses with their stamps as a trajectory; of a clock that was set back, in the order of time all the same."""
+    times_ns = np.array([time_ns for time_ns, _ in stamped], np.int64)
+    poses = np.array([pose for _, pose in stamped]).reshape(-1, 7)
+    poses[:, :4] /= np.linalg.norm(poses[:, :4], axis=1, keepdims=True)
+    order = np.argsort(times_ns, kind="stable")
+    return Trajectory(times_ns[order], poses[order])
 
 
 @contextmanager

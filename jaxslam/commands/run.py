@@ -174,9 +174,7 @@ class Run(OfRecording):
         start = None if self.map is None else load_map(self.map)
         slam = Slam(dataset.camera, config, map=start, localize_only=self.localize_only)
         viewer = _viewer(slam, dataset, live=self.viz, path=self.rrd)
-        summary = track(
-            dataset, slam, self.preset, self.folder(), viewer, save_map=self.save_map, quiet=self.json
-        )
+        summary = track(dataset, slam, self.preset, self.folder(), viewer, save_map=self.save_map, quiet=self.json)
         if self.json:
             print_json(summary)
 
@@ -351,6 +349,8 @@ def _print_summary(summary: dict[str, Any], evaluation: Evaluation | None, out: 
     console.print(table)
     if evaluation is None:
         console.print(f"Not evaluated: {summary['evaluation_problem']}.")
+    for file, poses in summary["poses_in_other_submaps"].items():
+        console.print(f"Note: {poses} poses are in a submap that nothing links to the map's frame; they are in {file}.")
     for note in evaluation.notes if evaluation is not None else ():
         console.print(f"Note: {note}.")
     console.print(f"Results in {out}: {', '.join(name for name in RESULT_FILES if (out / name).exists())}")

@@ -1,21 +1,27 @@
 """Worlds are told apart: which submap a pose is in, in results, trajectories, logs, and with a map from a file."""
 
+import csv
 import logging
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from room_round import TRACK, room
 from test_relocalisation import BLACK, SUBMAP, Played
 
+from jaxslam.cli import main
 from jaxslam.config import Config
 from jaxslam.frame import Frame
 from jaxslam.map import empty_map
 from jaxslam.map_file import save_map
 from jaxslam.pose import between
+from jaxslam.results import RunInfo, write_results
 from jaxslam.slam import Slam, _track_followed
 from jaxslam.state import TrackReason, TrackStatus
+from jaxslam.tracked import FrameRecord
+from jaxslam.trajectory import read as read_trajectory
 
 FPS = 15.0
 QUICK = replace(SUBMAP, track=replace(TRACK, restart_after=5))
@@ -34,15 +40,15 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> tuple[Played, Path, list
     handler.emit = lambda record: lines.append(record.getMessage())  # type: ignore[method-assign]
     log.addHandler(handler)
     level, _ = log.level, log.setLevel(logging.INFO)
-    compiled: list[int] = []
+    compiled, step = list[int](), cast(Any, _track_followed)
     try:
         with Slam(room().camera, QUICK) as slam:
             Played(slam, room(), ORDER[:2], FPS)
-            compiled.append(_track_followed._cache_size())
+            compiled.append(step._cache_size())
             slam.reset()
             lines.clear()
             result = Played(slam, room(), ORDER, FPS)
-            compiled.append(_track_followed._cache_size())
+            compiled.append(step._cache_size())
     finally:
         log.removeHandler(handler)
         log.setLevel(level)
@@ -100,6 +106,33 @@ class TestResults:
                 np.testing.assert_allclose(result.covariance, 1e-12 * np.eye(6), rtol=1e-6)
             elif result.status != TrackStatus.LOST:
                 assert 1e-10 < np.diag(result.covariance).min() < np.diag(result.covariance).max() < 0.1
+
+
+class TestFiles:
+    def test_results(self, played: tuple[Played, Path, list[str]], tmp_path: Path) -> None:
+        """Each world has a trajectory of its own; those of an earlier run go."""
+        (tmp_path / "trajectory_submap_7.txt").write_text("old")
+        slam, recording = played[0].slam, room()
+        records = [FrameRecord.of(result) for result in played[0].results]
+        summary, _ = write_results(tmp_path, slam, records, RunInfo(recording, "default", 1.0))
+        other = len(slam.trajectories[1])
+        assert summary["poses_in_other_submaps"] == {"trajectory_submap_1.txt": other}
+        assert len(read_trajectory(tmp_path / "trajectory.txt")) == len(A)
+        assert len(read_trajectory(tmp_path / "trajectory_submap_1.txt")) == other
+        assert not (tmp_path / "trajectory_submap_7.txt").exists()
+        with (tmp_path / "frames.csv").open() as lines:
+            assert {row["submap"] for row in csv.DictReader(lines)} == {"0", "1"}
+
+    def test_export(
+        self, played: tuple[Played, Path, list[str]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        """One world at a time, and it says which and what is left out."""
+        submaps, file = played[0].slam.map.submap, tmp_path / "k.txt"
+        for number in (0, 1):
+            main(["export", str(played[1]), "--trajectory", str(file), "--submap", str(number)])
+            assert len(read_trajectory(file)) == np.count_nonzero(submaps == number)
+            expected = f"Submap {number}; left out, each in a world of its own: submaps [{1 - number}] (--submap N)"
+            assert expected in capsys.readouterr().out
 
 
 class TestLoaded:
