@@ -32,8 +32,8 @@ _SIZES = (64, 256, 1024, 4096)
 _EDGES_A_NODE = 6
 _FEWEST, _AHEAD = 4, 2.0
 """Keyframes of a map from which graphs are compiled, and for how many times as many as there are."""
-_ONE_AT_A_TIME = threading.Lock()
-"""Two threads would each compile the same."""
+_ONE_AT_A_TIME = {size: threading.Lock() for size in _SIZES}
+"""Two threads would each compile the same; those of different sizes need not wait for each other."""
 
 
 class _Graph(NamedTuple):
@@ -150,7 +150,7 @@ def _solved(graph: _Graph, poses: np.ndarray, fixed: np.ndarray) -> Any:
     )
     edges, start = PoseGraphEdges(*columns), _pose_array(padded(poses, size, fill=IDENTITY))
     rank = band_rank(graph.source, graph.target, size)
-    with _ONE_AT_A_TIME:
+    with _ONE_AT_A_TIME[size]:
         solved = jax.device_get(_optimise(start, edges, padded(fixed, size, fill=False), np.arange(size) < num, rank))
     return solved._replace(chi2=solved.chi2[:num_edges])
 

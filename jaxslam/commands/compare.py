@@ -9,7 +9,8 @@ from typing import Any
 from jaxslam.benchmark.report import table
 from jaxslam.benchmark.rows import shown_label
 from jaxslam.commands.console import console, make_table, plain_console, print_json
-from jaxslam.commands.run import OfRecording, number, track
+from jaxslam.commands.run import OfRecording
+from jaxslam.commands.tracking import number, track
 from jaxslam.config import presets
 from jaxslam.detector_choice import network_files, preset_needs_network
 from jaxslam.errors import ConfigError, nearest

@@ -14,9 +14,9 @@ from host.true_surface import accuracy
 from jaxslam import Slam, load_config, open_dataset
 from jaxslam.benchmark.opencv_flow import corners_of, flow_ms
 from jaxslam.benchmark.timing import pinned_to_one_core
+from jaxslam.camera_path_kind import CameraPathKind
 from jaxslam.datasets import Dataset
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
-from jaxslam.datasets.synthetic.camera_path import CameraPathKind
 from jaxslam.frame import Frame, to_grey
 from jaxslam.pose import inverse, transform
 from jaxslam.semantics import load_detector

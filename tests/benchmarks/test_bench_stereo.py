@@ -10,9 +10,9 @@ import pytest
 from benchmarks.live import live_run, part_of, show
 
 from jaxslam import Slam, evaluate, load_config, open_dataset
+from jaxslam.camera_path_kind import CameraPathKind
 from jaxslam.datasets import Dataset
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
-from jaxslam.datasets.synthetic.camera_path import CameraPathKind
 from jaxslam.pose import between
 from jaxslam.trajectory import Trajectory
 

@@ -6,9 +6,9 @@ from typing import NamedTuple, get_args
 import numpy as np
 from host.small_scene import Clip
 
+from jaxslam.camera_path_kind import CameraPathKind
 from jaxslam.config import load_config
 from jaxslam.datasets.synthetic import SceneDetector, SyntheticConfig, SyntheticDataset
-from jaxslam.datasets.synthetic.camera_path import CameraPathKind
 from jaxslam.evaluation import evaluate
 from jaxslam.frame import Frame
 from jaxslam.slam import Slam

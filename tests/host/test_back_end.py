@@ -126,7 +126,8 @@ class TestCompiling:
             slam.finish()
             assert TrackStatus.RELOCALISED in statuses
             assert len(slam.map.ids) >= 4
-            assert compiled == []
+            # In turn, the optimization of loops is compiled beside the frames, in a thread of its own.
+            assert set(compiled) <= ({"jit(_optimise)"} if config is INLINE else set())
 
 
 class TestClose:

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from room_round import TRACK
 
+from jaxslam.camera_path_kind import CameraPathKind
 from jaxslam.config import Config
 from jaxslam.datasets import open_dataset
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
-from jaxslam.datasets.synthetic.camera_path import CameraPathKind
 from jaxslam.frame import Frame
 from jaxslam.pose import between
 from jaxslam.slam import Slam

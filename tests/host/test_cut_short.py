@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 from small_scene import CONFIG, SETTINGS, Clip, clip
 
+from jaxslam import datasets
 from jaxslam import slam as slam_module
 from jaxslam.cli import main
-from jaxslam.commands import run as run_module
 from jaxslam.commands.interruption import Interruption
-from jaxslam.commands.run import track
+from jaxslam.commands.tracking import track
 from jaxslam.files import write_atomically
 from jaxslam.map_file import load_map
 from jaxslam.results import RESULT_FILES
@@ -127,7 +127,7 @@ def test_map_outlives_a_picture_that_fails(tmp_path: Path, monkeypatch: pytest.M
 
 def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Exit code 130, and the table says it."""
-    monkeypatch.setattr(run_module, "open_dataset", lambda *_: Stopping(send(signal.SIGTERM)))
+    monkeypatch.setattr(datasets, "open_dataset", lambda *_: Stopping(send(signal.SIGTERM)))
     arguments = ["run", "somewhere", "--out", str(tmp_path), "--set", *SETTINGS]
     with pytest.raises(SystemExit) as stop:
         main(arguments)
@@ -204,7 +204,7 @@ class TestOutputs:
         monkeypatch.chdir(tmp_path)
         Path("file").write_text("")
         Path("folder").mkdir()
-        monkeypatch.setattr(run_module, "open_dataset", lambda *_: Stopping(pytest.fail, at=0))
+        monkeypatch.setattr(datasets, "open_dataset", lambda *_: Stopping(pytest.fail, at=0))
         monkeypatch.setattr(Slam, "warm_up", pytest.fail)
         with pytest.raises(SystemExit) as stop:
             main([*command.split(), "--set", *SETTINGS])

@@ -13,9 +13,9 @@ from scipy.spatial import KDTree
 from small_scene import CONFIG, clip
 from true_surface import accuracy, true_surface
 
+from jaxslam.camera_path_kind import CameraPathKind
 from jaxslam.config import Config, DenseConfig, load_config
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
-from jaxslam.datasets.synthetic.camera_path import CameraPathKind
 from jaxslam.datasets.synthetic.dataset import SyntheticFrame
 from jaxslam.dense.cloud import DenseCloud
 from jaxslam.dense.dense_map import DenseMap

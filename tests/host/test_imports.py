@@ -60,7 +60,9 @@ def test_listing_commands_loads_nothing_heavy(words: list[str]) -> None:
     assert not loaded_after(CALL.format(words=words)) & set(HEAVY)
 
 
-@pytest.mark.parametrize("name", ["eval", "doctor", "export", "models list", "models get", "models check", "data list"])
+@pytest.mark.parametrize(
+    "name", ["demo", "run", "eval", "doctor", "export", "models list", "models get", "models check", "data list"]
+)
 def test_help_of_a_command_loads_no_jax(name: str) -> None:
     loaded = loaded_after(CALL.format(words=[*name.split(), "--help"]))
     assert "tyro" in loaded

@@ -8,8 +8,8 @@ from statistics import median
 import pytest
 from dynamic_scenes import errors, scene
 
+from jaxslam.camera_path_kind import CameraPathKind
 from jaxslam.datasets.synthetic import SyntheticConfig
-from jaxslam.datasets.synthetic.camera_path import CameraPathKind
 
 FRAMES, WIDTH, HEIGHT = 60, 320, 240
 OVERRIDES = ("track.cell_px=12",)  # for a small image

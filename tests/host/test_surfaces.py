@@ -11,9 +11,9 @@ import pytest
 from small_scene import TRACK
 
 from jaxslam.camera import Camera
+from jaxslam.camera_path_kind import CameraPathKind
 from jaxslam.config import Config, DynamicsConfig, SemanticsConfig
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset, SyntheticFrame
-from jaxslam.datasets.synthetic.camera_path import CameraPathKind
 from jaxslam.dynamic_masks import DynamicMasks, FrameMask, MaskSource
 from jaxslam.frame import Frame, to_grey
 from jaxslam.masks.reduced import Raster

@@ -6,8 +6,8 @@ import zlib
 import numpy as np
 import pytest
 
+from jaxslam.camera_path_kind import CameraPathKind
 from jaxslam.datasets.synthetic import PERFECT_SENSOR, SyntheticConfig, SyntheticDataset
-from jaxslam.datasets.synthetic.camera_path import CameraPathKind
 from jaxslam.errors import ConfigError
 
 SMALL = SyntheticConfig(width=160, height=120, frames=120, people=0, seated=2)

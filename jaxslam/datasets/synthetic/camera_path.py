@@ -5,16 +5,13 @@ room. Poses are `T_world_cam`, wxyz_xyz, with OpenCV camera axes.
 """
 
 from collections.abc import Callable
-from typing import Literal, TypeAlias, get_args
+from typing import TypeAlias, get_args
 
 import numpy as np
 
+from jaxslam.camera_path_kind import CameraPathKind
 from jaxslam.errors import ConfigError, nearest
 from jaxslam.rotation import axis_rotation, multiply
-
-CameraPathKind: TypeAlias = Literal["xyz", "rpy", "halfsphere", "static", "loop"]
-"""`xyz` moves along the axes, `rpy` turns in place, `halfsphere` sweeps half a sphere of one metre diameter,
-`static` is held still, `loop` goes once round the desk in the middle of the room every `LOOP_SECONDS`."""
 
 CAMERA_PATHS: tuple[str, ...] = get_args(CameraPathKind)
 LOOP_SECONDS = 32.0
