@@ -46,7 +46,7 @@ def sigma_m(result: Tracked) -> float:
 
 
 class TestOnlyPeople:
-    @pytest.mark.parametrize(("path", "seed"), [("xyz", 0), ("xyz", 1), ("static", 1), ("halfsphere", 1)])
+    @pytest.mark.parametrize(("path", "seed"), [("xyz", 0), ("static", 1)])
     def test_no_wrong_pose_is_sure(self, path: CameraPathKind, seed: int) -> None:
         """All are carried along with the people; those said to be OK are within 5 standard deviations."""
         results, errors_m = tracked(path, 2, seed, 2.0)
@@ -59,7 +59,7 @@ class TestOnlyPeople:
         assert len(weak) > len(results) / 4
         assert {result.status for result in weak} == {TrackStatus.WEAK}
 
-    @pytest.mark.parametrize(("path", "reach_m"), [("rpy", 2.6), ("xyz", 2.6), ("halfsphere", 2.8)])
+    @pytest.mark.parametrize(("path", "reach_m"), [("rpy", 2.6), ("xyz", 2.6)])
     def test_nobody(self, path: CameraPathKind, reach_m: float) -> None:
         """Little depth, but of things at rest: the background confirms the pose, no frame is weak for it."""
         results, errors_m = tracked(path, 0, 1, reach_m)
