@@ -4,7 +4,8 @@ No text is read as markup of rich, in tables neither: names of runs, files and s
 """
 
 import json
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -33,8 +34,17 @@ def messages_for(command: object) -> Iterator[None]:
 
 
 def print_json(document: Any) -> None:
-    """Print a document to standard output, as the JSON files of results are written."""
-    print(json.dumps(document, indent=2))
+    """Print a document to standard output; a figure that is not finite, which JSON has no number for, is null."""
+    print(json.dumps(_finite(document), indent=2, allow_nan=False))
+
+
+def _finite(document: Any) -> Any:
+    """The document with `None` for floats that are not finite."""
+    if isinstance(document, float):
+        return document if math.isfinite(document) else None
+    if isinstance(document, Mapping):
+        return {key: _finite(value) for key, value in document.items()}
+    return [_finite(value) for value in document] if isinstance(document, list | tuple) else document
 
 
 def make_table(title: str, *headings: str, left: int = 1, wrap_first: bool = False, gap: int = 2) -> Table:

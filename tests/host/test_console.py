@@ -162,3 +162,9 @@ class TestJson:
         assert stop.value.code == 1
         assert json.loads(out)["errors"] == 1
         assert err.startswith("error: ")
+
+
+def test_figures_that_are_not_finite_are_null(capsys: pytest.CaptureFixture[str]) -> None:
+    print_json({"rows": [{"ate": float("nan")}, {"ate": float("inf")}, {"ate": 0.5, "name": "nan"}], "count": 3})
+    rows = [{"ate": None}, {"ate": None}, {"ate": 0.5, "name": "nan"}]
+    assert json.loads(capsys.readouterr().out) == {"rows": rows, "count": 3}
