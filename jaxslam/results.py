@@ -24,7 +24,7 @@ from jaxslam.run_pictures import RunPictures
 from jaxslam.slam import Slam
 from jaxslam.state import TrackStatus
 from jaxslam.tracked import FrameRecord
-from jaxslam.trajectory import write_kitti_frames, write_tum
+from jaxslam.trajectory import Trajectory, write_kitti_frames, write_tum
 from jaxslam.visualize import Snapshot, plot_map, plot_snapshots, plot_trajectory
 
 _ALWAYS = ("trajectory.txt", "trajectory_online.txt", "frames.csv", "summary.json", "config.yaml")
@@ -76,7 +76,7 @@ def write_results(
         The summary, and the evaluation if there is ground truth to compare with.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    truth, trajectory = info.dataset.ground_truth, slam.trajectory
+    truth, trajectory = info.dataset.ground_truth, slam.trajectory  # made anew at each call
     evaluation, problem = None, None if truth is not None else "no ground truth"
     if truth is not None:
         try:
@@ -94,7 +94,11 @@ def write_results(
     write_frames(folder / "frames.csv", records)
     write_atomically(folder / "config.yaml", to_yaml(slam.config).encode())
     write_atomically(folder / "summary.json", (json.dumps(summary, indent=2) + "\n").encode())
-    there = {*_ALWAYS, *dense_files, *_write_pictures(folder, slam, info, evaluation, pictures or RunPictures(0))}
+    there = {
+        *_ALWAYS,
+        *dense_files,
+        *_write_pictures(folder, slam, trajectory, info, evaluation, pictures or RunPictures(0)),
+    }
     if evaluation is not None:
         write_errors(folder / _ERRORS, evaluation)
         there.add(_ERRORS)
@@ -114,24 +118,29 @@ def _write_other_submaps(folder: Path, slam: Slam) -> dict[str, int]:
 
 
 def _write_pictures(
-    folder: Path, slam: Slam, info: RunInfo, evaluation: Evaluation | None, pictures: RunPictures
+    folder: Path,
+    slam: Slam,
+    trajectory: Trajectory,
+    info: RunInfo,
+    evaluation: Evaluation | None,
+    pictures: RunPictures,
 ) -> list[str]:
     """Write the pictures there is something for; gives the names of the files."""
     written: list[str] = []
-    if len(slam.trajectory):
+    if len(trajectory):
         plot_trajectory(
-            slam.trajectory,
+            trajectory,
             info.dataset.ground_truth,
             evaluation,
             folder / _OF_THE_PATH[0],
             pictures.snapshots,
             title=_title(slam, info),
         )
-        write_kitti_frames(folder / _OF_THE_PATH[1], slam.trajectory, info.dataset.timestamps_ns)
+        write_kitti_frames(folder / _OF_THE_PATH[1], trajectory, info.dataset.timestamps_ns)
         written += _OF_THE_PATH
     if len(slam.map.ids):
         write_keyframe_trajectory(folder / _OF_THE_MAP[0], slam.map, slam.map.world_submap)
-        plot_map(slam.map, slam.trajectory, folder / _OF_THE_MAP[1])
+        plot_map(slam.map, trajectory, folder / _OF_THE_MAP[1])
         written += _OF_THE_MAP
     failures = [*pictures.losses, *_worst(info.dataset, evaluation)]
     if failures:

@@ -313,7 +313,7 @@ class Slam:
         So has a detector that looks at keyframes alone, then.
         """
         if any(leaf.is_deleted() for leaf in jax.tree.leaves(self._state)):  # a step that Ctrl-C ended took it along
-            self._state = self._fresh_state()._replace(lost_frames=jnp.zeros((), jnp.int32))  # its place is sought
+            self._state = _to_be_placed(self._fresh_state())
         self._state = self._back.finish(self._state)
 
     def close(self) -> None:
