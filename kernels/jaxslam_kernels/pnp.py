@@ -19,7 +19,7 @@ from jaxslam_kernels.absolute_orientation import absolute_orientation
 from jaxslam_kernels.camera import MIN_DEPTH, Intrinsics
 from jaxslam_kernels.checks import checked
 from jaxslam_kernels.p3p import p3p
-from jaxslam_kernels.pose_cost import PoseProblem, pose_problem_and_idle
+from jaxslam_kernels.pose_cost import PoseProblem, pose_problem
 from jaxslam_kernels.pose_refine import PoseStatus, refine_problem, solve_pose, usable_pose
 from jaxslam_kernels.robust import Loss
 from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Points, Scalar, Weights
@@ -102,7 +102,7 @@ def ransac_pnp(
     """
     if X_world.shape[1] == 0:
         return _none_found(_fallback(initial, X_world.dtype)[0])
-    problem, idle = pose_problem_and_idle(
+    problem, idle = pose_problem(
         X_world,
         uv,
         intrinsics,

@@ -79,26 +79,11 @@ def pose_problem(
     sigma_depth: Weights | Scalar | float,
     scale: Scalar | float,
     prior: PosePrior | None,
-) -> PoseProblem:
-    """Cleans what came in: any value that is not finite takes its point (or only its depth) out of the problem.
-
-    A camera or a scale that means nothing takes all of them out.
-    """
-    return pose_problem_and_idle(X_world, uv, intrinsics, weights, depth, sigma_px, sigma_depth, scale, prior)[0]
-
-
-def pose_problem_and_idle(
-    X_world: Points,
-    uv: Pixels,
-    intrinsics: Intrinsics,
-    weights: Weights | None,
-    depth: Weights | None,
-    sigma_px: Weights | Scalar | float,
-    sigma_depth: Weights | Scalar | float,
-    scale: Scalar | float,
-    prior: PosePrior | None,
 ) -> tuple[PoseProblem, PoseProblem]:
-    """The problem of `pose_problem`, and the idle points: those of weight exactly 0 that are usable otherwise.
+    """The problem without what is unusable, and the idle points: those of weight exactly 0 that are usable otherwise.
+
+    Any value that is not finite takes its point (or only its depth) out of both; a camera or a scale that means nothing
+    takes all of them out.
 
     Idle points have no influence on the optimum, but the derivative by their weight is not zero. The second problem
     holds them alone, in their columns; its weights are all 0 and carry the derivative. See `with_idle`.

@@ -29,7 +29,7 @@ from jaxslam_kernels.pose_cost import (
     PosePrior,
     PoseProblem,
     pose_cost,
-    pose_problem_and_idle,
+    pose_problem,
     retract,
     tangent_basis,
     with_idle,
@@ -134,7 +134,7 @@ def refine_pose(
     Returns:
         A `PoseRefinement`; everything in it is finite, and so are its derivatives.
     """
-    problem, idle = pose_problem_and_idle(X_world, uv, intrinsics, weights, depth, sigma_px, sigma_depth, scale, prior)
+    problem, idle = pose_problem(X_world, uv, intrinsics, weights, depth, sigma_px, sigma_depth, scale, prior)
     return refine_problem(T_world_cam, problem, idle, loss, max_steps)
 
 

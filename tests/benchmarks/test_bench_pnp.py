@@ -71,7 +71,7 @@ def test_time_of_parts():
     """Scoring and drawing against a whole run of OpenCV, for scale."""
     scene = make_scene(0, N, outliers=0.5)
     X_world, uv, depth, sigma = scene.arrays()
-    problem = pose_problem(X_world, uv, INTRINSICS, None, depth, 1.0, sigma, 3.0, None)
+    problem = pose_problem(X_world, uv, INTRINSICS, None, depth, 1.0, sigma, 3.0, None)[0]
     poses = jax.random.normal(jax.random.key(0), (3, 4, HYPOTHESES))
     score, draw = jax.jit(score_poses), jax.jit(draw_samples, static_argnums=2)
     key = jax.random.key(0)

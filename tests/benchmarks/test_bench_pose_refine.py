@@ -30,7 +30,7 @@ def _refine(T, X_world, uv, depth, sigma_depth, intrinsics):
 
 def _tall_refine(T, X_world, uv, depth, sigma_depth, intrinsics):
     """The same cost handed to optimistix as residuals, its Levenberg-Marquardt with every default."""
-    problem = pose_problem(X_world, uv, intrinsics, None, depth, 1.0, sigma_depth, 2.0, None)
+    problem = pose_problem(X_world, uv, intrinsics, None, depth, 1.0, sigma_depth, 2.0, None)[0]
 
     def residuals(tangent, problem):
         R, t = T.rotation().as_matrix(), T.translation()

@@ -309,7 +309,7 @@ class TestRansac:
 
         @quick_compile
         def evaluate(X_world, uv, depth, sigma, poses):
-            problem = pose_problem(X_world, uv, camera(), None, depth, 1.0, sigma, 3.0, None)
+            problem = pose_problem(X_world, uv, camera(), None, depth, 1.0, sigma, 3.0, None)[0]
             return (
                 pose_cost(pose, problem, "squared").chi2,
                 score_poses(poses, problem),

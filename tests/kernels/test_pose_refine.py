@@ -195,7 +195,7 @@ class TestReference:
             inputs = _inputs(scene)
 
             def solve(T, inputs):
-                problem = pose_problem(*inputs[:3], *inputs[3:8], prior=None)
+                problem = pose_problem(*inputs[:3], *inputs[3:8], prior=None)[0]
                 return solve_pose(T, problem, loss, 200)
 
             optimum, report = jax.tree.map(np.asarray, quick_compile(solve)(pose_of(scene.initial), inputs))
@@ -293,7 +293,7 @@ class TestGradient:
             T, direction = pose_of(scene.initial), _direction(inputs, 7)
 
             def unrolled(inputs):
-                problem = pose_problem(*inputs)
+                problem = pose_problem(*inputs)[0]
 
                 def step(T, _):
                     equations = pose_cost(T, problem, "cauchy").equations
