@@ -1,6 +1,6 @@
 """`python -m jaxslam` is the command `jaxslam`."""
 
-from jaxslam.cli import main
+from jaxslam.cli.entry_point import main
 
 if __name__ == "__main__":
     main()

@@ -36,7 +36,7 @@ def pytest_sessionstart() -> None:
 
     These are strict too: a program that was traced with other rules has parts of other names, and is another one.
     """
-    from jaxslam.xla import enable_compile_cache, prefer_one_thread  # noqa: PLC0415 - before it there are no type checks
+    from jaxslam.runtime.compile_cache import enable_compile_cache, prefer_one_thread  # noqa: PLC0415 - before it there are no type checks
 
     prefer_one_thread()
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # a small one is loaded in a tenth of its time
@@ -57,12 +57,12 @@ def pytest_collection_finish() -> None:
 
 _LONGEST = (
     "test_readme",
-    "test_bench_command",
+    "test_bench",
     "test_pose_graph",
     "test_notebooks",
     "test_back_end",
     "test_cues_in_tracker",
-    "test_cluster",
+    "test_dask_executor",
 )
 
 

@@ -1,1 +1,1 @@
-"""Suites of recordings run with presets, and reports of their figures beside published ones."""
+"""Benchmarks: suites of recordings, batches, kernels beside other libraries, and their reports."""

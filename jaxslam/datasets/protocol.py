@@ -8,10 +8,10 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-from jaxslam.camera import Camera
-from jaxslam.frame import Frame
-from jaxslam.rectification import RectifiedPair
-from jaxslam.trajectory import Trajectory
+from jaxslam.sensors.camera import Camera
+from jaxslam.sensors.frame import Frame
+from jaxslam.sensors.rectification import RectifiedPair
+from jaxslam.trajectory.trajectory import Trajectory
 
 
 class Dataset(Protocol):

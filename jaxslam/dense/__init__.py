@@ -1,5 +1,5 @@
 """The dense map: coloured points of what stands still, and where space is free."""
 
-from jaxslam.dense.cloud import DenseCloud
+import lazy_loader
 
-__all__ = ["DenseCloud"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

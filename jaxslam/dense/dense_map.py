@@ -9,22 +9,22 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from jaxslam.camera import Camera
-from jaxslam.config import DenseConfig
-from jaxslam.dense.cloud import DenseCloud
-from jaxslam.dense.key_regions import Neighbour, object_boxes, points_inside
+from jaxslam.config.schema import DenseConfig
+from jaxslam.dense.depth_view import View
+from jaxslam.dense.key_objects import Neighbour, object_boxes, points_inside
 from jaxslam.dense.keyframe_depths import KeyframeDepths, Poses
+from jaxslam.dense.keyframe_poses import distance
 from jaxslam.dense.occupancy import Occupancy, occupancy
-from jaxslam.dense.places import distance
-from jaxslam.dense.view import View
+from jaxslam.dense.point_cloud import DenseCloud
 from jaxslam.dense.voxel_layer import Part, VoxelLayer
 from jaxslam.errors import MapFileError
-from jaxslam.map import Map
-from jaxslam.map_movers import Movers
-from jaxslam.pose import IDENTITY
+from jaxslam.geometry.se3 import IDENTITY
+from jaxslam.map.dynamic_removal import Movers
+from jaxslam.map.types import Map
+from jaxslam.runtime.stage_timer import StageTimes, Stopwatch
 from jaxslam.semantics import Detector
-from jaxslam.stage_times import StageTimes, Stopwatch
-from jaxslam.stereo import DenseDepth
+from jaxslam.sensors.camera import Camera
+from jaxslam.sensors.stereo_depth import DenseDepth
 
 _VOXELS_DEEP = 300
 """Voxels from the camera to the farthest depth believed, if the settings do not give their side."""

@@ -6,10 +6,10 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt16
 
-from jaxslam.dense.places import poses_of
-from jaxslam.dense.view import Looks, View
-from jaxslam.map import Map, has
-from jaxslam.pose import IDENTITY, angle, between, compose
+from jaxslam.dense.depth_view import Looks, View
+from jaxslam.dense.keyframe_poses import poses_of
+from jaxslam.geometry.se3 import IDENTITY, angle, between, compose
+from jaxslam.map.types import Map, has
 
 Poses: TypeAlias = Mapping[int, np.ndarray | None]
 """Where the depth of each keyframe was taken, `(7,)`; `None` if the keyframe is in a submap that is not shown, or in no

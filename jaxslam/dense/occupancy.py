@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
 from jaxslam.errors import MapFileError
-from jaxslam.rotation import matrices
+from jaxslam.geometry.so3 import matrices
 
 HIT, MISS = np.float32(np.log(0.7 / 0.3)), np.float32(np.log(0.4 / 0.6))
 LEAST, MOST = np.float32(np.log(0.12 / 0.88)), np.float32(np.log(0.97 / 0.03))

@@ -7,11 +7,13 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxslam_kernels.voxel_grid import empty_grid
-from jaxslam_kernels.voxel_hash import NO_ROW
+from jaxslam_kernels.depth.voxel_grid import empty_grid
+from jaxslam_kernels.depth.voxel_hash import NO_ROW
 from jaxtyping import Bool, Float32, Int, Int32, UInt8
 
-from jaxslam.dense.layer_programs import (
+from jaxslam.dense.block_bounds import RowBoxes
+from jaxslam.dense.depth_view import Looks, View
+from jaxslam.dense.voxel_programs import (
     MISS,
     ROWS,
     Cloud,
@@ -24,10 +26,8 @@ from jaxslam.dense.layer_programs import (
     reduced,
     taken_out,
 )
-from jaxslam.dense.row_boxes import RowBoxes
-from jaxslam.dense.view import Looks, View
-from jaxslam.padding import padded
-from jaxslam.pose import IDENTITY, transform
+from jaxslam.geometry.se3 import IDENTITY, transform
+from jaxslam.runtime.padding import padded
 
 HIT = np.float32(0.85)
 """Log-odds of a voxel that a keyframe has a point in: a probability of 0.7, OctoMap's."""

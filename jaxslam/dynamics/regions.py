@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxslam_kernels.camera import Intrinsics, back_project
-from jaxslam_kernels.kmeans import kmeans
+from jaxslam_kernels.clustering.kmeans import kmeans
 from jaxslam_kernels.types import DepthImage, Mask, Points, Weights
 from jaxtyping import Array, Bool, Float, Int, Key
 

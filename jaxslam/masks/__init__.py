@@ -1,1 +1,1 @@
-"""Masks of things that move: from a detector's boxes, and carried on from frame to frame."""
+"""Masks of movable objects: from boxes to masks, their propagation between detections, background depth, instances."""

@@ -18,16 +18,16 @@ import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxslam_kernels.dbscan import dbscan
-from jaxslam_kernels.image import Pyramid, build_pyramid
-from jaxslam_kernels.lk_flow import FlowPlan, LevelPlan, lk_flow
+from jaxslam_kernels.clustering.dbscan import dbscan
+from jaxslam_kernels.flow.lk_flow import FlowPlan, LevelPlan, lk_flow
+from jaxslam_kernels.image.pyramid import Pyramid, build_pyramid
 from jaxslam_kernels.types import Mask, Pixels, Weights
 from jaxtyping import Array, Bool, Float, Float32, Int, Int32, UInt8
 
-from jaxslam.aligned import aligned_array
-from jaxslam.masks.sampling import sample_mask
-from jaxslam.trace_cache import traced_once
-from jaxslam.xla import IN_ITS_THREAD
+from jaxslam.masks.point_sampling import sample_mask
+from jaxslam.runtime.aligned_memory import aligned_array
+from jaxslam.runtime.compile_cache import IN_ITS_THREAD
+from jaxslam.runtime.trace_cache import traced_once
 
 CAPACITY = 128
 """Most points: of a person who fills a fifth of the image, one in about every other cell."""

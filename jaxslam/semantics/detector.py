@@ -9,11 +9,11 @@ from jaxtyping import UInt8
 
 from jaxslam.errors import ConfigError, FrameError, ModelError, nearest
 from jaxslam.semantics.adapters import ADAPTERS, Adapter
-from jaxslam.semantics.choose import Wanted
 from jaxslam.semantics.class_names import one_name, valid_labels
 from jaxslam.semantics.detections import Detections
-from jaxslam.semantics.graph import Graph
-from jaxslam.semantics.network import Network, check_outputs
+from jaxslam.semantics.onnx_session import Network, check_outputs
+from jaxslam.semantics.onnx_signature import Graph
+from jaxslam.semantics.postprocess import Wanted
 
 
 class OnnxDetector:

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from jaxslam import Slam, evaluate, load_config, open_dataset
-from jaxslam.benchmark.opencv_flow import corners_of, flow_ms
+from jaxslam.benchmark.reference_flow import corners_of, flow_ms
 from jaxslam.datasets import Dataset
-from jaxslam.frame import Frame, to_grey
 from jaxslam.semantics import Detector
+from jaxslam.sensors.frame import Frame, to_grey
 
 WARM_UP = 10
 

@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 import pytest
-from jaxslam_kernels.alignment import ate
+from jaxslam_kernels.trajectory.alignment import ate
 
 from jaxslam.benchmark.kernels.point_cases import paths, scipy_ate
 from jaxslam.benchmark.timing import compare

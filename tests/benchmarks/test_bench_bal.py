@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxslam_kernels.bundle_adjust import BundleStatus, bundle_adjust
-from jaxslam_kernels.bundle_cost import Observations
+from jaxslam_kernels.bundle.bundle_adjust import BundleStatus, bundle_adjust
+from jaxslam_kernels.bundle.cost import Observations
 
 from jaxslam.benchmark.timing import pinned_to_one_core
 

@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxslam_kernels.bundle_adjust import BundleStatus, bundle_adjust
+from jaxslam_kernels.bundle.bundle_adjust import BundleStatus, bundle_adjust
 
-from jaxslam.benchmark.kernels.bundle_window import make_window, without_depth
-from jaxslam.benchmark.kernels.posed_scene import pose_error
+from jaxslam.benchmark.kernels.scenes.bundle_window import make_window, without_depth
+from jaxslam.benchmark.kernels.scenes.single_view import pose_error
 from jaxslam.benchmark.timing import compare, compile_seconds, pinned_to_one_core
 
 pytestmark = pytest.mark.benchmark
@@ -46,7 +46,7 @@ def test_one_step():
 
 def test_one_step_against_ceres():
     """Without depth, which COLMAP's cost functions lack, and so with two poses fixed. Ceres times its steps itself."""
-    ceres_window = pytest.importorskip("jaxslam.benchmark.kernels.ceres_window")
+    ceres_window = pytest.importorskip("jaxslam.benchmark.kernels.rivals.ceres")
     window, fixed, steps = without_depth(WINDOW), jnp.arange(K) < 2, 10
     ours = {n: jax.jit(partial(bundle_adjust, fixed_poses=fixed, tolerance=0.0, max_steps=n)) for n in (1, steps + 1)}
     inputs = window.poses, window.X_world, window.observations

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from jaxslam_kernels.camera import normalise, project
 
-from jaxslam.benchmark.kernels.posed_scene import DISTORTION, MATRIX, camera, make_scene
+from jaxslam.benchmark.kernels.scenes.single_view import DISTORTION, MATRIX, camera, make_scene
 from jaxslam.benchmark.timing import compare
 
 pytestmark = pytest.mark.benchmark

@@ -5,9 +5,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxslam_kernels.corners import corner_score, grid_corners
+from jaxslam_kernels.image.corners import corner_score, grid_corners
 
-from jaxslam.benchmark.kernels.known_warps import picture
+from jaxslam.benchmark.kernels.scenes.image_warps import picture
 from jaxslam.benchmark.timing import compare
 
 pytestmark = pytest.mark.benchmark

@@ -5,8 +5,8 @@
 
 import pytest
 
-from jaxslam.benchmark.kernels.cases import CASES
 from jaxslam.benchmark.kernels.measure import devices, measure
+from jaxslam.benchmark.kernels.registry import CASES
 
 pytestmark = pytest.mark.benchmark
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxslam_kernels.dbscan import dbscan
+from jaxslam_kernels.clustering.dbscan import dbscan
 from sklearn.cluster import DBSCAN
 
 from jaxslam.benchmark.kernels.point_cases import movers

@@ -9,18 +9,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from host.true_surface import accuracy
+from true_surface import accuracy
 
 from jaxslam import Slam, load_config, open_dataset
-from jaxslam.benchmark.opencv_flow import corners_of, flow_ms
+from jaxslam.benchmark.reference_flow import corners_of, flow_ms
 from jaxslam.benchmark.timing import pinned_to_one_core
-from jaxslam.camera_path_kind import CameraPathKind
 from jaxslam.datasets import Dataset
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
-from jaxslam.frame import Frame, to_grey
-from jaxslam.pose import inverse, transform
+from jaxslam.datasets.synthetic.camera_path_kind import CameraPathKind
+from jaxslam.geometry.se3 import inverse, transform
 from jaxslam.semantics import load_detector
-from jaxslam.trajectory import Trajectory
+from jaxslam.sensors.frame import Frame, to_grey
+from jaxslam.trajectory.trajectory import Trajectory
 
 pytestmark = [pytest.mark.benchmark, pytest.mark.usefixtures("opencv_in_one_thread")]
 

@@ -7,7 +7,7 @@ import itertools
 import math
 
 import pytest
-from host.dynamic_scenes import PATHS, errors, scene
+from dynamic_scenes import PATHS, errors, scene
 
 from jaxslam.datasets.synthetic import SyntheticConfig
 

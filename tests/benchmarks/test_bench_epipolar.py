@@ -10,15 +10,15 @@ import cv2
 import jax
 import numpy as np
 import pytest
-from jaxslam_kernels.fundamental import FundamentalStatus, ransac_fundamental
+from jaxslam_kernels.two_view.fundamental import FundamentalStatus, ransac_fundamental
 
+from jaxslam.benchmark.kernels.scenes.two_views import KINDS, TwoViewScene, make_two_views
 from jaxslam.benchmark.kernels.two_view_cases import (
     OPENCV_PX,
     SAME_BAND_PX,
     fundamental_arguments,
     opencv_fundamental,
 )
-from jaxslam.benchmark.kernels.two_views import KINDS, TwoViewScene, make_two_views
 from jaxslam.benchmark.timing import compare, compile_seconds
 
 pytestmark = pytest.mark.benchmark

@@ -8,16 +8,16 @@ import time
 import cv2
 import numpy as np
 import pytest
-from host.room_views import STILL, features, params, picture
+from room_views import STILL, features, params, picture
 
 from jaxslam.benchmark.timing import compare
-from jaxslam.features import Features, extract, features_of
-from jaxslam.frame import to_grey
-from jaxslam.map import Keyframe
-from jaxslam.matching import hamming, match_by_projection, match_descriptors
-from jaxslam.place_index import PlaceIndex
-from jaxslam.place_recognition import verify
-from jaxslam.step_input import frame_arrays
+from jaxslam.features.matching import hamming, match_by_projection, match_descriptors
+from jaxslam.features.orb import Features, extract, features_of
+from jaxslam.loop_closing.place_index import PlaceIndex
+from jaxslam.loop_closing.place_recognition import verify
+from jaxslam.map.types import Keyframe
+from jaxslam.sensors.frame import to_grey
+from jaxslam.sensors.frame_arrays import frame_arrays
 
 pytestmark = pytest.mark.benchmark
 

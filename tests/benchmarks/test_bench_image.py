@@ -3,9 +3,9 @@
 import cv2
 import jax
 import pytest
-from jaxslam_kernels.image import build_pyramid
+from jaxslam_kernels.image.pyramid import build_pyramid
 
-from jaxslam.benchmark.kernels.known_warps import picture
+from jaxslam.benchmark.kernels.scenes.image_warps import picture
 from jaxslam.benchmark.timing import compare
 
 pytestmark = pytest.mark.benchmark

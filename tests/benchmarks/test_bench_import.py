@@ -14,7 +14,7 @@ pytestmark = pytest.mark.benchmark
 
 ROUNDS = 15
 _REFERENCE = "import jax"
-MOST = {"import jaxslam": 1.9, "from jaxslam.cli import main; main(['--help'])": 0.6}
+MOST = {"import jaxslam": 1.9, "from jaxslam.cli.entry_point import main; main(['--help'])": 0.6}
 """The most that each may take, in times of `import jax`."""
 
 

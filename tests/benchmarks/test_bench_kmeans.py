@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxslam_kernels.kmeans import kmeans
+from jaxslam_kernels.clustering.kmeans import kmeans
 
 from jaxslam.benchmark.kernels.point_cases import opencv_kmeans
 from jaxslam.benchmark.timing import compare, compile_seconds

@@ -5,10 +5,10 @@ import jax
 import numpy as np
 import pytest
 from jax.extend.backend import clear_backends
-from jaxslam_kernels.image import build_pyramid
-from jaxslam_kernels.lk_flow import lk_flow
+from jaxslam_kernels.flow.lk_flow import lk_flow
+from jaxslam_kernels.image.pyramid import build_pyramid
 
-from jaxslam.benchmark.kernels.known_warps import corners, picture, warp
+from jaxslam.benchmark.kernels.scenes.image_warps import corners, picture, warp
 from jaxslam.benchmark.timing import compare
 
 pytestmark = pytest.mark.benchmark

@@ -13,14 +13,14 @@ import jax
 import numpy as np
 import pytest
 
-from jaxslam import local_mapping as module
 from jaxslam.benchmark.timing import pinned_to_one_core
-from jaxslam.config import Config
+from jaxslam.config.schema import Config
 from jaxslam.datasets import open_dataset
-from jaxslam.local_mapping import LocalMapping, NewKeyframe, mapping_plan
-from jaxslam.map import NONE, Map
-from jaxslam.slam import Slam
-from jaxslam.track_settings import track_params
+from jaxslam.map.types import NONE, Map
+from jaxslam.mapping import local_mapping as module
+from jaxslam.mapping.local_mapping import LocalMapping, NewKeyframe, mapping_plan
+from jaxslam.slam.slam import Slam
+from jaxslam.tracking.from_config import track_params
 
 pytestmark = pytest.mark.benchmark
 

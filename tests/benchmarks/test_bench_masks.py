@@ -12,17 +12,17 @@ import numpy as np
 import pytest
 from jaxlie import SE3
 from jaxslam_kernels.camera import make_intrinsics
-from jaxslam_kernels.depth_change import depth_change
-from jaxslam_kernels.image import Pyramid, build_pyramid
+from jaxslam_kernels.depth.depth_change import depth_change
+from jaxslam_kernels.image.pyramid import Pyramid, build_pyramid
 
-from jaxslam.benchmark.opencv_flow import corners_of, opencv_flow
+from jaxslam.benchmark.reference_flow import corners_of, opencv_flow
 from jaxslam.benchmark.timing import Comparison, compare, compile_seconds
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
-from jaxslam.dynamic_masks import WIDTH_PX
-from jaxslam.frame import to_grey
+from jaxslam.geometry.se3 import between
 from jaxslam.masks.propagation import PYRAMID_LEVELS, Origin, follow, make_origin, predicted_mask
-from jaxslam.masks.reduced import Raster, Reduced
-from jaxslam.pose import between
+from jaxslam.sensors.downscale import Raster, Reduced
+from jaxslam.sensors.frame import to_grey
+from jaxslam.slam.mask_pipeline import WIDTH_PX
 
 pytestmark = pytest.mark.benchmark
 

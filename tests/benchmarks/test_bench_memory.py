@@ -3,9 +3,9 @@
 import sys
 
 import pytest
-from host.small_scene import CONFIG, clip, resident_mb, track_round_trip
+from small_scene import CONFIG, clip, resident_mb, track_round_trip
 
-from jaxslam.slam import Slam
+from jaxslam.slam.slam import Slam
 
 
 @pytest.mark.benchmark

@@ -5,7 +5,7 @@
 
 import numpy as np
 import pytest
-from host.parked_object import WITHIN, verdicts
+from parked_object import WITHIN, verdicts
 
 pytestmark = pytest.mark.benchmark
 

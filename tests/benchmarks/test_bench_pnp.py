@@ -8,11 +8,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxslam_kernels.pnp import draw_samples, ransac_pnp, score_poses
-from jaxslam_kernels.pose_cost import pose_problem
+from jaxslam_kernels.pose.pnp import draw_samples, ransac_pnp, score_poses
+from jaxslam_kernels.pose.pose_cost import pose_problem
 from scipy.spatial.transform import Rotation
 
-from jaxslam.benchmark.kernels.posed_scene import DISTORTION, MATRIX, Scene, camera, make_scene, pose_error, to_wxyz_xyz
+from jaxslam.benchmark.kernels.scenes.single_view import (
+    DISTORTION,
+    MATRIX,
+    Scene,
+    camera,
+    make_scene,
+    pose_error,
+    to_wxyz_xyz,
+)
 from jaxslam.benchmark.timing import compare, compile_seconds
 
 pytestmark = pytest.mark.benchmark

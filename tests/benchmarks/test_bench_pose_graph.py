@@ -11,14 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxlie import SE3
-from jaxslam_kernels.block_band import GraphMatrix, factorise, solve_factor
-from jaxslam_kernels.pose_graph import PoseGraphStatus, band_rank, optimise_pose_graph
-from jaxslam_kernels.pose_graph_cost import PoseGraphEdges, graph_equations, graph_nodes, graph_problem
-from kernels.pose_graph_cases import read_g2o
+from jaxslam_kernels.pose_graph.block_tridiagonal_cg import GraphMatrix, factorise, solve_factor
+from jaxslam_kernels.pose_graph.cost import PoseGraphEdges, graph_equations, graph_nodes, graph_problem
+from jaxslam_kernels.pose_graph.pose_graph import PoseGraphStatus, band_rank, optimise_pose_graph
+from pose_graph_cases import read_g2o
 from scipy.sparse import bsr_array, coo_array
 from scipy.sparse.linalg import splu
 
-from jaxslam.benchmark.kernels.loop_graph import Graph
+from jaxslam.benchmark.kernels.scenes.loop_graph import Graph
 from jaxslam.benchmark.timing import compare, compile_seconds
 
 pytestmark = pytest.mark.benchmark

@@ -10,11 +10,11 @@ import numpy as np
 import optimistix as optx
 import pytest
 from jaxlie import SE3
-from jaxslam_kernels.pose_cost import pose_problem
-from jaxslam_kernels.pose_refine import refine_pose
+from jaxslam_kernels.pose.pose_cost import pose_problem
+from jaxslam_kernels.pose.pose_refine import refine_pose
 from scipy.spatial.transform import Rotation
 
-from jaxslam.benchmark.kernels.posed_scene import DISTORTION, MATRIX, camera, make_scene, pose_error, pose_of
+from jaxslam.benchmark.kernels.scenes.single_view import DISTORTION, MATRIX, camera, make_scene, pose_error, pose_of
 from jaxslam.benchmark.timing import compare, compile_seconds
 
 pytestmark = pytest.mark.benchmark

@@ -10,11 +10,11 @@ import pytest
 from benchmarks.live import live_run, part_of, show
 
 from jaxslam import Slam, evaluate, load_config, open_dataset
-from jaxslam.camera_path_kind import CameraPathKind
 from jaxslam.datasets import Dataset
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
-from jaxslam.pose import between
-from jaxslam.trajectory import Trajectory
+from jaxslam.datasets.synthetic.camera_path_kind import CameraPathKind
+from jaxslam.geometry.se3 import between
+from jaxslam.trajectory.trajectory import Trajectory
 
 pytestmark = [pytest.mark.benchmark, pytest.mark.usefixtures("opencv_in_one_thread")]
 

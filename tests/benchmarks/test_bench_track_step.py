@@ -6,10 +6,10 @@ import jax
 import pytest
 
 from jaxslam import Slam, frame_arrays, open_dataset, track_params, track_plan, track_step
-from jaxslam.benchmark.opencv_flow import corners_of, opencv_flow
+from jaxslam.benchmark.reference_flow import corners_of, opencv_flow
 from jaxslam.benchmark.timing import compare
-from jaxslam.config import Config, TrackConfig
-from jaxslam.frame import to_grey
+from jaxslam.config.schema import Config, TrackConfig
+from jaxslam.sensors.frame import to_grey
 
 pytestmark = pytest.mark.benchmark
 

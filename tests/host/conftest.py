@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import jax
 import pytest
 
-from jaxslam import known_models
+from jaxslam.semantics import model_zoo as known_models
 
 COMPILED = "/jax/core/compile/backend_compile_duration"
 

@@ -13,11 +13,11 @@ import jaxslam_kernels
 import numpy as np
 import pytest
 from jaxlie import SE3
-from jaxslam_kernels.bundle_adjust import BundleStatus
+from jaxslam_kernels.bundle.bundle_adjust import BundleStatus
 from jaxslam_kernels.camera import make_intrinsics, project
 from jaxslam_kernels.checks import checked
-from jaxslam_kernels.fundamental import FundamentalStatus
-from jaxslam_kernels.pose_refine import PoseStatus
+from jaxslam_kernels.pose.pose_refine import PoseStatus
+from jaxslam_kernels.two_view.fundamental import FundamentalStatus
 from jaxslam_kernels.types import Mask, Pixels, Points, Scalar, Weights
 from jaxtyping import Array, Key
 from kernel_cases import cases, filled

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from jaxslam_kernels.camera import make_intrinsics, normalise
 from jaxslam_kernels.first_order import first_order
-from jaxslam_kernels.image import build_pyramid
-from jaxslam_kernels.lk_flow import FlowPlan, lk_flow
-from jaxslam_kernels.lk_search import LevelPlan
-from jaxslam_kernels.patch_align import align_patches
+from jaxslam_kernels.flow.lk_flow import FlowPlan, lk_flow
+from jaxslam_kernels.flow.lk_search import LevelPlan
+from jaxslam_kernels.flow.patch_align import align_patches
+from jaxslam_kernels.image.pyramid import build_pyramid
 from quick_compile import quick_compile
 from small_problems import (
     adjust,

@@ -4,12 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxslam_kernels.alignment import align, ate
-from jaxslam_kernels.bundle_adjust import BundleStatus
-from jaxslam_kernels.fundamental import FundamentalStatus
-from jaxslam_kernels.motion import upper_limit
-from jaxslam_kernels.pose_graph import PoseGraphStatus
-from jaxslam_kernels.pose_refine import PoseStatus
+from jaxslam_kernels.bundle.bundle_adjust import BundleStatus
+from jaxslam_kernels.pose.pose_refine import PoseStatus
+from jaxslam_kernels.pose_graph.pose_graph import PoseGraphStatus
+from jaxslam_kernels.scene_flow import upper_limit
+from jaxslam_kernels.trajectory.alignment import align, ate
+from jaxslam_kernels.two_view.fundamental import FundamentalStatus
 from quick_compile import quick_compile
 from small_problems import (
     adjust,

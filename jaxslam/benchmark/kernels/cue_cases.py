@@ -9,7 +9,7 @@ from jaxslam_kernels.camera import back_project
 
 from jaxslam.benchmark.kernels.case import Case, Problem
 from jaxslam.benchmark.kernels.image_cases import moving_corners
-from jaxslam.benchmark.kernels.room_views import (
+from jaxslam.benchmark.kernels.scenes.room_views import (
     RoomViews,
     back_projected,
     followed_points,
@@ -17,20 +17,20 @@ from jaxslam.benchmark.kernels.room_views import (
     projected,
     room_views,
 )
-from jaxslam.benchmark.opencv_flow import NUM_CORNERS, opencv_flow
-from jaxslam.config import DynamicsConfig, OcclusionConfig, TrackConfig
+from jaxslam.benchmark.reference_flow import NUM_CORNERS, opencv_flow
+from jaxslam.config.schema import DynamicsConfig, OcclusionConfig, TrackConfig
 from jaxslam.dynamics.cue import Scene, combined
-from jaxslam.dynamics.known import with_cue_params, with_cues
 from jaxslam.dynamics.occlusion import PointState
 from jaxslam.dynamics.regions import RegionMemory, RegionPlan, find_regions, moving_pixels, no_regions
-from jaxslam.features import DESCRIPTOR_BYTES, Features
-from jaxslam.map import NONE, Keyframe, Map, MapPoints, Sightings, empty_map
-from jaxslam.map_edit import with_keyframe, with_points, with_sightings
-from jaxslam.point_states import PointStates
-from jaxslam.pose import between, to_local, transform
-from jaxslam.state import TrackPlan
-from jaxslam.step_input import FrameMemory
-from jaxslam.track_settings import track_params
+from jaxslam.features.orb import DESCRIPTOR_BYTES, Features
+from jaxslam.geometry.se3 import between, to_local, transform
+from jaxslam.map.edit import with_keyframe, with_points, with_sightings
+from jaxslam.map.types import NONE, Keyframe, Map, MapPoints, Sightings, empty_map
+from jaxslam.mapping.occlusion_states import PointStates
+from jaxslam.sensors.frame_arrays import FrameMemory
+from jaxslam.tracking.cue_registry import with_cue_params, with_cues
+from jaxslam.tracking.from_config import track_params
+from jaxslam.tracking.state import TrackPlan
 
 _SETTLING_STEPS = 20
 

@@ -5,13 +5,13 @@ from typing import Any
 
 import jax.numpy as jnp
 from jaxlie import SE3
-from jaxslam_kernels.bundle_adjust import bundle_adjust
-from jaxslam_kernels.pose_graph import Elimination, band_rank, optimise_pose_graph
-from jaxslam_kernels.pose_graph_cost import PoseGraphEdges
+from jaxslam_kernels.bundle.bundle_adjust import bundle_adjust
+from jaxslam_kernels.pose_graph.cost import PoseGraphEdges
+from jaxslam_kernels.pose_graph.pose_graph import Elimination, band_rank, optimise_pose_graph
 
-from jaxslam.benchmark.kernels.bundle_window import make_window, without_depth
 from jaxslam.benchmark.kernels.case import Case, Problem
-from jaxslam.benchmark.kernels.loop_graph import loop_graph
+from jaxslam.benchmark.kernels.scenes.bundle_window import make_window, without_depth
+from jaxslam.benchmark.kernels.scenes.loop_graph import loop_graph
 
 _POINTS_A_KEYFRAME, _VIEWS_A_POINT = 125, 4
 _STEPS, _NUM_FIXED = 10, 2
@@ -25,7 +25,7 @@ def _adjust(num_keyframes: int) -> Problem:
         return bundle_adjust(poses, X_world, observations, fixed_poses=fixed, tolerance=0.0, max_steps=_STEPS)
 
     def prepare() -> tuple[Any, ...]:
-        from jaxslam.benchmark.kernels import ceres_window  # noqa: PLC0415
+        from jaxslam.benchmark.kernels.rivals import ceres as ceres_window  # noqa: PLC0415 - a development tool
 
         adjuster, model = ceres_window.ceres_problem(window, _NUM_FIXED)
         return partial(ceres_window.solve, adjuster, _STEPS), model  # on whose memory Ceres works
@@ -57,7 +57,7 @@ def _optimise(num_keyframes: int, elimination: Elimination) -> Problem:
 
     @cache
     def prepare() -> tuple[Any, ...]:
-        from jaxslam.benchmark.kernels import gtsam_graph  # noqa: PLC0415
+        from jaxslam.benchmark.kernels.rivals import gtsam as gtsam_graph  # noqa: PLC0415 - a development tool
 
         return gtsam_graph.solve, *gtsam_graph.gtsam_problem(graph)
 

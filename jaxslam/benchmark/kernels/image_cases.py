@@ -7,13 +7,13 @@ import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxslam_kernels.corners import Corners, corner_score, grid_corners
-from jaxslam_kernels.image import build_pyramid
-from jaxslam_kernels.lk_flow import lk_flow
+from jaxslam_kernels.flow.lk_flow import lk_flow
+from jaxslam_kernels.image.corners import Corners, corner_score, grid_corners
+from jaxslam_kernels.image.pyramid import build_pyramid
 
 from jaxslam.benchmark.kernels.case import Case, Problem
-from jaxslam.benchmark.kernels.known_warps import corners, picture, warp
-from jaxslam.benchmark.opencv_flow import LEVELS, WINDOW_PX, opencv_flow
+from jaxslam.benchmark.kernels.scenes.image_warps import corners, picture, warp
+from jaxslam.benchmark.reference_flow import LEVELS, WINDOW_PX, opencv_flow
 
 _BORDER, _CELLS_A_ROW = 16, 32
 _BATCH_POINTS, _SHIFT_PX = 256, 10.0

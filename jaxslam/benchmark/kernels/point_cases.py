@@ -8,9 +8,9 @@ import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxslam_kernels.alignment import ate
-from jaxslam_kernels.dbscan import dbscan
-from jaxslam_kernels.kmeans import kmeans
+from jaxslam_kernels.clustering.dbscan import dbscan
+from jaxslam_kernels.clustering.kmeans import kmeans
+from jaxslam_kernels.trajectory.alignment import ate
 from scipy.spatial.transform import Rotation
 
 from jaxslam.benchmark.kernels.case import Case, Problem

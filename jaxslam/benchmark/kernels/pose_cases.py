@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxlie import SE3
-from jaxslam_kernels.pnp import ransac_pnp
-from jaxslam_kernels.pose_refine import refine_pose
+from jaxslam_kernels.pose.pnp import ransac_pnp
+from jaxslam_kernels.pose.pose_refine import refine_pose
 from scipy.spatial.transform import Rotation
 
 from jaxslam.benchmark.kernels.case import Case, Problem
-from jaxslam.benchmark.kernels.posed_scene import DISTORTION, MATRIX, Scene, camera, make_scene
+from jaxslam.benchmark.kernels.scenes.single_view import DISTORTION, MATRIX, Scene, camera, make_scene
 
 _THRESHOLD_PX = 3.0
 _POINTS = 500

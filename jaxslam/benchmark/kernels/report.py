@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxslam.benchmark.kernels.case import Case
-from jaxslam.benchmark.report import table
-from jaxslam.visualize import png
+from jaxslam.benchmark.reports.markdown import table
+from jaxslam.visualization.plots import png
 
 COLUMNS = ("kernel", "size", "on", "ours, ms", "p95", "theirs, ms", "p95", "ratio", "difference", "compile, s")
 _COLUMNS_OF_PLOTS, _WIDTH_IN, _HEIGHT_IN, _DPI = 3, 13.0, 3.4, 110

@@ -7,10 +7,10 @@ import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxslam_kernels.fundamental import ransac_fundamental
+from jaxslam_kernels.two_view.fundamental import ransac_fundamental
 
 from jaxslam.benchmark.kernels.case import Case, Problem
-from jaxslam.benchmark.kernels.two_views import TwoViewScene, make_two_views
+from jaxslam.benchmark.kernels.scenes.two_views import TwoViewScene, make_two_views
 
 OPENCV_PX, CONFIDENCE = 1.0, 0.99
 SAME_BAND_PX = OPENCV_PX * math.sqrt(0.5)

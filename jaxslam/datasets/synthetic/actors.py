@@ -11,11 +11,11 @@ import numpy as np
 
 from jaxslam.datasets.synthetic.body import TRUNK, below, body, bone
 from jaxslam.datasets.synthetic.crate import Crate
-from jaxslam.datasets.synthetic.parked import ParkedBox
-from jaxslam.datasets.synthetic.rigid import transform
-from jaxslam.datasets.synthetic.seated import SeatedPerson
-from jaxslam.datasets.synthetic.solids import Solid
-from jaxslam.rotation import axis_rotation
+from jaxslam.datasets.synthetic.homogeneous import transform
+from jaxslam.datasets.synthetic.parked_boxes import ParkedBox
+from jaxslam.datasets.synthetic.primitives import Solid
+from jaxslam.datasets.synthetic.seated_people import SeatedPerson
+from jaxslam.geometry.so3 import axis_rotation
 
 
 class Actor(Protocol):

@@ -5,10 +5,10 @@ Axes of a person: x forward, y to the left, z up, origin on the floor under the 
 
 import numpy as np
 
-from jaxslam.datasets.synthetic.rigid import transform
-from jaxslam.datasets.synthetic.solids import Solid, capsule, pill
+from jaxslam.datasets.synthetic.homogeneous import transform
+from jaxslam.datasets.synthetic.primitives import Solid, capsule, pill
 from jaxslam.datasets.synthetic.texture import Material
-from jaxslam.rotation import axis_rotation, matrices
+from jaxslam.geometry.so3 import axis_rotation, matrices
 
 _SKIN = Material((0.72, 0.50, 0.38), (0.85, 0.64, 0.52), noise_per_m=9.0, noise=0.35)
 _HAIR = Material((0.10, 0.07, 0.05), (0.26, 0.18, 0.12), noise_per_m=20.0, stretch=4.0, noise=0.8)

@@ -9,9 +9,9 @@ from typing import TypeAlias, get_args
 
 import numpy as np
 
-from jaxslam.camera_path_kind import CameraPathKind
+from jaxslam.datasets.synthetic.camera_path_kind import CameraPathKind
 from jaxslam.errors import ConfigError, nearest
-from jaxslam.rotation import axis_rotation, multiply
+from jaxslam.geometry.so3 import axis_rotation, multiply
 
 CAMERA_PATHS: tuple[str, ...] = get_args(CameraPathKind)
 LOOP_SECONDS = 32.0

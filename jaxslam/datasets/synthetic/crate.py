@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxslam.datasets.synthetic.solids import Solid, box
+from jaxslam.datasets.synthetic.primitives import Solid, box
 from jaxslam.datasets.synthetic.texture import Material
 
 Color = tuple[float, float, float]

@@ -8,19 +8,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.camera import Camera
-from jaxslam.checked import Checked, Range
-from jaxslam.datasets.synthetic import rigid
+from jaxslam.config.validation import Checked, Range
+from jaxslam.datasets.synthetic import homogeneous as rigid
 from jaxslam.datasets.synthetic.actors import cast
 from jaxslam.datasets.synthetic.camera_path import CameraPathKind, camera_path
-from jaxslam.datasets.synthetic.parked import MOST_PARKED
+from jaxslam.datasets.synthetic.parked_boxes import MOST_PARKED
 from jaxslam.datasets.synthetic.render import Rendering, View, pack_scene, render
-from jaxslam.datasets.synthetic.scene import furnish
-from jaxslam.datasets.synthetic.seated import MOST_SEATED, chairs
-from jaxslam.datasets.synthetic.sensor import SensorConfig, measure, sensor_params
+from jaxslam.datasets.synthetic.room import furnish
+from jaxslam.datasets.synthetic.seated_people import MOST_SEATED, chairs
+from jaxslam.datasets.synthetic.sensor_noise import SensorConfig, measure, sensor_params
 from jaxslam.errors import ConfigError
-from jaxslam.frame import Frame
-from jaxslam.trajectory import Trajectory
+from jaxslam.sensors.camera import Camera
+from jaxslam.sensors.frame import Frame
+from jaxslam.trajectory.trajectory import Trajectory
 
 DEPTH_COUNTS_PER_M = 5000.0
 """Of depth images in files, as in TUM RGB-D."""

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt
 
+from jaxslam.datasets.synthetic.primitives import Solid
 from jaxslam.datasets.synthetic.raycast import (
     TILE_HEIGHT,
     TILE_WIDTH,
@@ -23,10 +24,9 @@ from jaxslam.datasets.synthetic.raycast import (
     unpack,
 )
 from jaxslam.datasets.synthetic.shading import SUN, Hits, shade
-from jaxslam.datasets.synthetic.solids import Solid
 from jaxslam.datasets.synthetic.texture import N_WORDS
-from jaxslam.trace_cache import traced_once
-from jaxslam.xla import MUCH_COMPUTED
+from jaxslam.runtime.compile_cache import MUCH_COMPUTED
+from jaxslam.runtime.trace_cache import traced_once
 
 _CAPACITY_STEP = 64
 

@@ -5,10 +5,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from jaxslam.semantics.choose import Candidates, Wanted, choose
 from jaxslam.semantics.detections import Detections
-from jaxslam.semantics.graph import Colours, Graph, ImageInput
-from jaxslam.semantics.placement import Fit, Placement, boxes_to_image, place
+from jaxslam.semantics.letterbox import Fit, Placement, boxes_to_image, place
+from jaxslam.semantics.onnx_signature import Colours, Graph, ImageInput
+from jaxslam.semantics.postprocess import Candidates, Wanted, choose
 
 
 class Adapter(ABC):

@@ -6,11 +6,11 @@ import numpy as np
 
 from jaxslam.errors import ModelError
 from jaxslam.semantics.adapters.base import Adapter
-from jaxslam.semantics.choose import Wanted
 from jaxslam.semantics.class_names import VOC, pixel_names
 from jaxslam.semantics.detections import Detections, no_detections
-from jaxslam.semantics.graph import Colours, Graph, ImageInput, Port
-from jaxslam.semantics.placement import Fit, Placement, plane_to_image
+from jaxslam.semantics.letterbox import Fit, Placement, plane_to_image
+from jaxslam.semantics.onnx_signature import Colours, Graph, ImageInput, Port
+from jaxslam.semantics.postprocess import Wanted
 
 _IGNORED = 255  # VOC's and Cityscapes' number for what is no class
 _MOST_COARSE = 32  # pixels of the input for one of the map

@@ -9,11 +9,11 @@ from typing import ClassVar
 
 import numpy as np
 
+from jaxslam.semantics.adapters.anchor_grid import corners, grid
 from jaxslam.semantics.adapters.base import BoxAdapter
-from jaxslam.semantics.adapters.grid import corners, grid
-from jaxslam.semantics.choose import Candidates, Wanted, best_rows, probabilities
 from jaxslam.semantics.class_names import box_names
-from jaxslam.semantics.graph import Colours, Graph, ImageInput
+from jaxslam.semantics.onnx_signature import Colours, Graph, ImageInput
+from jaxslam.semantics.postprocess import Candidates, Wanted, best_rows, probabilities
 
 STRIDE = 16
 _OBJECT_POWER, _CLASS_POWER = 0.6, 0.4

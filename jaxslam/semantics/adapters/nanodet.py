@@ -9,12 +9,12 @@ from typing import ClassVar
 
 import numpy as np
 
+from jaxslam.semantics.adapters.anchor_grid import grid, map_sizes, num_cells
 from jaxslam.semantics.adapters.base import BoxAdapter
-from jaxslam.semantics.adapters.grid import grid, map_sizes, num_cells
-from jaxslam.semantics.choose import Candidates, Wanted, best_rows, probabilities
 from jaxslam.semantics.class_names import box_names
-from jaxslam.semantics.graph import Colours, Graph, ImageInput, Port
-from jaxslam.semantics.placement import Fit
+from jaxslam.semantics.letterbox import Fit
+from jaxslam.semantics.onnx_signature import Colours, Graph, ImageInput, Port
+from jaxslam.semantics.postprocess import Candidates, Wanted, best_rows, probabilities
 
 STRIDES = (8, 16, 32)
 PLUS_STRIDES = (8, 16, 32, 64)

@@ -18,9 +18,9 @@ import numpy as np
 
 from jaxslam.errors import ModelError
 from jaxslam.semantics.adapters.base import BoxAdapter
-from jaxslam.semantics.choose import Candidates, Wanted, probabilities
 from jaxslam.semantics.class_names import COCO_IDS
-from jaxslam.semantics.graph import Colours, Graph, ImageInput, Port
+from jaxslam.semantics.onnx_signature import Colours, Graph, ImageInput, Port
+from jaxslam.semantics.postprocess import Candidates, Wanted, probabilities
 
 
 class _Family(NamedTuple):

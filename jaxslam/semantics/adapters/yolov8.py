@@ -7,13 +7,13 @@ from typing import ClassVar
 
 import numpy as np
 
+from jaxslam.semantics.adapters.anchor_grid import corners, num_cells
 from jaxslam.semantics.adapters.base import Adapter, BoxAdapter, found
-from jaxslam.semantics.adapters.grid import corners, num_cells
-from jaxslam.semantics.choose import Candidates, Wanted, best_rows, choose, probabilities
 from jaxslam.semantics.class_names import box_names
 from jaxslam.semantics.detections import Detections
-from jaxslam.semantics.graph import Colours, Graph, ImageInput, Port
-from jaxslam.semantics.placement import Fit, Placement, boxes_to_image, plane_to_image
+from jaxslam.semantics.letterbox import Fit, Placement, boxes_to_image, plane_to_image
+from jaxslam.semantics.onnx_signature import Colours, Graph, ImageInput, Port
+from jaxslam.semantics.postprocess import Candidates, Wanted, best_rows, choose, probabilities
 
 STRIDES = (8, 16, 32)
 _COLOURS = Colours(std=(255.0, 255.0, 255.0))

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float32, Int
 
 from jaxslam.errors import ModelError
-from jaxslam.semantics.graph import Colours, Graph, ImageInput, Port
-from jaxslam.semantics.placement import Fit, Placement, place
+from jaxslam.semantics.letterbox import Fit, Placement, place
+from jaxslam.semantics.onnx_signature import Colours, Graph, ImageInput, Port
 from jaxslam.semantics.prompted.prompt import NO_POINT
 
 IMAGENET = Colours(mean=(123.675, 116.28, 103.53), std=(58.395, 57.12, 57.375))

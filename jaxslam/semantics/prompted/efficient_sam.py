@@ -8,8 +8,8 @@ from typing import ClassVar
 import cv2
 import numpy as np
 
-from jaxslam.semantics.graph import Colours, Graph
-from jaxslam.semantics.placement import Placement
+from jaxslam.semantics.letterbox import Placement
+from jaxslam.semantics.onnx_signature import Colours, Graph
 from jaxslam.semantics.prompted.base import Arrays, Kinds, Points, PromptAdapter
 
 _PATCH = 16  # pixels of what the network sees for one of its embedding

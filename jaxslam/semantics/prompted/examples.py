@@ -23,12 +23,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from jaxslam.checked import checked_value
-from jaxslam.datasets.image_file import read_color, read_grey
+from jaxslam.config.validation import checked_value
 from jaxslam.errors import ConfigError
+from jaxslam.io.yaml_files import check_keys, read_mapping
 from jaxslam.semantics.prompted.prompt import Prompt, prompt
 from jaxslam.semantics.prompted.segmenter import PromptSegmenter
-from jaxslam.yaml_file import check_keys, read_mapping
+from jaxslam.sensors.image_files import read_color, read_grey
 
 _KEYS = ("label", "image", "mask", "boxes", "points", "not_points")
 _MASK = "_mask"

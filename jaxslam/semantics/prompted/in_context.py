@@ -20,12 +20,12 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from jaxslam.errors import ConfigError, ModelError
-from jaxslam.semantics.choose import MAX_KEPT
 from jaxslam.semantics.detections import Detections
 from jaxslam.semantics.detector import check_image, check_share, check_threads
-from jaxslam.semantics.graph import Graph, ImageInput, Port
-from jaxslam.semantics.network import Network
-from jaxslam.semantics.placement import Placement, place, plane_to_image
+from jaxslam.semantics.letterbox import Placement, place, plane_to_image
+from jaxslam.semantics.onnx_session import Network
+from jaxslam.semantics.onnx_signature import Graph, ImageInput, Port
+from jaxslam.semantics.postprocess import MAX_KEPT
 from jaxslam.semantics.prompted.base import IMAGENET
 from jaxslam.semantics.prompted.detector import boxes_of
 from jaxslam.semantics.prompted.examples import Example

@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from jaxslam.semantics.placement import Fit, Placement
+from jaxslam.semantics.letterbox import Fit, Placement
 from jaxslam.semantics.prompted.base import Arrays, Kinds, Points, PromptAdapter, in_input
 from jaxslam.semantics.prompted.prompt import NO_POINT, TOP_LEFT
 

@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float32, UInt8
 
 from jaxslam.errors import ModelError, nearest
 from jaxslam.semantics.detector import check_image, check_threads
-from jaxslam.semantics.network import Network, check_outputs
-from jaxslam.semantics.placement import Placement, plane_to_image
+from jaxslam.semantics.letterbox import Placement, plane_to_image
+from jaxslam.semantics.onnx_session import Network, check_outputs
 from jaxslam.semantics.prompted.base import Planes, PromptAdapter
 from jaxslam.semantics.prompted.efficient_sam import EfficientSam
 from jaxslam.semantics.prompted.prompt import Prompt, prompt

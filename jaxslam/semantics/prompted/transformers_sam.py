@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from jaxslam.semantics.placement import Placement
+from jaxslam.semantics.letterbox import Placement
 from jaxslam.semantics.prompted.base import Arrays, Kinds, Points, PromptAdapter, in_input
 from jaxslam.semantics.prompted.prompt import BOTTOM_RIGHT, ON, TOP_LEFT
 

@@ -1,0 +1,1 @@
+"""Reports of benchmarks as Markdown and HTML, with plots."""

@@ -1,0 +1,321 @@
+"""What a suite has shown, as Markdown; and the tables of which the HTML page is made too."""
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+from jaxslam.benchmark.suites.aggregate import (
+    ACCURACY,
+    RUNNING,
+    Column,
+    by_sequence,
+    cell,
+    columns_of,
+    rows_of,
+    with_shown_labels,
+)
+from jaxslam.benchmark.suites.published import load_published
+from jaxslam.benchmark.suites.published_comparison import (
+    ATE,
+    METRICS,
+    VERDICTS,
+    PublishedMetric,
+    best_of_systems,
+    clip_of,
+    counted,
+    kitti_means,
+    length_is_known,
+    published_of,
+    reservations,
+    verdict_on,
+)
+from jaxslam.benchmark.suites.suite import Suite
+
+_INLINE = (
+    " In deterministic runs mapping and the detector are done within the frame, which takes so much longer; with"
+    " `--set run.deterministic=false` they have threads of their own."
+)
+_MARK = "*"
+"""Behind an error that may not be compared with published ones."""
+
+
+def markdown_report(suite: Suite, results: Sequence[Mapping[str, Any]], missing: Mapping[str, str]) -> str:
+    """The report of a suite.
+
+    Args:
+        suite: What was run.
+        results: Of every planned run, as `Collected.every` gives them.
+        missing: Names of what was not run, with the reason.
+    """
+    results = with_shown_labels(results)
+    rows = rows_of(results)
+    parts = [f"# {suite.name}\n", f"{suite.about}\n" if suite.about else ""]
+    parts.append(_markdown(overview_table(suite, rows)))
+    parts += [f"- {line}\n" for line in (*summary_lines(suite, rows), *warnings(suite, results))]
+    parts.append(_markdown(kitti_means(suite, rows)))
+    for sequence, of_it in by_sequence(rows).items():
+        parts.append(f"## {sequence}\n")
+        tables = (figure_table(of_it, ACCURACY), figure_table(of_it, RUNNING))
+        parts += [_markdown(found) for found in (*tables, *published_tables(suite, sequence, of_it))]
+        parts += [f"- {line}\n" for line in failures(of_it)]
+    if missing:
+        parts.append("## Not run\n")
+        parts += [f"- {name}: {why}\n" for name, why in missing.items()]
+    known = protocols(suite, rows)
+    if known:
+        parts += ["## How published figures came about\n", *(f"- {line}\n" for line in known)]
+    parts.append(how(results))
+    return "\n".join(part for part in parts if part)
+
+
+def overview_table(suite: Suite, rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """Median ATE of every label on every sequence beside the best published one; headings first.
+
+    Frames, and the least shares tracked and poses matched, are those of all runs of the sequence.
+    """
+    labels = list(dict.fromkeys(row["label"] for row in rows))
+    lines = [["ATE, m", *labels, "best published", "of", "frames", "tracked, %", "matched poses", "runs done"]]
+    for sequence, of_it in by_sequence(rows).items():
+        by_label = {row["label"]: row for row in of_it}
+        ours = [_ate(suite, by_label[label]) if label in by_label else "-" for label in labels]
+        best = best_of_systems(published_of(suite, sequence))[:1]
+        theirs = (f"{best[0].value:g}", best[0].system) if best else ("-", "-")
+        runs = f"{sum(row['done'] for row in of_it)} of {sum(row['runs'] for row in of_it)}"
+        least = (_least(of_it, "frames", 0), _least(of_it, "tracked_percent", 1), _least(of_it, "num_matched", 0))
+        lines.append([sequence, *ours, *theirs, *least, runs])
+    return lines if rows else []
+
+
+def summary_lines(suite: Suite, rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """How each label stands against what has been published, wins and losses."""
+    lines = []
+    for label in dict.fromkeys(row["label"] for row in rows):
+        best, every = counted(suite, [row for row in rows if row["label"] == label])
+        if every:
+            lines.append(
+                f"{label}: against the best published figures {_counts(best)}; against all systems {_counts(every)}"
+            )
+    return lines
+
+
+def warnings(suite: Suite, results: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Everything to know before the figures are believed, a line each."""
+    rows = rows_of(results)
+    return [
+        *progress_lines(results),
+        *reservation_lines(suite, rows),
+        *unevaluated_lines(rows),
+        *note_lines(rows),
+        *without_network(results),
+        *mixture_lines(results),
+    ]
+
+
+def progress_lines(results: Sequence[Mapping[str, Any]]) -> list[str]:
+    """How many of the planned runs are done, unless all are."""
+    statuses = Counter(result["status"] for result in results)
+    if statuses["done"] == len(results):
+        return []
+    failed = f", {statuses['failed']} failed" if statuses["failed"] else ""
+    left = f", {statuses['not run']} not made yet: --resume goes on with them" if statuses["not run"] else ""
+    return [f"{statuses['done']} of {len(results)} planned runs are done{failed}{left}"]
+
+
+def reservation_lines(suite: Suite, rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Why rows with published figures get no verdict, or what is not known about it."""
+    of_rows = [(row, reservations(suite, row)) for row in rows if published_of(suite, row["sequence"])]
+    reasons = [(row, ["; ".join(found)]) for row, found in of_rows if found]
+    lines = [f"no verdict for {of_it}: {reason}" for reason, of_it in _grouped(reasons)]
+    judged = [row for row, found in of_rows if not found and row["ate_rmse_m"] is not None]
+    unknown = [row["sequence"] for row in judged if not _length_known(suite, row)]
+    if unknown:
+        names = ", ".join(dict.fromkeys(unknown))
+        lines.append(f"{names}: the published length is not known; whether all of it was run is judged by ground truth")
+    return lines
+
+
+def unevaluated_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Why runs that are done have no ATE, a line a reason."""
+    of_rows = [(row, row["unevaluated"]) for row in rows]
+    return [f"no ATE of {of_it}: {reason}" for reason, of_it in _grouped(of_rows, _part_of_runs)]
+
+
+def note_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Reservations of the evaluations about their figures, each once, with what it holds for."""
+    return [f"note on {of_it}: {note}" for note, of_it in _grouped([(row, row["notes"]) for row in rows])]
+
+
+def mixture_lines(results: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What differs between runs of several calls: jaxslam, the data of a sequence, or the networks of a label."""
+    done = [result for result in results if result["status"] == "done"]
+    lines = []
+    if len({result.get("sources_sha256") for result in done}) > 1:
+        lines.append("runs of several versions of jaxslam stand beside each other: " + "; ".join(_versions(done)))
+    for sequence, of_it in by_sequence(done).items():
+        if len({result.get("data_sha256") for result in of_it}) > 1:
+            lines.append(f"{sequence}: its runs are of different recordings")
+    for label in dict.fromkeys(result["label"] for result in done):
+        networks = [result["networks_sha256"] for result in done if result["label"] == label]
+        if any(of_run != networks[0] for of_run in networks):
+            lines.append(f"{label}: its runs are of different networks")
+    return lines
+
+
+def without_network(results: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Runs in which no network looked at frames, a line a reason."""
+    lacking: dict[str, list[str]] = {}
+    for result in results:
+        if result["status"] == "done" and (why := result.get("without_network")) is not None:
+            lacking.setdefault(why, []).append(result["label"])
+    return [f"{', '.join(dict.fromkeys(labels))}: without a network ({why})" for why, labels in lacking.items()]
+
+
+def figure_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]) -> list[list[str]]:
+    """Figures of the rows of one sequence, those that there are; headings first."""
+    shown = columns_of(rows, columns)
+    lines = [["preset", "runs", *(column.heading for column in shown)]]
+    return lines + [
+        [row["label"], f"{row['done']} of {row['runs']}", *(cell(row, column) for column in shown)] for row in rows
+    ]
+
+
+def published_tables(suite: Suite, sequence: str, rows: Sequence[Mapping[str, Any]]) -> list[list[list[str]]]:
+    """What has been published about a sequence, a table for each of `METRICS` that papers have.
+
+    Args:
+        suite: What was run.
+        sequence: Its name in the suite; of a part of a recording nothing has been published.
+        rows: Those of `rows_of` that are of the sequence.
+    """
+    found = [published_table(suite, sequence, rows, metric) for metric in METRICS]
+    return [lines for lines in found if lines]
+
+
+def published_table(
+    suite: Suite, sequence: str, rows: Sequence[Mapping[str, Any]], metric: PublishedMetric = ATE
+) -> list[list[str]]:
+    """What has been published about a sequence, best first, and how each of our rows compares; headings first.
+
+    Args:
+        suite: What was run.
+        sequence: Its name in the suite.
+        rows: Those of `rows_of` that are of the sequence.
+        metric: Which figure.
+
+    Returns:
+        Lines of as many texts; none if nothing has been published.
+    """
+    figures = published_of(suite, sequence, metric.figure)
+    fit = [row for row in rows if row[metric.figure] is not None and not row["lacks_network"]]
+    ours = [(row, reservations(suite, row)) for row in fit]
+    beside = [f"{row['label']} is" for row, _ in ours]
+    lines = [[f"published {metric.name}", metric.unit, *beside, "aligned", "source", "note"]]
+    for figure in figures:
+        name = figure.system if figure.variant is None else f"{figure.system}, {figure.variant}"
+        stated = figure.alignment if figure.alignment_stated else f"{figure.alignment}, not stated"
+        whose = figure.source if figure.reported_by is None else f"{figure.source} of {figure.reported_by}"
+        verdicts = (verdict_on(row, metric.figure, figure.value, reasons) for row, reasons in ours)
+        lines.append([name, f"{figure.value:g}", *verdicts, stated, whose, figure.note])
+    return lines if figures and (ours or not any(row["lacks_network"] for row in rows)) else []
+
+
+def protocols(suite: Suite, rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Of every paper whose figures stand beside ours: which frames, and what was taken of how many runs."""
+    sequences = by_sequence(rows)
+    figures = [f for name in sequences for metric in METRICS for f in published_of(suite, name, metric.figure)]
+    names = {name for figure in figures for name in (figure.reported_by or figure.system).split(", ")}
+    names |= {line[1] for line in kitti_means(suite, rows)[1:]}
+    return [
+        f"{paper.name} ({paper.authors}; {paper.venue}{'' if paper.year is None else f', {paper.year}'}):"
+        f" {paper.protocol} {paper.link or ''}".rstrip()
+        for paper in load_published()
+        if paper.name in names
+    ]
+
+
+def failures(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Runs that failed, a line a row."""
+    for row in rows:
+        if row["failed"]:
+            yield f"{row['label']}: {row['failed']} runs failed: {'; '.join(row['problems'])}"
+
+
+def table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table in Markdown."""
+    lines = (columns, ["---"] * len(columns), *rows)
+    return "".join(f"| {' | '.join(text.replace('|', chr(92) + '|') for text in line)} |\n" for line in lines)
+
+
+def how(results: Sequence[Mapping[str, Any]]) -> str:
+    """On what the runs were made, and what the figures mean."""
+    done = [result for result in results if result["status"] == "done"]
+    if not done:
+        return "No run was finished.\n"
+    machines = sorted({f"{result['cpu']}, {result['cores']} cores" for result in done})
+    modes = sorted({_mode(result) for result in done})
+    return (
+        f"Figures are medians of the runs, those of frames, tracked and matched poses the least of them. ATE: RMSE over"
+        f" the poses matched with ground truth, after SE(3) alignment; `{_MARK}` behind it: not of all planned runs, or"
+        f" not of the whole recording. `better` than a published figure if all runs are, `in range` if it lies between"
+        f" them, however far apart they are; no verdict without all planned runs, the whole recording, and 95 % of its"
+        f" frames tracked. A system of several figures counts once, with its best. RPE: over 1 s."
+        f" First loss: the earliest of the runs; memory: the most. LK: OpenCV's optical flow of 1000 points in one"
+        f" thread, on the same machine."
+        f"{_INLINE if any(result['deterministic'] for result in done) else ''}"
+        f" Runs: {'; '.join(modes)}. Machine: {'; '.join(machines)}. jaxslam: {', '.join(_versions(done))}.\n"
+    )
+
+
+def _markdown(lines: Sequence[Sequence[str]]) -> str:
+    return table(lines[0], lines[1:]) if lines else ""
+
+
+def _counts(verdicts: Mapping[str, int]) -> str:
+    found = [f"{verdicts.get(name, 0)} {name}" for name in VERDICTS]
+    without = sum(verdicts.values()) - sum(verdicts.get(name, 0) for name in VERDICTS)
+    return ", ".join([*found, f"{without} without a verdict"] if without else found)
+
+
+def _ate(suite: Suite, row: Mapping[str, Any]) -> str:
+    if row["ate_rmse_m"] is None:
+        return "-"
+    return f"{row['ate_rmse_m']['median']:.4f}" + (_MARK if reservations(suite, row) else "")
+
+
+def _least(rows: Sequence[Mapping[str, Any]], figure: str, digits: int) -> str:
+    found = [row[figure]["least"] for row in rows if row[figure] is not None]
+    return f"{min(found):.{digits}f}" if found else "-"
+
+
+def _length_known(suite: Suite, row: Mapping[str, Any]) -> bool:
+    clip = clip_of(suite, row["sequence"])
+    return clip is None or length_is_known(clip.recording)
+
+
+def _grouped(
+    of_rows: Sequence[tuple[Mapping[str, Any], Iterable[str]]],
+    about: Callable[[Mapping[str, Any], str], str] = lambda row, text: row["label"],
+) -> list[tuple[str, str]]:
+    """Each text once, with the sequences and labels it is said of: `crowd (static, default); crowd2 (static)`."""
+    groups: dict[str, dict[str, list[str]]] = {}
+    for row, texts in of_rows:
+        for text in texts:
+            groups.setdefault(text, {}).setdefault(row["sequence"], []).append(about(row, text))
+    return [
+        (text, "; ".join(f"{sequence} ({', '.join(labels)})" for sequence, labels in of_it.items()))
+        for text, of_it in groups.items()
+    ]
+
+
+def _part_of_runs(row: Mapping[str, Any], reason: str) -> str:
+    return f"{row['label']}, {row['unevaluated'][reason]} of {row['done']} runs"
+
+
+def _versions(done: Sequence[Mapping[str, Any]]) -> list[str]:
+    return sorted({result["commit"] or result["versions"]["jaxslam"] for result in done})
+
+
+def _mode(result: Mapping[str, Any]) -> str:
+    if result["realtime"]:
+        return "at the rate of the recording, late frames dropped"
+    return "deterministic, all frames" if result["deterministic"] else "all frames, each module in its thread"

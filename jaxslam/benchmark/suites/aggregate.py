@@ -1,0 +1,165 @@
+"""What the runs of a sequence have in common: a row of a table."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxslam.benchmark.suites.run_names import run_folder
+
+
+class Column(NamedTuple):
+    """A column of figures.
+
+    Attributes:
+        heading: What stands above it.
+        figure: Name of the figure in `figures_of`.
+        digits: Decimals.
+        which: `median`, `least` or `most` of the runs, or `range` for the last two.
+    """
+
+    heading: str
+    figure: str
+    digits: int
+    which: str = "median"
+
+
+ACCURACY = (
+    Column("frames", "frames", 0, "least"),
+    Column("tracked, %", "tracked_percent", 1, "least"),
+    Column("matched poses", "num_matched", 0, "least"),
+    Column("ATE, m", "ate_rmse_m", 4),
+    Column("from - to", "ate_rmse_m", 4, "range"),
+    Column("ATE Sim(3), m", "ate_sim3_rmse_m", 4),
+    Column("RPE, m/s", "rpe_trans_m_per_s", 4),
+    Column("RPE, deg/s", "rpe_rot_deg_per_s", 3),
+    Column("RPE, m/frame", "rpe_trans_m_per_frame", 5),
+    Column("RPE, deg/frame", "rpe_rot_deg_per_frame", 4),
+    Column("t_rel, %", "kitti_trans_percent", 3),
+    Column("r_rel, deg/100 m", "kitti_rot_deg_per_100m", 3),
+)
+"""How good trajectories are; those of KITTI only where a path is long enough."""
+RUNNING = (
+    Column("dropped, %", "dropped_percent", 1),
+    Column("first loss, s", "first_loss_s", 2, "least"),
+    Column("found again", "relocalised", 0),
+    Column("mask age, frames", "mask_age_median", 0),
+    Column("ms", "track_ms_median", 1),
+    Column("p95, ms", "track_ms_p95", 1),
+    Column("max, ms", "track_ms_max", 1),
+    Column("time / LK", "flow_ratio_median", 2),
+    Column("p95 / LK", "flow_ratio_p95", 2),
+    Column("max / LK", "flow_ratio_max", 2),
+    Column("memory, MB", "peak_rss_mb", 0, "most"),
+)
+"""How they came about."""
+COVERAGE = ("images", "tracked_of_all_percent", "matched_percent", "span_percent")
+"""What else decides whether figures may be compared with published ones: images of the whole recording, and shares of
+the frames, dropped ones too, that were tracked, and that were matched with ground truth; and of its time."""
+_FIGURES = (*(column.figure for column in (*ACCURACY, *RUNNING)), *COVERAGE)
+
+
+def row_name(sequence: str, label: str) -> str:
+    """What a row is called."""
+    return f"{sequence}, {label}"
+
+
+def rows_of(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Results by sequence and label: how many runs were planned, and the figures of those that are done.
+
+    A row has `sequence`, `label`, `runs` (planned), `done`, `failed`, `problems` of those that failed, `unevaluated`
+    (why runs that are done have no ATE, with how many), `notes` of the evaluations, `lacks_network` (whether they went
+    without the network that their preset needs), and by the name of each figure its `median`, `least` and `most`, or
+    `None`.
+    """
+    groups: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
+    for result in results:
+        groups.setdefault((result["sequence"], result["label"]), []).append(result)
+    return [_row(sequence, label, group) for (sequence, label), group in groups.items()]
+
+
+def with_shown_labels(results: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Results whose label says if they went without the network that their preset needs; `folder` is as it was."""
+    return [_shown(result) for result in results]
+
+
+def shown_label(label: str, *, lacks_network: bool) -> str:
+    """A label as tables show it: with the remark that runs went without the network that their preset needs."""
+    return f"{label} (without a network)" if lacks_network else label
+
+
+def by_sequence(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
+    """Rows or results, by the name of the sequence they are of, in their order."""
+    groups: dict[str, list[Mapping[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault(row["sequence"], []).append(row)
+    return groups
+
+
+def median_run(results: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
+    """Of results of one row that are done, at least one: the run of median error, the better of two."""
+    ates = [np.inf if result["ate_rmse_m"] is None else result["ate_rmse_m"] for result in results]
+    return results[int(np.argsort(ates, kind="stable")[(len(results) - 1) // 2])]
+
+
+def figures_of(result: Mapping[str, Any]) -> dict[str, float | None]:
+    """Every figure of a run that a table may show or a verdict needs, by name."""
+    flat = {**(result["evaluation"] or {}), **result}
+    if frames := flat.get("frames"):
+        flat["tracked_of_all_percent"] = 100 * flat["tracked"] / frames
+        if (matched := flat.get("num_matched")) is not None:
+            flat["matched_percent"] = 100 * matched / frames
+    for name in ("track_ms", "mask_age_frames"):
+        short = name.removesuffix("_frames")
+        flat |= {f"{short}_{measure}": value for measure, value in (result[name] or {}).items()}
+    return {name: flat.get(name) for name in _FIGURES}
+
+
+def columns_of(rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]) -> list[Column]:
+    """The columns in which a row has a figure."""
+    return [column for column in columns if any(row[column.figure] is not None for row in rows)]
+
+
+def cell(row: Mapping[str, Any], column: Column) -> str:
+    """The text of a row in a column, `-` if no run has the figure."""
+    spread = row[column.figure]
+    if spread is None:
+        return "-"
+    which = ("least", "most") if column.which == "range" else (column.which,)
+    return " - ".join(f"{spread[name]:.{column.digits}f}" for name in which)
+
+
+def _shown(result: Mapping[str, Any]) -> Mapping[str, Any]:
+    folder = str(run_folder(result["sequence"], result["label"], result["seed"]))
+    label = shown_label(result["label"], lacks_network=bool(result.get("lacks_network")))
+    return {**result, "folder": folder, "label": label}
+
+
+def _row(sequence: str, label: str, group: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    done = [result for result in group if result["status"] == "done"]
+    failed = [result for result in group if result["status"] == "failed"]
+    figures = [figures_of(result) for result in done]
+    values = {name: [value for of_run in figures if (value := of_run[name]) is not None] for name in _FIGURES}
+    notes = (note for result in done for note in (result["evaluation"] or {}).get("notes", ()))
+    return {
+        "sequence": sequence,
+        "label": label,
+        "runs": len(group),
+        "done": len(done),
+        "failed": len(failed),
+        "problems": sorted({result["problem"] for result in failed}),
+        "unevaluated": Counter(
+            result.get("evaluation_problem") or "not evaluated" for result in done if result["ate_rmse_m"] is None
+        ),
+        "notes": list(dict.fromkeys(notes)),
+        "lacks_network": any(result.get("lacks_network") for result in done),
+        **{name: _spread(of_it) for name, of_it in values.items()},
+    }
+
+
+def _spread(values: Sequence[float]) -> dict[str, float] | None:
+    """Median and range."""
+    if not values:
+        return None
+    return {"median": float(np.median(values)), "least": float(min(values)), "most": float(max(values))}

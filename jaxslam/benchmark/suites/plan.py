@@ -1,0 +1,195 @@
+"""The runs that a suite and a command line come to, and what the command line changes about the suite."""
+
+import dataclasses
+import hashlib
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from jaxslam.benchmark.suites.job import Job
+from jaxslam.benchmark.suites.run_names import flattened
+from jaxslam.benchmark.suites.suite import Sequence as Clip
+from jaxslam.benchmark.suites.suite import Suite
+from jaxslam.datasets.catalog import known_recordings
+from jaxslam.errors import BenchmarkError
+
+_OPENING, _CLOSING, _QUOTES = "([{", ")]}", "'\""
+
+
+def plan(
+    suite: Suite, *, presets: Sequence[str] = (), runs: int | None = None, settings: Sequence[str] = ()
+) -> list[Job]:
+    """All runs of a suite.
+
+    Args:
+        suite: What is run.
+        presets: Instead of its own, if there are any.
+        runs: How often each, instead of as often as the suite and its sequences say.
+        settings: `key=value` each, applied last: they beat those of the suite and of its variants.
+    """
+    variants = suite.variants or {"": ()}
+    return [
+        # Without `runs`: a run is the same run, however many others there are.
+        Job(replace(clip, runs=None), preset, variant, (*suite.settings, *of_variant, *settings), seed)
+        for clip in suite.sequences
+        for preset in dict.fromkeys(presets or suite.presets)
+        for variant, of_variant in variants.items()
+        for seed in range(runs or clip.runs or suite.runs)
+    ]
+
+
+def missing(suite: Suite, found: Collection[str]) -> dict[str, str]:
+    """Recordings that are not there, by name, and how to get them.
+
+    Args:
+        suite: What is run.
+        found: Names of the recordings that are there.
+    """
+    names = [clip.recording for clip in suite.sequences if clip.recording and clip.recording not in found]
+    public = known_recordings()
+    way = lambda name: f"; to get it: jaxslam data get {name}" if name in public else ", nor in `jaxslam data list`"
+    return {name: f"not there{way(name)}" for name in names}
+
+
+def swept(suite: Suite, sweeps: Iterable[str]) -> Suite:
+    """The suite with every combination of values as a variant.
+
+    Args:
+        suite: What is run.
+        sweeps: `key=v1,v2,...` each. Commas inside brackets or quotes belong to a value: `dynamics.cues=[],[a,b]` has
+            two values.
+
+    Raises:
+        BenchmarkError: If one is no such text, or two have the same key.
+    """
+    variants = dict(suite.variants) or {"": ()}
+    keys: set[str] = set()
+    for sweep in sweeps:
+        key, found, text = sweep.partition("=")
+        values = _values(text)
+        if not found or not key or not all(values):
+            raise BenchmarkError(f"--sweep: expected key=value,value,..., got '{sweep}'")
+        if key in keys:
+            raise BenchmarkError(f"--sweep: expected all values of {key} in one, got '{sweep}' besides another")
+        keys.add(key)
+        short = key.rpartition(".")[2]
+        variants = {
+            ",".join(filter(None, (name, f"{short}={value}"))): (*settings, f"{key}={value}")
+            for name, settings in variants.items()
+            for value in values
+        }
+    return replace(suite, variants=variants)
+
+
+def replaced_settings(suite: Suite, settings: Sequence[str], sweeps: Sequence[str] = ()) -> list[str]:
+    """What the command line changes about a suite's own settings, a line each.
+
+    Args:
+        suite: As its file says it, without sweeps.
+        settings: `key=value` each, of `--set`.
+        sweeps: `key=v1,v2,...` each, of `--sweep`.
+
+    Raises:
+        BenchmarkError: If a setting is given and swept too.
+    """
+    for setting in settings:
+        key = setting.partition("=")[0]
+        clash = next((sweep for sweep in sweeps if _same_place(sweep.partition("=")[0], key)), None)
+        if clash is not None:
+            raise BenchmarkError(f"--sweep: expected no setting that --set gives, got '{clash}' and '{setting}'")
+    own = [("the suite", suite.settings), *((f"variant {name}", of_it) for name, of_it in suite.variants.items())]
+    given = {setting.partition("=")[0]: setting for setting in (*settings, *sweeps)}
+    return [
+        f"{setting} from the command line replaces {old if old_key == key else f'{old_key}={old}'} of {whose}"
+        for key, setting in given.items()
+        for whose, of_it in own
+        for old_key, _, old in (text.partition("=") for text in of_it)
+        if _same_place(old_key, key) and (old_key, old) != (key, setting.partition("=")[2])
+    ]
+
+
+def fingerprint(jobs: Sequence[Job]) -> dict[str, Any]:
+    """What was planned, as plain data that a file can keep and `plan_differences` compares.
+
+    Settings are those that a suite and a command line give, not those of presets: a preset that is changed is what a
+    comparison is for. Of rooms and recordings it says what is not as `SyntheticConfig` and `Sequence` have it.
+
+    Args:
+        jobs: From `plan`, or those of some presets or sequences of it.
+
+    Returns:
+        `sequences` by name, `presets` by label with their settings, and `runs` of each; a sequence with more runs than
+        the others says how many.
+    """
+    labels = {job.label: {"preset": job.preset, "settings": list(job.settings)} for job in jobs}
+    rows = Counter((job.clip.name, job.label) for job in jobs)
+    least = min(rows.values(), default=0)
+    clips = {}
+    for job in jobs:
+        number = rows[job.clip.name, job.label]
+        clips[job.clip.name] = _plain_clip(job.clip) | ({"runs": number} if number > least else {})
+    return {"sequences": clips, "presets": labels, "runs": least}
+
+
+def plan_differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """In what two plans differ, a line each; none if they are the same.
+
+    Args:
+        before: From `fingerprint`, perhaps out of a file.
+        now: From `fingerprint`.
+    """
+    old, new = flattened(before), flattened(now)
+    return [
+        f"{key}: {_shown(old, key)}, now {_shown(new, key)}"
+        for key in dict.fromkeys((*old, *new))
+        if _shown(old, key) != _shown(new, key)
+    ]
+
+
+def _shown(leaves: Mapping[str, Any], key: str) -> str:
+    return str(leaves[key]) if key in leaves else "not there"
+
+
+def _values(text: str) -> list[str]:
+    """What commas separate, but for those inside brackets or quotes."""
+    values, depth, quote = [""], 0, ""
+    for letter in text:
+        if quote:
+            quote = "" if letter == quote else quote
+        elif letter in _QUOTES:
+            quote = letter
+        else:
+            depth += (letter in _OPENING) - (letter in _CLOSING)
+        if letter == "," and not depth and not quote:
+            values.append("")
+        else:
+            values[-1] += letter
+    return [value.strip() for value in values]
+
+
+def _same_place(first: str, second: str) -> bool:
+    """Whether two dotted keys are the same, or one is of a section that the other is in."""
+    return f"{first}.".startswith(f"{second}.") or f"{second}.".startswith(f"{first}.")
+
+
+def _plain_clip(clip: Clip) -> dict[str, Any]:
+    plain = _changed_fields(clip, Clip(clip.name, clip.recording, clip.room))
+    plain |= {"recording": clip.recording} if clip.room is None else {"room": _changed_fields(clip.room)}
+    if clip.camera is not None and Path(clip.camera).is_file():  # the same file wherever it lies
+        plain["camera"] = hashlib.sha256(Path(clip.camera).read_bytes()).hexdigest()
+    return plain
+
+
+def _changed_fields(value: Any, default: Any = None) -> dict[str, Any]:
+    """The fields of a dataclass that are not as in another, or as it is by default; nested ones likewise."""
+    other = type(value)() if default is None else default
+    found: dict[str, Any] = {}
+    for field in dataclasses.fields(value):
+        inner, usual = getattr(value, field.name), getattr(other, field.name)
+        if inner != usual:
+            nested = dataclasses.is_dataclass(inner) and dataclasses.is_dataclass(usual)
+            plain = _changed_fields(inner, usual) if nested else inner
+            found[field.name] = list(plain) if isinstance(plain, tuple) else plain
+    return found

@@ -1,0 +1,165 @@
+"""What the figures of a run depend on besides its settings: sources and libraries, recording, camera file, networks.
+
+Each result keeps it, so that a later call knows whether the run would be the same now.
+"""
+
+import functools
+import hashlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+from jaxslam.benchmark.suites.suite import Sequence as Clip
+from jaxslam.config.schema import Config, SemanticsConfig, configs_dir
+from jaxslam.datasets.catalog import find_recording
+from jaxslam.errors import BenchmarkError, ModelError
+from jaxslam.io.download import sha256_of
+from jaxslam.runtime.machine import machine
+from jaxslam.runtime.trace_cache import source_files
+from jaxslam.semantics.from_config import network_files
+
+_MOST_HASHED_BYTES = 5_000_000
+_HASHED = (".txt", ".yaml", ".csv")
+_COMPUTED_BY = ("commit", "versions")
+
+
+class Run(Protocol):
+    """A run, as far as this module needs it: `jaxslam.benchmark.suites.job.Job`."""
+
+    @property
+    def clip(self) -> Clip:
+        """What is tracked."""
+        ...
+
+    @property
+    def config(self) -> Config:
+        """Every setting of it."""
+        ...
+
+
+def identities(runs: Sequence[Run], root: Path | None) -> list[dict[str, Any]]:
+    """What the figures of runs depend on, here and now; equal for equal figures on one kind of processor.
+
+    Args:
+        runs: Whose recordings are on this machine.
+        root: Folder in which recordings are looked for first.
+
+    Returns:
+        For each: `commit` and `versions` of jaxslam and its libraries, `sources_sha256`, `data_sha256` of the
+        recording, `camera_sha256` of a camera file, and `networks_sha256`; `None` for what a run has not.
+    """
+    here = {key: value for key, value in machine().items() if key in _COMPUTED_BY}
+    sources = sources_sha256()
+    known = _Known(root)
+    found = []
+    for run in runs:
+        folder = known.folder(run.clip.recording) if run.clip.recording else None
+        found.append(
+            here
+            | {
+                "sources_sha256": sources,
+                "data_sha256": None if folder is None else known.data(folder),
+                "camera_sha256": camera_sha256(run.clip),
+                "networks_sha256": known.networks(run.config.semantics),
+            }
+        )
+    return found
+
+
+def changes(result: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """Why a run would not give these figures again, in words; empty if it would, but for what seeds and clocks do.
+
+    The sources decide, not the commit: a checkout with changes that are not committed is known by them.
+
+    Args:
+        result: Of an earlier run.
+        now: Its identity, from `identities`.
+    """
+    found = []
+    if result.get("sources_sha256") != now["sources_sha256"]:
+        before, here = (_version(each) for each in (result, now))
+        found.append(f"jaxslam was {before}, is {here}" if before != here else f"the sources of jaxslam {here} changed")
+    old = result.get("versions") or {}
+    found += [
+        f"{name} was {old.get(name)}, is {version}"
+        for name, version in now["versions"].items()
+        if name != "jaxslam" and old.get(name) != version
+    ]
+    if result.get("data_sha256") != now["data_sha256"]:
+        found.append("the recording has changed, or is another one")
+    if result.get("camera_sha256") != now["camera_sha256"]:
+        found.append("the camera file has changed")
+    had, has = result.get("networks_sha256") or {}, now["networks_sha256"]
+    for name in dict.fromkeys((*had, *has)):
+        if had.get(name) != has.get(name):
+            found.append(f"semantics.{name}: network was {_network(had, name)}, is {_network(has, name)}")
+    return found
+
+
+def sources_sha256() -> str:
+    """Hash of the sources of jaxslam and its kernels, and of the cameras that come with it.
+
+    Raises:
+        BenchmarkError: If the package is not a folder of files.
+    """
+    files = source_files()
+    if files is None:
+        raise BenchmarkError("jaxslam: expected its sources in a folder, they are not")
+    cameras = {file: file.name for file in sorted((configs_dir() / "cameras").glob("*"))}
+    digest = hashlib.sha256()
+    for file, name in (files | cameras).items():
+        digest.update(f"{name}\n".encode() + file.read_bytes())
+    return digest.hexdigest()
+
+
+def data_sha256(folder: Path) -> str:
+    """A hash of the text files of a recording, and of names and sizes of the others."""
+    digest = hashlib.sha256()
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        size = path.stat().st_size
+        digest.update(f"{path.relative_to(folder)} {size}\n".encode())
+        if path.suffix in _HASHED and size <= _MOST_HASHED_BYTES:
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def camera_sha256(clip: Clip) -> str | None:
+    """Hash of the camera file of a sequence; `None` if it names none, or a known camera."""
+    return sha256_of(Path(clip.camera)) if clip.camera is not None and Path(clip.camera).is_file() else None
+
+
+def networks_sha256(config: SemanticsConfig) -> dict[str, str | None]:
+    """Hashes of the networks of a run by the settings that name them; `None` for one that is not on this machine.
+
+    Raises:
+        ModelError: If a file is named that is not there.
+    """
+    return {setting: path and sha256_of(path) for setting, path in network_files(config).items()}
+
+
+def _networks_or_problem(config: SemanticsConfig) -> dict[str, str | None]:
+    """As `networks_sha256`; a file that is named and not there is the problem of the run, which will say so."""
+    try:
+        return networks_sha256(config)
+    except ModelError as problem:
+        return {"model": str(problem)}
+
+
+def _version(result: Mapping[str, Any]) -> str:
+    return result.get("commit") or (result.get("versions") or {}).get("jaxslam") or "of unknown version"
+
+
+def _network(hashes: Mapping[str, str | None], name: str) -> str:
+    if name not in hashes:
+        return "none"
+    return f"{hashes[name]:.12}" if hashes[name] else "not on the machine"
+
+
+class _Known:
+    """Hashes and folders that were asked for: what they are of does not change within a call of a command."""
+
+    def __init__(self, root: Path | None) -> None:
+        """With the folder in which recordings are looked for first."""
+        self.folder = functools.cache(lambda recording: find_recording(recording, root))
+        self.data = functools.cache(data_sha256)
+        self.networks = functools.cache(_networks_or_problem)

@@ -1,0 +1,172 @@
+"""The commands of `jaxslam`: the one table of their names, help texts and modules, and that of the exit codes.
+
+It imports nothing heavy: `jaxslam --help` prints from it, and only the module of the chosen command is imported.
+"""
+
+from enum import IntEnum
+from importlib import import_module
+from typing import Any, NamedTuple
+
+
+class ExitCode(IntEnum):
+    """How every command ends."""
+
+    DONE = 0
+    KNOWN_ERROR = 1
+    USAGE = 2
+    INTERRUPTED = 130
+
+    @property
+    def text(self) -> str:
+        """What the code says, in words."""
+        return _EXIT_TEXTS[self]
+
+
+_EXIT_TEXTS = {
+    ExitCode.DONE: "done",
+    ExitCode.KNOWN_ERROR: "an error, said in one line: bad input or settings, a failed run or check",
+    ExitCode.USAGE: "an unknown command or option, or a network that is not on this machine",
+    ExitCode.INTERRUPTED: "interrupted",
+}
+
+
+class Command(NamedTuple):
+    """One command.
+
+    Attributes:
+        words: What is typed after `jaxslam`.
+        place: Module and class of its options, `module:Class`, in `jaxslam.cli`; `None` if it is nothing but
+            the commands whose words begin with its own.
+        about: What it does, in one line.
+        more: More about it, for its own help.
+    """
+
+    words: tuple[str, ...]
+    place: str | None
+    about: str
+    more: str = ""
+
+    @property
+    def name(self) -> str:
+        """What is typed after `jaxslam`, as one text."""
+        return " ".join(self.words)
+
+    @property
+    def description(self) -> str:
+        """What its own help says about it."""
+        others = [f"jaxslam {command.name}: {command.about}" for command in below(self)]
+        pointer = ["These have a --help of their own:", *others] if others else []
+        return "\n\n".join(text for text in (self.about, self.more, *pointer) if text)
+
+    def options(self) -> type[Any]:
+        """The dataclass of its options, whose `main` runs it; its module is imported now.
+
+        Raises:
+            ValueError: If it has none.
+        """
+        if self.place is None:
+            raise ValueError(f"{self.name}: expected a command with options of its own")
+        module, name = self.place.split(":")
+        return getattr(import_module(f"jaxslam.cli.{module}"), name)
+
+
+COMMANDS = (
+    Command(
+        ("demo",),
+        "run:Demo",
+        "Render a room with walking people, track the camera through it, and evaluate.",
+        "Needs no data. Leaves the files of `run` in `--out`.",
+    ),
+    Command(
+        ("run",),
+        "run:Run",
+        "Track a recording and, if it has ground truth, evaluate.",
+        "The dataset kind and the cameras of TUM (fr1, fr2, fr3) and Bonn are recognised from the folder.",
+    ),
+    Command(
+        ("compare",),
+        "compare:Compare",
+        "Track a recording with several presets and put their figures into one table.",
+        "With the presets given, it is Table V of NGD-SLAM: a static world, a detector whose every mask is waited for,"
+        " masks propagated to the present, and flow between keyframes.",
+    ),
+    Command(
+        ("bench",),
+        "bench:Bench",
+        "Run a suite: recordings or rendered rooms, presets, several seeds.",
+        "Without a suite, list those there are.",
+    ),
+    Command(
+        ("bench", "accuracy"),
+        "bench_accuracy:AccuracyRuler",
+        "Compare accuracy with a frozen baseline, on real recordings and rendered rooms.",
+        "Recordings are those at hand. Ten seeds or more each with the preset `default`, in two processes, in 10 to 20"
+        " minutes. What counts is the geometric mean over recordings of the ratios of median errors, at most 1.04; no"
+        " recording above 1.15; no fewer frames tracked. In the table, 'worst' is the largest ATE of a seed over the"
+        " median, 'by chance' is where 95 % of the ratios lie if nothing but the seeds has changed, which is also what"
+        " the rounding of another CPU does, and 'equal' counts seeds whose trajectory has the very bytes of the"
+        " baseline.",
+    ),
+    Command(
+        ("bench", "batch"),
+        "bench_batch:Batch",
+        "Track 1 to 64 clips at once with `vmap`, beside a loop.",
+        "Frames a second, on the GPU where JAX has one. Nothing else should run on the machine meanwhile; some minutes."
+        " `NPROC=1` before the command holds XLA to one thread.",
+    ),
+    Command(
+        ("bench", "gate"),
+        "bench_gate:Gate",
+        "Run the suite of a baseline, and fail if errors, coverage or times are worse.",
+    ),
+    Command(
+        ("bench", "kernels"),
+        "bench_kernels:Kernels",
+        "Measure each kernel beside OpenCV, SciPy, Ceres, gtsam or scikit-learn.",
+        "Over sizes; on a GPU too if there is one. Nothing else should run on the machine meanwhile; some minutes.",
+    ),
+    Command(
+        ("eval",),
+        "eval:Eval",
+        "Compare an estimated trajectory with the truth: ATE, RPE and KITTI's figures.",
+        "KITTI's t_rel and r_rel are for paths of 100 m or more. Formats (TUM, KITTI, EuRoC's ground truth) are"
+        " recognised.",
+    ),
+    Command(
+        ("doctor",),
+        "doctor:Doctor",
+        "Look a recording over before tracking it: files, times, calibration, depth.",
+        "Scale of depth and quality of pictures too.",
+    ),
+    Command(
+        ("export",),
+        "export:Export",
+        "Write a map for other programs.",
+        "Points as PLY, all of it as a COLMAP model, keyframes as a trajectory.",
+    ),
+    Command(("models",), None, "Networks that find people: list them, get one, check one."),
+    Command(
+        ("models", "check"),
+        "models_check:CheckModel",
+        "Run a network on an image: what it finds, how long it takes, drawn.",
+    ),
+    Command(("models", "get"), "models:GetModel", "Download a network, or go on with a download that was cut."),
+    Command(
+        ("models", "list"), "models:ListModels", "Print the known networks: size, licence, adapter, where they are."
+    ),
+    Command(("data",), None, "Public recordings to track: list them, get one."),
+    Command(("data", "get"), "data:GetRecording", "Download a recording and unpack it, or go on with a cut download."),
+    Command(("data", "list"), "data:ListRecordings", "Print the known recordings: size, licence, where they are."),
+)
+
+
+def below(command: Command) -> tuple[Command, ...]:
+    """The commands whose words begin with those of another one, and go on."""
+    first = command.words
+    return tuple(other for other in COMMANDS if other is not command and other.words[: len(first)] == first)
+
+
+def find_command(words: list[str]) -> Command | None:
+    """The command that the words of a command line call for: the longest that they begin with, if any."""
+    called = [command for command in COMMANDS if tuple(words[: len(command.words)]) == command.words]
+    return max(called, key=lambda command: len(command.words), default=None)

@@ -1,0 +1,137 @@
+"""`jaxslam models check`: what a network finds in an image, and how long it takes."""
+
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import cv2
+import numpy as np
+import tyro
+
+from jaxslam.cli.console import make_table, plain_console, print_json
+from jaxslam.cli.shared_options import WithJson
+from jaxslam.config.schema import SemanticsConfig
+from jaxslam.errors import ConfigError
+from jaxslam.io.atomic_files import write_atomically
+from jaxslam.semantics import Detections, Detector, load_detector
+from jaxslam.semantics.model_zoo import find_model
+from jaxslam.visualization.draw_detections import draw_detections
+
+_REPEATS = 5
+_NONE = "none"
+
+
+@dataclass(frozen=True)
+class CheckModel(WithJson):
+    """Options of `jaxslam models check`."""
+
+    file: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
+    """Model file (ONNX), or the name of a known model; with `--prompt-encoder` its boxes are prompts, and `none` is for
+    prompts of `--examples` alone."""
+    image: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="IMAGE")]
+    """Image to look at."""
+    out: Path = Path("detections.png")
+    """PNG to draw to."""
+    labels: str = "person"
+    """What to look for, separated by commas."""
+    adapter: str | None = None
+    """What reads the outputs of the network; recognised from them if not given."""
+    min_score: float = 0.3
+    """Leave out what is less sure than this, 0 to 1."""
+    prompt_encoder: str | None = None
+    """Encoder of a promptable segmenter, which makes masks: model file, or the name of a known model."""
+    prompt_decoder: str | None = None
+    """Its decoder."""
+    examples: Path | None = None
+    """YAML file or folder of examples: for an in-context segmenter images with masks, else boxes and points."""
+
+    def main(self) -> None:
+        """Run the command."""
+        labels = tuple(label for label in map(str.strip, self.labels.split(",")) if label)
+        if not labels:
+            raise ConfigError(f"--labels: expected names separated by commas, got '{self.labels}'")
+        if not 0 <= self.min_score <= 1:
+            raise ConfigError(f"--min-score: expected 0 to 1, got {self.min_score}")
+        if self.out.suffix.lower() != ".png":
+            raise ConfigError(f"--out: expected a name that ends in .png, got '{self.out}'")
+        from jaxslam.sensors.image_files import read_color  # noqa: PLC0415 - with JAX, which `--help` does without
+
+        image = read_color(self.image)
+        detector, files = self._detector(labels)
+        found, first_ms, median_ms = _timed(detector, image)
+        if self.json:
+            times = {"median_ms": median_ms, "first_ms": first_ms}
+            print_json({**_figures(found), **times, "files": list(map(str, files)), "picture": str(self.out)})
+        else:
+            _print_found(found, labels, self.min_score)
+        plain_console.print(f"{median_ms:.1f} ms an image, the first {first_ms:.1f} ms ({', '.join(map(str, files))})")
+        bgr = cv2.cvtColor(draw_detections(image, found), cv2.COLOR_RGB2BGR)
+        write_atomically(self.out, cv2.imencode(".png", bgr)[1].tobytes())
+        plain_console.print(f"Picture: {self.out}")
+
+    def _detector(self, labels: tuple[str, ...]) -> tuple[Detector, list[Path]]:
+        """What finds, and the files of its networks. Unlike in a run, a known one that is not here is an error."""
+        prompts = (self.prompt_encoder, self.prompt_decoder)
+        if self.examples is None and prompts == (None, None):
+            path = find_model(self.file)
+            return load_detector(path, labels=labels, min_score=self.min_score, adapter=self.adapter), [path]
+        if self.adapter is not None:
+            raise ConfigError(f"--adapter: expected none with prompts or examples, got '{self.adapter}'")
+        model = None if self.file == _NONE else self.file
+        files = [find_model(name) for name in (model, *prompts) if name is not None]
+        settings = SemanticsConfig(
+            model=model,
+            labels=labels,
+            min_score=self.min_score,
+            prompt_encoder=self.prompt_encoder,
+            prompt_decoder=self.prompt_decoder,
+            examples=None if self.examples is None else str(self.examples),
+        )
+        from jaxslam.semantics.from_config import detector_of  # noqa: PLC0415 - with JAX
+
+        detector = detector_of(settings)
+        assert detector is not None  # all files are here
+        return detector, files
+
+
+def _timed(detector: Callable[[np.ndarray], Detections], image: np.ndarray) -> tuple[Detections, float, float]:
+    """What it finds, and milliseconds: of the first run, and the median of those after it."""
+    times_ms: list[float] = []
+    found: Any = None
+    for _ in range(_REPEATS + 1):
+        began_s = time.perf_counter()
+        found = detector(image)
+        times_ms.append(1e3 * (time.perf_counter() - began_s))
+    return found, times_ms[0], statistics.median(times_ms[1:])
+
+
+def _figures(found: Detections) -> dict[str, Any]:
+    """What was found, for `--json`: boxes in pixels, masks as shares of the image."""
+    shares = [None] * len(found.labels) if found.masks is None else found.masks.mean((1, 2)).tolist()
+    rows = zip(found.labels, found.scores.tolist(), found.boxes.tolist(), shares, strict=True)
+    return {
+        "found": [
+            {"label": label, "score": score, "box": box, "mask_share": share} for label, score, box, share in rows
+        ],
+        "class_map_share": None if found.class_mask is None else float(found.class_mask.mean()),
+    }
+
+
+def _print_found(found: Detections, labels: tuple[str, ...], min_score: float) -> None:
+    if len(found.labels):
+        table = make_table("Found", "label", "score", "left", "top", "right", "bottom", "mask")
+        shares = (
+            ["-"] * len(found.labels)
+            if found.masks is None
+            else [f"{share:.1%}" if share else "-" for share in found.masks.mean((1, 2))]
+        )
+        for label, score, box, share in zip(found.labels, found.scores, found.boxes, shares, strict=True):
+            table.add_row(label, f"{score:.2f}", *(f"{edge:.0f}" for edge in box), share)
+        plain_console.print(table)
+    elif found.class_mask is None:
+        plain_console.print(f"Found nothing: no {' or '.join(labels)} with a score of at least {min_score}.")
+    if found.class_mask is not None:
+        plain_console.print(f"{' or '.join(labels)}: {found.class_mask.mean():.1%} of the picture, by class map")

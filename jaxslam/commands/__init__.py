@@ -1,1 +1,0 @@
-"""The commands of `jaxslam`, one file each; `cli.py` chooses."""

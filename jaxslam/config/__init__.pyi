@@ -1,0 +1,17 @@
+from .schema import ClusterCueConfig as ClusterCueConfig
+from .schema import Config as Config
+from .schema import DenseConfig as DenseConfig
+from .schema import DynamicsConfig as DynamicsConfig
+from .schema import EpipolarCueConfig as EpipolarCueConfig
+from .schema import MappingConfig as MappingConfig
+from .schema import MotionConfig as MotionConfig
+from .schema import OcclusionConfig as OcclusionConfig
+from .schema import RunConfig as RunConfig
+from .schema import SemanticsConfig as SemanticsConfig
+from .schema import TrackConfig as TrackConfig
+from .schema import TrajectoryCueConfig as TrajectoryCueConfig
+from .schema import configs_dir as configs_dir
+from .schema import load_config as load_config
+from .schema import presets as presets
+from .schema import to_yaml as to_yaml
+from .schema import updated as updated

@@ -1,0 +1,124 @@
+"""Images of one's own in two folders, `left` and `right` or `rgb` and `depth`, and a camera file."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxslam.datasets.image_folders import IMAGES, files_in, times_of
+from jaxslam.datasets.paired_images import ImagePairs, check_stereo, moved
+from jaxslam.datasets.protocol import Fit, Loader
+from jaxslam.errors import CameraError, DatasetError
+from jaxslam.sensors.camera import Camera
+from jaxslam.sensors.image_files import read_color, read_depth, read_depth_metres
+from jaxslam.sensors.rectification import RectifiedPair
+from jaxslam.trajectory.trajectory import Trajectory, read_tum
+
+_COLOR, _DEPTH, _LEFT, _RIGHT = ("rgb", "color", "image"), "depth", "left", "right"
+_TIMES, _GROUND_TRUTH = "times.txt", "groundtruth.txt"
+_METRES = ".npy"
+
+
+class _Layout(NamedTuple):
+    """The two folders: of images, and of what goes with them."""
+
+    first: Path
+    second: Path
+    pair: bool
+
+
+class FolderDataset(ImagePairs):
+    """Two folders of images, the n-th of one with the n-th of the other, sorted by name.
+
+    `left` and `right` hold a stereo pair; `rgb` (or `color`, `image`) and `depth` colour and depth, as counts in .png
+    (`depth_scale_per_m` of the camera) or as metres in .npy. Times are those of `times.txt` (seconds, one a line);
+    without it those that are the names, as nanoseconds (16 to 19 digits) or seconds (with decimals); without either,
+    frames follow each other at `fps` of the camera. `groundtruth.txt` may hold poses in the format of TUM.
+
+    Attributes:
+        name: The folder's name.
+        camera: The camera, that of the rectified pair if two cameras as they are were given.
+        timestamps_ns: `(n,)` int64 nanoseconds, strictly increasing.
+    """
+
+    def __init__(self, folder: Path, camera: Camera | RectifiedPair) -> None:
+        """List the images; they are decoded when a frame is asked for.
+
+        Raises:
+            DatasetError: If folders are missing or ambiguous, the numbers of images differ, or times are malformed.
+            CameraError: If the camera is not of the kind that the folders need.
+        """
+        layout = _layout(folder)
+        self._taken_with(camera)
+        self.name, self._folder = folder.name, folder
+        first = files_in(layout.first, IMAGES)
+        second = files_in(layout.second, IMAGES) if layout.pair else _depth_files(layout.second)
+        _check_camera(self.camera, folder, layout, second[0].suffix)
+        if len(first) != len(second):
+            raise DatasetError(
+                f"{layout.second}: expected as many images as in {layout.first.name}, {len(first)}, got {len(second)}"
+            )
+        self._files = list(zip(first, second, strict=True))
+        self.timestamps_ns = times_of(first, folder / _TIMES, self.camera.fps)
+
+    def _truth(self) -> Trajectory | None:
+        """The poses of `groundtruth.txt`; in the file they are of the camera as it is, before it is rectified."""
+        path = self._folder / _GROUND_TRUTH
+        if not path.is_file():
+            return None
+        truth = read_tum(path)
+        return truth if self._pair is None else moved(truth, self._pair.T_left_camera)
+
+    @property
+    def _readers(self) -> tuple[Callable[[Path], np.ndarray], Callable[[Path], np.ndarray]]:
+        return read_color, read_color if self.camera.is_stereo else self._depth
+
+    def _depth(self, path: Path) -> np.ndarray:
+        if path.suffix == _METRES:
+            return read_depth_metres(path)
+        return read_depth(path, self.camera.depth_scale_per_m or 1.0)  # checked at the start
+
+
+def _layout(folder: Path) -> _Layout:
+    color = [name for name in _COLOR if (folder / name).is_dir()]
+    sides = [name for name in (_LEFT, _RIGHT) if (folder / name).is_dir()]
+    depth = (folder / _DEPTH).is_dir()
+    if len(sides) == 2 and not depth:
+        return _Layout(folder / _LEFT, folder / _RIGHT, True)
+    if len(color) == 1 and depth and not sides:
+        return _Layout(folder / color[0], folder / _DEPTH, False)
+    there = [*color, *sides, *([_DEPTH] if depth else [])]
+    raise DatasetError(
+        f"{folder}: expected the folders left and right, or depth and one of {', '.join(_COLOR)}, got"
+        f" {' and '.join(there) or 'neither'}"
+    )
+
+
+def _depth_files(folder: Path) -> list[Path]:
+    kinds = {path.suffix for path in folder.iterdir() if path.suffix in (".png", _METRES)}
+    if len(kinds) > 1:
+        raise DatasetError(f"{folder}: expected depth as .png or as .npy, got both")
+    return files_in(folder, (".png", _METRES))
+
+
+def _check_camera(camera: Camera, folder: Path, layout: _Layout, suffix: str) -> None:
+    if layout.pair:
+        check_stereo(camera)
+        return
+    if camera.is_stereo:
+        raise CameraError(f"camera '{camera.name}': expected one with depth for {folder}, got a stereo pair")
+    if suffix != _METRES and camera.depth_scale_per_m is None:
+        raise CameraError(f"camera '{camera.name}': depth_scale_per_m: expected a number for depth as .png, got none")
+
+
+def _fit(folder: Path) -> Fit:
+    names = [name for name in (*_COLOR, _DEPTH, _LEFT, _RIGHT) if (folder / name).is_dir()]
+    return Fit.FOLDERS if (_DEPTH in names or _LEFT in names) and len(names) > 1 else Fit.NO
+
+
+def _camera(_: Path) -> None:
+    return None
+
+
+LOADER = Loader("folder", _fit, _camera, FolderDataset, rectifies=True)

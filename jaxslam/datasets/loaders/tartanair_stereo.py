@@ -1,0 +1,18 @@
+"""TartanAir as stereo pairs, whether there is depth or not: `kind="tartanair_stereo"`."""
+
+from pathlib import Path
+
+from jaxslam.datasets.loaders.tartanair import TartanAirDataset, tartanair_camera
+from jaxslam.datasets.protocol import Fit, Loader
+from jaxslam.sensors.camera import Camera
+
+
+def _fit(_: Path) -> Fit:
+    return Fit.NO  # only if asked for: `tartanair` takes depth where there is some
+
+
+def _camera(_: Path) -> Camera:
+    return tartanair_camera(stereo=True)
+
+
+LOADER = Loader("tartanair_stereo", _fit, _camera, TartanAirDataset)

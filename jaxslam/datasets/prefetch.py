@@ -1,0 +1,92 @@
+"""Parts of a recording, and reading ahead of whoever consumes it."""
+
+from collections import deque
+from collections.abc import Generator
+from concurrent.futures import ThreadPoolExecutor
+from itertools import islice
+from typing import Protocol, TypeVar
+
+import numpy as np
+
+from jaxslam.datasets.protocol import Dataset
+from jaxslam.errors import DatasetError
+from jaxslam.sensors.camera import Camera
+from jaxslam.sensors.frame import Frame
+from jaxslam.trajectory.trajectory import Trajectory
+
+_Item_co = TypeVar("_Item_co", covariant=True)
+
+
+class Subset:
+    """Frames `start` to `stop - 1` of another recording, all or every nth, with its camera and whole ground truth.
+
+    Attributes:
+        whole: The other recording.
+        indices: Of the frames in it.
+    """
+
+    def __init__(self, dataset: Dataset, start: int = 0, stop: int | None = None, step: int = 1) -> None:
+        """Choose the frames as a slice does: negative numbers of frames count from the end.
+
+        Raises:
+            DatasetError: If no frame is left.
+        """
+        self.whole = dataset
+        self.indices = range(len(dataset))[start:stop:step]
+        if not self.indices:
+            raise DatasetError(f"{dataset.name}: expected a part of {len(dataset)} frames, got {start}:{stop}")
+        every = f":{step}" if step > 1 else ""
+        self.name = f"{dataset.name}[{self.indices.start}:{self.indices.stop}{every}]"
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of the whole recording."""
+        return self.whole.camera
+
+    @property
+    def timestamps_ns(self) -> np.ndarray:
+        """`(n,)` int64 nanoseconds of the chosen frames."""
+        return self.whole.timestamps_ns[self.indices.start : self.indices.stop : self.indices.step]
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """The ground truth of the whole recording."""
+        return self.whole.ground_truth
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def __getitem__(self, index: int) -> Frame:
+        return self.whole[self.indices[index]]
+
+
+class Indexed(Protocol[_Item_co]):
+    """What `prefetch` reads: a recording, or anything with a length and items."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int) -> _Item_co: ...
+
+
+def prefetch(dataset: Indexed[_Item_co], ahead: int = 4) -> Generator[_Item_co]:
+    """Every frame in order, decoded in one background thread while the caller works on earlier ones.
+
+    The thread ends with the iterator: when it is exhausted, closed, or thrown away half-way.
+
+    Args:
+        dataset: The recording.
+        ahead: Frames to decode ahead, at least 1; as many are held in memory.
+
+    Raises:
+        JaxSlamError: Whatever decoding a frame raised, when that frame's turn comes.
+    """
+    indices = iter(range(len(dataset)))
+    pool = ThreadPoolExecutor(1, thread_name_prefix="jaxslam-prefetch")
+    try:
+        pending = deque(pool.submit(dataset.__getitem__, index) for index in islice(indices, max(ahead, 1)))
+        while pending:
+            frame = pending.popleft().result()
+            pending.extend(pool.submit(dataset.__getitem__, index) for index in islice(indices, 1))
+            yield frame
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)

@@ -1,0 +1,83 @@
+"""Open a recording: recognize what kind its folder holds, and choose its camera."""
+
+import functools
+import importlib
+import pkgutil
+from pathlib import Path
+
+from jaxslam.datasets import loaders
+from jaxslam.datasets.protocol import Dataset, Fit, Loader
+from jaxslam.errors import CameraError, DatasetError, nearest
+from jaxslam.sensors.camera import Camera, known_cameras
+from jaxslam.sensors.rectification import RectifiedPair, load_camera
+
+
+def open_dataset(
+    path: str | Path, kind: str = "auto", camera: Camera | RectifiedPair | str | Path | None = None
+) -> Dataset:
+    """Open a recording.
+
+    Args:
+        path: Its folder.
+        kind: One of `dataset_kinds()`, or `auto` to recognise it by its files and name.
+        camera: A camera, the name of a known one or a camera file; for raw images of two cameras a rectified pair or
+            its file. `None` takes `camera.yaml` in the folder or, without one, the camera that the folder tells.
+
+    Raises:
+        DatasetError: If the folder is missing, of no known kind, incomplete or unreadable.
+        CameraError: If the camera cannot be told or loaded.
+    """
+    folder = Path(path).expanduser().resolve()
+    if not folder.is_dir():
+        what = "a file (an archive must be unpacked first)" if folder.exists() else "nothing there"
+        raise DatasetError(f"{path}: expected the folder of a recording, got {what}")
+    loader = _loader(folder, kind)
+    chosen = _camera(folder, loader, camera)
+    if isinstance(chosen, RectifiedPair) and not loader.rectifies:
+        raise CameraError(
+            f"rig '{chosen.rig.name}': expected one camera, as recordings of kind {loader.kind} are rectified, got two"
+        )
+    return loader.open(folder, chosen)
+
+
+def dataset_kinds() -> list[str]:
+    """The kinds of recordings that can be opened."""
+    return sorted(_loaders())
+
+
+@functools.cache
+def _loaders() -> dict[str, Loader]:
+    modules = [module.name for module in pkgutil.iter_modules(loaders.__path__)]
+    found = [getattr(importlib.import_module(f"{loaders.__name__}.{name}"), "LOADER", None) for name in modules]
+    return {loader.kind: loader for loader in found if isinstance(loader, Loader)}
+
+
+def _loader(folder: Path, kind: str) -> Loader:
+    if kind != "auto":
+        if kind not in _loaders():
+            raise DatasetError(f"kind: expected 'auto' or a known one, got '{kind}'{nearest(kind, _loaders())}")
+        return _loaders()[kind]
+    best = max(_loaders().values(), key=lambda loader: loader.fit(folder))
+    if best.fit(folder) is Fit.NO:
+        raise DatasetError(
+            f"{folder}: expected a recording of kind {' or '.join(dataset_kinds())} (rgb.txt and depth.txt;"
+            " calib.txt, times.txt, image_0 and image_1; mav0/cam0 and mav0/cam1; pose_left.txt and image_left;"
+            " or folders left and right, or rgb and depth), got a folder without those files"
+        )
+    return best
+
+
+def _camera(folder: Path, loader: Loader, camera: Camera | RectifiedPair | str | Path | None) -> Camera | RectifiedPair:
+    if isinstance(camera, Camera | RectifiedPair):
+        return camera
+    if camera is not None:
+        return load_camera(camera)
+    if (folder / "camera.yaml").is_file():
+        return load_camera(folder / "camera.yaml")
+    told = loader.camera(folder)
+    if told is None:
+        raise CameraError(
+            f"{folder.name}: its name does not tell the camera; give --camera with a camera file or one of "
+            + ", ".join(known_cameras())
+        )
+    return told

@@ -1,0 +1,1 @@
+from .point_cloud import DenseCloud as DenseCloud

@@ -1,0 +1,214 @@
+"""Compiled programs over a grid of voxels, block by block of points or rows.
+
+A loop over blocks does only as many as there are: a keyframe with half of the points costs half. What is worked out of
+a block stays in the processor's cache; arrays as long as the grid would be fetched from memory time and again. With
+213,000 voxels, comparing all with a depth image takes 3.5 ms in blocks of 1024 and 5.7 in blocks of 65,536.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxlie import SE3
+from jaxslam_kernels.camera import Intrinsics
+from jaxslam_kernels.depth.free_space import SeenFrom, seen_from
+from jaxslam_kernels.depth.voxel_grid import (
+    Colours,
+    VoxelGrid,
+    Voxels,
+    centroids,
+    changed,
+    empty_grid,
+    reduced_cloud,
+    weighed,
+    with_cloud,
+)
+from jaxslam_kernels.depth.voxel_hash import NO_ROW
+from jaxslam_kernels.se3 import to_world
+from jaxslam_kernels.types import Points, Weights
+from jaxtyping import Array, Float, Float16, Float32, Int, Int16, Int32, UInt8
+
+from jaxslam.runtime.compile_cache import IN_ITS_THREAD
+from jaxslam.runtime.trace_cache import traced_once
+
+ROWS = 1024
+"""Rows of the grid in a block: small, so that few of a block in view are out of it."""
+_POINTS = 2048
+MISS, SEEN = -0.85, 0.4
+"""Log-odds of a voxel that a depth image sees past: 0.4 as a probability in OctoMap, for rays that graze a surface;
+here it must be clearly behind, and says as much as a point does. And of one that has a surface where its points are."""
+_SAME_SHARE, _SAME_M = 0.03, 0.03
+"""Differences of depth that are none, a share and metres: sensors are a percent or two off at four metres."""
+_State = TypeVar("_State")
+
+
+class Cloud(NamedTuple):
+    """The points of a part, at the size that programs are compiled for: a multiple of that of blocks.
+
+    Attributes:
+        X_cam: `(3, m)` in units, int16.
+        colour: `(3, m)` uint8.
+        counts: `(m,)` float16, 0 beyond the last point.
+        num: Points.
+        unit_m: Of the coordinates.
+    """
+
+    X_cam: Int16[Array, "3 m"]
+    colour: UInt8[Array, "3 m"]
+    counts: Float16[Array, " m"]
+    num: Int32[Array, ""]
+    unit_m: Float32[Array, ""]
+
+    @property
+    def size(self) -> int:
+        """`m`."""
+        return self.counts.shape[0]
+
+    def block(self, start: Array) -> tuple[Points, Colours, Weights]:
+        """Points in metres, colours and counts of a block."""
+        X, colour, counts = (_cut(array, start).astype(self.unit_m.dtype) for array in self[:3])
+        return X * self.unit_m, colour, counts
+
+
+def cloud_size(points: int) -> int:
+    """The size of clouds of so many points."""
+    return -(-points // _POINTS) * _POINTS
+
+
+@partial(jax.jit, static_argnames="capacity", compiler_options=IN_ITS_THREAD)
+@traced_once
+def reduced(
+    X_cam: Float32[Array, "3 n"],
+    colour: UInt8[Array, "3 n"],
+    num: Int32[Array, ""],
+    voxel_m: Float32[Array, ""],
+    unit_m: Float32[Array, ""],
+    *,
+    capacity: int,
+) -> tuple[tuple[Array, Array, Array], Int32[Array, ""]]:
+    """The first `num` of some points, one a voxel, as a `Part` keeps them; and how many there are."""
+    mask = jnp.arange(X_cam.shape[1], dtype=jnp.int32) < num
+    voxels = reduced_cloud(X_cam, colour.astype(X_cam.dtype), mask, voxel_m, capacity=capacity)
+    X = jnp.clip(jnp.round(voxels.X / unit_m), -32767, 32767).astype(jnp.int16)
+    return (X, jnp.round(voxels.colour).astype(jnp.uint8), voxels.counts.astype(jnp.float16)), voxels.num
+
+
+@partial(jax.jit, donate_argnums=0, compiler_options=IN_ITS_THREAD)
+@traced_once
+def put(
+    grid: VoxelGrid, cloud: Cloud, evidence: Float[Array, " m"], pose: Float[Array, "7"], voxel_m: Float[Array, ""]
+) -> tuple[VoxelGrid, Int[Array, " m"]]:
+    """The grid with the points of a part in it, and their rows."""
+
+    def add(start: Array, so_far: tuple[VoxelGrid, Array]) -> tuple[VoxelGrid, Array]:
+        grid, rows = so_far
+        X_cam, colour, count = cloud.block(start)
+        X, odds = to_world(SE3(pose), X_cam), _cut(evidence, start)
+        grid, there = with_cloud(grid, X, colour, count, odds, voxel_m)
+        return grid, lax.dynamic_update_slice(rows, there, (start,))
+
+    return _over_blocks(cloud, add, (grid, jnp.full(cloud.size, NO_ROW, jnp.int32)))
+
+
+@partial(jax.jit, donate_argnums=0, compiler_options=IN_ITS_THREAD)
+@traced_once
+def taken_out(
+    grid: VoxelGrid,
+    rows: Int[Array, " m"],
+    cloud: Cloud,
+    evidence: Float[Array, " m"],
+    pose: Float[Array, "7"],
+    voxel_m: Float[Array, ""],
+) -> VoxelGrid:
+    """The grid without the points of a part that have a row."""
+
+    def take(start: Array, grid: VoxelGrid) -> VoxelGrid:
+        X_cam, colour, count = cloud.block(start)
+        X, odds = to_world(SE3(pose), X_cam), _cut(evidence, start)
+        return changed(grid, _cut(rows, start), X, colour, -count, odds, voxel_m)
+
+    return _over_blocks(cloud, take, grid)
+
+
+@partial(jax.jit, donate_argnums=0, compiler_options=IN_ITS_THREAD)
+@traced_once
+def looked(
+    grid: VoxelGrid,
+    blocks: Int[Array, " b"],
+    num: Int[Array, ""],
+    pose: Float[Array, "7"],
+    depth: Float[Array, "h w"],
+    least: Float[Array, "h w"],
+    intrinsics: Intrinsics,
+    voxel_m: Float[Array, ""],
+) -> VoxelGrid:
+    """The grid after a depth image has said, of the first `num` of some blocks of rows, what is there and what not."""
+    size = min(ROWS, len(grid.sums))
+
+    def look(index: Array, sums: Array) -> Array:
+        start = blocks[index] * size
+        first = jnp.minimum(start, len(sums) - size)
+        voxels = centroids(grid._replace(sums=sums), first, voxel_m, size=size)
+        seen = _seen(voxels.X, pose, depth, least, intrinsics)
+        counts = (voxels.counts > 0) & (first + jnp.arange(size, dtype=jnp.int32) >= start)
+        evidence = jnp.where(seen.past, MISS, jnp.where(seen.there, SEEN, 0)).astype(sums.dtype)
+        return weighed(grid._replace(sums=sums), first, jnp.where(counts, evidence, 0)).sums
+
+    return grid._replace(sums=lax.fori_loop(0, num, look, grid.sums))
+
+
+@partial(jax.jit, compiler_options=IN_ITS_THREAD)
+@traced_once
+def num_past(
+    cloud: Cloud,
+    pose: Float[Array, "7"],
+    depths: Float[Array, "k h w"],
+    leasts: Float[Array, "k h w"],
+    poses: Float[Array, "k 7"],
+    intrinsics: Intrinsics,
+) -> Int[Array, " m"]:
+    """How many depth images see past each point of a part."""
+
+    def count(start: Array, counts: Array) -> Array:
+        X = to_world(SE3(pose), cloud.block(start)[0])
+        # One image after the other: side by side they would be fetched anew for each point.
+        past = [_seen(X, *one, intrinsics).past for one in zip(poses, depths, leasts, strict=True)]
+        return lax.dynamic_update_slice(counts, sum(one.astype(jnp.int32) for one in past), (start,))
+
+    return _over_blocks(cloud, count, jnp.zeros(cloud.size, jnp.int32))
+
+
+@jax.jit
+@traced_once
+def all_centroids(grid: VoxelGrid, voxel_m: Float[Array, ""]) -> Voxels:
+    """The points of all rows."""
+    return centroids(grid, jnp.zeros((), jnp.int32), voxel_m, size=len(grid.sums))
+
+
+@partial(jax.jit, static_argnums=3)
+@traced_once
+def rebuilt(
+    grid: VoxelGrid, old_m: Float[Array, ""], new_m: Float[Array, ""], capacity: int
+) -> tuple[VoxelGrid, Int[Array, " c"], Points]:
+    """The grid with voxels of another side, without free ones; the new row of each old one, and its point."""
+    voxels = centroids(grid, jnp.zeros((), jnp.int32), old_m, size=capacity)
+    count = jnp.where(grid.log_odds > 0, voxels.counts, 0)
+    return *with_cloud(empty_grid(capacity), voxels.X, voxels.colour, count, grid.log_odds, new_m), voxels.X
+
+
+def _over_blocks(cloud: Cloud, step: Callable[[Array, _State], _State], begin: _State) -> _State:
+    """`step` for the start of each block of points, as many as there are."""
+    blocks = (cloud.num + _POINTS - 1) // _POINTS
+    return lax.fori_loop(0, blocks, lambda index, state: step(index * _POINTS, state), begin)
+
+
+def _cut(array: Array, start: Array) -> Array:
+    return lax.dynamic_slice_in_dim(array, start, _POINTS, axis=array.ndim - 1)
+
+
+def _seen(X: Points, pose: Array, depth: Array, least: Array, intrinsics: Intrinsics) -> SeenFrom:
+    limits = jnp.float32(_SAME_SHARE), jnp.float32(_SAME_M)
+    return seen_from(X, SE3(pose), depth, least, intrinsics, same_share=limits[0], same_m=limits[1])

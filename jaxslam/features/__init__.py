@@ -1,0 +1,1 @@
+"""ORB features, their matching, and poses from matches."""

@@ -1,0 +1,238 @@
+"""ORB features of an image: what can be recognised from other places and later."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import cv2
+import jax
+import numpy as np
+from jaxslam_kernels.camera import to_pixels
+from jaxslam_kernels.depth.sampling import believable, sample_depth
+from jaxslam_kernels.image.pyramid import build_pyramid
+from jaxslam_kernels.types import Pixels, Weights
+from jaxtyping import Array, Bool, Float, Float32, UInt8
+
+from jaxslam.runtime.padding import padded
+from jaxslam.runtime.trace_cache import traced_once
+from jaxslam.sensors.frame_arrays import FrameArrays
+from jaxslam.tracking.measurement import RIGHT_LEVELS, View, match_depth, observe
+from jaxslam.tracking.state import TrackParams
+
+DESCRIPTOR_BYTES = 32
+_PATCH_PX = 31
+_BORDER_PX = 19
+"""Room that a turned patch and its blur need, pixels of its level (`EDGE_THRESHOLD` of ORB-SLAM)."""
+_CLEARANCE_PX = 8
+"""How far from what is to be ignored the middle of a patch must be, pixels of its level: most comparisons of a
+descriptor lie within it."""
+_MOST_CANDIDATES = 12
+"""Corners a level looked at for every feature wanted; it bounds the time that noise and gravel take."""
+
+
+class Features(NamedTuple):
+    """ORB features of one image, `n` of them.
+
+    Attributes:
+        seen_uv: Where they are, pixels of the distorted image.
+        uv: Where an ideal pinhole camera without distortion and rolling shutter would have seen them, pixels.
+        depth: Metres, 0 where there is none to believe.
+        octave: Level of the scale pyramid, 0 the finest.
+        angle: Direction of the patch, radians, from u towards v.
+        descriptor: 256 bits each.
+    """
+
+    seen_uv: Float32[np.ndarray, "2 n"]
+    uv: Float32[np.ndarray, "2 n"]
+    depth: Float32[np.ndarray, " n"]
+    octave: UInt8[np.ndarray, " n"]
+    angle: Float32[np.ndarray, " n"]
+    descriptor: UInt8[np.ndarray, "n 32"]
+
+
+class FeaturePlan(NamedTuple):
+    """How features are found.
+
+    Attributes:
+        num_features: At most so many.
+        num_levels: Levels of the scale pyramid.
+        scale_factor: From one level to the next.
+        fast_threshold: Contrast of a corner, grey values.
+        min_fast_threshold: The same in cells that have no such corner.
+    """
+
+    num_features: int = 1000
+    num_levels: int = 8
+    scale_factor: float = 1.2
+    fast_threshold: int = 20
+    min_fast_threshold: int = 7
+
+    def quotas(self) -> np.ndarray:
+        """`(num_levels,)` features a level: fewer where it is smaller, by its scale (Mur-Artal et al. 2015)."""
+        shares = self.scale_factor ** -np.arange(self.num_levels, dtype=np.float64)
+        ends = np.round(np.cumsum(shares) / shares.sum() * self.num_features).astype(np.int64)
+        return np.diff(ends, prepend=0)
+
+    def scale(self, octave: np.ndarray) -> np.ndarray:
+        """Size of the features of some octaves in the image, octave 0 being 1."""
+        return np.float32(self.scale_factor) ** octave.astype(np.float32)
+
+
+class Patches(NamedTuple):
+    """Features as found in the image, without geometry; as in `Features`."""
+
+    seen_uv: Float32[np.ndarray, "2 n"]
+    octave: UInt8[np.ndarray, " n"]
+    angle: Float32[np.ndarray, " n"]
+    descriptor: UInt8[np.ndarray, "n 32"]
+
+
+DEFAULT_PLAN = FeaturePlan()
+
+
+def features_of(
+    frame: FrameArrays, twist: np.ndarray, params: TrackParams, plan: FeaturePlan = DEFAULT_PLAN
+) -> Features:
+    """The features of a frame, with distortion and rolling shutter removed and depth read.
+
+    Args:
+        frame: Its image is uint8; nothing is taken where it says `ignore`.
+        twist: `(6,)` velocity of the camera in its own axes, metres a second then radians a second.
+        params: Camera, readout time, and the depths that are believed.
+        plan: How features are found.
+    """
+    patches = extract(np.asarray(frame.image), np.asarray(frame.ignore), plan)
+    num = len(patches.octave)
+    fixed_size = padded(patches.seen_uv, plan.num_features, axis=1)  # compiled once
+    uv, depth = jax.device_get(_ideal(fixed_size, twist.astype(np.float32), frame, params))
+    return Features(patches.seen_uv, uv[:, :num], depth[:num], *patches[1:])
+
+
+def extract(grey: np.ndarray, ignore: np.ndarray | None = None, plan: FeaturePlan = DEFAULT_PLAN) -> Patches:
+    """ORB features, well spread over the image.
+
+    Every level of the pyramid has its quota and a grid of as many cells. The best corner of every cell comes first,
+    then the second best, and so on until the quota is spent, so that what texture there is fills it.
+
+    Source: Rublee et al., ORB: an efficient alternative to SIFT or SURF, 2011; the two thresholds and the quotas are
+    ORB-SLAM's (Mur-Artal et al. 2015).
+
+    Args:
+        grey: `(h, w)` uint8.
+        ignore: `(h, w)` bool, true where no feature may be.
+        plan: How many, and where.
+    """
+    clearance = None if ignore is None or not ignore.any() else _distance_to(ignore)
+    levels = zip(_pyramid(grey, plan), plan.quotas(), strict=True)
+    found = [_extract_level(grey, picture, clearance, int(quota), plan) for picture, quota in levels]
+    found = [patches._replace(octave=patches.octave + np.uint8(level)) for level, patches in enumerate(found)]
+    seen_uv, octave, angle, descriptor = zip(*found, strict=True)
+    return Patches(
+        np.concatenate(seen_uv, axis=1), np.concatenate(octave), np.concatenate(angle), np.concatenate(descriptor)
+    )
+
+
+def _distance_to(ignore: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+    """Distance of every pixel from the nearest one to be ignored."""
+    return cv2.distanceTransform((~ignore).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3)
+
+
+def _extract_level(
+    grey: np.ndarray, picture: np.ndarray, clearance: np.ndarray | None, quota: int, plan: FeaturePlan
+) -> Patches:
+    """Features of one level, called octave 0."""
+    if min(picture.shape) <= 2 * _BORDER_PX or quota == 0:
+        return _no_patches()
+    orb = cv2.ORB.create(
+        nfeatures=_MOST_CANDIDATES * quota,
+        nlevels=1,
+        edgeThreshold=_BORDER_PX,
+        scoreType=cv2.ORB_FAST_SCORE,
+        patchSize=_PATCH_PX,
+        fastThreshold=plan.min_fast_threshold,
+    )
+    corners = orb.detect(picture, None)
+    uv = _positions(corners)
+    response = np.array([corner.response for corner in corners], np.float32)
+    clear = np.arange(len(corners))
+    if clearance is not None:
+        column, row = np.round(_in_image(uv, picture, grey)).astype(np.int64)
+        clear = np.flatnonzero(clearance[row, column] > _CLEARANCE_PX * grey.shape[0] / picture.shape[0])
+    chosen = clear[_spread(uv[:, clear], response[clear], picture.shape, quota, plan.fast_threshold)]
+    if not len(chosen):
+        return _no_patches()
+    kept, descriptor = orb.compute(picture, [corners[index] for index in chosen])
+    angle = np.radians(np.array([corner.angle for corner in kept], np.float32))
+    seen_uv = _in_image(_positions(kept), picture, grey)
+    return Patches(seen_uv, np.zeros(len(kept), np.uint8), angle, descriptor)
+
+
+def _pyramid(grey: np.ndarray, plan: FeaturePlan) -> list[np.ndarray]:
+    """Every level made from the one before, so that fine texture is smoothed away and not sampled."""
+    pictures = [np.ascontiguousarray(grey)]
+    for scale in plan.scale(np.arange(1, plan.num_levels)):
+        height, width = (max(round(side / float(scale)), 1) for side in grey.shape)
+        pictures.append(cv2.resize(pictures[-1], (width, height)))
+    return pictures
+
+
+def _positions(corners: Sequence[cv2.KeyPoint]) -> Float32[np.ndarray, "2 n"]:
+    return np.asarray(cv2.KeyPoint.convert(corners), np.float32).reshape(-1, 2).T
+
+
+def _in_image(uv: np.ndarray, picture: np.ndarray, grey: np.ndarray) -> Float32[np.ndarray, "2 n"]:
+    """Where pixels of a shrunk picture are in the image: the outer edges of both coincide, not their first pixels."""
+    ratio = np.array([[grey.shape[1] / picture.shape[1]], [grey.shape[0] / picture.shape[0]]], np.float32)
+    return (uv + np.float32(0.5)) * ratio - np.float32(0.5)
+
+
+def _spread(
+    uv: np.ndarray, response: np.ndarray, shape: tuple[int, ...], quota: int, fast_threshold: int
+) -> np.ndarray:
+    """Indices of at most `quota` corners, round by round the best one left in every cell.
+
+    The response of a corner is the highest threshold at which it is one. A cell with a corner at `fast_threshold`
+    gives no weaker ones.
+    """
+    side = np.sqrt(shape[0] * shape[1] / quota)
+    column, row = (uv / side).astype(np.int64)
+    cell = row * (int(shape[1] / side) + 1) + column
+    weakness = 255 - response.astype(np.int64)
+    order = np.argsort(256 * cell + weakness, kind="stable")
+    first = np.flatnonzero(np.diff(cell[order], prepend=-1))
+    size = np.diff(first, append=len(order))
+    rank = np.arange(len(order)) - np.repeat(first, size)
+    best = np.repeat(response[order][first], size)
+    allowed = (response[order] >= fast_threshold) | (best < fast_threshold)
+    order, rank = order[allowed], rank[allowed]
+    return order[np.argsort(256 * rank + weakness[order], kind="stable")][:quota]
+
+
+def no_features() -> Features:
+    """Features of an image that has none."""
+    seen_uv, *rest = _no_patches()
+    return Features(seen_uv, seen_uv, np.zeros(0, np.float32), *rest)
+
+
+def _no_patches() -> Patches:
+    return Patches(
+        np.zeros((2, 0), np.float32),
+        np.zeros(0, np.uint8),
+        np.zeros(0, np.float32),
+        np.zeros((0, DESCRIPTOR_BYTES), np.uint8),
+    )
+
+
+@jax.jit
+@traced_once
+def _ideal(
+    seen_uv: Pixels, twist: Float[Array, "6"], frame: FrameArrays, params: TrackParams
+) -> tuple[Pixels, Weights]:
+    """Pixels of the ideal camera, and depth; of a pair by matching."""
+    believed = believable(frame.depth, params.min_depth_m, params.max_depth_m)
+    rough, matched = sample_depth(believed, seen_uv), None
+    if frame.right is not None:
+        pyramid = build_pyramid(frame.image, num_levels=RIGHT_LEVELS, dtype=seen_uv.dtype)
+        view = View(frame, pyramid, believed, frame.dt_s).with_right()
+        matched = match_depth(view, seen_uv, rough, rough > 0, params, known_point=False)
+    seen = observe(seen_uv, rough, twist, believed, frame.depth_delay_s, params, matched=matched)
+    return to_pixels(params.intrinsics, seen.xy), seen.depth

@@ -1,0 +1,84 @@
+"""Rigid transforms of many poses at once on the host, in NumPy float64: `wxyz_xyz`, as everywhere.
+
+jaxlie's are for compiled code, where float64 needs a setting of the whole process.
+"""
+
+import math
+
+import numpy as np
+
+from jaxslam.geometry.so3 import matrices, multiply
+
+IDENTITY = np.array([1.0, 0, 0, 0, 0, 0, 0])
+
+
+def rotate(T: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """`(..., 3)` vectors turned by the rotations of `(..., 7)` transforms."""
+    return np.einsum("...ij,...j->...i", matrices(T[..., :4]), vectors)
+
+
+def compose(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """`(..., 7)` products of `(..., 7)` transforms, `second` acting first: `T_a_c` of `T_a_b` and `T_b_c`."""
+    if first.ndim == second.ndim == 1:
+        return _compose_one(first.tolist(), second.tolist())
+    rotation = multiply(first[..., :4], second[..., :4])
+    rotation /= np.linalg.norm(rotation, axis=-1, keepdims=True)
+    return np.concatenate([rotation, rotate(first, second[..., 4:]) + first[..., 4:]], axis=-1)
+
+
+def _compose_one(first: list[float], second: list[float]) -> np.ndarray:
+    """The same of two single ones: NumPy's calls would take ten times as long as the arithmetic."""
+    w, x, y, z, t, u, v = first
+    a, b, c, d, e, f, g = second
+    rotation = (
+        w * a - x * b - y * c - z * d,
+        w * b + x * a + y * d - z * c,
+        w * c - x * d + y * a + z * b,
+        w * d + x * c - y * b + z * a,
+    )
+    length = math.hypot(*rotation)
+    # A vector turned: v + 2 w (q x v) + 2 q x (q x v).
+    i, j, k = 2 * (y * g - z * f), 2 * (z * e - x * g), 2 * (x * f - y * e)
+    shifted = (
+        e + w * i + y * k - z * j + t,
+        f + w * j + z * i - x * k + u,
+        g + w * k + x * j - y * i + v,
+    )
+    return np.array([part / length for part in rotation] + list(shifted))
+
+
+def inverse(T: np.ndarray) -> np.ndarray:
+    """`(..., 7)` inverses of `(..., 7)` transforms."""
+    if T.ndim == 1:
+        w, x, y, z, *shift = T.tolist()
+        turned_back = _compose_one([w, -x, -y, -z, 0, 0, 0], [1, 0, 0, 0, *shift])
+        return np.concatenate([[w, -x, -y, -z], -turned_back[4:]])
+    conjugate = np.concatenate([T[..., :4] * np.array([1.0, -1, -1, -1]), np.zeros_like(T[..., 4:])], axis=-1)
+    return np.concatenate([conjugate[..., :4], -rotate(conjugate, T[..., 4:])], axis=-1)
+
+
+def between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """`(..., 7)` transforms from `second` to `first`: `T_a_b` of `T_world_a` and `T_world_b`."""
+    return compose(inverse(first), second)
+
+
+def transform(T: np.ndarray, X: np.ndarray) -> np.ndarray:
+    """`(3, n)` points carried over by one transform `(7,)`."""
+    return matrices(T[:4]) @ X + T[4:, None]
+
+
+def to_local(T: np.ndarray, X: np.ndarray) -> np.ndarray:
+    """`(3, n)` points in the axes of `T`, a transform `(7,)` that carries those into the axes of the points."""
+    return matrices(T[:4]).T @ (X - T[4:, None])
+
+
+def angle(T: np.ndarray) -> np.ndarray:
+    """`(...,)` angles of the rotations of `(..., 7)` transforms, radians."""
+    return 2 * np.arctan2(np.linalg.norm(T[..., 1:4], axis=-1), np.abs(T[..., 0]))
+
+
+def moved(T: np.ndarray, tangent: np.ndarray) -> np.ndarray:
+    """`(7,)` transform after a small motion in its own axes: translation, then rotation vector, each by itself."""
+    turn = np.linalg.norm(tangent[3:])
+    axis = np.sinc(turn / (2 * np.pi)) * 0.5 * tangent[3:]
+    return compose(T, np.concatenate([[np.cos(turn / 2)], axis, tangent[:3]]))

@@ -1,0 +1,1 @@
+"""Files and network: atomic writes, YAML, time stamps, downloads, archives, folder ownership."""

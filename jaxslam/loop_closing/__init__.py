@@ -1,0 +1,1 @@
+"""Loop closing: place index, recognition, verification, essential graph, correction."""

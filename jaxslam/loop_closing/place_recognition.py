@@ -1,0 +1,178 @@
+"""Recognising a place: where an image was taken, relative to a keyframe that shows the same place."""
+
+from collections.abc import Set
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxslam_kernels.camera import without_distortion
+from jaxslam_kernels.pose.pnp import PnpResult, ransac_pnp
+from jaxslam_kernels.pose.pose_refine import PoseStatus
+from jaxtyping import Array, Float64, Int64, Key
+
+from jaxslam.features.matching import hamming_pairs, match_by_projection, match_descriptors, predicted_octave, same_turn
+from jaxslam.features.orb import DEFAULT_PLAN, FeaturePlan, Features, no_features
+from jaxslam.features.pose_from_matches import Matches, fit_pose, matches_depth_sigma, matches_of, pinhole
+from jaxslam.geometry.se3 import IDENTITY, to_local
+from jaxslam.loop_closing.place_index import PlaceIndex
+from jaxslam.map.types import Keyframe, Map, has
+from jaxslam.runtime.compile_cache import SOON_COMPILED
+from jaxslam.runtime.trace_cache import traced_once
+from jaxslam.tracking.state import TrackParams
+
+MIN_AGREEING = 12
+"""Fewest matches of descriptors alone that agree on a pose."""
+_MOST_MATCHES = 512
+_HYPOTHESES = 256
+_GATE_SIGMAS = 3.0
+_GUIDED_PX = 8.0
+_GUIDED_BITS = 64
+_GUIDED_RATIO = 0.9
+
+
+class Recognition(NamedTuple):
+    """A place recognised.
+
+    Attributes:
+        keyframe: Id of the keyframe it was recognised in.
+        T_keyframe_cam: `wxyz_xyz`, the pose of the camera in the axes of the keyframe.
+        covariance: Of the pose in the tangent space at the camera: translation (m), then rotation (rad). Errors that
+            features have in common are not in it.
+        num_inliers: Features that agree with the pose.
+        inlier_share: Their share of the features matched where the pose puts them.
+        pairs: Index of each of them among the features of the keyframe, and among those of the image.
+    """
+
+    keyframe: int
+    T_keyframe_cam: Float64[np.ndarray, "7"]
+    covariance: Float64[np.ndarray, "6 6"]
+    num_inliers: int
+    inlier_share: float
+    pairs: Int64[np.ndarray, "2 k"]
+
+
+def recognise(
+    map: Map,
+    index: PlaceIndex,
+    features: Features,
+    params: TrackParams,
+    *,
+    exclude: Set[int] = frozenset(),
+    limit: int = 5,
+    seed: int = 0,
+    plan: FeaturePlan = DEFAULT_PLAN,
+) -> Recognition | None:
+    """Where an image was taken, relative to a keyframe that shows the same place; `None` if that is not certain.
+
+    A wrong place is worse than none: enough features, spread over the image, must agree with one pose.
+
+    Args:
+        map: Holds the keyframes. Those of the index that are not in it are passed over.
+        index: Of its keyframes.
+        features: Of the image.
+        params: Camera, of which ideal pixels leave the pinhole, and the errors of its depth.
+        exclude: Keyframes not to be recognised, such as the latest ones.
+        limit: Most keyframes looked at, the most alike first.
+        seed: Of random choices.
+        plan: How features were found.
+    """
+    for keyframe_id, _ in index.query(features, exclude, limit):
+        if has(map.ids, np.array([keyframe_id]))[0]:
+            found = verify(map.keyframe(keyframe_id), features, params, seed=seed, plan=plan)
+            if found is not None:
+                return found
+    return None
+
+
+def verify(
+    keyframe: Keyframe, features: Features, params: TrackParams, *, seed: int = 0, plan: FeaturePlan = DEFAULT_PLAN
+) -> Recognition | None:
+    """Where an image was taken, relative to one keyframe, if it certainly shows the same place; as in `recognise`."""
+    source = keyframe.features
+    pairs = _by_descriptor(source, features)
+    if pairs.shape[1] < MIN_AGREEING:
+        return None
+    key = jax.random.fold_in(jax.random.key(seed), keyframe.id)
+    coarse: PnpResult = jax.device_get(
+        _agreed(key, _matches(source, features, pairs, _MOST_MATCHES, params, plan), params)
+    )
+    if coarse.status > PoseStatus.NOT_CONVERGED:
+        return None
+    T_coarse = np.asarray(coarse.T_world_cam.wxyz_xyz, np.float64)
+    pairs = _where_expected(source, features, T_coarse, params, plan)
+    fit = fit_pose(T_coarse, _matches(source, features, pairs, plan.num_features, params, plan), params)
+    if fit is None:
+        return None
+    return Recognition(keyframe.id, fit.T_origin_cam, fit.covariance, len(fit.agree), fit.share, pairs[:, fit.agree])
+
+
+def _by_descriptor(source: Features, features: Features) -> Int64[np.ndarray, "2 k"]:
+    """The matches that are most alike, of features whose place in the keyframe is known."""
+    pairs = match_descriptors(source, features)
+    pairs = pairs[:, source.depth[pairs[0]] > 0]
+    distance = hamming_pairs(source.descriptor[pairs[0]], features.descriptor[pairs[1]])
+    return pairs[:, np.argsort(distance, kind="stable")[:_MOST_MATCHES]]
+
+
+def _where_expected(
+    source: Features, features: Features, T_keyframe_cam: np.ndarray, params: TrackParams, plan: FeaturePlan
+) -> Int64[np.ndarray, "2 k"]:
+    """Matches near where a pose puts the features of the keyframe."""
+    known = np.flatnonzero(source.depth > 0)
+    X_cam = to_local(T_keyframe_cam, _in_camera(source, params)[:, known])
+    in_front = X_cam[2] > float(params.min_depth_m)
+    known, X_cam = known[in_front], X_cam[:, in_front]
+    focal, centre = pinhole(params)
+    pairs = match_by_projection(
+        X_cam[:2] / X_cam[2] * focal + centre,
+        predicted_octave(source.octave[known], source.depth[known], X_cam[2], plan),
+        source.descriptor[known],
+        features,
+        radius_px=_GUIDED_PX,
+        max_distance=_GUIDED_BITS,
+        ratio=_GUIDED_RATIO,
+        plan=plan,
+    )
+    pairs[0] = known[pairs[0]]
+    return pairs[:, same_turn(features.angle[pairs[1]] - source.angle[pairs[0]])]
+
+
+def _in_camera(features: Features, params: TrackParams) -> Float64[np.ndarray, "3 n"]:
+    """Where features are in the axes of their camera; at its centre without depth."""
+    focal, centre = pinhole(params)
+    return np.concatenate([(features.uv - centre) / focal, np.ones((1, len(features.depth)))]) * features.depth
+
+
+def _matches(
+    source: Features, features: Features, pairs: np.ndarray, capacity: int, params: TrackParams, plan: FeaturePlan
+) -> Matches:
+    then, now = pairs
+    X = _in_camera(source, params)[:, then]
+    return matches_of(X, source.depth[then], features, now, plan, capacity=capacity)
+
+
+@partial(jax.jit, compiler_options=SOON_COMPILED)
+@traced_once
+def _agreed(key: Key[Array, ""], matches: Matches, params: TrackParams) -> PnpResult:
+    return ransac_pnp(
+        key,
+        matches.X,
+        matches.uv,
+        without_distortion(params.intrinsics),
+        weights=matches.weight,
+        depth=matches.depth,
+        threshold_px=_GATE_SIGMAS * matches.sigma_px,
+        threshold_depth=_GATE_SIGMAS * matches_depth_sigma(matches, params),
+        min_inliers=MIN_AGREEING,
+        num_hypotheses=_HYPOTHESES,
+    )
+
+
+def compile_recognition(params: TrackParams, plan: FeaturePlan = DEFAULT_PLAN) -> None:
+    """Compile all that `recognise` needs, so that nothing is compiled while frames come."""
+    nothing: Any = np.zeros((2, 0), np.int64)
+    empty = no_features()
+    key = jax.random.fold_in(jax.random.key(0), 0)
+    jax.block_until_ready(_agreed(key, _matches(empty, empty, nothing, _MOST_MATCHES, params, plan), params))
+    fit_pose(IDENTITY, _matches(empty, empty, nothing, plan.num_features, params, plan), params)

@@ -1,0 +1,1 @@
+"""The files of a run: trajectories, summary, frame table, pictures, dense map."""

@@ -1,0 +1,237 @@
+"""What a run leaves behind: trajectories, a log of its frames, a summary, the settings in effect, and pictures."""
+
+import json
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxslam.config.schema import to_yaml
+from jaxslam.datasets import Dataset
+from jaxslam.results.dense_results import DENSE_FILES, write_dense
+from jaxslam.errors import TrajectoryError
+from jaxslam.trajectory.evaluation import Evaluation, evaluate
+from jaxslam.io.atomic_files import write_atomically
+from jaxslam.results.frame_table import write_errors, write_frames
+from jaxslam.runtime.machine import machine, peak_rss_mb
+from jaxslam.map.export import write_keyframe_trajectory
+from jaxslam.visualization.mask_gallery import write_mask_pictures
+from jaxslam.mapping.occlusion_states import occluded_shares
+from jaxslam.visualization.snapshots import RunPictures
+from jaxslam.slam.slam import Slam
+from jaxslam.tracking.state import TrackStatus
+from jaxslam.slam.frame_result import FrameRecord
+from jaxslam.trajectory.trajectory import Trajectory, write_kitti_frames, write_tum
+from jaxslam.visualization.plots import Snapshot, plot_map, plot_snapshots, plot_trajectory
+
+_ALWAYS = ("trajectory.txt", "trajectory_online.txt", "frames.csv", "summary.json", "config.yaml")
+_OF_THE_PATH = ("plot.png", "trajectory_kitti.txt")
+_OF_THE_MAP = ("trajectory_keyframes.txt", "map.png")
+_ERRORS, _FAILURES = "errors.csv", "failures.png"
+_OTHER_SUBMAP = "trajectory_submap_{}.txt"
+_OF_MASKS = ("masks.png", "masks.gif")
+RESULT_FILES = (*_ALWAYS, *_OF_THE_PATH, *_OF_THE_MAP, _ERRORS, _FAILURES, *_OF_MASKS, *DENSE_FILES)
+"""All that a run can leave behind: no path, no keyframes, no truth, no masks, no dense map, none of their files."""
+
+
+@dataclass(frozen=True)
+class RunInfo:
+    """What the results of a run cannot tell by themselves.
+
+    Attributes:
+        dataset: The recording.
+        preset: Name of the preset.
+        wall_s: Duration of the run, seconds.
+        cut_short: Why the run ended before the recording did: "interrupted", "terminated", or an error; `None` if it
+            did not.
+    """
+
+    dataset: Dataset
+    preset: str
+    wall_s: float
+    cut_short: str | None = None
+
+
+def write_results(
+    folder: Path,
+    slam: Slam,
+    records: Sequence[FrameRecord],
+    info: RunInfo,
+    pictures: RunPictures | None = None,
+) -> tuple[dict[str, Any], Evaluation | None]:
+    """Write those of `RESULT_FILES` there is something for: trajectories, a summary, the settings, pictures.
+
+    Args:
+        folder: Where they go; made if it is not there. Files of an earlier run are replaced, each in one piece, or
+            removed if this one has none.
+        slam: What tracked.
+        records: From `Slam.run`.
+        info: The recording and how it was run.
+        pictures: What was kept of its frames, to be shown.
+
+    Returns:
+        The summary, and the evaluation if there is ground truth to compare with.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    truth, trajectory = info.dataset.ground_truth, slam.trajectory  # made anew at each call
+    evaluation, problem = None, None if truth is not None else "no ground truth"
+    if truth is not None:
+        try:
+            evaluation = evaluate(trajectory, truth, frames_ns=info.dataset.timestamps_ns)
+        except TrajectoryError as error:
+            problem = str(error)
+    dense, dense_files = write_dense(folder, slam.dense_mapping, trajectory, slam.times.ms)
+    summary = _summary(slam, records, info, evaluation) | {
+        "evaluation_problem": problem,
+        "dense": dense,
+        "poses_in_other_submaps": _write_other_submaps(folder, slam),
+    }
+    write_tum(folder / "trajectory.txt", trajectory)
+    write_tum(folder / "trajectory_online.txt", slam.online_trajectory)
+    write_frames(folder / "frames.csv", records)
+    write_atomically(folder / "config.yaml", to_yaml(slam.config).encode())
+    write_atomically(folder / "summary.json", (json.dumps(summary, indent=2) + "\n").encode())
+    there = {
+        *_ALWAYS,
+        *dense_files,
+        *_write_pictures(folder, slam, trajectory, info, evaluation, pictures or RunPictures(0)),
+    }
+    if evaluation is not None:
+        write_errors(folder / _ERRORS, evaluation)
+        there.add(_ERRORS)
+    for name in there.symmetric_difference(RESULT_FILES):
+        (folder / name).unlink(missing_ok=True)
+    return summary, evaluation
+
+
+def _write_other_submaps(folder: Path, slam: Slam) -> dict[str, int]:
+    """Write the trajectory of every submap that nothing links to the map's frame; gives files with numbers of poses."""
+    for file in folder.glob(_OTHER_SUBMAP.format("*")):
+        file.unlink()
+    others = {n: path for n, path in slam.trajectories.items() if n != slam.map.world_submap}
+    for number, path in others.items():
+        write_tum(folder / _OTHER_SUBMAP.format(number), path)
+    return {_OTHER_SUBMAP.format(number): len(path) for number, path in others.items()}
+
+
+def _write_pictures(
+    folder: Path,
+    slam: Slam,
+    trajectory: Trajectory,
+    info: RunInfo,
+    evaluation: Evaluation | None,
+    pictures: RunPictures,
+) -> list[str]:
+    """Write the pictures there is something for; gives the names of the files."""
+    written: list[str] = []
+    if len(trajectory):
+        plot_trajectory(
+            trajectory,
+            info.dataset.ground_truth,
+            evaluation,
+            folder / _OF_THE_PATH[0],
+            pictures.snapshots,
+            title=_title(slam, info),
+        )
+        write_kitti_frames(folder / _OF_THE_PATH[1], trajectory, info.dataset.timestamps_ns)
+        written += _OF_THE_PATH
+    if len(slam.map.ids):
+        write_keyframe_trajectory(folder / _OF_THE_MAP[0], slam.map, slam.map.world_submap)
+        plot_map(slam.map, trajectory, folder / _OF_THE_MAP[1])
+        written += _OF_THE_MAP
+    failures = [*pictures.losses, *_worst(info.dataset, evaluation)]
+    if failures:
+        plot_snapshots(failures, folder / _FAILURES)
+        written.append(_FAILURES)
+    if pictures.masks:
+        write_mask_pictures(folder, pictures.masks)
+        written += _OF_MASKS
+    return written
+
+
+def _title(slam: Slam, info: RunInfo) -> str:
+    """What was run, for a picture."""
+    why = slam.without_network
+    return f"{info.dataset.name}, {info.preset}" + ("" if why is None else f", without a network ({why})")
+
+
+def _worst(dataset: Dataset, evaluation: Evaluation | None) -> list[Snapshot]:
+    """The frame of the largest error, without points, if errors are known."""
+    if evaluation is None:
+        return []
+    index = int(np.argmax(evaluation.errors_m))
+    frame = int(np.searchsorted(dataset.timestamps_ns, evaluation.timestamps_ns[index]))
+    title = f"frame {frame}: the largest error, {evaluation.errors_m[index]:.4f} m"
+    nothing = np.zeros((2, 0)), np.zeros(0), np.zeros(0, bool)
+    return [Snapshot(title, dataset[frame].image, *nothing)]
+
+
+def _summary(
+    slam: Slam, records: Sequence[FrameRecord], info: RunInfo, evaluation: Evaluation | None
+) -> dict[str, Any]:
+    statuses = Counter(record.status.name for record in records)
+    lost = [record for record in records if record.status in (TrackStatus.LOST, TrackStatus.REJECTED)]
+    dropped = statuses[TrackStatus.DROPPED.name]
+    given = len(records) - dropped
+    tracked = given - len(lost)
+    figures = evaluation.summary() if evaluation is not None else {}
+    wanted = ("ate_rmse_m", "ate_sim3_rmse_m", "sim3_scale", "rpe_trans_m_per_s", "rpe_rot_deg_per_s")
+    return {
+        "dataset": info.dataset.name,
+        "camera": info.dataset.camera.name,
+        "preset": info.preset,
+        "cut_short": info.cut_short,
+        "model": slam.config.semantics.model,
+        "without_network": slam.without_network,
+        "deterministic": slam.config.run.in_turn,
+        "realtime": slam.config.run.realtime,
+        "seed": slam.config.run.seed,
+        "frames": len(records),
+        "tracked": tracked,
+        "tracked_percent": round(100 * tracked / max(given, 1), 3),  # of the frames that were not dropped
+        "dropped": dropped,
+        "dropped_percent": round(100 * dropped / max(len(records), 1), 3),
+        "status_counts": dict(sorted(statuses.items())),
+        "first_loss_s": (lost[0].timestamp_ns - records[0].timestamp_ns) * 1e-9 if lost else None,
+        "relocalised": statuses[TrackStatus.RELOCALISED.name],
+        "keyframes": len(slam.map.ids),
+        "keyframes_made": sum(record.is_keyframe for record in records),
+        "map_points": len(slam.map.points.ids),
+        "loops_closed": slam.loops_closed,
+        "submaps": len(set(slam.map.submap.tolist())),
+        **{name: figures.get(name) for name in wanted},
+        "evaluation": figures or None,
+        "occluded_share": _distribution(_occluded_shares(slam)),
+        "mask_sources": dict(sorted(Counter(record.mask_source.name for record in records).items())),
+        "mask_age_frames": _distribution([record.mask_age for record in records if record.mask_age >= 0]),
+        "removed_by_semantics": slam.removed_by_semantics,
+        "keyframes_passed_over": slam.keyframes_passed_over,
+        "detector_errors": sum(bool(record.detector_error) for record in records),
+        "stage_ms": {stage: _distribution(times.tolist()) for stage, times in slam.times.ms.items()},
+        "track_ms": _distribution([record.track_ms for record in records if record.track_ms is not None]),
+        "compile_s": round(slam.compile_s, 3),
+        "wall_s": round(info.wall_s, 3),
+        "peak_rss_mb": round(peak_rss_mb(), 1),
+        **machine(),
+    }
+
+
+def _occluded_shares(slam: Slam) -> list[float]:
+    """Share of the points of each keyframe that are OCCLUDED; nothing if the settings do not ask for it."""
+    return occluded_shares(slam.map).tolist() if slam.config.dynamics.occlusion.enabled else []
+
+
+def _distribution(figures: Sequence[float]) -> dict[str, float] | None:
+    if not figures:
+        return None
+    values = np.asarray(figures)
+    measures = {
+        "mean": values.mean(),
+        "median": np.median(values),
+        "p95": np.percentile(values, 95),
+        "max": values.max(),
+    }
+    return {name: round(float(value), 3) for name, value in measures.items()}

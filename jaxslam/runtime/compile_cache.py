@@ -1,0 +1,130 @@
+"""How XLA, JAX's compiler, works for jaxslam: what it keeps between processes, and how many threads it uses."""
+
+import functools
+import logging
+import os
+import tempfile
+from pathlib import Path
+
+import platformdirs
+
+from jaxslam.io.folder_ownership import OWN_MODE, why_not_own
+
+_log = logging.getLogger(__name__)
+
+
+def cache_dir() -> Path:
+    """Where jaxslam keeps compiled code: `xla` in the user's cache folder for jaxslam."""
+    return Path(platformdirs.user_cache_dir("jaxslam", appauthor=False)) / "xla"
+
+
+_CACHE_ENABLED = "jax_enable_compilation_cache"
+_LEAST_COMPILE, _LEAST_COMPILE_OF_JAX_S = "jax_persistent_cache_min_compile_time_secs", 1.0
+_LEAST_COMPILE_S = 0.05
+"""Programs that take less are compiled anew, unless the user chose otherwise. With 0.5 some 25 of a run's 40 were,
+every time; with JAX's own limit, a second, even more."""
+
+
+def compile_cache_dir() -> Path:
+    """Where compiled code is kept: the user's own folder where one was chosen in JAX's settings, else `cache_dir()`."""
+    import jax  # noqa: PLC0415 - `usable_cores` and `cache_dir` need none
+
+    chosen: str | None = jax.config.values["jax_compilation_cache_dir"]
+    return Path(chosen) if chosen else cache_dir()
+
+
+def enable_compile_cache() -> Path | None:
+    """Keep compiled code between processes, so that only the first start on a machine waits for the compiler.
+
+    `Slam` does it when it begins; what is compiled before, such as the renderer of rooms, is kept if this comes first.
+    A folder that cannot be written to is read from only; where there is none and none can be made, or `cache_dir()` is
+    not the user's own, nothing is kept. One warning says so.
+
+    Returns:
+        The folder: the user's own where one was chosen in JAX's settings, else `cache_dir()`; `None` if nothing is
+        kept.
+    """
+    import jax  # noqa: PLC0415
+
+    if not jax.config.values[_CACHE_ENABLED]:
+        return None
+    folder = compile_cache_dir()
+    if not _is_usable(folder, chosen=bool(jax.config.values["jax_compilation_cache_dir"])):
+        jax.config.update(_CACHE_ENABLED, False)
+        return None
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    least_s: float = jax.config.values[_LEAST_COMPILE]
+    if not _is_writable(folder):
+        jax.config.update(_LEAST_COMPILE, float("inf"))  # JAX warns of every program otherwise
+    elif least_s == _LEAST_COMPILE_OF_JAX_S:
+        jax.config.update(_LEAST_COMPILE, _LEAST_COMPILE_S)
+    return folder
+
+
+@functools.cache
+def _is_usable(folder: Path, *, chosen: bool) -> bool:
+    """Whether a folder can be used for compiled code; if not, that is logged. Looked at once a process."""
+    try:
+        folder.mkdir(mode=OWN_MODE, parents=True, exist_ok=True)
+        why = None if chosen else why_not_own(folder)
+    except OSError as problem:
+        why = f"it cannot be made: {problem.strerror}"
+    if why is not None:
+        _log.warning("%s: not used to keep compiled code, so that every start takes longer: %s", folder, why)
+    return why is None
+
+
+@functools.cache
+def _is_writable(folder: Path) -> bool:
+    """Whether files can be written in a folder; if not, that is logged. Looked at once a process."""
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError as problem:
+        _log.warning("%s: compiled code cannot be kept, so that starts take longer: %s", folder, problem.strerror)
+        return False
+
+
+SOON_COMPILED: dict[str, bool | str] = {"xla_cpu_use_fusion_emitters": False}
+"""Options of `jax.jit` for a large program of many small parts: they are written by XLA's older generator of code.
+
+The tracker with its map is compiled in 17 s instead of 35 (AMD EPYC, two cores), and a frame takes as long, within 3 %.
+"""
+
+IN_ITS_THREAD: dict[str, bool | str] = {"xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"}
+"""Options of `jax.jit` for a program that runs beside another: one part after the other, all in the calling thread.
+
+XLA else hands parts that do not depend on each other to a pool of threads, even if that has one thread only, and they
+wait there behind those of other programs: beside optical flow, 0.3 ms of work for masks took 2.1 ms. A program that has
+the machine for itself is faster with the pool: the second part of the tracker's step takes 2.5 ms, and 3.3 without.
+"""
+
+MUCH_COMPUTED: dict[str, bool | str] = {"xla_cpu_use_fusion_emitters": True}
+"""Options of `jax.jit` for a program that computes much for every pixel: XLA's newer generator of code, whatever
+`XLA_FLAGS` says. With the older one a frame of a room takes 111 ms instead of 63 (640x480, one thread, AMD EPYC).
+"""
+
+
+def prefer_one_thread() -> None:
+    """Compute in the calling thread, unless `NPROC` in the environment says otherwise; before the first array.
+
+    XLA splits work that is too small for it and waits for the parts. On two cores, a frame takes 9.3 ms with one
+    thread and 10.0 with two, and 9.9 ms of processor time instead of 12.0. XLA's one thread would then be a queue for
+    all of Python's; without asynchronous dispatch each computes by itself: beside a thread that is always computing,
+    a call of 2 ms takes 2 ms instead of 30.
+    """
+    import jax  # noqa: PLC0415
+
+    os.environ.setdefault("NPROC", "1")
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
+
+
+def threads() -> int:
+    """How many threads XLA computes with, if `NPROC` is now what it was at the first array."""
+    chosen = os.environ.get("NPROC", "")
+    return int(chosen) if chosen.isdigit() and int(chosen) > 0 else usable_cores()
+
+
+def usable_cores() -> int:
+    """Cores this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

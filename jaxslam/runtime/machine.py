@@ -1,0 +1,94 @@
+"""What a process computes with: versions of packages, the processor, its memory, the commit of jaxslam."""
+
+import platform
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from jaxslam.runtime.compile_cache import threads, usable_cores
+
+_PACKAGES = ("jaxslam", "jax", "jaxlib", "jaxlie", "equinox", "optimistix", "numpy", "opencv-python-headless")
+_WINDOWS_COUNTERS = (
+    *("PeakWorkingSetSize", "WorkingSetSize", "QuotaPeakPagedPoolUsage", "QuotaPagedPoolUsage"),
+    *("QuotaPeakNonPagedPoolUsage", "QuotaNonPagedPoolUsage", "PagefileUsage", "PeakPagefileUsage"),
+)
+"""The fields of `PROCESS_MEMORY_COUNTERS` of the Windows API that follow the two counts."""
+
+
+def machine() -> dict[str, Any]:
+    """What computed: versions of packages, the processor, cores and threads of this process, the commit."""
+    return {
+        "versions": {"python": platform.python_version(), **{name: version(name) for name in _PACKAGES}},
+        "cpu": cpu_model(),
+        "vectors": _vectors(),
+        "cores": usable_cores(),
+        "threads": threads(),
+        "commit": _commit(),
+    }
+
+
+def peak_rss_mb() -> float:
+    """The most memory this process has had, megabytes."""
+    if sys.platform == "win32":
+        return _peak_working_set_mb()
+    import resource  # noqa: PLC0415 - POSIX only
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1e6 if sys.platform == "darwin" else 1e3)  # bytes there, kilobytes elsewhere
+
+
+def _peak_working_set_mb() -> float:
+    """The peak working set of this process, megabytes, as Windows counts it (`GetProcessMemoryInfo`)."""
+    import ctypes  # noqa: PLC0415 - used on Windows only
+    from ctypes import wintypes  # noqa: PLC0415
+
+    class Counters(ctypes.Structure):
+        _fields_ = (
+            ("cb", wintypes.DWORD),
+            ("PageFaultCount", wintypes.DWORD),
+            *((name, ctypes.c_size_t) for name in _WINDOWS_COUNTERS),
+        )
+
+    kernel32 = getattr(ctypes, "WinDLL")("kernel32", use_last_error=True)  # noqa: B009 - not in POSIX's stubs
+    kernel32.GetCurrentProcess.restype = wintypes.HANDLE
+    kernel32.K32GetProcessMemoryInfo.argtypes = (wintypes.HANDLE, ctypes.POINTER(Counters), wintypes.DWORD)
+    counters = Counters(cb=ctypes.sizeof(Counters))
+    if not kernel32.K32GetProcessMemoryInfo(kernel32.GetCurrentProcess(), ctypes.byref(counters), counters.cb):
+        raise OSError(f"GetProcessMemoryInfo failed with error {getattr(ctypes, 'get_last_error')()}")  # noqa: B009
+    return counters.PeakWorkingSetSize / 1e6
+
+
+def cpu_model() -> str:
+    """The name of the processor; its architecture where the system tells no name."""
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        for line in info.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def _vectors() -> str:
+    """The widest instructions of the processor that matter to rounding and speed; its architecture if unknown."""
+    info = Path("/proc/cpuinfo")
+    flags = set(info.read_text().split()) if info.is_file() else set()
+    return next((name for name in ("avx512f", "avx2", "avx", "sse4_2") if name in flags), platform.machine())
+
+
+def _commit() -> str | None:
+    """The commit of the checkout jaxslam runs from, `+` behind it if the checkout has changes; `None` if installed."""
+    root = Path(__file__).resolve().parents[2]
+    if not (root / ".git").exists():
+        return None
+
+    def git(*words: str) -> str:
+        return subprocess.run(
+            ["git", "-C", str(root), *words], capture_output=True, text=True, check=True
+        ).stdout.strip()
+
+    try:
+        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--untracked-files=no") else "")
+    except (OSError, subprocess.CalledProcessError):
+        return None

@@ -1,0 +1,12 @@
+from .detector import PromptedDetector as PromptedDetector
+from .examples import Example as Example
+from .examples import read_examples as read_examples
+from .examples import with_masks as with_masks
+from .in_context import InContextDetector as InContextDetector
+from .in_context import load_in_context as load_in_context
+from .prompt import Prompt as Prompt
+from .prompt import prompt as prompt
+from .segmenter import PROMPT_ADAPTERS as PROMPT_ADAPTERS
+from .segmenter import PromptSegmenter as PromptSegmenter
+from .segmenter import Segments as Segments
+from .segmenter import load_segmenter as load_segmenter

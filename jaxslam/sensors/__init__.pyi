@@ -1,0 +1,11 @@
+from .camera import Camera as Camera
+from .camera import known_cameras as known_cameras
+from .frame import Frame as Frame
+from .frame import check_frame as check_frame
+from .frame_arrays import FrameArrays as FrameArrays
+from .frame_arrays import stack_frames as stack_frames
+from .rectification import RectifiedPair as RectifiedPair
+from .rectification import load_camera as load_camera
+from .stereo_rig import Lens as Lens
+from .stereo_rig import LensModel as LensModel
+from .stereo_rig import Rig as Rig

@@ -1,0 +1,170 @@
+"""A calibrated camera: one frozen record, its checks, and the files it comes from."""
+
+import dataclasses
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+from jax.typing import DTypeLike
+from jaxslam_kernels.camera import Intrinsics, make_intrinsics
+
+from jaxslam.config.schema import configs_dir
+from jaxslam.config.validation import Checked, Range
+from jaxslam.errors import CameraError, JaxSlamError, nearest
+from jaxslam.io.atomic_files import write_atomically
+from jaxslam.sensors.camera_formats import read_camera_fields
+
+MOST_BASELINE_M = 10.0
+"""Longest baseline of a pair; more is rather millimeters."""
+
+_UNITS = {
+    "width": "pixels",
+    "height": "pixels",
+    "fx": "pixels",
+    "fy": "pixels",
+    "cx": "pixels, from the centre of the top-left pixel",
+    "cy": "pixels",
+    "distortion": "k1 k2 p1 p2 k3, as in OpenCV",
+    "depth_scale_per_m": "counts of the depth image a metre",
+    "fps": "frames a second",
+    "baseline_m": "metres between left and right camera",
+    "far_depth_m": "metres; depth beyond it is not trusted on its own",
+    "readout_s": "seconds from the first row to the last; 0 for a global shutter",
+    "color_order": "of a live stream; image files are always read right",
+}
+
+
+@dataclass(frozen=True)
+class Camera(Checked):
+    """A pinhole camera with OpenCV's radial-tangential distortion.
+
+    Attributes:
+        name: What to call it in messages.
+        width: Image width in pixels.
+        height: Image height in pixels.
+        fx: Focal length along a row in pixels.
+        fy: Focal length along a column in pixels.
+        cx: Principal point along a row in pixels, from the centre of the top-left pixel.
+        cy: Principal point along a column in pixels.
+        distortion: `(k1, k2, p1, p2, k3)` as in OpenCV; zeros for rectified images.
+        depth_scale_per_m: Counts of the integer depth image a metre: 5000.0 for TUM and Bonn, 1000.0 for
+            millimetres; `None` for a camera whose depth comes in metres or from stereo.
+        fps: Nominal frames a second. Motion models use timestamps; this only where those fit no rate, and at first.
+        baseline_m: Distance between left and right camera in metres, at most 10; `None` if not stereo.
+        far_depth_m: Depth in metres beyond which a measured depth is not trusted on its own (in ORB-SLAM,
+            `ThDepth` times the baseline); `None` if not known.
+        readout_s: Time in seconds a rolling shutter takes from the first row of a colour image to the last; 0 for a
+            global shutter. `jaxslam.Slam` corrects for it.
+        color_order: Order of the channels in which the camera's driver hands over a colour image.
+
+    Raises:
+        CameraError: If a value has the wrong type or is impossible.
+    """
+
+    name: str
+    width: Annotated[int, Range(at_least=8, at_most=32768)]
+    height: Annotated[int, Range(at_least=8, at_most=32768)]
+    fx: Annotated[float, Range(above=0)]
+    fy: Annotated[float, Range(above=0)]
+    cx: float
+    cy: float
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    depth_scale_per_m: Annotated[float, Range(above=0)] | None = None
+    fps: Annotated[float, Range(above=0, at_most=100_000)] = 30.0
+    baseline_m: Annotated[float, Range(above=0)] | None = None
+    far_depth_m: Annotated[float, Range(above=0)] | None = None
+    readout_s: Annotated[float, Range(at_least=0, at_most=0.1)] = 0.0
+    color_order: Literal["rgb", "bgr"] = "rgb"
+
+    _error: ClassVar[type[JaxSlamError]] = CameraError
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_axis("Camera", "x", self.fx, self.cx, self.width)
+        check_axis("Camera", "y", self.fy, self.cy, self.height)
+        if self.baseline_m is not None:
+            check_baseline("Camera.baseline_m", self.baseline_m)
+
+    @classmethod
+    def load(cls, source: str | Path) -> "Camera":
+        """Read a camera by its known name or from a file of jaxslam, ORB-SLAM2 or ORB-SLAM3.
+
+        Args:
+            source: A name such as `tum_fr1` (`known_cameras()` lists them) or the path of a YAML file.
+
+        Raises:
+            CameraError: If there is no such name or file, or the file is incomplete, misspelt or impossible.
+        """
+        path = Path(source)
+        if str(source) in known_cameras():
+            path = _cameras_dir() / f"{source}.yaml"
+        elif not path.is_file():
+            hint = nearest(str(source), known_cameras())
+            raise CameraError(f"camera: expected a known name or a YAML file, got '{source}'{hint}")
+        fields = read_camera_fields(path, [field.name for field in dataclasses.fields(cls)])
+        try:
+            return cls(**fields)
+        except CameraError as error:
+            raise CameraError(f"{path}: {error}") from None
+
+    def save(self, path: str | Path) -> None:
+        """Write jaxslam's own camera file, which `load` reads back to an equal camera.
+
+        Raises:
+            CameraError: If the file cannot be written.
+        """
+        lines = [_line(key, value) for key, value in dataclasses.asdict(self).items() if value is not None]
+        write_atomically(path, ("\n".join(lines) + "\n").encode(), CameraError)
+
+    @property
+    def is_stereo(self) -> bool:
+        """Whether it takes rectified pairs: it has a baseline and no depth images. ORB-SLAM's RGB-D files have both."""
+        return self.baseline_m is not None and self.depth_scale_per_m is None
+
+    def intrinsics(self, dtype: DTypeLike = np.float32) -> Intrinsics:
+        """The part of the calibration that the kernels compute with, as arrays of `dtype`."""
+        return make_intrinsics(self.fx, self.fy, self.cx, self.cy, self.distortion, dtype)
+
+
+def known_cameras() -> list[str]:
+    """The names of the cameras that come with jaxslam."""
+    return sorted(path.stem for path in _cameras_dir().glob("*.yaml"))
+
+
+def _cameras_dir() -> Path:
+    return configs_dir() / "cameras"
+
+
+def check_axis(whose: str, axis: str, focal: float, centre: float, extent: int) -> None:
+    """Refuse a focal length that does not suit the image, or a principal point outside it.
+
+    Raises:
+        CameraError: If so.
+    """
+    shortest, longest = extent / 20, extent * 50  # 169 and 1.1 degrees of view
+    if not shortest <= focal <= longest:
+        raise CameraError(
+            f"{whose}.f{axis}: expected pixels that suit an image of {extent}, {shortest:g} to {longest:g},"
+            f" got {focal:g} (millimetres, or relative to the width?)"
+        )
+    if not 0 < centre < extent:
+        raise CameraError(f"{whose}.c{axis}: expected a pixel inside the image, 0 to {extent}, got {centre:g}")
+
+
+def check_baseline(field: str, baseline_m: float) -> None:
+    """Refuse a distance between two cameras that is rather in millimeters.
+
+    Raises:
+        CameraError: If so.
+    """
+    if baseline_m > MOST_BASELINE_M:
+        raise CameraError(
+            f"{field}: expected a baseline in meters, at most {MOST_BASELINE_M:g}, got {baseline_m:g} (millimeters?)"
+        )
+
+
+def _line(key: str, value: object) -> str:
+    unit = f"  # {_UNITS[key]}" if key in _UNITS else ""
+    return f"{key}: {json.dumps(value, ensure_ascii=False)}{unit}"

@@ -1,0 +1,557 @@
+"""All that goes on beside tracking: mapping, loop closing, recall, and a detector that looks at keyframes alone.
+
+It runs in threads or on a fixed schedule. The tracker hands over keyframes and takes what is there; it never waits.
+Every exchange happens in the tracker's thread, in `update`: jobs and results are immutable, so threads share nothing
+but their queues and the index of places, which has a lock.
+"""
+
+import threading
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple, TypeAlias
+
+import jax
+import numpy as np
+from jaxlie import SE3
+
+from jaxslam.config.schema import Config
+from jaxslam.features.orb import Features, features_of, no_features
+from jaxslam.features.pose_from_matches import MIN_INLIERS
+from jaxslam.geometry.se3 import IDENTITY, compose, inverse, transform
+from jaxslam.loop_closing.essential_graph import GraphCompiler
+from jaxslam.loop_closing.loop_detector import LoopClosing, LoopClosure
+from jaxslam.loop_closing.place_index import PlaceIndex
+from jaxslam.loop_closing.place_recognition import compile_recognition, recognise
+from jaxslam.map.dynamic_removal import Movers
+from jaxslam.map.types import NONE, Map, empty_map, has
+from jaxslam.mapping.local_map_tracking import keyframes_in_view, match_local_map
+from jaxslam.mapping.local_mapping import LocalMapping, NewKeyframe, mapping_plan, point_ids, with_new_keyframe
+from jaxslam.mapping.occlusion_states import PointStates, StateChanges
+from jaxslam.runtime.preload import import_scipy
+from jaxslam.runtime.stage_timer import StageTimes
+from jaxslam.runtime.trace_cache import traced_once
+from jaxslam.runtime.worker import Worker, close_all, make_worker
+from jaxslam.semantics import Detector
+from jaxslam.sensors.camera import Camera
+from jaxslam.sensors.frame_arrays import FrameArrays
+from jaxslam.slam.dense_thread import DenseMapping
+from jaxslam.slam.keyframe_recall import Recalled, recall
+from jaxslam.slam.keyframe_semantics import KeyframeSemantics
+from jaxslam.slam.tracker_map_sync import Hung, MapLink, pose_of, tracks_of
+from jaxslam.tracking.state import TrackOutput, TrackParams, TrackPlan, TrackReason, TrackState, TrackStatus
+from jaxslam.tracking.state_updates import relocated
+
+_relocated = jax.jit(traced_once(relocated), donate_argnums=0)
+
+_RECALL_EVERY = 10
+"""Frames after which a tracker that only localises gets other keyframes."""
+_MOST_ON_THE_WAY = 2
+"""Keyframes: one that mapping is at, and one that is done when it is looked for next."""
+_PATIENCE_S = 0.02
+"""Longest wait for the index of places, while lost; the next frame asks again."""
+
+
+class Placed(NamedTuple):
+    """Where a frame was taken, by points of the map found in it.
+
+    Attributes:
+        hung: The pose.
+        num_matched: Points that agree on it.
+        covariance: `(6, 6)` in the tangent space at the camera: translation (m), then rotation (rad).
+    """
+
+    hung: Hung
+    num_matched: int
+    covariance: np.ndarray
+
+
+class _Look(NamedTuple):
+    """A job: look whether a keyframe closes a loop."""
+
+    map: Map
+    keyframe: int
+
+
+class _Recall(NamedTuple):
+    """A job: find and prepare keyframes that show what the camera sees."""
+
+    map: Map
+    T_world_cam: np.ndarray
+    submap: int
+    known: frozenset[int]
+
+
+class _Replace(NamedTuple):
+    """A job: take in that a keyframe has lost features."""
+
+    map: Map
+    keyframe: int
+
+
+class _MapUpdate(NamedTuple):
+    """A new map, and what is new in it.
+
+    Attributes:
+        map: The map.
+        keyframe: The new keyframe, or `NONE`.
+        loops: Loops closed.
+        cleaned: The keyframe that what may move has left, or `NONE`.
+        removed: Points that have left the map with it,
+        gone: and the tracker's numbers of them.
+        states: Number of the changes of states that it has, and all before; 0 if no more than the map before.
+    """
+
+    map: Map
+    keyframe: int = NONE
+    loops: int = 0
+    cleaned: int = NONE
+    removed: int = 0
+    gone: np.ndarray | None = None
+    states: int = 0
+
+
+_MapJob: TypeAlias = NewKeyframe | LoopClosure | Movers | StateChanges
+_PlaceJob: TypeAlias = _Look | _Recall | _Replace
+_PlaceResult: TypeAlias = LoopClosure | tuple[Recalled, ...] | None
+
+
+class BackEnd:
+    """Owns the map and the threads that make it."""
+
+    def __init__(
+        self,
+        camera: Camera,
+        params: TrackParams,
+        plan: TrackPlan,
+        config: Config,
+        map: Map | None = None,
+        *,
+        localize_only: bool = False,
+        detector: Detector | None = None,
+        dense: DenseMapping | None = None,
+        times: StageTimes | None = None,
+    ) -> None:
+        """Start with a map, empty by default.
+
+        Args:
+            camera: That takes the frames.
+            params: Of the tracker.
+            plan: Of the tracker.
+            config: Settings.
+            map: To start with.
+            localize_only: Leave the map as it is.
+            detector: Finds in keyframes what may move, which leaves them and the map.
+            dense: Gets keyframes once they are in the map, and where they go.
+            times: Where to keep how long the jobs of the threads take.
+        """
+        self._times = times or StageTimes()
+        self._params, self._track_plan = params, plan
+        self._plan = mapping_plan(camera, config)
+        self._camera, self._config, self._localize_only = camera, config, localize_only
+        start = empty_map(camera) if map is None else map
+        self._mapping = LocalMapping(camera, params, self._plan, start)
+        self._index, self._lock = PlaceIndex.from_map(start), threading.Lock()
+        self._loops = LoopClosing(self._index, params, self._plan.features, self._lock)
+        self._to_mapping: Worker[_MapJob, _MapUpdate] = self._worker(self._map_job, "mapping", 1)
+        self._to_places: Worker[_PlaceJob, _PlaceResult] = self._worker(self._place_job, "places", 2)
+        self._semantics = None if detector is None else self._semantics_of(detector)
+        self._dense = dense
+        self._graphs = GraphCompiler()
+        self._link = MapLink(plan, start)
+        most = config.mapping.num_features + self._num_tracks
+        occlusion = config.dynamics.occlusion
+        self._states = PointStates(occlusion, params, start, most) if occlusion.enabled else None
+        self._states_in_map = 0  # number of the changes that the newest map has
+        self._arrived: Map | None = None
+        self._waiting: list[Recalled] = []
+        self._wanted: set[int] = set()
+        self._correction = IDENTITY
+        self._features: Features | None = None  # of the present frame, once they have been sought
+        self._gone: list[np.ndarray] = []  # numbers of points that the tracker is to forget
+        self._detector_error = ""
+        self._loops_closed = self._removed = 0
+        self._closed = False
+
+    @property
+    def map(self) -> Map:
+        """The map as it is now."""
+        return self._link.map
+
+    @property
+    def loops_closed(self) -> int:
+        """Loops that have been closed, submaps that became one included."""
+        return self._loops_closed
+
+    @property
+    def removed_by_semantics(self) -> int:
+        """Points that have left the map because a keyframe saw them where something may move."""
+        return self._removed
+
+    @property
+    def keyframes_passed_over(self) -> int:
+        """Keyframes that the detector has never looked at, because too many waited."""
+        return 0 if self._semantics is None else self._semantics.num_passed_over
+
+    @property
+    def _num_tracks(self) -> int:
+        """Points that the tracker sees in a frame at most."""
+        plan = self._track_plan
+        return plan.num_points + plan.num_sources * plan.points_per_source
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether keyframes wait that mapping has not begun with; never on the schedule of a deterministic run."""
+        return not self._config.run.in_turn and self._link.num_on_the_way > _MOST_ON_THE_WAY
+
+    def compile(self, frame: FrameArrays, state: TrackState) -> None:
+        """Compile all that is needed while frames of this kind come, with a state that is not needed any more."""
+        import_scipy()
+        self._mapping.compile(frame, self._num_tracks)
+        if self._states is not None:
+            self._states.compile(frame)
+        compile_recognition(self._params, self._plan.features)
+        self._compile_edits(state)
+        if self._dense is not None:
+            self._dense.compile()
+        if not self._config.run.in_turn:
+            self._graphs.compile_now()  # while frames come, it would take seconds from them
+
+    def update(self, state: TrackState, frame: int) -> tuple[TrackState, np.ndarray]:
+        """Take in what is ready by a frame: carry the tracker along with the map, and give it keyframes back.
+
+        Returns:
+            The state, and the correction of the world `(7,)` at the camera since the last update.
+
+        Raises:
+            RuntimeError: If it is closed.
+            Exception: What went wrong in a thread. The state is as it was, and nothing else is lost.
+        """
+        if self._closed:
+            raise RuntimeError("the tracker is closed; Slam.reset() begins anew")
+        self._features = None
+        if self._semantics is not None:
+            self._take_movers(*self._semantics.take(frame), frame)
+        self._take_places(self._to_places.take(frame), frame)
+        more = self._take_maps(self._to_mapping.take(frame), frame)
+        if self._dense is not None:
+            self._dense.take(frame)
+        state = self._carried(state)
+        if more:
+            self._offer_recall(self._link.believed(self._link.reference), frame)
+        correction, self._correction = self._correction, IDENTITY
+        return self._with_recalled(state), correction
+
+    def told_error(self) -> str:
+        """What went wrong in the detector that looks at keyframes; told once, empty if nothing did."""
+        error, self._detector_error = self._detector_error, ""
+        return error
+
+    def keyframe_made(
+        self,
+        timestamp_ns: int,
+        image: np.ndarray,
+        arrays: FrameArrays,
+        output: TrackOutput,
+        frame: int,
+        recognised: Hung | None,
+    ) -> None:
+        """Hand over a keyframe of the tracker.
+
+        Args:
+            timestamp_ns: Its time.
+            image: `(h, w, 3)` RGB or `(h, w)`; copied if it is needed.
+            arrays: The frame; it is copied.
+            output: What the tracker said of it.
+            frame: Its number.
+            recognised: Where it is, if tracking began at a place that was recognised.
+        """
+        keyframe = NONE
+        if not self._localize_only:
+            new = self._link.keyframe_made(timestamp_ns, _copied(arrays), output, recognised)
+            keyframe = new.id
+            states = None if self._states is None else self._states.handed_over()
+            if self._dense is not None:
+                self._dense.keyframe_made(new, image, pose_of(output), frame)
+            self._to_mapping.offer(new._replace(features=self._features, states=states), frame)
+        if self._semantics is not None:
+            self._semantics.offer(keyframe, image, np.asarray(arrays.depth), tracks_of(output), frame)
+
+    def held_to_map(
+        self, state: TrackState, arrays: FrameArrays, output: TrackOutput
+    ) -> tuple[TrackState, TrackOutput, int]:
+        """A frame whose flow is weak, with the pose that points of the map around it give it.
+
+        Returns:
+            State and output, and how many points agree on the pose; as they were and 0 if too few do.
+        """
+        pose = pose_of(output)
+        self._features = features_of(arrays, np.asarray(output.twist), self._params, self._plan.features)
+        placed = self._in_local_map(self._features, pose)
+        if placed is None:
+            return state, output, 0
+        T_world_cam = self._link.pose(placed.hung)
+        change = compose(T_world_cam, inverse(pose))
+        state = self._link.moved(state, change, is_keyframe=bool(output.keyframe))
+        X_world = transform(change, np.asarray(output.X_world, np.float64))
+        fine = placed.num_matched >= self._config.track.weak_inliers
+        wxyz_xyz: Any = T_world_cam.astype(np.float32)
+        output = output._replace(
+            T_world_cam=SE3(wxyz_xyz),
+            X_world=X_world.astype(np.float32),
+            covariance=placed.covariance.astype(np.float32),
+            status=TrackStatus.OK if fine else output.status,
+            reason=TrackReason.NONE if fine else output.reason,
+        )
+        return state, output, placed.num_matched
+
+    def look_at_points(self, arrays: FrameArrays, output: TrackOutput) -> float | None:
+        """Take in which points of the reference keyframe a frame that was tracked shows, and which are blocked in it.
+
+        Returns:
+            The share of them that are OCCLUDED; `None` if the settings do not ask for it, or the map has no keyframe.
+        """
+        if self._states is None or (hung := self._link.in_map(pose_of(output))) is None:
+            return None
+        return self._states.see(self.map, hung.keyframe, hung.T_keyframe_cam, np.asarray(output.twist), arrays)
+
+    def regain(self, arrays: FrameArrays, predicted: np.ndarray | None) -> tuple[Placed | None, bool]:
+        """Where a frame was taken that flow has lost, if the map shows that place.
+
+        Args:
+            arrays: The frame.
+            predicted: `(7,)` where the camera may be, if it was lost just now.
+
+        Returns:
+            Where; and if nowhere, whether the frame shows enough to tell that its place is not in the map.
+        """
+        features = features_of(arrays, np.zeros(6, np.float32), self._params, self._plan.features)
+        near = None if predicted is None else self._in_local_map(features, predicted)
+        if near is not None:
+            return near, False
+        if np.count_nonzero(features.depth) < MIN_INLIERS:
+            return None, False
+        if not self._lock.acquire(timeout=_PATIENCE_S):
+            return None, False
+        try:
+            found = recognise(self.map, self._index, features, self._params, plan=self._plan.features)
+        finally:
+            self._lock.release()
+        if found is None:
+            return None, True
+        return Placed(Hung(found.keyframe, found.T_keyframe_cam), found.num_inliers, found.covariance), False
+
+    def relocated(self, state: TrackState, recognised: Hung) -> TrackState:
+        """The state of the tracker begun anew where the map recognised a place, with keyframes of it at hand."""
+        self._link.refer_to(recognised.keyframe)
+        pose = self._link.pose(recognised)
+        state = self.restarted(state, pose)
+        self._wait_for(self._recalls(_Recall(self.map, pose, self._link.submap_now(), frozenset())))
+        while self._waiting:
+            state = self._with_recalled(state)
+        return state
+
+    def restarted(self, state: TrackState, T_world_cam: np.ndarray) -> TrackState:
+        """The state of the tracker begun anew at a pose."""
+        self._link.forget_slots()
+        self._wait_for(())
+        return _relocated(state, T_world_cam.astype(np.float32))
+
+    def localize(self, T_world_cam: np.ndarray, frame: int) -> None:
+        """Look now and then for keyframes to recall, when none are made any more."""
+        if self._localize_only and frame % _RECALL_EVERY == 0:
+            self._offer_recall(T_world_cam, frame)
+
+    def hang(self, T_world_cam: np.ndarray) -> Hung:
+        """A pose of the tracker, tied to the map."""
+        return self._link.hang(T_world_cam)
+
+    def pose(self, hung: Hung) -> np.ndarray:
+        """`(7,)` where it is in the map now."""
+        return self._link.pose(hung)
+
+    def submap_of(self, hung: Hung) -> int:
+        """Number of the submap that a pose is in now."""
+        return self._link.submap_of(hung.keyframe)
+
+    @property
+    def submap_now(self) -> int:
+        """Number of the submap that the present frame is in."""
+        return self._link.submap_now()
+
+    def finish(self, state: TrackState) -> TrackState:
+        """Wait until everything handed over is in the map; once closed, take what was done until then.
+
+        Raises:
+            Exception: What went wrong in a thread. The state is as it was, and nothing else is lost: finish again.
+        """
+        if self._semantics is not None:
+            self._take_movers(*self._semantics.drain(), 0)
+        if self._states is not None and not (self._localize_only or self._closed):
+            self._offer_states(self._states)
+        self._take_places(self._to_places.drain(), 0)
+        while self._take_maps(self._to_mapping.drain(), 0):
+            self._take_places(self._to_places.drain(), 0)
+        if self._dense is not None:
+            self._dense.finish()
+        return self._carried(state)
+
+    def close(self) -> None:
+        """End the threads, with the jobs they have not begun, in less than two seconds."""
+        self._closed = True
+        looking = () if self._semantics is None else (self._semantics.worker,)
+        dense = () if self._dense is None else (self._dense.worker,)
+        close_all((self._to_mapping, self._to_places, *looking, *dense))
+
+    def _in_local_map(self, features: Features, T_world_cam: np.ndarray) -> Placed | None:
+        """Where a frame was taken that is about at a pose, if the map around shows it."""
+        about = self._link.in_map(T_world_cam)
+        if about is None:
+            return None
+        found = match_local_map(
+            self.map, about.keyframe, about.T_keyframe_cam, features, self._params, self._plan.features, self._states
+        )
+        if found is None:
+            return None
+        return Placed(Hung(about.keyframe, found.T_origin_cam), len(found.agree), found.covariance)
+
+    def _compile_edits(self, state: TrackState) -> None:
+        """Compile the changes to the tracker's state."""
+        state = self._link.compile(_relocated(state, np.asarray(IDENTITY, np.float32)))
+        if self._semantics is not None:
+            state = self._link.forgotten(state, np.zeros(1, np.int64))
+        jax.block_until_ready(state)
+
+    def _semantics_of(self, detector: Detector) -> KeyframeSemantics:
+        settings = self._config.semantics
+        return KeyframeSemantics(
+            self._camera,
+            detector,
+            deterministic=self._config.run.in_turn,
+            latency_frames=settings.latency_frames,
+            dilate_px=settings.dilate_px,
+            times=self._times,
+        )
+
+    def _worker(self, work: Callable[[Any], Any], name: str, turn: int) -> Worker[Any, Any]:
+        latency_frames = turn * self._config.mapping.latency_frames
+        return make_worker(
+            self._times.timed(name, work),
+            f"jaxslam-{name}",
+            deterministic=self._config.run.in_turn,
+            latency_frames=latency_frames,
+        )
+
+    def _map_job(self, job: _MapJob) -> _MapUpdate:
+        before = self._mapping.map
+        try:
+            if isinstance(job, LoopClosure):
+                map = self._mapping.close_loop(job)
+                return _MapUpdate(map, loops=int(map is not before))
+            if isinstance(job, Movers):
+                map, gone = self._mapping.remove(job)
+                removed = len(before.points.ids) - len(map.points.ids)
+                return _MapUpdate(map, cleaned=job.keyframe, removed=removed, gone=gone)
+            if isinstance(job, StateChanges):
+                return _MapUpdate(self._mapping.take_states(job), states=job.number)
+            return _MapUpdate(self._mapping.add(job), job.id, states=0 if job.states is None else job.states.number)
+        except BaseException:
+            # What was begun is forgotten; those after a keyframe hang on it, and so it is there, without points.
+            map = with_new_keyframe(before, job, no_features()) if isinstance(job, NewKeyframe) else before
+            self._mapping = LocalMapping(self._camera, self._params, self._plan, map)
+            raise
+
+    def _place_job(self, job: _PlaceJob) -> _PlaceResult:
+        if isinstance(job, _Look):
+            return self._loops.look(job.map, job.keyframe)
+        if isinstance(job, _Replace):
+            return self._loops.replace(job.map, job.keyframe)
+        return self._recalls(job)
+
+    def _recalls(self, job: _Recall) -> tuple[Recalled, ...]:
+        wanted = keyframes_in_view(job.map, job.T_world_cam, job.submap, set(job.known), self._track_plan.num_recalled)
+        return tuple(recall(job.map, keyframe_id, self._track_plan.num_points) for keyframe_id in wanted)
+
+    def _take_maps(self, updates: list[_MapUpdate], frame: int) -> bool:
+        """Keep the newest map until the state is carried along, and look for loops; whether there was one."""
+        for update in updates:
+            self._arrived = update.map
+            self._loops_closed += update.loops
+            self._removed += update.removed
+            self._graphs.keep_ahead(len(update.map.ids))
+            if self._dense is not None and not self._closed:
+                self._dense.map_made(update.map, update.keyframe, frame)
+            self._states_in_map = max(self._states_in_map, update.states)
+            if update.gone is not None:
+                self._gone.append(update.gone)
+            if update.cleaned != NONE and not self._closed:
+                self._to_places.offer(_Replace(update.map, update.cleaned), frame)
+            if update.keyframe != NONE and not self._closed:
+                self._to_places.offer(_Look(update.map, update.keyframe), frame)
+        return bool(updates)
+
+    def _carried(self, state: TrackState) -> TrackState:
+        if self._arrived is not None:
+            state, change = self._link.corrected(state, self._arrived)
+            self._arrived = None
+            self._correction = compose(change, self._correction)
+            if self._states is not None:
+                self._states.arrived(self.map, self._states_in_map)
+        for gone in self._gone:
+            state = self._link.forgotten(state, gone)
+        self._gone.clear()
+        return state
+
+    def _take_movers(self, found: list[Movers], error: str, frame: int) -> None:
+        """Have what may move leave the keyframes it was found in, the map, and the tracker's state."""
+        self._detector_error = error or self._detector_error
+        for movers in found:
+            self._gone.append(movers.tracks)
+            if self._dense is not None and movers.mask.any() and not self._closed:
+                self._dense.remove(movers, frame)
+            if movers.keyframe != NONE and movers.mask.any() and not self._closed:
+                self._to_mapping.offer(movers, frame)
+
+    def _offer_states(self, states: PointStates) -> None:
+        """Hand over what has changed since the last keyframe."""
+        changes = states.handed_over()
+        if len(changes.ids):
+            self._to_mapping.offer(changes, 0)
+
+    def _take_places(self, results: list[_PlaceResult], frame: int) -> None:
+        for result in results:
+            if isinstance(result, LoopClosure):
+                if not self._closed:
+                    self._to_mapping.offer(result, frame)
+            elif result:
+                self._wait_for(result)
+
+    def _wait_for(self, keyframes: Iterable[Recalled]) -> None:
+        """Have keyframes put back into the tracker, one a frame."""
+        self._waiting = list(keyframes)
+        self._wanted = {keyframe.keyframe for keyframe in self._waiting}
+
+    def _offer_recall(self, T_world_cam: np.ndarray, frame: int) -> None:
+        if self._track_plan.num_recalled and self._link.reference != NONE:
+            known = frozenset(self._link.latest())
+            self._to_places.offer(_Recall(self.map, T_world_cam, self._link.submap_now(), known), frame)
+
+    def _with_recalled(self, state: TrackState) -> TrackState:
+        """The state with one more of the keyframes that wait; one a frame, so that none takes long."""
+        while self._waiting:
+            keyframe = self._waiting.pop(0)
+            if self._semantics is not None:
+                keyframe = _without_removed(keyframe, self.map)
+            slot = self._link.slot_for(keyframe.keyframe, self._wanted)
+            if slot is not None:
+                return self._link.recalled(state, slot, keyframe)
+        return state
+
+
+def _without_removed(keyframe: Recalled, map: Map) -> Recalled:
+    """A keyframe that was prepared from an earlier map, without the points that have left it since."""
+    there = has(map.points.ids, point_ids(keyframe.id))
+    return keyframe._replace(weight=np.where(there, keyframe.weight, np.float32(0)))
+
+
+def _copied(arrays: FrameArrays) -> FrameArrays:
+    """A frame's own copy, for use after the caller has got its images back."""
+    return FrameArrays(*jax.tree.map(np.array, tuple(arrays)))

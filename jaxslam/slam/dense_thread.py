@@ -1,0 +1,193 @@
+"""The dense map in the making, in a thread of its own.
+
+The tracker's thread hands over copies and goes on. At most so many keyframes wait; when more come, the oldest of them
+is never looked at.
+"""
+
+import threading
+from collections import deque
+from typing import TypeAlias
+
+import numpy as np
+
+from jaxslam.config.schema import DenseConfig
+from jaxslam.dense.coverage import SeenArea
+from jaxslam.dense.dense_map import DenseFigures, DenseMap, Look, Shown
+from jaxslam.dense.key_objects import Neighbours
+from jaxslam.dense.occupancy import Occupancy
+from jaxslam.dense.point_cloud import DenseCloud
+from jaxslam.geometry.se3 import IDENTITY, moved
+from jaxslam.map.dynamic_removal import Movers
+from jaxslam.map.types import NONE, Map
+from jaxslam.mapping.local_mapping import NewKeyframe
+from jaxslam.runtime.worker import Worker, make_worker
+from jaxslam.sensors.frame_arrays import FrameArrays
+from jaxslam.slam.tracker_map_sync import pose_of
+from jaxslam.tracking.state import TrackOutput
+
+_MOST_WAITING = 8
+"""Keyframes that wait: 2.5 MB each at 640x480, and more than two seconds of a tracker that makes three a second."""
+_LOOK_EVERY = 5
+"""Frames, of which one has its look at what is not there any more, and at what is new: with keyframes alone, twice as
+many ghosts stay. A keyframe of a camera that measures depth has none of its own besides."""
+
+_Job: TypeAlias = Shown | Look | Movers | None
+"""`None`: look at the newest map."""
+
+
+class DenseMapping:
+    """Makes the dense map of keyframes that are in the map.
+
+    All but `cloud`, `cells` and `figures` is called from the tracker's thread.
+
+    Attributes:
+        wants_keyframe: Whether much is in the picture that no keyframe shows.
+    """
+
+    def __init__(self, map: DenseMap, seen: SeenArea, config: DenseConfig, *, deterministic: bool) -> None:
+        """Begin.
+
+        Args:
+            map: Empty; from now on nobody else's.
+            seen: Without keyframes; nobody else's either.
+            config: Settings that it was made with.
+            deterministic: Work in turn; else in a thread.
+        """
+        self._map, self._carves = map, config.carve
+        self._seen, self._least_seen, self.wants_keyframe = seen, config.keyframe_below, False
+        self._neighbours = Neighbours(config.key_window, config.key_frames) if map.has_keys else None
+        self._on_the_way: dict[int, Shown] = {}
+        self._waiting: deque[_Job] = deque()
+        self._lock, self._waiting_lock = threading.Lock(), threading.Lock()
+        self._passed_over = 0
+        self.worker: Worker[None, None] = make_worker(
+            self._next_job, "jaxslam-dense", deterministic=deterministic, latency_frames=0
+        )
+
+    def compile(self) -> None:
+        """Compile all that is needed."""
+        with self._lock:
+            self._map.compile()
+
+    def keyframe_made(self, new: NewKeyframe, image: np.ndarray, pose: np.ndarray, frame: int) -> None:
+        """Take a keyframe; it is put in when it is in the map.
+
+        Args:
+            new: As local mapping gets it.
+            image: `(h, w, 3)` RGB or `(h, w)`; copied.
+            pose: `(7,)` where the tracker has it.
+            frame: Its number.
+        """
+        arrays = new.frame
+        self._seen.add(pose)
+        self.wants_keyframe = False
+        self._on_the_way[new.id] = Shown(
+            keyframe=new.id,
+            image=image.copy(),
+            depth=np.asarray(arrays.depth),
+            pair=None if arrays.right is None else (np.asarray(arrays.image), np.asarray(arrays.right)),
+            ignore=np.asarray(arrays.ignore),
+            T_cam_depth=moved(IDENTITY, new.twist * float(arrays.depth_delay_s)),
+            neighbours=() if self._neighbours is None else self._neighbours.before(frame, pose),
+        )
+
+    def frame_tracked(self, frame: int, image: np.ndarray, arrays: FrameArrays, output: TrackOutput) -> None:
+        """Take in a frame that was tracked.
+
+        It may show key objects of a keyframe to come, and what it sees past is not there.
+        """
+        depth, ignore, pose = np.asarray(arrays.depth), np.asarray(arrays.ignore), pose_of(output)
+        if self._neighbours is not None:
+            self._neighbours.see(frame, image, depth, ignore, pose)
+        if frame % _LOOK_EVERY:
+            return
+        self.wants_keyframe = self._seen.share(depth, ignore, pose) < self._least_seen
+        # Rough depth of a pair would see past what is there: keyframes, which are matched again, look instead.
+        if self._carves and arrays.right is None and len(self._waiting) < _MOST_WAITING:
+            pose = moved(pose, np.asarray(output.twist) * float(arrays.depth_delay_s))
+            self._add_job(self._map.look_of(depth, ignore, pose), frame)
+
+    def map_made(self, map: Map, keyframe: int, frame: int) -> None:
+        """Take in a new map, and the keyframe that is new in it, or `NONE`."""
+        self._map.sparse = map
+        shown = self._on_the_way.pop(keyframe, None)
+        self._add_job(shown, frame)
+
+    def remove(self, movers: Movers, frame: int) -> None:
+        """Take in what may move in a keyframe."""
+        shown = self._on_the_way.get(movers.keyframe)
+        if shown is not None:
+            self._on_the_way[movers.keyframe] = shown._replace(ignore=shown.ignore | movers.mask)
+        elif movers.keyframe != NONE:
+            self._add_job(movers, frame)
+
+    def take(self, frame: int) -> None:
+        """Raise what went wrong, if something did."""
+        self.worker.take(frame)
+
+    def finish(self) -> None:
+        """Wait until all is in, and every keyframe where the map has it."""
+        self.worker.drain()
+        with self._lock:
+            self._map.correct_all()
+
+    def cloud(self) -> DenseCloud:
+        """The points as they are now, in the submap with most keyframes; from any thread."""
+        with self._lock:
+            return self._map.cloud()
+
+    def cells(self) -> Occupancy:
+        """What is occupied and free, by all keyframes that are kept; from any thread.
+
+        Raises:
+            MapFileError: If there is none yet.
+        """
+        with self._lock:
+            depths, poses = self._map.depths()
+        return self._map.cells(depths, poses)
+
+    @property
+    def sees_anything(self) -> bool:
+        """Whether a keyframe that is kept has depth."""
+        with self._lock:
+            return self._map.sees_anything
+
+    def figures(self) -> DenseFigures:
+        """How the map was made so far; from any thread."""
+        with self._lock:
+            return self._map.figures(self._passed_over)
+
+    def _add_job(self, job: _Job, frame: int) -> None:
+        if job is None and self._waiting:
+            return  # the newest map is looked at with each job
+        if isinstance(job, Shown):
+            jobs = tuple(self._waiting)
+            waiting = [number for number, other in enumerate(jobs) if isinstance(other, Shown)]
+            if len(waiting) >= _MOST_WAITING:
+                self._pass_over(jobs[waiting[0]])
+        self._waiting.append(job)
+        self.worker.offer(None, frame)
+
+    def _pass_over(self, job: _Job) -> None:
+        """Take the place of a job that waits, unless its turn has come; then nothing is done in that turn."""
+        with self._waiting_lock:
+            for number, other in enumerate(self._waiting):
+                if other is job:
+                    del self._waiting[number]
+                    self._passed_over += 1
+                    return
+
+    def _next_job(self, _: None) -> None:
+        with self._waiting_lock:
+            if not self._waiting:
+                return
+            job = self._waiting.popleft()
+        with self._lock:
+            if isinstance(job, Shown):
+                self._map.add(job)
+            elif isinstance(job, Movers):
+                self._map.remove(job)
+            elif isinstance(job, Look):
+                self._map.look(job)
+            else:
+                self._map.correct()

@@ -1,0 +1,55 @@
+"""Looks at the input of a run for what is wrong but shows only in the pictures: units, sides, rows, color order."""
+
+import numpy as np
+
+from jaxslam.semantics.checked_detector import WatchedDetector
+from jaxslam.sensors.camera import Camera
+from jaxslam.sensors.depth_checks import contradiction_of_depth
+from jaxslam.sensors.frame import Frame, to_grey
+from jaxslam.sensors.image_checks import scaled_to_one
+from jaxslam.sensors.stereo_checks import contradiction_of_pairs, matched_shifts
+from jaxslam.slam.input_warnings import InputWarnings
+
+_FIRST, _RARELY = 10, 100
+_PAIR_EVERY = 3
+"""Of the first frames, those whose pair is matched: it takes longest."""
+
+
+class InputWatch:
+    """Looks at the first ten frames, then at every hundredth, and warns of what contradicts the camera."""
+
+    def __init__(self, camera: Camera, warnings: InputWarnings, detector: WatchedDetector | None) -> None:
+        """Begin before the first frame.
+
+        Args:
+            camera: That takes the frames.
+            warnings: Where to say what looks wrong.
+            detector: The detector that looks at the same frames, which notices swapped colors.
+        """
+        self._camera, self._warnings, self._detector = camera, warnings, detector
+        self._frames = 0
+        self._shifts = np.zeros((0, 2))
+
+    def look(self, frame: Frame) -> None:
+        """Look at the next frame, if it is one of those looked at."""
+        number, self._frames = self._frames, self._frames + 1
+        if self._detector is not None and self._detector.color_suspicion:
+            self._warnings.warn("color order", self._detector.color_suspicion)
+        if number >= _FIRST and number % _RARELY:
+            return
+        if scaled_to_one(to_grey(frame.image)):
+            text = "image: expected values from 0 to 255, got 0 and 1 only; it looks like an image scaled to 0 to 1"
+            self._warnings.warn("image range", text)
+        if self._camera.is_stereo:
+            self._look_at_pair(frame, number)
+        elif frame.depth_m is not None and (contradiction := contradiction_of_depth(frame.depth_m)):
+            self._warnings.warn("depth scale", f"depth_m: expected meters along the optical axis, got {contradiction}")
+
+    def _look_at_pair(self, frame: Frame, number: int) -> None:
+        if frame.right is None or (number < _FIRST and number % _PAIR_EVERY):
+            return
+        new = matched_shifts(to_grey(frame.image), to_grey(frame.right), quick=True)
+        self._shifts = new if number >= _FIRST else np.concatenate([self._shifts, new])
+        topic, text = contradiction_of_pairs(self._shifts)
+        if text:
+            self._warnings.warn(topic, text)

@@ -1,0 +1,142 @@
+"""The detector on keyframes alone, in a thread of its own: what may move leaves keyframe and map when it is found.
+
+Source: Ji, Wang and Xie, "Towards Real-time Semantic RGB-D SLAM in Dynamic Environments" (TRS-SLAM), 2021, section
+III-A. Nobody waits for it: until a keyframe has been looked at, it is taken as it is.
+"""
+
+import logging
+from collections import deque
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxslam.map.dynamic_removal import Movers, under
+from jaxslam.mapping.local_mapping import Tracks
+from jaxslam.masks.box_to_mask import dilated
+from jaxslam.runtime.stage_timer import StageTimes
+from jaxslam.runtime.worker import Worker, make_worker
+from jaxslam.semantics import Detector
+from jaxslam.sensors.camera import Camera
+from jaxslam.sensors.downscale import Raster, Reduced
+from jaxslam.slam.mask_pipeline import WIDTH_PX
+from jaxslam.slam.semantic_thread import Failures, mask_found, rgb_copy
+
+_log = logging.getLogger(__name__)
+
+_MOST_WAITING = 32
+"""Keyframes that wait for the detector. A late mask still cleans the map, so few would do harm; so many are 40 MB at
+640x480, and ten seconds of a tracker that makes three a second. When more come, the one that has waited longest is
+never looked at: the tracker is done with it, and what others see of the same objects is removed with them."""
+
+
+class _Shown(NamedTuple):
+    """A keyframe for the detector, its own copy.
+
+    Attributes:
+        keyframe: Its id, or `NONE`.
+        image: `(h, w, 3)` RGB.
+        depth: `(h', w')` metres, at the size of masks.
+        id: `(n,)` the tracker's numbers of the points it saw,
+        seen_uv: `(2, n)` and where, pixels.
+    """
+
+    keyframe: int
+    image: np.ndarray
+    depth: np.ndarray
+    id: np.ndarray
+    seen_uv: np.ndarray
+
+
+class KeyframeSemantics:
+    """Looks at one keyframe after the other, in their order.
+
+    Attributes:
+        worker: That does it.
+        num_passed_over: Keyframes that were never looked at, because too many waited.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        detector: Detector,
+        *,
+        deterministic: bool,
+        latency_frames: int,
+        dilate_px: int,
+        times: StageTimes | None = None,
+    ) -> None:
+        """Begin idle.
+
+        Args:
+            camera: That takes the frames.
+            detector: What looks.
+            deterministic: Have it look in turn, what it finds `latency_frames` later; else in a thread.
+            latency_frames: With 0, it is there with the next frame.
+            dilate_px: How far a mask reaches beyond what was found.
+            times: Where to keep how long a look takes.
+        """
+        self._detector, self._dilate_px = detector, dilate_px
+        self._reduced, self._failures = Reduced(Raster.of(camera), WIDTH_PX), Failures()
+        self._waiting: deque[_Shown] = deque(maxlen=_MOST_WAITING)
+        self.num_passed_over = 0
+        # A job is only the word that there is one more: of those that wait, the thread takes the first.
+        self.worker: Worker[None, Movers | None] = make_worker(
+            (times or StageTimes()).timed("detector", self._look),
+            "jaxslam-semantics",
+            deterministic=deterministic,
+            latency_frames=latency_frames,
+        )
+
+    def offer(
+        self, keyframe: int, image: np.ndarray, depth: Float[np.ndarray, "h w"], tracks: Tracks, frame: int
+    ) -> None:
+        """Have it look at a keyframe.
+
+        Args:
+            keyframe: Its id; `NONE` if it does not go into the map.
+            image: `(h, w, 3)` RGB or `(h, w)`; copied.
+            depth: Metres; copied.
+            tracks: Points that the tracker saw in it.
+            frame: Number of the frame.
+        """
+        seen = tracks.weight > 0
+        points = tracks.id[seen].astype(np.int64), tracks.seen_uv[:, seen]
+        self._waiting.append(_Shown(keyframe, rgb_copy(image), self._reduced.every(depth).copy(), *points))
+        self.worker.offer(None, frame)
+
+    def take(self, frame: int) -> tuple[list[Movers], str]:
+        """What was found by a frame, in the order of the keyframes, and what went wrong last; told once."""
+        return self._taken(lambda: self.worker.take(frame))
+
+    def drain(self) -> tuple[list[Movers], str]:
+        """The same once all keyframes have been looked at; it waits for that, unless it is closed."""
+        return self._taken(self.worker.drain)
+
+    def _look(self, _: None) -> Movers | None:
+        if not self._waiting:
+            return None  # more came than can wait
+        shown = self._waiting.popleft()
+        found = mask_found(self._detector, self._reduced, shown.image, shown.depth)
+        mask = dilated(self._reduced.whole(found), self._dilate_px)
+        return Movers(shown.keyframe, mask, shown.id[under(mask, shown.seen_uv)])
+
+    def _taken(self, take: Callable[[], list[Movers | None]]) -> tuple[list[Movers], str]:
+        found: list[Movers] = []
+        error = ""
+        while True:
+            try:
+                done = take()
+            except Exception as wrong:  # whatever a network raises: tracking goes on without it
+                error = self._failures.told(f"{type(wrong).__name__}: {wrong}")
+                continue
+            if not done:
+                return found, error
+            found += (movers for movers in done if movers is not None)
+            self._pass_over(sum(movers is None for movers in done))
+
+    def _pass_over(self, count: int) -> None:
+        if count and not self.num_passed_over:
+            _log.warning("the detector is slow: keyframes that waited too long are not looked at")
+        self.num_passed_over += count

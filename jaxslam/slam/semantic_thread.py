@@ -1,0 +1,167 @@
+"""The detector in a thread of its own: one frame in, one mask out, and the tracker never waits.
+
+Frames that come while it looks at one are not for it; so it always looks at the newest. In a deterministic run it is
+called in turn, and its masks come a fixed number of frames later.
+"""
+
+import logging
+import time
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from jaxslam.masks.box_to_mask import mask_of_detections, reduced_detections
+from jaxslam.masks.propagation import Origin, make_origin
+from jaxslam.runtime.stage_timer import StageTimes
+from jaxslam.runtime.worker import InlineWorker, Worker, make_worker
+from jaxslam.semantics import Detector
+from jaxslam.sensors.downscale import Reduced
+
+_log = logging.getLogger(__name__)
+
+_PATIENCE_S = 2.0
+"""Longest wait for the mask of a frame that has to wait."""
+
+
+class Seen(NamedTuple):
+    """A frame for the detector.
+
+    Attributes:
+        frame: Its number.
+        image: `(h, w, 3)` RGB or `(h, w)`.
+        grey: `(h', w')` uint8, of the size of masks.
+        depth: `(h', w')` metres.
+    """
+
+    frame: int
+    image: np.ndarray
+    grey: np.ndarray
+    depth: np.ndarray
+
+
+class Found(NamedTuple):
+    """What the detector has found.
+
+    Attributes:
+        frame: The frame it looked at.
+        origin: The mask, and the points it is followed by.
+    """
+
+    frame: int
+    origin: Origin
+
+
+class Failures:
+    """What goes wrong in a detector: told every time, in the log only when it changes."""
+
+    def __init__(self) -> None:
+        """Begin with nothing wrong."""
+        self._said = ""
+
+    def told(self, error: str) -> str:
+        """What went wrong, as it is told."""
+        if error != self._said:
+            _log.warning("detector failed: %s", error)
+        self._said = error
+        return error
+
+
+def rgb_copy(image: np.ndarray) -> np.ndarray:
+    """`(h, w, 3)` of `(h, w, 3)` or of grey `(h, w)`, as a detector takes it; a copy."""
+    return image.copy() if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
+
+
+def mask_found(
+    detector: Detector, reduced: Reduced, rgb: UInt8[np.ndarray, "h w 3"], depth: Float[np.ndarray, "_h _w"]
+) -> Bool[np.ndarray, "_h _w"]:
+    """What a detector finds in an image, as a mask of the size of masks, no wider than it was found."""
+    return mask_of_detections(reduced_detections(detector(rgb), reduced), depth, dilate_px=0)
+
+
+class SemanticThread:
+    """Looks at one frame after the other.
+
+    Attributes:
+        looking_at: The frame it has not finished; `None` if it is idle.
+    """
+
+    def __init__(
+        self,
+        detector: Detector,
+        reduced: Reduced,
+        *,
+        deterministic: bool,
+        latency_frames: int,
+        seed: int = 0,
+        times: StageTimes | None = None,
+    ) -> None:
+        """Begin idle.
+
+        Args:
+            detector: What looks.
+            reduced: The size of masks.
+            deterministic: Have it look in turn, its masks `latency_frames` later; else in a thread.
+            latency_frames: 0 has every frame wait for its mask, in a thread too.
+            seed: Of random choices.
+            times: Where to keep how long a look takes.
+        """
+        self.looking_at: int | None = None
+        self._offered: int | None = None
+        self._detector, self._reduced, self._seed = detector, reduced, seed
+        self._all_wait, self._begun, self._failures = latency_frames == 0, False, Failures()
+        self._worker: Worker[Seen, Found] = make_worker(
+            (times or StageTimes()).timed("detector", self._look),
+            "jaxslam-semantics",
+            deterministic=deterministic,
+            latency_frames=latency_frames,
+        )
+
+    def newest(self, seen: Seen) -> tuple[Found | None, str]:
+        """The newest mask there is by a frame, if it is newer than the last one, and what went wrong; told once.
+
+        The first frame of all waits for its mask: whatever the tracker starts with would else be taken for static.
+        """
+        found, error = self._newest(seen.frame)
+        if self._all_wait or not self._begun:
+            self.offer(seen)
+            later, failed = self._awaited(seen.frame)
+            found, error = later or found, failed or error
+        self._begun = True
+        return found, error
+
+    def offer(self, seen: Seen) -> None:
+        """Have it look at a frame, if it is idle and has not yet; image and depth are copied."""
+        if self.looking_at is None and seen.frame != self._offered:
+            self._worker.offer(seen._replace(image=rgb_copy(seen.image), depth=seen.depth.copy()), seen.frame)
+            self.looking_at = self._offered = seen.frame
+
+    def close(self) -> None:
+        """End the thread."""
+        self._worker.close()
+
+    def _look(self, job: Seen) -> Found:
+        mask = mask_found(self._detector, self._reduced, job.image, job.depth)
+        return Found(job.frame, make_origin(mask, job.grey, self._seed + job.frame))
+
+    def _newest(self, frame: int) -> tuple[Found | None, str]:
+        try:
+            done = self._worker.take(frame)
+        except Exception as error:
+            self.looking_at = None
+            return None, self._failures.told(f"{type(error).__name__}: {error}")
+        if not done:
+            return None, ""
+        self.looking_at = None
+        return done[-1], ""
+
+    def _awaited(self, frame: int) -> tuple[Found | None, str]:
+        """The mask of this very frame, if it comes in time."""
+        until_s = time.monotonic() + _PATIENCE_S
+        inline = isinstance(self._worker, InlineWorker)
+        while True:
+            # The schedule of a deterministic run is in frames: this one is as if it came later.
+            found, error = self._newest(np.iinfo(np.int64).max if inline else frame)
+            if found is not None or error or time.monotonic() > until_s:
+                return found, error
+            time.sleep(0.001)

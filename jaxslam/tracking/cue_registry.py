@@ -1,0 +1,87 @@
+"""The cues that settings can name, and their parameters as the settings have them."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax.typing import DTypeLike
+
+from jaxslam.config.schema import DynamicsConfig, MotionConfig
+from jaxslam.dynamics.cluster_cue import ClusterParams, make_cluster_cue
+from jaxslam.dynamics.cue import Cue
+from jaxslam.dynamics.epipolar_cue import EpipolarParams, make_epipolar_cue
+from jaxslam.dynamics.object_motion import MotionParams, MotionPlan
+from jaxslam.dynamics.regions import RegionPlan
+from jaxslam.dynamics.scene_flow_cue import TrajectoryParams, trajectory_cue
+from jaxslam.tracking.floating_dtype import floating_dtype
+from jaxslam.tracking.state import TrackParams, TrackPlan
+
+
+class _Known(NamedTuple):
+    """A cue of settings, and what has the names of its parameters, each of which is a setting or the temperature.
+
+    Attributes:
+        cue: Makes it of the settings of all cues.
+        params: The class of its parameters.
+        needs_regions: Whether it judges regions.
+    """
+
+    cue: Callable[[DynamicsConfig], Cue]
+    params: Callable[..., Any]
+    needs_regions: bool = False
+
+
+_KNOWN = {
+    "trajectory": _Known(lambda _: trajectory_cue, TrajectoryParams),
+    "epipolar": _Known(lambda config: make_epipolar_cue(config.epipolar.num_hypotheses), EpipolarParams),
+    "clusters": _Known(
+        lambda config: make_cluster_cue(config.clusters.as_published), ClusterParams, needs_regions=True
+    ),
+}
+
+
+def with_cues(plan: TrackPlan, config: DynamicsConfig, *, pairs: bool = False) -> TrackPlan:
+    """The plan with the cues of the settings, and regions if one of them needs those.
+
+    The depth of pairs is found at half the size, and so are its regions.
+    """
+    chosen, clusters = [_KNOWN[name] for name in config.cues], config.clusters
+    step_px = 2 * clusters.step_px if pairs else clusters.step_px
+    regions = RegionPlan(clusters.num_regions, step_px, clusters.num_steps, clusters.recover_frames)
+    needed = config.even_votes or any(known.needs_regions for known in chosen)
+    return plan._replace(
+        cues=tuple(known.cue(config) for known in chosen),
+        regions=regions if needed else None,
+        even_votes=config.even_votes,
+        motion=_motion_plan(config.motion),
+    )
+
+
+def with_cue_params(params: TrackParams, config: DynamicsConfig, dtype: DTypeLike | None = None) -> TrackParams:
+    """The parameters with those of the cues of the settings, all of one floating-point type.
+
+    Args:
+        params: From `track_params`.
+        config: Settings of the cues.
+        dtype: Floating-point type of the parameters added; that of `params` if not given.
+
+    Raises:
+        TypeError: If `dtype` is no floating-point type, or is float64 while `jax_enable_x64` is off.
+    """
+    dtype = jnp.result_type(params.pixel_sigma) if dtype is None else floating_dtype(dtype)
+    cues = tuple(_params_of(getattr(config, name), _KNOWN[name].params, config, dtype) for name in config.cues)
+    motion = _params_of(config.motion, MotionParams, config, dtype) if config.motion.enabled else None
+    return params._replace(cues=cues, motion=motion)
+
+
+def _motion_plan(config: MotionConfig) -> MotionPlan | None:
+    if not config.enabled:
+        return None
+    return MotionPlan(config.num_objects, config.reserved, config.dense_cell_px, config.as_published)
+
+
+def _params_of(chosen: Any, make: Callable[..., Any], config: DynamicsConfig, dtype: jnp.dtype) -> Any:
+    fields: Any = make._fields  # type: ignore[attr-defined]
+    values = {field: getattr(chosen, field) for field in fields if field != "temperature"}
+    values["temperature"] = config.temperature
+    return make(**{field: jnp.asarray(value, dtype) for field, value in values.items()})

@@ -1,0 +1,161 @@
+"""The ring of keyframes: which to look into, looking their points up in a frame, and adding one."""
+
+import jax
+import jax.numpy as jnp
+from jaxlie import SE3
+from jaxslam_kernels.camera import Intrinsics, normalise
+from jaxslam_kernels.depth.sampling import sample_depth
+from jaxslam_kernels.flow.patch_align import align_patches
+from jaxslam_kernels.se3 import to_camera
+from jaxslam_kernels.types import Mask, Pixels, Scalar, Weights
+from jaxtyping import Array, Bool, Float, Int, Num
+
+from jaxslam.tracking.measurement import View, predict_pixels
+from jaxslam.tracking.state import Keyframes, LookedUp, TrackedPoints, TrackParams, TrackPlan
+
+_MARGIN_PX = 8
+_MOST_TURN = 0.7
+"""Cosine of the largest angle between the directions from which a point is looked up and was seen."""
+_MOST_SCALE = 2.0
+"""How much nearer or farther it may be."""
+_MAX_SHIFT_PX = 12.0
+"""A point found further from where the pose predicts it is another one."""
+
+
+def empty_keyframes(height: int, width: int, plan: TrackPlan, image_dtype: jnp.dtype, dtype: jnp.dtype) -> Keyframes:
+    """A ring without keyframes."""
+    k, n = plan.num_keyframes + plan.num_recalled, plan.num_points
+    return Keyframes(
+        images=jnp.zeros((k, height, width), image_dtype),
+        T_world_cam=jnp.tile(SE3.identity().wxyz_xyz.astype(dtype), (k, 1)),
+        uv=jnp.zeros((k, 2, n), dtype),
+        X_world=jnp.zeros((k, 3, n), dtype),
+        weight=jnp.zeros((k, n), dtype),
+        id=jnp.zeros((k, n), jnp.int32),
+        made=jnp.zeros((), jnp.int32),
+    )
+
+
+def look_up(
+    keyframes: Keyframes,
+    T_world_cam: SE3,
+    twist: Float[Array, "6"],
+    view: View,
+    params: TrackParams,
+    plan: TrackPlan,
+) -> LookedUp:
+    """Look points of the best keyframes up in the current frame, around where the pose predicts them.
+
+    Args:
+        keyframes: The ring.
+        T_world_cam: Pose of the current frame, good to a few pixels.
+        twist: Velocity of the camera, for the rolling shutter.
+        view: The current frame; its depth drops points that something covers.
+        params: Thresholds and camera.
+        plan: Static.
+    """
+    height, width = view.pyramid.size()
+    k, n = keyframes.weight.shape
+    valid = keyframes.weight > 0
+    X_cam = to_camera(T_world_cam, jnp.moveaxis(keyframes.X_world, 1, 0).reshape(3, k * n))
+    predicted = predict_pixels(X_cam, twist, height, params)
+    alike = _seen_alike(keyframes, T_world_cam).reshape(-1)
+    visible = _visible(predicted, X_cam[2], height, width) & alike & valid.reshape(-1)
+    shown = jnp.sum(visible.reshape(k, n), axis=1)
+    overlap = jnp.max((shown / jnp.maximum(jnp.sum(valid, axis=1), 1)).astype(predicted.dtype))
+    if plan.num_sources == 0:
+        return _nothing_found(overlap, keyframes)
+    _, sources = jax.lax.top_k(shown, plan.num_sources)
+    chosen = jax.vmap(lambda s: jnp.nonzero(visible.reshape(k, n)[s], size=plan.points_per_source, fill_value=n)[0])(
+        sources
+    )
+    real = (chosen < n).reshape(-1)
+    index = (sources[:, None] * n + jnp.minimum(chosen, n - 1).astype(sources.dtype)).reshape(-1)
+    take = lambda array: jnp.take(array, index, axis=-1, mode="clip")
+    guess, X_there = take(predicted), take(X_cam)
+    seen_depth = sample_depth(view.depth, jax.lax.stop_gradient(guess), reach=0)
+    column, row = jnp.round(jax.lax.stop_gradient(guess)).astype(jnp.int32)
+    ignored = view.frame.ignore.at[row, column].get(mode="fill", fill_value=True)
+    covered = (seen_depth > 0) & (jnp.abs(seen_depth - X_there[2]) > 0.1 * X_there[2] + 0.05)
+    source = index // n
+    X_world = take(jnp.moveaxis(keyframes.X_world, 1, 0).reshape(3, k * n))
+    match = align_patches(
+        keyframes.images,
+        source,
+        take(jnp.moveaxis(keyframes.uv, 1, 0).reshape(2, k * n)),
+        _warp(guess, X_there[2], T_world_cam, keyframes.T_world_cam[source], params.intrinsics),
+        view.pyramid,
+        guess,
+        real & ~covered & ~ignored,
+        plan=plan.look_up,
+    )
+    shift = jnp.sum(jnp.square(match.points - guess), axis=0)
+    found = match.converged & (match.correlation > params.min_correlation) & (shift < _MAX_SHIFT_PX**2)
+    weight = jnp.where(found, take(keyframes.weight.reshape(-1)), 0)
+    return LookedUp(X_world, match.points, weight, take(keyframes.id.reshape(-1)), overlap)
+
+
+def _nothing_found(overlap: Scalar, keyframes: Keyframes) -> LookedUp:
+    none = lambda like, rows: jnp.zeros((*rows, 0), like.dtype)
+    found = none(keyframes.X_world, (3,)), none(keyframes.uv, (2,)), none(keyframes.weight, ()), none(keyframes.id, ())
+    return LookedUp(*found, overlap)
+
+
+def _visible(uv: Pixels, depth: Weights, height: int, width: int) -> Mask:
+    u, v = uv
+    inside = (u > _MARGIN_PX) & (v > _MARGIN_PX) & (u < width - _MARGIN_PX) & (v < height - _MARGIN_PX)
+    return inside & (depth > 0)
+
+
+def _seen_alike(keyframes: Keyframes, T_world_cam: SE3) -> Bool[Array, "k n"]:
+    """Which points are seen from about the same direction and distance as in their keyframe."""
+    then = keyframes.X_world - keyframes.T_world_cam[:, 4:, None]
+    now = keyframes.X_world - T_world_cam.translation()[None, :, None]
+    far_then, far_now = jnp.sum(jnp.square(then), axis=1), jnp.sum(jnp.square(now), axis=1)
+    along = jnp.sum(then * now, axis=1)
+    aligned = (along > 0) & (jnp.square(along) > _MOST_TURN**2 * far_then * far_now)
+    return aligned & (far_now < _MOST_SCALE**2 * far_then) & (far_then < _MOST_SCALE**2 * far_now)
+
+
+def _warp(
+    uv: Pixels, depth: Weights, T_world_cam: SE3, sources: Float[Array, "n 7"], intrinsics: Intrinsics
+) -> Float[Array, "2 2 n"]:
+    """Offset in the keyframe for an offset in the frame, `[to, from]`, on a plane that faces the camera."""
+    xy = normalise(intrinsics, uv)
+    focal = jnp.stack([intrinsics.fx, intrinsics.fy])
+
+    def ray_in_keyframe(source: Float[Array, "7"], x: Scalar, y: Scalar, z: Scalar) -> Float[Array, "2"]:
+        X_cam = jnp.stack([x * z, y * z, z])[:, None]
+        X_world = T_world_cam.rotation().as_matrix() @ X_cam + T_world_cam.translation()[:, None]
+        point = to_camera(SE3(source), X_world)[:, 0]
+        return focal * point[:2] / jnp.maximum(point[2], 0.1)
+
+    step = 1.0
+    at = jax.vmap(ray_in_keyframe)
+    centre = at(sources, xy[0], xy[1], depth)
+    right = at(sources, xy[0] + step / intrinsics.fx, xy[1], depth)
+    below = at(sources, xy[0], xy[1] + step / intrinsics.fy, depth)
+    return jnp.stack([(right - centre).T, (below - centre).T], axis=1) / step
+
+
+def with_keyframe(
+    keyframes: Keyframes,
+    make: Bool[Array, ""],
+    image: Num[Array, "h w"],
+    T_world_cam: SE3,
+    points: TrackedPoints,
+    weight: Weights,
+    plan: TrackPlan,
+) -> Keyframes:
+    """The ring with a keyframe in place of the oldest one where `make` is true, else unchanged."""
+    slot: Int[Array, ""] = keyframes.made % plan.num_keyframes
+    put = lambda ring, new: ring.at[slot].set(jnp.where(make, new, ring[slot]))
+    return Keyframes(
+        images=put(keyframes.images, image.astype(keyframes.images.dtype)),
+        T_world_cam=put(keyframes.T_world_cam, T_world_cam.wxyz_xyz),
+        uv=put(keyframes.uv, points.uv),
+        X_world=put(keyframes.X_world, points.X_world),
+        weight=put(keyframes.weight, weight),
+        id=put(keyframes.id, points.id),
+        made=keyframes.made + make.astype(jnp.int32),
+    )

@@ -1,0 +1,172 @@
+"""From pixels to geometry and back: distortion, the rolling shutter, and depth taken at another time."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxlie import SE3
+from jaxslam_kernels.camera import distort, normalise, to_pixels
+from jaxslam_kernels.depth.sampling import believable, sample_depth
+from jaxslam_kernels.flow.disparity import ROW_PLAN, row_disparities
+from jaxslam_kernels.flow.lk_flow import FlowPlan
+from jaxslam_kernels.image.pyramid import Pyramid, build_pyramid
+from jaxslam_kernels.rolling_shutter import as_if_at_once, image_velocity, row_time
+from jaxslam_kernels.se3 import to_camera
+from jaxslam_kernels.types import DepthImage, Mask, Pixels, Points, Scalar, Weights
+from jaxtyping import Array, Bool, Float
+
+from jaxslam.sensors.frame_arrays import FrameArrays
+from jaxslam.tracking.state import TrackParams
+
+RIGHT_LEVELS = 2
+"""Of the pyramid of the right image: where matching begins is known to a few pixels."""
+_EXPECTED_PX = 1.0
+"""A match so close to where the map has a point is that point."""
+
+
+class View(NamedTuple):
+    """The current frame, prepared.
+
+    Attributes:
+        frame: As it came.
+        pyramid: Of its image.
+        depth: Its depth image, 0 where missing or not to be believed.
+        elapsed_s: Seconds since the last good frame.
+        right: Finest levels of the right image of a pair; `None` where depth is measured.
+        matched: `(n,)` depth of the points followed, by matching left and right, metres, 0 where that failed; `None`
+            where depth is measured.
+    """
+
+    frame: FrameArrays
+    pyramid: Pyramid
+    depth: DepthImage
+    elapsed_s: Scalar
+    right: Pyramid | None = None
+    matched: Weights | None = None
+
+    def with_right(self) -> "View":
+        """The same frame with the right image of its pair, if it is one."""
+        if self.frame.right is None:
+            return self
+        dtype, border = self.pyramid.levels[0].dtype, self.pyramid.border
+        return self._replace(right=build_pyramid(self.frame.right, num_levels=RIGHT_LEVELS, border=border, dtype=dtype))
+
+    def without(self, pixels: Bool[Array, "h w"]) -> "View":
+        """The same frame with these pixels to be ignored too."""
+        return self._replace(frame=self.frame._replace(ignore=self.frame.ignore | pixels))
+
+
+class Observed(NamedTuple):
+    """Points as an ideal camera would have seen them at the time of the frame.
+
+    Attributes:
+        xy: `(2, n)` normalised coordinates.
+        depth: `(n,)` measured depth in metres, 0 where there is none to believe.
+    """
+
+    xy: Pixels
+    depth: Weights
+
+    def in_camera(self) -> Points:
+        """`(3, n)` where the points are in the axes of the camera; at its centre without depth."""
+        return jnp.concatenate([self.xy, jnp.ones_like(self.xy[:1])]) * self.depth[None, :]
+
+
+def observe(
+    uv: Pixels,
+    expected_depth: Weights,
+    twist: Float[Array, "6"],
+    depth: DepthImage,
+    depth_delay_s: Scalar,
+    params: TrackParams,
+    *,
+    reach: int = 1,
+    matched: Weights | None = None,
+) -> Observed:
+    """Remove distortion, rolling shutter and the delay of the depth image from what was seen.
+
+    Args:
+        uv: `(2, n)` pixels as seen.
+        expected_depth: `(n,)` metres, about; it scales the part of the image motion that translation causes.
+        twist: Velocity of the camera in its own axes.
+        depth: Depth image, 0 where missing.
+        depth_delay_s: Seconds from the time of the image to that of the depth.
+        params: Camera and its readout time.
+        reach: As for `sample_depth`, static.
+        matched: `(n,)` depth at the pixels by `match_depth`, which then is what was measured.
+    """
+    xy = normalise(params.intrinsics, uv)
+    focal = jnp.stack([params.intrinsics.fx, params.intrinsics.fy])[:, None]
+    velocity = image_velocity(xy, expected_depth, twist)
+    at_once = as_if_at_once(xy, velocity, uv[1], depth.shape[0], params.readout_s)
+    if matched is not None:
+        return Observed(at_once, matched)
+    later = uv + focal * velocity * depth_delay_s
+    return Observed(at_once, sample_depth(depth, later, reach=reach))
+
+
+def observe_points(
+    X_world: Points,
+    uv: Pixels,
+    pose: SE3,
+    twist: Float[Array, "6"],
+    view: View,
+    params: TrackParams,
+    matched: Weights | None = None,
+) -> Observed:
+    """What a frame says of map points, `(3, n)` metres, seen at pixels `uv` from about `pose`; `matched` as above."""
+    expected = jnp.maximum(to_camera(pose, X_world)[2], params.min_depth_m)
+    return observe(uv, expected, twist, view.depth, view.frame.depth_delay_s, params, matched=matched)
+
+
+def match_depth(
+    view: View,
+    uv: Pixels,
+    expected_depth: Weights,
+    mask: Mask,
+    params: TrackParams,
+    *,
+    known_point: bool = True,
+    plan: FlowPlan = ROW_PLAN,
+) -> Weights | None:
+    """Depth of pixels of the left image of a pair by matching them in the right one; `None` without a pair.
+
+    Args:
+        view: The frame.
+        uv: `(2, n)` pixels as seen.
+        expected_depth: `(n,)` metres, where matching begins; where it is not positive, the frame's own rough depth.
+        mask: `(n,)` which to match.
+        params: Camera, and the depths to be believed.
+        known_point: Whether `expected_depth` is that of points of the map, static: where it is confirmed, a match needs
+            no way back. Else it is rough depth of this very pair, which may be wrong in the same way.
+        plan: How rows are searched, static.
+
+    Returns:
+        `(n,)` metres, 0 where there is no match.
+    """
+    if view.right is None:
+        return None
+    if not uv.shape[1]:  # a plan that looks nothing up
+        return jnp.zeros(0, expected_depth.dtype)
+    focal_baseline = params.intrinsics.fx * params.baseline_m
+    rough = jnp.where(expected_depth > 0, expected_depth, sample_depth(view.depth, uv, reach=0))
+    known = mask & (rough > 0)
+    left = Pyramid(view.pyramid.levels[: len(view.right.levels)], view.pyramid.border)
+    guess = focal_baseline / jnp.where(known, rough, 1)
+    expected_px = _EXPECTED_PX if known_point else 0.0
+    match = row_disparities(left, view.right, uv, guess, known, expected_px=expected_px, plan=plan)
+    depth = focal_baseline / jnp.where(match.found, match.disparity, 1)
+    return believable(jnp.where(match.found, depth, 0), params.min_depth_m, params.max_depth_m)
+
+
+def predict_pixels(X_cam: Points, twist: Float[Array, "6"], height: int, params: TrackParams) -> Pixels:
+    """Where points appear in a frame of a rolling shutter, while the camera moves with `twist`."""
+    depth = jnp.maximum(X_cam[2], params.min_depth_m / 2)
+    xy = X_cam[:2] / depth[None, :]
+    v = to_pixels(params.intrinsics, distort(params.intrinsics, xy))[1]
+    late = xy + image_velocity(xy, depth, twist) * row_time(v, height, params.readout_s)[None, :]
+    return to_pixels(params.intrinsics, distort(params.intrinsics, late))
+
+
+def depth_sigma(depth: Weights, params: TrackParams) -> Weights:
+    """Standard deviation of measured depth, metres."""
+    return params.depth_sigma_m + params.depth_sigma_per_m2 * jnp.square(depth)

@@ -1,0 +1,104 @@
+"""New points for free slots: corners where no point is, with depth that can be believed."""
+
+import jax.numpy as jnp
+from jaxlie import SE3
+from jaxslam_kernels.depth.sampling import sample_depth
+from jaxslam_kernels.image.corners import corner_score, grid_corners, occupied_cells
+from jaxslam_kernels.se3 import to_world
+from jaxslam_kernels.types import Code
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxslam.tracking.measurement import Observed, View, depth_sigma, match_depth, observe
+from jaxslam.tracking.state import TrackedPoints, TrackParams, TrackPlan
+
+_MIN_SCORE = 2.0
+"""Smallest eigenvalue of a corner worth tracking, in squared intensity a squared pixel, on the second level."""
+_EDGE_PX = 12
+_DEPTH_STEP = 0.3
+"""Largest difference of depth in the window of a point that counts as one surface, as a share of its depth."""
+
+
+def refill(
+    points: TrackedPoints,
+    next_id: Int[Array, ""],
+    view: View,
+    T_world_cam: SE3,
+    twist: Float[Array, "6"],
+    params: TrackParams,
+    plan: TrackPlan,
+    *,
+    first: Bool[Array, "h w"] | None = None,
+    cell_px: int | None = None,
+) -> tuple[TrackedPoints, Code]:
+    """Put the best corners of empty grid cells into free slots, numbered from `next_id` on.
+
+    Corners are sought on the second level of the pyramid: a quarter of the work, and less noise. A new point has the
+    depth measured at it, the rolling shutter and the delay of the depth image taken into account.
+
+    Corners on one surface come first: where a window also shows what is behind, flow follows neither. Mixed, ATE was
+    1.4 mm instead of 0.3 on the synthetic room (camera path xyz, nobody in it), 3.9 instead of 2.1 with two people,
+    16.6 instead of 11.7 on the start of Bonn `crowd`, but 8.3 instead of 9.2 on TUM `fr1_rpy`. Refusing mixed windows
+    leaves too few points (`fr1_rpy` 10.2); giving them a fifth of the weight hands the scene to people, who are one
+    surface (two people 145).
+
+    Args:
+        points: As they are.
+        next_id: Number of the first new one.
+        view: The frame.
+        T_world_cam: Its pose.
+        twist: Velocity of the camera.
+        params: Thresholds and camera.
+        plan: Static.
+        first: Pixels whose corners come before all others; some slots are kept free for them.
+        cell_px: Side of the cells instead of that of the plan, static.
+
+    Returns:
+        The points, and how many cells of the grid hold a corner, with depth or without.
+    """
+    border, cell, depth = view.pyramid.border, (cell_px or plan.cell_px) // 2, view.depth
+    image = view.pyramid.levels[1][border:-border, border:-border]
+    v, u = jnp.mgrid[: image.shape[0], : image.shape[1]]
+    edge = _EDGE_PX // 2
+    inside = (u >= edge) & (v >= edge) & (u < image.shape[1] - edge) & (v < image.shape[0] - edge)
+    ignore = view.frame.ignore[::2, ::2][: image.shape[0], : image.shape[1]]
+    corners = grid_corners(corner_score(image), inside & ~ignore, cell=cell)
+    taken = occupied_cells(points.uv / 2, points.valid, (image.shape[0], image.shape[1]), cell=cell)
+    uv = corners.points * 2
+
+    rough = sample_depth(depth, uv, reach=2)
+    seen = observe(uv, rough, twist, depth, view.frame.depth_delay_s, params, reach=2)
+
+    good = (corners.score > _MIN_SCORE) & ~taken & (rough > 0) & (seen.depth > 0)
+    one_surface = sample_depth(depth, uv, reach=plan.flow.finest.window // 2, max_step=_DEPTH_STEP) > 0
+    rank = jnp.cumsum(~points.valid, dtype=jnp.int32) - 1
+    keys, room = (-corners.score, ~one_surface, ~good), jnp.sum(good, dtype=jnp.int32)
+    if first is not None and plan.motion is not None:
+        column, row = jnp.round(uv).astype(jnp.int32)
+        ahead = good & first.at[row, column].get(mode="fill", fill_value=False)
+        keys, num_ahead = (*keys[:2], ~ahead, keys[2]), jnp.sum(ahead, dtype=jnp.int32)
+        room = jnp.minimum(room, jnp.maximum(num_ahead, rank[-1] + 1 - plan.motion.reserved))
+    order = jnp.lexsort(keys)
+    candidate = order[jnp.clip(rank, 0, order.shape[0] - 1)]
+    new = ~points.valid & (rank < room)
+    uv, rough, *chosen = (jnp.take(array, candidate, axis=-1) for array in (uv, rough, *seen))
+    seen = Observed(*chosen)
+    matched = match_depth(view, uv, rough, new, params, known_point=False, plan=plan.pair_flow)
+    if matched is not None:
+        seen, new = seen._replace(depth=matched), new & (matched > 0)
+    X_world = to_world(T_world_cam, seen.in_camera())
+    put = lambda old, fresh: jnp.where(new, fresh, old)
+    num_corners = jnp.sum(corners.score > _MIN_SCORE, dtype=jnp.int32)
+    filled = TrackedPoints(
+        uv=put(points.uv, uv),
+        xy=put(points.xy, seen.xy),
+        depth=put(points.depth, seen.depth),
+        X_world=put(points.X_world, X_world),
+        X_anchor=put(points.X_anchor, X_world),
+        information=put(points.information, 1 / jnp.square(depth_sigma(seen.depth, params))),
+        weight=jnp.where(new, 1, points.weight),
+        age=jnp.where(new, 0, points.age),
+        anchor_age=jnp.where(new, 0, points.anchor_age),
+        id=jnp.where(new, next_id + rank, points.id),
+        valid=points.valid | new,
+    )
+    return filled, num_corners

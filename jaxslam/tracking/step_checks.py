@@ -1,0 +1,281 @@
+"""Checks of what the tracker's step is given: shapes, types and counts.
+
+They run while a program is traced, so that compiled code has none of them. A wrong shape or value is a `ValueError`, a
+wrong type a `TypeError`; the message names the argument, what was expected and what came.
+"""
+
+from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jax.typing import DTypeLike
+from jaxlie import SE3
+
+from jaxslam.dynamics.cue import Verdict
+from jaxslam.dynamics.object_motion import MotionParams
+from jaxslam.sensors.frame_arrays import FrameArrays, check_grey_range
+from jaxslam.tracking.state import TrackParams, TrackPlan, TrackState
+
+_STATE_DTYPE = " as the state"
+_FINEST = float(jnp.finfo(jnp.float32).eps)
+
+
+def check_step(state: TrackState, frame: FrameArrays, params: TrackParams, plan: TrackPlan) -> None:
+    """Refuse arguments of both parts of the step that do not fit each other.
+
+    Whether the state fits is for `check_state`, whether those of cues are there for `check_cues`.
+
+    Raises:
+        ValueError: If a shape does not fit the image, the parts of the plan do not go together, or an image that is no
+            tracer has grey values from 0 to 1.
+        TypeError: If an argument is of another class, or its arrays are of another type than the state's.
+    """
+    for name, value, cls in (("state", state, TrackState), ("frame", frame, FrameArrays), ("plan", plan, TrackPlan)):
+        _check_class(name, value, cls)
+    dtype = _state_dtype(state)
+    check_plan(plan)
+    _check_precision(plan, dtype)
+    _check_frame(frame, dtype)
+    _check_class("params", params, TrackParams)
+    _check_numbers("params", params._replace(cues=(), motion=None), dtype)
+
+
+def check_cues(state: TrackState, frame: FrameArrays, params: TrackParams, plan: TrackPlan) -> None:
+    """Refuse arguments that lack what the cues of a plan and its `motion` need; following points takes none of it.
+
+    Raises:
+        ValueError: If there are not as many parameters of cues as cues, or no numbers of what may move.
+        TypeError: If parameters are of another class or type.
+    """
+    dtype = _state_dtype(state)
+    if len(params.cues) != len(plan.cues):
+        raise ValueError(
+            f"params.cues: expected {len(plan.cues)}, one for each of plan.cues, got {len(params.cues)};"
+            " `with_cue_params` adds those of the settings"
+        )
+    for path, leaf in jax.tree_util.tree_leaves_with_path(params.cues):
+        # A cue may have arrays of any shape, whole numbers, and what is no array.
+        if jnp.issubdtype(getattr(leaf, "dtype", np.bool_), jnp.floating):
+            check_array(f"params.cues{jax.tree_util.keystr(path)}", leaf, np.shape(leaf), dtype, _STATE_DTYPE)
+    if plan.motion is not None:
+        _check_class("params.motion", params.motion, MotionParams)
+        _check_numbers("params.motion", params.motion, dtype)
+        if frame.movable is None:
+            raise ValueError("frame.movable: expected numbers of what may move for a plan with `motion`, got None")
+
+
+def check_array(name: str, value: object, shape: tuple[int, ...], dtype: DTypeLike | None, like: str = "") -> None:
+    """Refuse an array of another shape or type.
+
+    Args:
+        name: What to call it in the message, such as `frame.depth`.
+        value: What came. A Python number has the type it is compared with, as in any sum.
+        shape: The shape it must have.
+        dtype: The type it must have; any if not given.
+        like: What it must be like, such as ` as frame.image`, for the message.
+
+    Raises:
+        ValueError: If the shape is another one.
+        TypeError: If the type is another one, or it is no array.
+    """
+    try:
+        got = jax.typeof(value)
+    except TypeError:
+        expected = "an array" if dtype is None else f"{jnp.dtype(dtype)} {shape}"
+        raise TypeError(f"{name}: expected {expected}{like}, got {type(value).__name__}") from None
+    if got.shape != shape:
+        raise ValueError(f"{name}: expected {shape}{like}, got {got.shape}")
+    if dtype is not None and not _fits(got, jnp.dtype(dtype)):
+        raise TypeError(f"{name}: expected {jnp.dtype(dtype)}{like}, got {got.dtype}")
+
+
+def _fits(got: Any, dtype: jnp.dtype) -> bool:
+    """Whether an array is of a type, or a Python number that becomes one of it."""
+    kinds = (jnp.floating, jnp.integer) if jnp.issubdtype(dtype, jnp.floating) else (jnp.integer,)
+    return got.dtype == dtype or (got.weak_type and any(jnp.issubdtype(got.dtype, kind) for kind in kinds))
+
+
+def _check_class(name: str, value: object, cls: type) -> None:
+    if not isinstance(value, cls):
+        raise TypeError(f"{name}: expected {cls.__name__}, got {type(value).__name__}")
+
+
+def _state_dtype(state: TrackState) -> jnp.dtype:
+    """The floating-point type of a state, that of its twist."""
+    dtype = jax.typeof(state.twist).dtype
+    if not jnp.issubdtype(dtype, jnp.floating):
+        raise TypeError(f"state.twist: expected a floating-point type, got {dtype}")
+    return dtype
+
+
+def check_state(state: TrackState, expected: TrackState) -> None:
+    """Refuse a state that was made for another plan, another size of image or another type.
+
+    Args:
+        state: The state.
+        expected: Shapes and types, as `jax.eval_shape` gives them, of what `init_state` makes for plan and frame.
+
+    Raises:
+        ValueError: If a shape is another one, or there are more or fewer arrays.
+        TypeError: If a type is another one.
+    """
+    kept = expected.keyframes.images
+    height, width = kept.shape[1:]
+    made_by = f"init_state({height}, {width}, plan, image_dtype={kept.dtype}, dtype={expected.twist.dtype})"
+    try:
+        _check_images(state, expected)
+        _check_like("state", state, expected)
+    except (TypeError, ValueError) as error:
+        raise type(error)(f"{error}; make the state with {made_by}") from None
+
+
+def _check_images(state: TrackState, expected: TrackState) -> None:
+    """Its keyframes first: of all that depends on the image they alone have its very shape and type."""
+    kept, images = expected.keyframes.images, state.keyframes.images
+    check_array("state.keyframes.images", images, kept.shape, None, " for the plan and frame.image")
+    check_array("state.keyframes.images", images, kept.shape, kept.dtype, " as frame.image")
+
+
+def _check_like(name: str, given: Any, expected: Any) -> None:
+    """Refuse a pytree that has not the arrays of another one."""
+    wanted, came = (dict(jax.tree_util.tree_leaves_with_path(tree)) for tree in (expected, given))
+    for path, leaf in wanted.items():
+        at = name + jax.tree_util.keystr(path)
+        if path not in came:
+            raise ValueError(f"{at}: expected {leaf.dtype} {leaf.shape} for the plan, got nothing")
+        check_array(at, came[path], leaf.shape, leaf.dtype, " for the plan and the frame")
+    more = next((path for path in came if path not in wanted), None)
+    if more is not None:
+        raise ValueError(f"{name}{jax.tree_util.keystr(more)}: expected nothing there for the plan, got an array")
+    if jax.tree.structure(given) != jax.tree.structure(expected):
+        raise ValueError(f"{name}: expected {jax.tree.structure(expected)}, got {jax.tree.structure(given)}")
+
+
+def _check_frame(frame: FrameArrays, dtype: jnp.dtype) -> None:
+    image = _checked_image(frame)
+    for name, of in (("depth", dtype), ("ignore", np.bool_)):
+        check_array(f"frame.{name}", getattr(frame, name), image.shape, None, " as frame.image")
+        check_array(f"frame.{name}", getattr(frame, name), image.shape, of, _STATE_DTYPE if name == "depth" else "")
+    for name in ("dt_s", "depth_delay_s"):
+        check_array(f"frame.{name}", getattr(frame, name), (), dtype, _STATE_DTYPE)
+    if frame.right is not None:
+        check_array("frame.right", frame.right, image.shape, image.dtype, " as frame.image")
+    if frame.movable is not None:
+        check_array("frame.movable", frame.movable, image.shape, None, " as frame.image")
+        check_array("frame.movable", frame.movable, image.shape, np.uint8)
+
+
+def _checked_image(frame: FrameArrays) -> Any:
+    """Shape and type of the image, if it is one."""
+    try:
+        image = jax.typeof(frame.image)
+    except TypeError:
+        raise TypeError(f"frame.image: expected an array (h, w), got {type(frame.image).__name__}") from None
+    if image.ndim != 2:
+        raise ValueError(
+            f"frame.image: expected one grey image (h, w), got {image.shape};"
+            " make colour grey, and scan over the frames of a clip"
+        )
+    if image.dtype != np.uint8 and not jnp.issubdtype(image.dtype, jnp.floating):
+        raise TypeError(f"frame.image: expected uint8 or a floating-point type, got {image.dtype}")
+    if not isinstance(frame.image, Tracer):
+        check_grey_range("frame.image", frame.image)
+    return image
+
+
+def _check_numbers(name: str, params: Any, dtype: jnp.dtype) -> None:
+    """Refuse parameters that are no scalars of a type; `distortion` has five of them, and cues are not looked at."""
+    for field, value in params._asdict().items():
+        if isinstance(value, tuple) and hasattr(value, "_fields"):
+            _check_numbers(f"{name}.{field}", value, dtype)
+        elif field not in ("cues", "motion"):
+            check_array(f"{name}.{field}", value, (5,) if field == "distortion" else (), dtype, _STATE_DTYPE)
+
+
+def check_followed(followed: NamedTuple, expected: NamedTuple) -> None:
+    """Refuse points that were followed into a frame by another plan, size or type, as `check_state` does."""
+    _check_class("followed_points", followed, type(expected))
+    _check_like("followed_points", followed, expected)
+
+
+def check_verdict(name: str, verdict: Verdict, num_points: int, dtype: jnp.dtype) -> None:
+    """Refuse what a cue says if it is not of every point.
+
+    Raises:
+        ValueError: If a shape is another one.
+        TypeError: If it is no `Verdict`, or a type is another one.
+    """
+    _check_class(name, verdict, Verdict)
+    for field, of in (("weight", dtype), ("evidence", dtype), ("known", np.bool_)):
+        check_array(f"{name}.{field}", getattr(verdict, field), (num_points,), of, " for every point")
+
+
+_LEAST = {
+    "num_points": 1, "num_levels": 2, "num_keyframes": 1, "num_recalled": 0, "num_sources": 0, "points_per_source": 1,
+    "num_hypotheses": 1, "pose_steps": 1,
+}  # fmt: skip
+
+
+def check_plan(plan: TrackPlan) -> None:
+    """Refuse a plan whose parts do not go together.
+
+    Raises:
+        ValueError: If a number is too small, a side of cells is odd or one of a window even, a word is unknown, more
+            keyframes are looked into than there are, or even votes lack regions.
+    """
+    for name, least in _LEAST.items():
+        if getattr(plan, name) < least:
+            raise ValueError(f"plan.{name}: expected at least {least}, got {getattr(plan, name)}")
+    for name, hint in get_type_hints(TrackPlan).items():
+        if get_origin(hint) is Literal and getattr(plan, name) not in get_args(hint):
+            raise ValueError(f"plan.{name}: expected one of {get_args(hint)}, got {getattr(plan, name)!r}")
+    slots = plan.num_keyframes + plan.num_recalled
+    if plan.num_sources > slots:
+        raise ValueError(
+            f"plan.num_sources: expected at most num_keyframes + num_recalled, {slots}, got {plan.num_sources}"
+        )
+    if plan.even_votes and plan.regions is None:
+        raise ValueError("plan.regions: expected a RegionPlan for even_votes, got None")
+    _check_sides(plan)
+
+
+def _check_sides(plan: TrackPlan) -> None:
+    """Sides of cells are even: corners are sought on the second level. Those of windows are odd."""
+    cells = {"cell_px": plan.cell_px}
+    if plan.motion is not None:
+        cells["motion.dense_cell_px"] = plan.motion.dense_cell_px
+    for name, side in cells.items():
+        if side < 2 or side % 2:
+            raise ValueError(f"plan.{name}: expected an even number, at least 2, got {side}")
+    for name, level in _levels(plan).items():
+        if level.window < 1 or not level.window % 2:
+            raise ValueError(f"plan.{name}.window: expected an odd number, got {level.window}")
+
+
+def _levels(plan: TrackPlan) -> dict[str, Any]:
+    flows = {"flow": plan.flow, "pair_flow": plan.pair_flow}
+    parts = ("coarsest", "middle", "finest")
+    of_flows = {f"{name}.{part}": getattr(flow, part) for name, flow in flows.items() for part in parts}
+    return {**of_flows, "look_up": plan.look_up}
+
+
+def _check_precision(plan: TrackPlan, dtype: jnp.dtype) -> None:
+    """Refuse a search that goes on to what its type cannot hold: no point would ever be found."""
+    for name, level in _levels(plan).items():
+        if level.tolerance < _FINEST and jnp.finfo(dtype).eps >= _FINEST:
+            raise TypeError(
+                f"plan.{name}.tolerance: expected state, parameters and frames in float64 for searches that go on to"
+                f" {level.tolerance:g} px, as with TrackPlan.exact(), got {dtype}; turn on jax_enable_x64, and give"
+                ' init_state, track_params and stack_frames dtype="float64"'
+            )
+
+
+def check_pose(name: str, pose: object) -> None:
+    """Refuse what is no pose, such as a matrix.
+
+    Raises:
+        TypeError: If it is no `jaxlie.SE3`.
+    """
+    _check_class(name, pose, SE3)

@@ -1,0 +1,206 @@
+"""The rows of trajectory files as they stand there: TUM, KITTI, and the ground truth of EuRoC."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxslam.errors import JaxSlamError, TrajectoryError, one_line
+from jaxslam.geometry.so3 import quaternions
+from jaxslam.io.timestamps import nanoseconds
+
+PathLike: TypeAlias = str | os.PathLike[str]
+
+NOT_FINITE = "holds a number that is not finite"
+
+_Rows: TypeAlias = Sequence[tuple[int, list[str]]]
+"""The line number and the words of every line that counts."""
+
+_LONGEST_YEARS = 30
+_TUM_COLUMNS, _KITTI_COLUMNS, _EUROC_COLUMNS = 8, 12, 8
+
+
+@dataclass(frozen=True, eq=False)
+class PoseRows:
+    """The poses of a file in the order of its rows, which need not be that of time.
+
+    Attributes:
+        path: The file.
+        kind: Its format.
+        lines: `(n,)` the number of the line each pose stands in, from 1.
+        timestamps_ns: `(n,)` int64 nanoseconds; `None` for KITTI, whose rows have no stamps.
+        T_world_cam: `(n, 7)` `qw qx qy qz x y z`, metres; quaternions as the file has them, not checked.
+    """
+
+    path: Path
+    kind: Literal["TUM", "KITTI", "EuRoC"]
+    lines: Int[np.ndarray, " n"]
+    timestamps_ns: Int[np.ndarray, " n"] | None
+    T_world_cam: Float[np.ndarray, "n 7"]
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+
+def read_rows(path: PathLike) -> PoseRows:
+    """Read a file in the TUM format (8 columns), the KITTI format (12) or EuRoC's (commas), whichever it is.
+
+    A file is EuRoC's if it is separated by commas and either begins with a `#` line that is, too, or is named `.csv`.
+
+    Raises:
+        TrajectoryError: If the file is missing, unreadable, empty, or in none of these formats.
+    """
+    if _is_euroc(path):
+        return read_euroc_rows(path)
+    rows = _pose_rows(path)
+    number, words = rows[0]
+    match len(words):
+        case 8:
+            return _tum(path, rows)
+        case 12:
+            return _kitti(path, rows)
+        case found:
+            raise TrajectoryError(f"{path}:{number}: expected 8 (TUM) or 12 (KITTI) columns, found {found}")
+
+
+def read_tum_rows(path: PathLike) -> PoseRows:
+    """Read rows of `timestamp tx ty tz qx qy qz qw`: seconds, metres.
+
+    Raises:
+        TrajectoryError: If the file is missing, unreadable or empty, or a row is malformed.
+    """
+    return _tum(path, _pose_rows(path))
+
+
+def read_kitti_rows(path: PathLike) -> PoseRows:
+    """Read rows of the upper 3 x 4 of `T_world_cam`; matrices are replaced by the nearest rotations.
+
+    Raises:
+        TrajectoryError: If the file is missing, unreadable or empty, or a row is malformed.
+    """
+    return _kitti(path, _pose_rows(path))
+
+
+def read_euroc_rows(path: PathLike) -> PoseRows:
+    """Read rows of `nanoseconds, x, y, z, qw, qx, qy, qz`, whatever follows; `#` begins a comment.
+
+    Raises:
+        TrajectoryError: If the file is missing, unreadable or empty, or a row is malformed.
+    """
+    rows = _pose_rows(path, commas=True)
+    stamps: list[int] = []
+    poses: list[list[float]] = []
+    for number, words in rows:
+        if len(words) < _EUROC_COLUMNS:
+            raise TrajectoryError(
+                f"{path}:{number}: expected at least {_EUROC_COLUMNS} columns (nanoseconds, x y z, qw qx qy qz),"
+                f" got {len(words)}"
+            )
+        try:
+            stamps.append(int(np.int64(int(words[0]))))
+            x, y, z, *wxyz = (float(word) for word in words[1:_EUROC_COLUMNS])
+        except (ValueError, OverflowError):
+            raise TrajectoryError(f"{path}:{number}: expected nanoseconds, x y z and qw qx qy qz") from None
+        poses.append([*wxyz, x, y, z])
+    return PoseRows(Path(path), "EuRoC", _lines(rows), np.array(stamps, np.int64), np.array(poses))
+
+
+def read_times(path: PathLike) -> Int[np.ndarray, " n"]:
+    """`(n,)` int64 nanoseconds of a file of one stamp in seconds a line, as KITTI's `times.txt`.
+
+    Raises:
+        TrajectoryError: If the file is missing, unreadable or empty, or a line is not one number.
+    """
+    rows = _pose_rows(path)
+    _table(path, rows, 1, "timestamp")
+    return _stamps(path, rows)
+
+
+def text_rows(path: PathLike, error: type[JaxSlamError], *, commas: bool = False) -> list[tuple[int, list[str]]]:
+    """The number and the words of every line that is neither empty nor a comment.
+
+    Args:
+        path: The file.
+        error: Class of the error to raise.
+        commas: Whether words are separated by commas instead of spaces.
+
+    Raises:
+        JaxSlamError: Of class `error`, if the file cannot be read.
+    """
+    split = (lambda line: [word.strip() for word in line.split(",")]) if commas else str.split
+    rows = ((number, split(line)) for number, line in enumerate(_text(path, error).split("\n"), 1))
+    return [(number, words) for number, words in rows if any(words) and not words[0].startswith("#")]
+
+
+def _text(path: PathLike, error: type[JaxSlamError]) -> str:
+    try:
+        return Path(path).read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as problem:
+        raise error(f"{path}: cannot be read: {one_line(problem)}") from problem
+
+
+def _is_euroc(path: PathLike) -> bool:
+    lines = [line for line in _text(path, TrajectoryError).split("\n") if line.strip()]
+    first = next((line for line in lines if not line.lstrip().startswith("#")), "")
+    headed = bool(lines) and lines[0].lstrip().startswith("#") and "," in lines[0]
+    return "," in first and (headed or Path(path).suffix.lower() == ".csv")
+
+
+def _pose_rows(path: PathLike, *, commas: bool = False) -> _Rows:
+    """The lines that count, at least one."""
+    rows = text_rows(path, TrajectoryError, commas=commas)
+    if not rows:
+        raise TrajectoryError(f"{path}: holds no poses")
+    return rows
+
+
+def _tum(path: PathLike, rows: _Rows) -> PoseRows:
+    numbers = _table(path, rows, _TUM_COLUMNS, "timestamp tx ty tz qx qy qz qw")
+    return PoseRows(Path(path), "TUM", _lines(rows), _stamps(path, rows), numbers[:, [7, 4, 5, 6, 1, 2, 3]])
+
+
+def _kitti(path: PathLike, rows: _Rows) -> PoseRows:
+    top = _table(path, rows, _KITTI_COLUMNS, "the 3 x 4 matrix of a pose, row by row").reshape(-1, 3, 4)
+    R = top[:, :, :3]
+    error = np.abs(R @ R.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
+    wrong = ~((error < 0.05) & (np.linalg.det(R) > 0))
+    if wrong.any():
+        raise TrajectoryError(f"{path}:{rows[int(np.argmax(wrong))][0]}: the 3 x 3 matrix is not a rotation")
+    return PoseRows(Path(path), "KITTI", _lines(rows), None, np.hstack([quaternions(R), top[:, :, 3]]))
+
+
+def _lines(rows: _Rows) -> Int[np.ndarray, " n"]:
+    return np.array([number for number, _ in rows])
+
+
+def _table(path: PathLike, rows: _Rows, columns: int, meaning: str) -> Float[np.ndarray, "n columns"]:
+    """All words as floats, `(n, columns)`."""
+    values: list[list[float]] = []
+    for number, words in rows:
+        if len(words) != columns:
+            found = f"{len(words)}: {' '.join(words)[:80]}"
+            raise TrajectoryError(f"{path}:{number}: expected {columns} columns ({meaning}), found {found}")
+        try:
+            values.append([float(word) for word in words])
+        except ValueError as error:
+            raise TrajectoryError(
+                f"{path}:{number}: expected {columns} numbers ({meaning}): {one_line(error, 80)}"
+            ) from None
+    table = np.array(values)
+    wrong = ~np.isfinite(table).all(axis=1)
+    if wrong.any():
+        raise TrajectoryError(f"{path}:{rows[int(np.argmax(wrong))][0]}: {NOT_FINITE}")
+    return table
+
+
+def _stamps(path: PathLike, rows: _Rows) -> Int[np.ndarray, " n"]:
+    """`(n,)` int64 nanoseconds of the first words."""
+    stamps = np.array([nanoseconds(words[0], f"{path}:{number}", TrajectoryError) for number, words in rows])
+    years = np.ptp(stamps / 1e9) / 31_557_600
+    if years > _LONGEST_YEARS:
+        raise TrajectoryError(f"{path}: the timestamps span {years:.0f} years; are they all in seconds?")
+    return stamps

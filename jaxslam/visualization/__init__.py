@@ -1,0 +1,1 @@
+"""Plots, overlays, galleries and the viewer."""

@@ -1,0 +1,148 @@
+"""What was left out of the frames of a run, to look at: an animation and a contact sheet of frames with masks."""
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from jaxslam.io.atomic_files import write_atomically
+from jaxslam.sensors.frame import Frame
+from jaxslam.slam.frame_result import Rejected, Tracked
+from jaxslam.slam.mask_pipeline import MaskSource
+from jaxslam.visualization.overlay import GREEN, ORANGE, PURPLE, SKY_BLUE, VERMILION, Rgb, tint
+from jaxslam.visualization.plots import PNG_LEVEL
+
+MASK_RGB: dict[MaskSource, Rgb] = {
+    MaskSource.NONE: (120, 120, 120),
+    MaskSource.DETECTOR: ORANGE,
+    MaskSource.PROPAGATED: SKY_BLUE,
+    MaskSource.CALLER: PURPLE,
+    MaskSource.DEPTH: GREEN,
+    MaskSource.CUES: VERMILION,
+}
+"""The colour of a mask, by where it comes from."""
+
+_MOST_PICTURES = 60
+_WIDTH_PX, _BAR_PX, _FONT_PX = 320, 20, 14
+_FRAME_MS, _GIF_COLORS, _MOST_GIF_BYTES = 150, 128, 3_000_000
+_SHEET_PICTURES, _SHEET_COLUMNS = 12, 4
+
+
+class MaskPictures:
+    """Keeps pictures of frames that had a mask, evenly over a run: an `on_frame` of `Slam.run`.
+
+    How many frames will have one is not known before, so that one of n is kept, and n doubles whenever there are too
+    many. Which one of n is left to chance: a detector comes back every few frames, and every nth might be its own.
+
+    Attributes:
+        kept: `(h, 320, 3)` uint8 RGB each, in the order of the run: the frame, its mask in the colour of its source,
+            and a line that says what it is.
+    """
+
+    def __init__(self, most: int = _MOST_PICTURES) -> None:
+        """Keep `most` pictures at most, half as many at least, or those there are."""
+        self.kept: list[np.ndarray] = []
+        self._most, self._one_of, self._wanted, self._masked, self._seen = most, 1, 0, 0, 0
+        self._random = np.random.default_rng(0)
+
+    def __call__(self, frame: Frame | None, result: Tracked | Rejected) -> None:
+        """Look at one frame."""
+        if frame is not None and isinstance(result, Tracked) and result.dynamic_mask.any():
+            if self._masked % self._one_of == 0:
+                self._wanted = self._masked + int(self._random.integers(self._one_of))
+            if self._masked == self._wanted:
+                self._keep(draw_mask(frame.image, result, f"frame {self._seen}"))
+            self._masked += 1
+        self._seen += 1
+
+    def _keep(self, picture: np.ndarray) -> None:
+        if len(self.kept) == self._most:
+            self.kept = _spread(self.kept, self._most // 2, self._random)
+            self._one_of *= 2
+        self.kept.append(picture)
+
+
+def draw_mask(image: np.ndarray, tracked: Tracked, title: str) -> np.ndarray:
+    """A small picture of a frame with its mask, and where that comes from, its age and share of the image in words.
+
+    Args:
+        image: `(h, w, 3)` RGB or `(h, w)` grey, uint8.
+        tracked: What became of the frame; its mask is of the image's size.
+        title: What to write first.
+
+    Returns:
+        `(round(320 h / w) + 20, 320, 3)` uint8 RGB.
+    """
+    size = _WIDTH_PX, max(1, round(_WIDTH_PX * image.shape[0] / image.shape[1]))
+    picture = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    picture = picture if picture.ndim == 3 else np.repeat(picture[..., None], 3, axis=2)
+    color = MASK_RGB[tracked.mask_source]
+    mask = cv2.resize(tracked.dynamic_mask.view(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    tint(picture, mask.view(bool), color)
+    age = f", age {tracked.mask_age}" if tracked.mask_age >= 0 else ""
+    text = f"{title}: {tracked.mask_source.name.lower()}{age}, {100 * tracked.dynamic_ratio:.0f} %"
+    return np.concatenate([_bar(text, color), picture])
+
+
+def write_mask_pictures(folder: Path, pictures: Sequence[np.ndarray]) -> None:
+    """Write `masks.gif`, 3 MB at most, and `masks.png`, twelve of the pictures side by side.
+
+    Args:
+        folder: Where they go; it must exist. Files that are there are replaced, each in one piece.
+        pictures: `(h, w, 3)` uint8 RGB, at least one, of one size.
+
+    Raises:
+        JaxSlamError: If a file cannot be written.
+    """
+    write_atomically(folder / "masks.png", _sheet(_spread(pictures, _SHEET_PICTURES)))
+    write_atomically(folder / "masks.gif", _small_animation(pictures))
+
+
+def _spread(pictures: Sequence[np.ndarray], most: int, random: np.random.Generator | None = None) -> list[np.ndarray]:
+    """So many of them, or all: one by chance from each of as many parts of equal length."""
+    if len(pictures) <= most:
+        return list(pictures)
+    random = random or np.random.default_rng(0)
+    ends = np.linspace(0, len(pictures), most + 1).astype(int)
+    return [pictures[index] for index in random.integers(ends[:-1], ends[1:])]
+
+
+def _bar(text: str, color: tuple[int, int, int]) -> np.ndarray:
+    """Black words on a ground of a colour."""
+    bar = Image.new("RGB", (_WIDTH_PX, _BAR_PX), color)
+    font = ImageFont.load_default(_FONT_PX)
+    ImageDraw.Draw(bar).text((4, _BAR_PX // 2), text, fill=(0, 0, 0), font=font, anchor="lm")
+    return np.asarray(bar)
+
+
+def _sheet(pictures: Sequence[np.ndarray]) -> bytes:
+    """PNG of pictures in rows of four."""
+    columns = min(len(pictures), _SHEET_COLUMNS)
+    rows = -(-len(pictures) // columns)
+    blank = [np.full_like(pictures[0], 255)] * (rows * columns - len(pictures))
+    tiles = [*pictures, *blank]
+    lines = [np.concatenate(tiles[row * columns : (row + 1) * columns], axis=1) for row in range(rows)]
+    file = io.BytesIO()
+    Image.fromarray(np.concatenate(lines)).save(file, "PNG", compress_level=PNG_LEVEL)
+    return file.getvalue()
+
+
+def _small_animation(pictures: Sequence[np.ndarray]) -> bytes:
+    """GIF of as many pictures as fit: all of them, or every 2nd, 4th, ... if it would be too large."""
+    data = _animation(pictures)
+    while len(data) > _MOST_GIF_BYTES and len(pictures) > 1:
+        pictures = pictures[::2]
+        data = _animation(pictures)
+    return data
+
+
+def _animation(pictures: Sequence[np.ndarray]) -> bytes:
+    """GIF in one palette for all, so that a mask has the same colour throughout."""
+    palette = Image.fromarray(np.concatenate(_spread(pictures, 8))).quantize(_GIF_COLORS)
+    frames = [Image.fromarray(each).quantize(palette=palette, dither=Image.Dither.NONE) for each in pictures]
+    file = io.BytesIO()
+    frames[0].save(file, "GIF", save_all=True, append_images=frames[1:], duration=_FRAME_MS, loop=0)
+    return file.getvalue()

@@ -1,0 +1,1 @@
+"""Weighted bundle adjustment by the Schur complement."""

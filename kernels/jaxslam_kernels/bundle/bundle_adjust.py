@@ -1,0 +1,366 @@
+"""Weighted windowed bundle adjustment: many poses and points at once, differentiably.
+
+Levenberg-Marquardt with Marquardt's scaling. No two points share a residual, so the points are eliminated and what is
+left to factorise is the Schur complement, dense, six numbers a camera: right for a window of up to some 64 cameras.
+A camera may have a lens to be found with its pose, three numbers more (`bundle_lens`).
+`levenberg_marquardt` holds its Hessian as one matrix, which here would have thousands of rows; hence a loop of its own.
+
+The result is differentiable, forward and reverse, by the implicit function theorem at the optimum, with one more
+elimination of the exact Hessian, however many steps the solver took. Where a solve starts has no derivative, apart
+from what is held fixed. Of a weight that is exactly 0 the derivative is the one-sided limit from above; see
+`bundle_idle` for points that have no weight at all. Second derivatives raise `NotImplementedError`.
+
+Source: Triggs et al., "Bundle Adjustment: A Modern Synthesis", 2000, section 6.
+"""
+
+from enum import IntEnum
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxlie import SE3
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxslam_kernels.bundle.cost import (
+    BundleEquations,
+    BundleProblem,
+    Observations,
+    Plane,
+    Poses,
+    bundle_cost,
+    bundle_problem,
+    bundle_views,
+    clean_weights,
+    exact_blocks,
+    free_cameras,
+    normal_equations,
+)
+from jaxslam_kernels.bundle.lens import Cameras, Lenses, move_cameras, shift_cameras, usable_lenses
+from jaxslam_kernels.bundle.schur import Reduced, eliminate, is_determined, points_determined, solve_reduced
+from jaxslam_kernels.bundle.zero_weight_points import idle_points
+from jaxslam_kernels.checks import checked
+from jaxslam_kernels.first_order import first_order
+from jaxslam_kernels.pose.pose_cost import UNKNOWN_CHI2
+from jaxslam_kernels.pose.pose_refine import usable_pose
+from jaxslam_kernels.robust import Loss
+from jaxslam_kernels.types import Code, Flag, Mask, Points, Scalar, Weights
+
+_INITIAL_DAMPING = 1e-4  # relative to the diagonal of the Hessian: nearly a Gauss-Newton step
+_DAMPING_FACTOR = 10.0
+_MAX_DAMPING = 1e6
+
+
+class BundleStatus(IntEnum):
+    """What an adjustment is worth. Poses and points are finite whatever it says."""
+
+    OK = 0
+    NOT_CONVERGED = 1
+    """The steps ran out, or none lowered the cost; the values are the best ones found."""
+    NOTHING_TO_ADJUST = 2
+    """No observation counts, or everything seen is fixed; the values are the initial ones."""
+    DEGENERATE = 3
+    """The poses can move together at no cost, as a whole or in scale. The values lower the cost; which of the equal
+    ones they are depends on the start, and nothing has a derivative."""
+
+
+class BundleAdjustment(NamedTuple):
+    """Adjusted poses and points and what they are worth.
+
+    Attributes:
+        poses: `wxyz_xyz` of T_world_cam; the identity where the initial one was not finite.
+        X_world: Points in metres; the origin where the initial one was not finite.
+        initial_cost: `½ Σ w ρ(s)` before.
+        cost: The same after.
+        status: A `BundleStatus`.
+        num_steps: Steps tried.
+        determined: Points whose observations leave no direction free.
+        used: Observations that have weight, a slot of their own, and lie in front of the camera.
+        robust_weights: `ρ'(s)` in [0, 1] of every observation, whatever its weight; 0 where it has no value.
+        chi2: Squared whitened residual s of every observation, `UNKNOWN_CHI2` where it has no value.
+        lenses: Adjusted lenses, focal length one where the initial one was not usable; `None` without.
+    """
+
+    poses: Poses
+    X_world: Points
+    initial_cost: Scalar
+    cost: Scalar
+    status: Code
+    num_steps: Int[Array, ""]
+    determined: Mask
+    used: Bool[Array, " m"]
+    robust_weights: Float[Array, " m"]
+    chi2: Float[Array, " m"]
+    lenses: Lenses | None = None
+
+
+@checked
+def bundle_adjust(
+    poses: Poses,
+    X_world: Points,
+    observations: Observations,
+    *,
+    fixed_poses: Bool[Array, " k"],
+    fixed_points: Mask | None = None,
+    point_weights: Weights | None = None,
+    lenses: Lenses | None = None,
+    fixed_lenses: Bool[Array, " k"] | None = None,
+    two_sided: bool = False,
+    loss: Loss = "cauchy",
+    scale: Scalar | float = 2.0,
+    tolerance: Scalar | float = 1e-6,
+    max_steps: int = 20,
+) -> BundleAdjustment:
+    """Finds the poses and points that explain all observations together.
+
+    Hold at least one pose fixed (two, without depths): otherwise the whole can move freely, see
+    `BundleStatus.DEGENERATE`. A pose or point that nothing sees stays where it is; an observation of a pose or point
+    that is not finite does not count.
+
+    Args:
+        poses: Where to start, `wxyz_xyz` of T_world_cam.
+        X_world: Where the points start, metres.
+        observations: What is seen.
+        fixed_poses: Poses that do not move.
+        fixed_points: Points that do not move; `None` for none.
+        point_weights: Factor of all observations of a point, not negative; `None` for one each. A point of weight 0
+            stays where it starts and has no influence; the derivative by its weight is the limit from above.
+        lenses: Where a lens of each camera's own starts (focal length, k1, k2); the observations then are pixels from
+            the principal point, see `Observations`. `None` for ideal cameras.
+        fixed_lenses: Lenses that do not change; `None` for none.
+        two_sided: Whether a point behind a camera is seen too, where its line of sight meets the image, static. Data
+            sets whose residuals ignore the side need it, as Bundle Adjustment in the Large.
+        loss: The robust loss, static.
+        scale: Its scale in standard deviations, traced.
+        tolerance: Ends the solve when a step changes the cost by less than this fraction, traced; rounding ends it
+            at the latest. Derivatives are as good as the optimum is.
+        max_steps: Bound on the steps, static.
+
+    Returns:
+        A `BundleAdjustment`; everything in it is finite, and so are its derivatives.
+    """
+    dtype, n = X_world.dtype, X_world.shape[1]
+    fixed_points = jnp.zeros(n, bool) if fixed_points is None else fixed_points
+    point_weights = jnp.ones(n, dtype) if point_weights is None else point_weights
+    cameras, X_world, observations = _usable(Cameras(poses, lenses), X_world, observations)
+    problem, slot = bundle_problem(observations, point_weights, jnp.asarray(scale, dtype), ~fixed_poses, ~fixed_points)
+    if lenses is not None:
+        free_lens = jnp.ones_like(fixed_poses) if fixed_lenses is None else ~fixed_lenses
+        problem = problem._replace(free_lens=free_lens)
+    problem = problem._replace(two_sided=jnp.array(True) if two_sided else None)
+    solution = solve_bundle(cameras, X_world, problem, loss, jnp.asarray(tolerance, dtype), max_steps)
+    # What is fixed keeps its derivative, what is free gets that of the optimum.
+    start = _where_free(problem, solution.cameras, cameras)
+    start_points = jnp.where(fixed_points[None, :], X_world, solution.X_world)
+    relative = _on_grid(clean_weights(observations.weights), slot, problem)
+    tangents, shifts, more_cost = _optimum_shift(start, start_points, problem, relative, loss)
+    optimum = shift_cameras(start, tangents)
+    initial_cost = bundle_cost(bundle_views(cameras, X_world, problem, loss), problem, loss)
+    result = _report(optimum, start_points + shifts, problem, slot, loss, initial_cost, solution)
+    return result._replace(cost=result.cost + more_cost)
+
+
+class Solution(NamedTuple):
+    """Where the solver ended, a constant for differentiation."""
+
+    cameras: Cameras
+    X_world: Points
+    converged: Flag
+    num_steps: Int[Array, ""]
+
+
+class _State(NamedTuple):
+    cameras: Cameras
+    X_world: Points
+    cost: Scalar
+    damping: Scalar
+    converged: Flag
+    stuck: Flag
+    num_steps: Int[Array, ""]
+
+
+def solve_bundle(
+    cameras: Cameras, X_world: Points, problem: BundleProblem, loss: Loss, tolerance: Scalar, max_steps: int
+) -> Solution:
+    """The optimum from finite cameras and points."""
+    cameras, X_world, problem, tolerance = lax.stop_gradient((cameras, X_world, problem, tolerance))
+    epsilon = float(jnp.finfo(X_world.dtype).eps)
+
+    def evaluate(cameras: Cameras, X_world: Points) -> Scalar:
+        return bundle_cost(bundle_views(cameras, X_world, problem, loss), problem, loss)
+
+    def step(state: _State) -> _State:
+        equations = normal_equations(bundle_views(state.cameras, state.X_world, problem, loss))
+        reduced = eliminate(equations, problem, state.damping)
+        tangents, shifts = solve_reduced(reduced, equations.camera_gradient, equations.point_gradient)
+        predicted = _predicted_decrease(equations, tangents, shifts, state.damping)
+        cameras = _where_free(problem, move_cameras(state.cameras, tangents), state.cameras)
+        X_world = state.X_world + shifts
+        cost = evaluate(cameras, X_world)
+        finite = jnp.isfinite(cost) & jnp.isfinite(X_world).all()
+        finite = finite & jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(cameras)]).all()
+        accept = finite & (cost <= (1.0 + 32.0 * epsilon) * state.cost)  # a sum is no better than its rounding
+        # The promised gain is the square of the step in standard deviations: it tells steps far below what the cost
+        # can show, down to the rounding of the values themselves.
+        enough = jnp.maximum(tolerance * state.cost, (1e4 * epsilon) ** 2 * jnp.maximum(state.cost, 1.0))
+        level = (finite & (predicted <= enough)) | (accept & (jnp.abs(state.cost - cost) < tolerance * state.cost))
+        damping = jnp.where(accept, state.damping / _DAMPING_FACTOR, state.damping * _DAMPING_FACTOR)
+        cameras, X_world, cost = jax.tree.map(
+            lambda new, old: jnp.where(accept, new, old), (cameras, X_world, cost), state[:3]
+        )
+        return _State(
+            cameras=cameras,
+            X_world=X_world,
+            cost=cost,
+            damping=jnp.maximum(damping, 4.0 * epsilon),
+            converged=level,
+            stuck=damping > _MAX_DAMPING,
+            num_steps=state.num_steps + 1,
+        )
+
+    cost, no = evaluate(cameras, X_world), jnp.zeros((), bool)
+    damping = jnp.full_like(cost, _INITIAL_DAMPING)
+    start = _State(cameras, X_world, cost, damping, no, no, jnp.zeros((), jnp.int32))
+    end = lax.while_loop(lambda s: ~s.converged & ~s.stuck & (s.num_steps < max_steps), step, start)
+    return Solution(end.cameras, end.X_world, end.converged, end.num_steps)
+
+
+def _where_free(problem: BundleProblem, new: Cameras, old: Cameras) -> Cameras:
+    """New poses and lenses, but for those that are fixed."""
+    poses = jnp.where(problem.free_pose[:, None], new.poses, old.poses)
+    if problem.free_lens is None or new.lenses is None or old.lenses is None:
+        return Cameras(poses)
+    return Cameras(poses, jnp.where(problem.free_lens[:, None], new.lenses, old.lenses))
+
+
+def _on_grid(values: Float[Array, " m"], slot: Int[Array, " m"], problem: BundleProblem) -> Plane:
+    """What belongs to observations, in their slots; 0 elsewhere."""
+    k, n = problem.weights.shape
+    return jnp.zeros(k * n + 1, values.dtype).at[slot].set(values)[:-1].reshape(k, n)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(4,))
+def _optimum_shift(
+    cameras: Cameras, X_world: Points, problem: BundleProblem, relative: Plane, loss: Loss
+) -> tuple[Float[Array, "k c"], Points, Scalar]:
+    """Zeros, with the derivative of the optimum with respect to the problem and to what is fixed.
+
+    At the optimum the gradient g of the cost vanishes whatever the problem θ, so dξ = -H⁻¹ (∂g/∂θ) dθ with H the
+    exact Hessian. Points without weight count where they would go, see `bundle_idle`; the last zero has the derivative
+    that the cost lacks because they are not there.
+    """
+    del problem, relative, loss
+    c = 6 if cameras.lenses is None else 9
+    return jnp.zeros((cameras.poses.shape[0], c), X_world.dtype), jnp.zeros_like(X_world), jnp.zeros((), X_world.dtype)
+
+
+@_optimum_shift.defjvp
+def _optimum_shift_jvp(loss: Loss, primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
+    cameras, X_world, problem, relative = first_order(primals, "bundle_adjust")
+    idle = idle_points(cameras, X_world, problem, relative, loss)
+    change, silent = tangents[2], idle.mask & ~idle.rising
+    heard = change._replace(weights=jnp.where(silent[None, :], 0.0, change.weights))
+
+    def gradients(cameras: Cameras, X_world: Points, problem: BundleProblem) -> tuple[Array, Array]:
+        equations = normal_equations(bundle_views(cameras, X_world, problem, loss))
+        return equations.camera_gradient, equations.point_gradient
+
+    _, changes = jax.jvp(gradients, (cameras, idle.X_world, problem), (*tangents[:2], heard))
+    reduced, determined = lax.stop_gradient(_at_optimum(cameras, X_world, problem, loss))
+    keep = lambda change: jnp.where(determined, change, 0.0)
+    shifts = solve_reduced(reduced, *map(keep, changes))
+
+    def cost_at(X_world: Points, weights: Plane) -> Scalar:  # linear in the weights
+        counted = jnp.where(idle.mask[None, :], weights, 0.0)
+        return bundle_cost(bundle_views(cameras, X_world, problem, loss), problem._replace(weights=counted), loss)
+
+    more_cost = cost_at(idle.X_world, heard.weights) - cost_at(X_world, change.weights)
+    return _optimum_shift(cameras, X_world, problem, relative, loss), (*shifts, more_cost)
+
+
+def _at_optimum(cameras: Cameras, X_world: Points, problem: BundleProblem, loss: Loss) -> tuple[Reduced, Flag]:
+    """The exact Hessian, eliminated, and whether it determines the cameras.
+
+    At a strict minimum it is positive definite. A point where it is not (the solver stopped short of one, or a
+    direction is free) gets its reweighted Hessian; all of them do if the cameras are undetermined still.
+    """
+    reweighted = normal_equations(bundle_views(cameras, X_world, problem, loss))
+    blocks = exact_blocks(cameras, X_world, problem, loss)
+    convex = points_determined(blocks.point.sum(axis=2), problem.free_point) | ~problem.free_point
+    rest = problem._replace(weights=jnp.where(convex[None, :], 0.0, problem.weights))
+    others = normal_equations(bundle_views(cameras, X_world, rest, loss))
+    mixed = BundleEquations(
+        camera_gradient=reweighted.camera_gradient,
+        camera_hessian=others.camera_hessian + jnp.where(convex, blocks.camera, 0.0).sum(axis=3),
+        point_gradient=reweighted.point_gradient,
+        point_hessian=others.point_hessian + jnp.where(convex, blocks.point.sum(axis=2), 0.0),
+        cross=others.cross + jnp.where(convex, blocks.cross, 0.0),
+    )
+    first, second = (eliminate(equations, problem, jnp.zeros_like(problem.scale)) for equations in (mixed, reweighted))
+    reduced = jax.tree.map(lambda a, b: jnp.where(is_determined(first), a, b), first, second)
+    determined = is_determined(reduced)
+    identity = jnp.eye(reduced.factor.shape[0], dtype=reduced.factor.dtype)
+    return reduced._replace(factor=jnp.where(determined, reduced.factor, identity)), determined
+
+
+def _report(
+    cameras: Cameras,
+    X_world: Points,
+    problem: BundleProblem,
+    slot: Int[Array, " m"],
+    loss: Loss,
+    initial_cost: Scalar,
+    solution: Solution,
+) -> BundleAdjustment:
+    """Everything that is said of the final values, evaluated there."""
+    views = bundle_views(cameras, X_world, problem, loss)
+    equations = lax.stop_gradient(normal_equations(views))
+    counts = (problem.weights > 0) & (views.robust_weights > 0)
+    free = counts & (free_cameras(problem).any(axis=1)[:, None] | problem.free_point[None, :])
+    determined = is_determined(eliminate(equations, problem, jnp.zeros_like(problem.scale)))
+    status = jnp.select(
+        [~free.any(), ~determined, ~solution.converged],
+        [BundleStatus.NOTHING_TO_ADJUST, BundleStatus.DEGENERATE, BundleStatus.NOT_CONVERGED],
+        BundleStatus.OK,
+    )
+    of_slot = lambda plane, none: jnp.append(plane.reshape(-1), jnp.asarray(none, plane.dtype))[slot]
+    return BundleAdjustment(
+        poses=cameras.poses,
+        X_world=X_world,
+        initial_cost=initial_cost,
+        cost=bundle_cost(views, problem, loss),
+        status=status.astype(jnp.int32),
+        num_steps=solution.num_steps,
+        determined=points_determined(equations.point_hessian, jnp.ones_like(problem.free_point)),
+        used=of_slot(counts, False),
+        robust_weights=of_slot(views.robust_weights, 0.0),
+        chi2=of_slot(views.chi2, UNKNOWN_CHI2),
+        lenses=cameras.lenses,
+    )
+
+
+def _usable(cameras: Cameras, X_world: Points, observations: Observations) -> tuple[Cameras, Points, Observations]:
+    """Finite poses with unit quaternions and finite points; what observes others is no longer valid."""
+    clean, usable = jax.vmap(usable_pose)(SE3(cameras.poses))
+    lenses = cameras.lenses
+    if lenses is not None:
+        lenses, usable_lens = usable_lenses(lenses)
+        usable = usable & usable_lens
+    finite = jnp.isfinite(X_world).all(axis=0)
+    camera = jnp.clip(observations.camera, 0, usable.shape[0] - 1)
+    point = jnp.clip(observations.point, 0, X_world.shape[1] - 1)
+    valid = observations.valid & usable[camera] & finite[point]
+    X_world = jnp.where(finite[None, :], X_world, 0.0)
+    return Cameras(clean.wxyz_xyz, lenses), X_world, observations._replace(valid=valid)
+
+
+def _predicted_decrease(
+    equations: BundleEquations, tangents: Float[Array, "k c"], shifts: Points, damping: Scalar
+) -> Scalar:
+    """What the quadratic model promises of a damped step."""
+    slope = jnp.sum(equations.camera_gradient * tangents) + jnp.sum(equations.point_gradient * shifts)
+    camera_diagonal = jnp.diagonal(equations.camera_hessian, axis1=1, axis2=2)
+    point_diagonal = jnp.diagonal(equations.point_hessian).T
+    raised = jnp.sum(camera_diagonal * jnp.square(tangents)) + jnp.sum(point_diagonal * jnp.square(shifts))
+    return 0.5 * (damping * raised - slope)

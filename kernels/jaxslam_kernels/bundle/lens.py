@@ -1,0 +1,109 @@
+"""What a lens of each camera's own adds to bundle adjustment: a focal length and two radial coefficients to be found.
+
+With `(x, y)` the point's slopes and `r² = x² + y²`, the camera sees it at `f (1 + k1 r² + k2 r⁴) (x, y)` from the
+principal point. So the derivatives by all three lie along `(x, y)`, and the one by `(x, y)` is symmetric.
+
+Source: Agarwal et al., "Bundle Adjustment in the Large", 2010, whose cameras these are, but for the sign of z and y.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxlie import SE3
+from jaxtyping import Array, Bool, Float
+
+from jaxslam_kernels.pose.pose_cost import retract, tangent_basis
+
+Lenses = Float[Array, "k 3"]
+"""Focal length, k1 and k2, one row a camera."""
+Plane = Float[Array, "k n"]
+
+
+class Cameras(NamedTuple):
+    """What is sought of the cameras, c = 6 numbers each, or 9 with a lens of their own.
+
+    Attributes:
+        poses: `wxyz_xyz` of T_world_cam.
+        lenses: `None` for ideal cameras.
+    """
+
+    poses: Float[Array, "k 7"]
+    lenses: Lenses | None = None
+
+
+class Bend(NamedTuple):
+    """What a lens does to every slope. Planes `(k, n)`.
+
+    Attributes:
+        seen: Where the point is seen.
+        across: Derivatives of that by the slopes: of u by x, of u by y and of v by x, of v by y.
+        by_lens: Its derivatives by focal length, k1 and k2, in units of the slopes.
+    """
+
+    seen: tuple[Plane, Plane]
+    across: tuple[Plane, Plane, Plane]
+    by_lens: tuple[Plane, Plane, Plane]
+
+
+class LensPart(NamedTuple):
+    """What the normal equations of the lenses are made of. Planes `(k, n)`.
+
+    Attributes:
+        by_lens: As in `Bend`.
+        pull: Derivative of the cost in units of `by_lens`.
+        information: Second derivative likewise,
+        cross: and that by the slopes over the depth.
+    """
+
+    by_lens: tuple[Plane, Plane, Plane]
+    pull: Plane
+    information: Plane
+    cross: tuple[Plane, Plane]
+
+
+def bend(lenses: Lenses, x: Plane, y: Plane) -> Bend:
+    """Slopes through each camera's lens."""
+    f, k1, k2 = (lenses[:, i, None] for i in range(3))
+    r2 = x * x + y * y
+    factor = 1.0 + r2 * (k1 + r2 * k2)
+    growth = 2.0 * f * (k1 + 2.0 * k2 * r2)  # of f times the factor with r² / 2
+    straight = f * factor
+    return Bend(
+        seen=(straight * x, straight * y),
+        across=(straight + growth * x * x, growth * x * y, straight + growth * y * y),
+        by_lens=(factor, f * r2, f * r2 * r2),
+    )
+
+
+def lens_gradient(part: LensPart) -> Lenses:
+    """Of the cost by the lenses."""
+    return jnp.stack([jnp.sum(d * part.pull, axis=1) for d in part.by_lens], axis=1)
+
+
+def lens_hessian(part: LensPart) -> Float[Array, "k 3 3"]:
+    """Second derivative by each lens."""
+    planes = jnp.stack(part.by_lens, axis=1)
+    return jnp.einsum("kan,kbn->kab", planes * part.information[:, None, :], planes)
+
+
+def shift_cameras(cameras: Cameras, tangents: Float[Array, "k c"]) -> Cameras:
+    """Cameras after small steps, right to first order: for derivatives."""
+    moved = jax.vmap(lambda pose, tangent: tangent_basis(SE3(pose)) @ tangent)(cameras.poses, tangents[:, :6])
+    return _with_lenses(cameras, cameras.poses + moved, tangents)
+
+
+def move_cameras(cameras: Cameras, tangents: Float[Array, "k c"]) -> Cameras:
+    """Cameras after steps of any size."""
+    poses = jax.vmap(lambda pose, tangent: retract(SE3(pose), tangent).wxyz_xyz)(cameras.poses, tangents[:, :6])
+    return _with_lenses(cameras, poses, tangents)
+
+
+def usable_lenses(lenses: Lenses) -> tuple[Lenses, Bool[Array, " k"]]:
+    """Lenses that are finite and not blind; the others become a focal length of one."""
+    usable = jnp.isfinite(lenses).all(axis=1) & (lenses[:, 0] > 0)
+    return jnp.where(usable[:, None], lenses, jnp.array([1.0, 0.0, 0.0], lenses.dtype)[None, :]), usable
+
+
+def _with_lenses(cameras: Cameras, poses: Float[Array, "k 7"], tangents: Float[Array, "k c"]) -> Cameras:
+    return Cameras(poses, None if cameras.lenses is None else cameras.lenses + tangents[:, 6:])

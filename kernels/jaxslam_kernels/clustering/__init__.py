@@ -1,0 +1,1 @@
+"""k-means and DBSCAN with fixed shapes."""

@@ -1,0 +1,1 @@
+"""Depth images: sampling, change, free space, and voxels."""

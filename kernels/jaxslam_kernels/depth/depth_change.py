@@ -1,0 +1,76 @@
+"""A depth image against one taken before from elsewhere: which surfaces were there then, and which were not.
+
+A pixel is carried into the earlier image. If depth there agrees, the surface has been there since. If the earlier image
+saw something farther away along that ray, the surface was not there: it would have hidden that. Nothing can be said
+where depth is missing, out of the earlier view, or hidden in it. Source: free space between a depth camera and what it
+sees, as in occupancy mapping; Palazzolo et al., "ReFusion", 2019, section III-D, uses it on a model of the scene.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxlie import SE3
+from jaxtyping import Array, Bool, Int
+
+from jaxslam_kernels.camera import MIN_DEPTH, Intrinsics
+from jaxslam_kernels.checks import checked
+from jaxslam_kernels.se3 import to_world
+from jaxslam_kernels.types import DepthImage, Scalar
+
+
+class DepthChange(NamedTuple):
+    """What an earlier depth image says of each pixel of the present one.
+
+    Attributes:
+        same: Its surface was there already.
+        new: It was not: the earlier image saw past it.
+        then: Where in the earlier image it is, as `row * w + column`; a pixel of it in any case, even if it is neither.
+    """
+
+    same: Bool[Array, "h w"]
+    new: Bool[Array, "h w"]
+    then: Int[Array, "h w"]
+
+
+@checked
+def depth_change(
+    depth: DepthImage,
+    depth_then: DepthImage,
+    T_then_now: SE3,
+    intrinsics: Intrinsics,
+    *,
+    same_share: Scalar | float = 0.03,
+    same_m: Scalar | float = 0.02,
+    new_share: Scalar | float = 0.05,
+    new_m: Scalar | float = 0.15,
+) -> DepthChange:
+    """Compare two depth images of one camera.
+
+    Args:
+        depth: The present one, metres; 0 or not a number where missing.
+        depth_then: The earlier one, of the same size.
+        T_then_now: From the present camera to the earlier one.
+        intrinsics: Of both; their distortion is left out.
+        same_share: Differences of depth up to this share of the depth,
+        same_m: and so many metres more, are none.
+        new_share: The earlier depth must be greater by this share,
+        new_m: and so many metres more, for the surface to be new.
+    """
+    height, width = depth.shape
+    v, u = jnp.mgrid[:height, :width].astype(depth.dtype)
+    ray = jnp.stack([(u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy, jnp.ones_like(u)])
+    known = jnp.isfinite(depth) & (depth > MIN_DEPTH)
+    X_now = (ray * jnp.where(known, depth, 1)[None]).reshape(3, -1)
+    x, y, z = to_world(T_then_now, X_now).reshape(3, height, width)
+    known &= jnp.isfinite(z) & (z > MIN_DEPTH)
+    z = jnp.where(known, z, 1)
+    column = jnp.round(intrinsics.fx * x / z + intrinsics.cx)
+    row = jnp.round(intrinsics.fy * y / z + intrinsics.cy)
+    known &= (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    then = jnp.where(known, row, 0).astype(jnp.int32) * width + jnp.where(known, column, 0).astype(jnp.int32)
+    seen = depth_then.reshape(-1)[then]
+    known &= jnp.isfinite(seen) & (seen > MIN_DEPTH)
+    beyond = jnp.where(known, seen, z) - z
+    same = known & (jnp.abs(beyond) < same_share * z + same_m)
+    new = known & (beyond > new_share * z + new_m)
+    return DepthChange(same, new, then)

@@ -1,0 +1,1 @@
+"""Pyramidal Lucas-Kanade flow, patch alignment, and disparity along rows."""

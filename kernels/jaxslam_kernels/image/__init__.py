@@ -1,0 +1,1 @@
+"""Image pyramids, corners, and patches around points."""

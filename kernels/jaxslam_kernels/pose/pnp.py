@@ -1,0 +1,293 @@
+"""Robust absolute pose of an RGB-D camera: batched RANSAC with a fixed number of hypotheses.
+
+All hypotheses are drawn, solved and scored at once: P3P on three points, the root chosen by a fourth and by measured
+depths, then one pass over hypotheses x points. The best one is refined, first on all points under a redescending
+loss that is a smooth form of the score, then on its inliers. Which points are inliers is a constant for
+differentiation; the last refinement carries the gradient (see `pose_refine`).
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.typing import DTypeLike
+from jaxlie import SE3, SO3
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from jaxslam_kernels.camera import MIN_DEPTH, Intrinsics
+from jaxslam_kernels.checks import checked
+from jaxslam_kernels.pose.absolute_orientation import absolute_orientation
+from jaxslam_kernels.pose.p3p import p3p
+from jaxslam_kernels.pose.pose_cost import PoseProblem, pose_problem
+from jaxslam_kernels.pose.pose_refine import PoseStatus, refine_problem, solve_pose, usable_pose
+from jaxslam_kernels.robust import Loss
+from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Points, Scalar, Weights
+
+SAMPLE_SIZE = 4
+"""Three points for P3P and one to choose its root."""
+
+_GATE_SIGMAS = 3.0  # a threshold is taken as so many standard deviations in the refinement
+_NARROW = 0.5
+"""Scale of the redescending loss, in thresholds: with 1 it is drawn from the right pose to one half way to a mover."""
+_CONSENSUS_STEPS = 10
+
+_Transforms = Float[Array, "3 4 h"]
+"""`[R | t]` of T_cam_world, one a hypothesis."""
+
+
+class PnpResult(NamedTuple):
+    """A pose that many points agree on.
+
+    Attributes:
+        T_world_cam: The pose; the initial one (or the identity) if `status` says that none was found.
+        inliers: Which points agree with it. All false if none was found.
+        num_inliers: How many.
+        score: `Σ w (1 - min(e², 1))` with e the error in thresholds: the weight of the inliers, less for larger errors;
+            `Σ w (1 - min(e, 1))²` if averaged.
+        status: A `PoseStatus`.
+    """
+
+    T_world_cam: SE3
+    inliers: Mask
+    num_inliers: Int[Array, ""]
+    score: Scalar
+    status: Code
+
+
+@checked
+def ransac_pnp(
+    key: Key[Array, ""],
+    X_world: Points,
+    uv: Pixels,
+    intrinsics: Intrinsics,
+    *,
+    weights: Weights | None = None,
+    depth: Weights | None = None,
+    initial: SE3 | None = None,
+    threshold_px: Weights | Scalar | float = 3.0,
+    threshold_depth: Weights | Scalar | float = 0.1,
+    min_inliers: int = 8,
+    num_hypotheses: int = 128,
+    loss: Loss = "huber",
+    max_steps: int = 25,
+    averaged: bool = False,
+) -> PnpResult:
+    """Finds the camera pose that most points agree on, among any number of wrong ones.
+
+    With a share ω of good points the chance that all of h hypotheses fail is about `(1 - ω⁴)^h`: 3e-4 for half of
+    them good, 128 hypotheses. Points count as in `refine_pose`: positive weight, everything finite.
+
+    Args:
+        key: Random key; the same key gives the same answer.
+        X_world: Points in the world, metres. At least `SAMPLE_SIZE` usable ones, not all on a line.
+        uv: Where they are seen, pixels of the distorted image.
+        intrinsics: The camera.
+        weights: How likely each point is to be drawn, and its part in the score; `None` for one each. The derivative by
+            a weight of 0 is the limit from above.
+        depth: Measured depths in metres, 0 or NaN where missing; `None` for pixels alone. They take part in the
+            choice of the root, in the score and in the refinement.
+        initial: A predicted pose, tried as one more hypothesis.
+        threshold_px: Largest error of an inlier in the image, pixels: about three standard deviations.
+        threshold_depth: Largest error of an inlier along the optical axis, metres. The two combine:
+            `e² = (pixels / threshold_px)² + (depth / threshold_depth)² < 1`.
+        min_inliers: Fewer than this is no consensus.
+        num_hypotheses: How many samples are drawn, static.
+        loss: The loss of the last refinement over the inliers, with a scale of half a threshold, static.
+        max_steps: Bound on the steps of the last refinement, static.
+        averaged: Whether the score is averaged over thresholds, see `score_poses`, static.
+
+    Returns:
+        A `PnpResult`; everything in it is finite.
+    """
+    if X_world.shape[1] == 0:
+        return _none_found(_fallback(initial, X_world.dtype)[0])
+    problem, idle = pose_problem(
+        X_world,
+        uv,
+        intrinsics,
+        weights,
+        depth,
+        jnp.asarray(threshold_px, X_world.dtype) / _GATE_SIGMAS,
+        jnp.asarray(threshold_depth, X_world.dtype) / _GATE_SIGMAS,
+        _GATE_SIGMAS,
+        None,
+    )
+    fixed = lax.stop_gradient(problem)
+    fallback, has_initial = _fallback(initial, X_world.dtype)
+    hypotheses, real = _hypotheses(fixed, draw_samples(key, fixed.weights, num_hypotheses))
+    hypotheses = jnp.concatenate([hypotheses, _as_transform(fallback)], axis=2)
+    scores = jnp.where(jnp.append(real, has_initial), score_poses(hypotheses, fixed, averaged), -1.0)
+    best, _ = usable_pose(_as_pose(hypotheses[:, :, jnp.argmax(scores)]))
+    consensus = _improved(best, fixed, averaged)
+    inliers, _ = _consensus(consensus, fixed, averaged)
+    weights_of_inliers = jnp.where(inliers, problem.weights, 0.0)
+    on_inliers = problem._replace(weights=weights_of_inliers, scale=0.5 * problem.scale)
+    agrees = _squared_errors(_as_transform(consensus), *_observed(lax.stop_gradient(idle))) < 1.0
+    idle = idle._replace(weights=jnp.where(agrees, idle.weights, 0.0))
+    refined = refine_problem(consensus, on_inliers, idle, loss, max_steps)
+    return _result(refined.T_world_cam, refined.status, fixed, fallback, scores.max() >= 0, min_inliers, averaged)
+
+
+_MOST_COMPARED = 2**15
+"""Up to so many weights times samples comparing with all is faster than halving, and twenty times less code."""
+
+
+@checked
+def draw_samples(
+    key: Key[Array, ""], weights: Weights, num_samples: int, size: int = SAMPLE_SIZE
+) -> Int[Array, "size h"]:
+    """Draws samples of `size` different points, each in proportion to its weight among those left.
+
+    Exact sequential sampling without replacement: a draw lands on the line of stacked weights from which the ones
+    drawn before have been cut out. With fewer points of positive weight than the sample has, some come twice.
+
+    Raises:
+        ValueError: While tracing, if there is no point at all.
+    """
+    if weights.size == 0:
+        raise ValueError("draw_samples: weights: expected at least one, got none")
+    search = "compare_all" if weights.size * num_samples <= _MOST_COMPARED else "scan"
+    ends = jnp.cumsum(weights)
+    starts, total = ends - weights, ends[-1]
+    uniform = jax.random.uniform(key, (size, num_samples), weights.dtype)
+    drawn: list[Array] = []
+    taken: list[tuple[Array, Array]] = []  # where each one drawn starts on the line, in its order, and its weight
+    for position in range(size):
+        target = uniform[position] * (total - sum(weight for _, weight in taken))
+        for start, weight in taken:  # every cut ahead of the target moves it on
+            target = target + jnp.where(target >= start, weight, 0.0)
+        chosen = jnp.searchsorted(ends, target, side="right", method=search).astype(jnp.int32)
+        drawn.append(jnp.minimum(chosen, weights.size - 1))
+        taken = _inserted(taken, starts[drawn[-1]], weights[drawn[-1]])
+    return jnp.stack(drawn)
+
+
+def _inserted(line: list[tuple[Array, Array]], start: Array, weight: Array) -> list[tuple[Array, Array]]:
+    """The pieces of a line in their order, with one more; elementwise, where a sort is a call of its own."""
+    longer: list[tuple[Array, Array]] = []
+    for other_start, other_weight in line:
+        first = start < other_start
+        longer.append((jnp.where(first, start, other_start), jnp.where(first, weight, other_weight)))
+        start, weight = jnp.where(first, other_start, start), jnp.where(first, other_weight, weight)
+    return [*longer, (start, weight)]
+
+
+@checked
+def score_poses(T_cam_world: _Transforms, problem: PoseProblem, averaged: bool = False) -> Float[Array, " h"]:
+    """The score of each pose (see `PnpResult.score`), thresholds being `problem.scale` deviations.
+
+    Averaged: `(1 - e)²` is the truncated squared error `1 - min(e² / s², 1)`, averaged over all thresholds s up to 1.
+    Nobody knows the noise, and a pose that fits some points well is rather right than one that fits more of them badly
+    (the idea of Barath, Matas and Noskova, "MAGSAC: marginalizing sample consensus", CVPR 2019). Without the average, a
+    pose half way between a room and a box that is carried before it beats both.
+
+    One fused pass over hypotheses x points: 40 us for 128 x 500 on one core. As a matrix product followed by the
+    errors it takes 50 us, with an exponential map in the loop 9 ms.
+    """
+    error = _squared_errors(T_cam_world[..., None], *(o[..., None, :] for o in _observed(problem)))
+    error = jnp.minimum(error, 1.0)
+    agreement = jnp.square(1.0 - jnp.sqrt(error)) if averaged else 1.0 - error
+    return agreement @ problem.weights
+
+
+def _observed(problem: PoseProblem) -> tuple[Array, Array, Array, Array]:
+    """What `_squared_errors` compares with: points, directions, depths, and factors in units of the threshold."""
+    return problem.X_world, problem.xy, problem.depth, problem.precision / problem.scale
+
+
+def _squared_errors(T: Array, X_world: Array, xy: Array, depth: Array, precision: Array) -> Array:
+    """`e²` in squared thresholds, 1 or more behind the camera; the axes behind the first broadcast."""
+    x, y, z = X_world
+    X, Y, Z = (row[0] * x + row[1] * y + row[2] * z + row[3] for row in T)
+    inverse_z = 1.0 / jnp.maximum(Z, MIN_DEPTH)
+    fu, fv, fd = precision
+    eu, ev, ed = (X * inverse_z - xy[0]) * fu, (Y * inverse_z - xy[1]) * fv, (Z - depth) * fd
+    return eu * eu + ev * ev + ed * ed + jnp.where(Z > MIN_DEPTH, 0.0, 1.0)
+
+
+def _hypotheses(problem: PoseProblem, samples: Int[Array, "4 h"]) -> tuple[_Transforms, Bool[Array, " h"]]:
+    """One pose a sample: of the up to four of P3P, the one that agrees best with what else was measured."""
+    X_world, xy, depth, precision = (o[..., samples] for o in _observed(problem))
+    bearings = jnp.stack([xy[0], xy[1], jnp.ones_like(xy[0])])
+    bearings = bearings * lax.rsqrt(jnp.square(bearings).sum(axis=0))[None, :, :]
+    distances, real = p3p(bearings[:, :3], X_world[:, :3])
+    corners = distances[None, :, :, :] * bearings[:, :3, None, :]
+    world_corners = jnp.broadcast_to(X_world[:, :3, None, :], corners.shape)
+    R, t, spans = absolute_orientation(world_corners, corners)
+    T = jnp.concatenate([R, t[:, None]], axis=1)  # (3, 4, solution, sample)
+    disagreement = _squared_errors(T[:, :, None], *(o[..., :, None, :] for o in (X_world, xy, depth, precision))).sum(
+        axis=0
+    )
+    disagreement = jnp.where(real & spans, disagreement, jnp.inf)
+    chosen = jnp.argmin(disagreement, axis=0)
+    T = jnp.take_along_axis(T, chosen[None, None, None, :], axis=2)[:, :, 0, :]
+    return T, (real & spans).any(axis=0)
+
+
+def _improved(best: SE3, problem: PoseProblem, averaged: bool) -> SE3:
+    """A pose after a redescending refinement; averaged, as it was if that has led away to where fewer agree."""
+    if not averaged:
+        return solve_pose(best, problem, "geman_mcclure", _CONSENSUS_STEPS)[0]
+    solved, _ = solve_pose(best, problem._replace(scale=_NARROW * problem.scale), "geman_mcclure", _CONSENSUS_STEPS)
+    better = _consensus(solved, problem, averaged)[1] > _consensus(best, problem, averaged)[1]
+    return SE3(jnp.where(better, solved.wxyz_xyz, best.wxyz_xyz))
+
+
+def _consensus(T_world_cam: SE3, problem: PoseProblem, averaged: bool) -> tuple[Mask, Scalar]:
+    """Which points agree with a pose, and its score."""
+    T = _as_transform(T_world_cam)
+    error = _squared_errors(T, *_observed(problem))
+    return (error < 1.0) & (problem.weights > 0), score_poses(T, problem, averaged)[0]
+
+
+def _result(
+    T_world_cam: SE3,
+    status: Code,
+    problem: PoseProblem,
+    fallback: SE3,
+    any_real: Array,
+    min_inliers: int,
+    averaged: bool,
+) -> PnpResult:
+    inliers, score = _consensus(T_world_cam, problem, averaged)
+    num_inliers = jnp.sum(inliers, dtype=jnp.int32)
+    usable = jnp.sum(problem.weights > 0)
+    status = jnp.select(
+        [usable < SAMPLE_SIZE, ~any_real | (status == PoseStatus.DEGENERATE), num_inliers < min_inliers],
+        [PoseStatus.TOO_FEW_POINTS, PoseStatus.DEGENERATE, PoseStatus.NO_CONSENSUS],
+        status,
+    ).astype(jnp.int32)
+    found = status <= PoseStatus.NOT_CONVERGED
+    return PnpResult(
+        T_world_cam=SE3(jnp.where(found, T_world_cam.wxyz_xyz, fallback.wxyz_xyz)),
+        inliers=inliers & found,
+        num_inliers=jnp.where(found, num_inliers, 0),
+        score=jnp.where(found, score, 0.0),
+        status=status,
+    )
+
+
+def _none_found(fallback: SE3) -> PnpResult:
+    """The result of no points."""
+    dtype = fallback.wxyz_xyz.dtype
+    status = jnp.asarray(PoseStatus.TOO_FEW_POINTS, jnp.int32)
+    return PnpResult(fallback, jnp.zeros(0, bool), jnp.zeros((), jnp.int32), jnp.zeros((), dtype), status)
+
+
+def _fallback(initial: SE3 | None, dtype: DTypeLike) -> tuple[SE3, Flag]:
+    """The initial pose and true, or the identity and false if there is none."""
+    if initial is None:
+        return SE3(jnp.zeros(7, dtype).at[0].set(1.0)), jnp.array(False)
+    return usable_pose(initial)
+
+
+def _as_transform(T_world_cam: SE3) -> Float[Array, "3 4 1"]:
+    T_world_cam = lax.stop_gradient(T_world_cam)
+    R_world_cam, position = T_world_cam.rotation().as_matrix(), T_world_cam.translation()
+    return jnp.concatenate([R_world_cam.T, -(R_world_cam.T @ position)[:, None]], axis=1)[:, :, None]
+
+
+def _as_pose(T_cam_world: Float[Array, "3 4"]) -> SE3:
+    R_world_cam = T_cam_world[:, :3].T
+    return SE3.from_rotation_and_translation(SO3.from_matrix(R_world_cam), -(R_world_cam @ T_cam_world[:, 3]))

@@ -1,0 +1,1 @@
+"""Pose graph optimization, dense and sparse."""

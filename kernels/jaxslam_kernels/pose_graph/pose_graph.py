@@ -1,0 +1,404 @@
+"""Optimises a pose graph, SE(3) or Sim(3): closes loops over thousands of nodes, differentiably.
+
+Levenberg-Marquardt on the cost of `pose_graph_cost`; each step solves the sparse normal equations, by the conjugate
+gradients of `block_band` or, much faster for graphs of thousands of nodes, on the host by `pose_graph_sparse`. The
+result is differentiable, forward and reverse, by the implicit function theorem at the optimum, with respect to measured
+poses, scales, information, weights and loss scale: one sparse solve with the exact Hessian. The initial poses have no
+derivative, but for nodes that are fixed or otherwise stay where they were. Of a weight that is exactly 0 the derivative
+is the one-sided limit from above. Second derivatives raise `NotImplementedError`.
+
+Source: Grisetti et al., "A Tutorial on Graph-Based SLAM", 2010; Strasdat et al., "Scale Drift-Aware Large Scale
+Monocular SLAM", 2010, for Sim(3); Madsen, Nielsen and Tingleff, "Methods for Non-Linear Least Squares Problems", 2004,
+section 3.2, for the damping.
+"""
+
+from collections.abc import Callable
+from enum import IntEnum
+from functools import partial
+from typing import Annotated, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxlie import SE3
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxslam_kernels.checks import checked
+from jaxslam_kernels.first_order import first_order
+from jaxslam_kernels.pose_graph.block_tridiagonal_cg import (
+    GraphMatrix,
+    Vector,
+    conjugate_gradients,
+    factorise,
+    multiply,
+    solve_factor,
+)
+from jaxslam_kernels.pose_graph.cost import (
+    GraphEquations,
+    GraphProblem,
+    Nodes,
+    PoseGraphEdges,
+    Steps,
+    graph_cost,
+    graph_equations,
+    graph_gradient,
+    graph_nodes,
+    graph_problem_and_idle,
+    idle_cost,
+    idle_gradient,
+    move_nodes,
+    shift_nodes,
+)
+from jaxslam_kernels.pose_graph.sparse_solve import solve_on_host
+from jaxslam_kernels.robust import Loss
+from jaxslam_kernels.types import Code, Flag, Scalar
+
+GROUP_SIZE = 32
+"""Nodes in a group of the preconditioner; at the largest `|rank[source] - rank[target]|` the factor is exact."""
+
+Elimination = Literal["band", "host"]
+"""How the normal equations are solved: in compiled code, within a band; or on the host, whatever the structure."""
+
+_GROUP_SIZES = (16, 32, 64)
+"""Those that `suitable_group_size` chooses from: beyond, the host is faster."""
+_INITIAL_DAMPING = 1e-5  # relative to the diagonal of the Hessian
+_LEAST_DAMPING, _MOST_DAMPING = 1e-9, 1e9
+_STEP_TOLERANCE = 1e-2  # of the conjugate gradients in a step
+
+
+class PoseGraphStatus(IntEnum):
+    """What the poses are worth. Only `OK`, `NOT_CONVERGED` and `DISCONNECTED` carry new ones."""
+
+    OK = 0
+    NOT_CONVERGED = 1
+    """The steps ran out; the poses are the best found."""
+    DISCONNECTED = 2
+    """Some nodes have no path of edges to a fixed one: those stayed, the rest is optimal."""
+    NOTHING_TO_DO = 3
+    """No edge counts that leads to a free node with a path to a fixed one: no edges, no free or no fixed nodes."""
+    BAD_INITIAL = 4
+    """The initial pose or scale of a node in use is not finite: nothing moved, and that node came back as identity."""
+
+
+class PoseGraph(NamedTuple):
+    """An optimised pose graph.
+
+    Attributes:
+        T_world_cam: k poses, `wxyz_xyz` `(k, 7)`.
+        scales: `(k,)` scales, all ones in SE(3).
+        cost_before: `½ Σ w ρ(s)` at the initial poses.
+        cost: The same at the result.
+        chi2: `(m,)` squared whitened error s of every edge; 0 where there is none.
+        robust_weights: `(m,)` the loss's weight `ρ'(s)` in [0, 1]; 0 where there is no edge.
+        anchored: `(k,)` which nodes are fixed, or have a path of edges to a fixed one.
+        status: A `PoseGraphStatus`.
+        num_steps: Steps of Levenberg-Marquardt tried.
+        num_iterations: Iterations of conjugate gradients, all steps together.
+    """
+
+    T_world_cam: SE3
+    scales: Float[Array, " k"]
+    cost_before: Scalar
+    cost: Scalar
+    chi2: Float[Array, " m"]
+    robust_weights: Float[Array, " m"]
+    anchored: Bool[Array, " k"]
+    status: Code
+    num_steps: Int[Array, ""]
+    num_iterations: Int[Array, ""]
+
+
+class _Graph(NamedTuple):
+    """What stays constant in a solve."""
+
+    problem: GraphProblem
+    free: Bool[Array, " k"]
+    rank: Int[Array, " k"]
+
+
+class _Solver(NamedTuple):
+    """Static settings."""
+
+    loss: Loss
+    max_steps: int
+    max_iterations: int
+    group_size: int
+    elimination: Elimination
+
+
+class _Search(NamedTuple):
+    nodes: Nodes
+    cost: Scalar
+    equations: GraphEquations
+    damping: Scalar
+    growth: Scalar
+    num_steps: Int[Array, ""]
+    num_iterations: Int[Array, ""]
+    converged: Flag
+
+
+@checked
+def optimise_pose_graph(
+    T_world_cam: Annotated[SE3, "k"],
+    edges: PoseGraphEdges,
+    fixed: Bool[Array, " k"],
+    *,
+    scales: Float[Array, " k"] | None = None,
+    mask: Bool[Array, " k"] | None = None,
+    rank: Int[Array, " k"] | None = None,
+    loss: Loss = "squared",
+    loss_scale: Scalar | float = 1.0,
+    max_steps: int = 50,
+    max_iterations: int = 200,
+    group_size: int = GROUP_SIZE,
+    elimination: Elimination = "band",
+) -> PoseGraph:
+    """The poses that agree best with the measured relative poses.
+
+    An edge does not count if anything in it is not finite, if it leads to no node in use or from a node to itself, or
+    if its information is not positive definite: what would be undetermined stays where it was, and is not moved.
+
+    Args:
+        T_world_cam: k initial poses, `wxyz_xyz` `(k, 7)`.
+        edges: m measured relative poses; with scales and 7 x 7 information for Sim(3).
+        fixed: `(k,)` nodes that stay. At least one in every connected part, or the part stays as a whole.
+        scales: `(k,)` positive initial scales: Sim(3). `None`: SE(3).
+        mask: `(k,)` which slots hold a node; all by default.
+        rank: `(k,)` a permutation, each node's place in the order of elimination, from `band_rank`; the given order
+            by default, which suits a chain with few loops. It changes the time and not the result.
+        loss: The robust loss, static.
+        loss_scale: Its scale in standard deviations, traced.
+        max_steps: Bound on the steps, static.
+        max_iterations: Bound on the iterations of conjugate gradients in a step, static.
+        group_size: Nodes in a group of the preconditioner, static; see `suitable_group_size`.
+        elimination: Where the normal equations are solved, static. "host" calls back to SciPy from compiled code, and
+            then `rank`, `max_iterations` and `group_size` matter to derivatives only, or not at all.
+
+    Returns:
+        A `PoseGraph`; everything in it is finite, and so are its derivatives.
+    """
+    k, d = fixed.shape[0], 6 if scales is None else 7
+    mask = jnp.ones(k, bool) if mask is None else mask
+    rank = jnp.arange(k) if rank is None else rank
+    initial, usable = graph_nodes(T_world_cam, scales)
+    problem, idle = graph_problem_and_idle(edges, mask & usable, loss_scale, d)
+    used = problem.weights > 0
+    anchored = _anchored(problem, fixed & mask & usable)
+    free = anchored & ~fixed
+    touched = jnp.zeros(k, bool).at[problem.source].max(used).at[problem.target].max(used)
+    solver = _Solver(loss, max_steps, max_iterations, group_size, elimination)
+    bad_initial = (mask & ~usable).any()
+    free = free & ~bad_initial
+    graph = _Graph(problem, free, rank)
+    end = _solve(lax.stop_gradient(initial), lax.stop_gradient(graph), solver)
+    optimum = jnp.where(free[:, None], end.nodes, initial)
+    # An edge that would connect what has no path to a fixed node is fitted exactly, however small its weight.
+    idle_counts = anchored[idle.source] == anchored[idle.target]
+    idle = idle._replace(weights=jnp.where(idle_counts, idle.weights, 0.0))
+    optimum = shift_nodes(optimum, _optimum_shift(solver, end.converged, optimum, graph, idle))
+    status = jnp.select(
+        [bad_initial, ~(touched & free).any(), ~end.converged, (mask & ~anchored).any()],
+        [
+            PoseGraphStatus.BAD_INITIAL,
+            PoseGraphStatus.NOTHING_TO_DO,
+            PoseGraphStatus.NOT_CONVERGED,
+            PoseGraphStatus.DISCONNECTED,
+        ],
+        PoseGraphStatus.OK,
+    ).astype(jnp.int32)
+    cost, chi2, robust_weights = graph_cost(optimum, problem, loss)
+    return PoseGraph(
+        T_world_cam=SE3(optimum[:, :7]),
+        scales=jnp.exp(optimum[:, 7]),
+        cost_before=graph_cost(initial, problem, loss)[0] + idle_cost(initial, idle, loss),
+        cost=cost + idle_cost(optimum, idle, loss),
+        chi2=chi2,
+        robust_weights=robust_weights,
+        anchored=anchored,
+        status=status,
+        num_steps=end.num_steps,
+        num_iterations=end.num_iterations,
+    )
+
+
+def band_rank(source: np.ndarray, target: np.ndarray, num_nodes: int) -> np.ndarray:
+    """An order of elimination that keeps both ends of every edge close together, by reverse Cuthill-McKee.
+
+    For the host: the graph's structure decides, once for each change of it. A millisecond for thousands of nodes.
+
+    Args:
+        source: `(m,)` indices of nodes, those of edges in use only.
+        target: `(m,)` indices of nodes.
+        num_nodes: Capacity k, slots without edges included.
+
+    Returns:
+        `(k,)` each node's place.
+    """
+    from scipy.sparse import coo_array  # noqa: PLC0415 - only for graphs, on the host
+    from scipy.sparse.csgraph import reverse_cuthill_mckee  # noqa: PLC0415
+
+    graph = coo_array((np.ones(len(source)), (source, target)), shape=(num_nodes, num_nodes))
+    order = reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True)
+    rank = np.empty(num_nodes, np.int32)
+    rank[order] = np.arange(num_nodes, dtype=np.int32)
+    return rank
+
+
+def suitable_group_size(source: np.ndarray, target: np.ndarray, rank: np.ndarray) -> int | None:
+    """The least group size of a few that makes every step exact in one iteration.
+
+    For the host, like `band_rank`. The sizes are few so that a graph that grows seldom compiles anew.
+
+    Args:
+        source: `(m,)` indices of nodes, those of edges in use only.
+        target: `(m,)` indices of nodes.
+        rank: `(k,)` each node's place, from `band_rank`.
+
+    Returns:
+        The size, or `None` if the band is too wide: then `elimination="host"` is faster.
+    """
+    width = int(np.abs(rank[source] - rank[target]).max(initial=1))
+    return next((size for size in _GROUP_SIZES if size >= width), None)
+
+
+def _anchored(problem: GraphProblem, fixed: Bool[Array, " k"]) -> Bool[Array, " k"]:
+    """Which nodes have a path to a fixed one: labels fall to the least of the neighbours' until they rest."""
+    k, used = fixed.shape[0], problem.weights > 0
+    source, target = problem.source, problem.target
+
+    def spread(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        labels, _ = state
+        least = jnp.where(used, jnp.minimum(labels[source], labels[target]), k)
+        new = labels.at[labels[source]].min(least).at[labels[target]].min(least)
+        new = new.at[source].min(least).at[target].min(least)
+        new = new[new]  # halves the way to the root
+        return new, (new != labels).any()
+
+    labels, _ = lax.while_loop(lambda state: state[1], spread, (jnp.arange(k), jnp.array(True)))
+    return jnp.zeros(k, bool).at[labels].max(fixed)[labels]
+
+
+def _solve(initial: Nodes, graph: _Graph, solver: _Solver) -> _Search:
+    dtype, k = initial.dtype, initial.shape[0]
+    epsilon = float(jnp.finfo(dtype).eps)
+    one, none = jnp.ones((), dtype), jnp.zeros((), jnp.int32)
+    cost, _, _ = graph_cost(initial, graph.problem, solver.loss)
+    equations = graph_equations(initial, graph.problem, solver.loss)
+    has_work = graph.free.any() & (graph.problem.weights > 0).any()
+    start = _Search(initial, cost, equations, _INITIAL_DAMPING * one, 2.0 * one, none, none, ~has_work)
+
+    def step(s: _Search) -> _Search:
+        matrix = _system(s.equations, graph, s.damping)
+        gradient = jnp.where(graph.free[:, None], s.equations.gradient, 0.0)
+        steps, iterations = _linear_solve(matrix, -gradient, graph, solver)
+        trial = move_nodes(s.nodes, steps)
+        trial_cost, _, _ = graph_cost(trial, graph.problem, solver.loss)
+        damped = s.damping * jnp.sum(steps * _diagonal(s.equations, graph) * steps)
+        promised = 0.5 * (damped - jnp.sum(gradient * steps))
+        won = s.cost - trial_cost
+        better = (won > 0) & jnp.isfinite(trial_cost)
+        gain = won / jnp.where(promised > 0, promised, 1.0)
+        short = promised <= jnp.maximum(epsilon * k, 8.0 * epsilon * s.cost)
+        level = jnp.abs(won) <= 8.0 * epsilon * s.cost
+        eased = jnp.maximum(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)
+        damping = jnp.clip(s.damping * jnp.where(better, eased, s.growth), _LEAST_DAMPING, _MOST_DAMPING)
+        nodes, cost = jnp.where(better, trial, s.nodes), jnp.where(better, trial_cost, s.cost)
+        return _Search(
+            nodes=nodes,
+            cost=cost,
+            equations=lax.cond(better, lambda: graph_equations(nodes, graph.problem, solver.loss), lambda: s.equations),
+            damping=damping,
+            growth=jnp.where(better, 2.0, 2.0 * s.growth),
+            num_steps=s.num_steps + 1,
+            num_iterations=s.num_iterations + iterations,
+            converged=short | level,
+        )
+
+    return lax.while_loop(lambda s: ~s.converged & (s.num_steps < solver.max_steps), step, start)
+
+
+def _linear_solve(matrix: GraphMatrix, right: Steps, graph: _Graph, solver: _Solver) -> tuple[Steps, Int[Array, ""]]:
+    precondition = _preconditioner(matrix, graph, solver)
+    if solver.elimination == "host":
+        return precondition(right), jnp.ones((), jnp.int32)
+    return conjugate_gradients(
+        partial(multiply, matrix), precondition, right, tolerance=_STEP_TOLERANCE, max_steps=solver.max_iterations
+    )
+
+
+def _preconditioner(matrix: GraphMatrix, graph: _Graph, solver: _Solver) -> Callable[[Vector], Vector]:
+    """The inverse of the matrix, exact on the host and as good as the band is otherwise."""
+    if solver.elimination == "host":
+        return partial(solve_on_host, matrix)
+    return partial(solve_factor, factorise(matrix, graph.rank, solver.group_size))
+
+
+def _diagonal(equations: GraphEquations, graph: _Graph) -> Steps:
+    """What the damping is relative to: the diagonal of the Hessian, one for nodes that stay."""
+    diagonal = jnp.diagonal(equations.diagonal, axis1=1, axis2=2)
+    largest = jnp.max(diagonal) if diagonal.size else 0.0
+    floor = jnp.finfo(diagonal.dtype).eps * largest + jnp.finfo(diagonal.dtype).tiny * 1e8
+    return jnp.where(graph.free[:, None], jnp.maximum(diagonal, floor), 1.0)
+
+
+def _system(equations: GraphEquations, graph: _Graph, damping: Scalar | float) -> GraphMatrix:
+    """The damped normal equations, with identity rows for nodes that stay."""
+    free, problem = graph.free, graph.problem
+    d = equations.diagonal.shape[1]
+    eye = jnp.eye(d, dtype=equations.diagonal.dtype)[None]
+    blocks = equations.diagonal + eye * (damping * _diagonal(equations, graph))[:, :, None]
+    both = free[problem.source] & free[problem.target] & (problem.weights > 0)
+    coupling = jnp.where(both[:, None, None], equations.coupling, 0.0)
+    return GraphMatrix(jnp.where(free[:, None, None], blocks, eye), coupling, problem.source, problem.target)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _optimum_shift(solver: _Solver, converged: Flag, optimum: Nodes, graph: _Graph, idle: GraphProblem) -> Steps:
+    """Zero, with the derivative of the optimum with respect to the problem and to the nodes that stay.
+
+    At the optimum the gradient g of the cost vanishes whatever the problem θ, so dξ = -H⁻¹ (∂g/∂θ) dθ with H the
+    exact Hessian. Zero where the solver did not converge.
+    """
+    del solver, converged, idle
+    return jnp.zeros((optimum.shape[0], graph.problem.information.shape[1]), optimum.dtype)
+
+
+@_optimum_shift.defjvp
+def _optimum_shift_jvp(solver: _Solver, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    converged, optimum, graph, idle = first_order(primals, "optimise_pose_graph")
+    free = graph.free[:, None]
+    value = _optimum_shift(solver, converged, optimum, graph, idle)
+    still = jnp.where(free, 0.0, tangents[1])  # the initial values of the free nodes do not matter
+
+    def gradient(nodes: Nodes, problem: GraphProblem) -> Steps:
+        return graph_gradient(nodes, problem, solver.loss)
+
+    _, change = jax.jvp(gradient, (optimum, graph.problem), (still, tangents[2].problem))
+    change = change + idle_gradient(optimum, idle, tangents[3].weights, solver.loss)
+    constant = lax.stop_gradient((optimum, graph))
+    shift = -_solve_exact(solver, *constant, jnp.where(free & converged, change, 0.0))
+    return value, jnp.where(free & converged, shift, 0.0)
+
+
+def _solve_exact(solver: _Solver, optimum: Nodes, graph: _Graph, right: Steps) -> Steps:
+    """`H⁻¹ right` with the exact Hessian, preconditioned by the reweighted one; itself differentiable in `right`."""
+    free, zero = graph.free[:, None], jnp.zeros_like(right)
+
+    def gradient(steps: Steps) -> Steps:
+        return graph_gradient(shift_nodes(optimum, steps), graph.problem, solver.loss)
+
+    def hessian(steps: Steps) -> Steps:
+        moved = jax.jvp(gradient, (zero,), (jnp.where(free, steps, 0.0),))[1]
+        return jnp.where(free, moved, steps)
+
+    epsilon = float(jnp.finfo(right.dtype).eps)
+    matrix = _system(graph_equations(optimum, graph.problem, solver.loss), graph, _LEAST_DAMPING)
+    precondition = _preconditioner(matrix, graph, solver)
+
+    def solve(_: object, b: Steps) -> Steps:
+        return conjugate_gradients(
+            hessian, precondition, b, tolerance=epsilon**0.75, max_steps=4 * solver.max_iterations
+        )[0]
+
+    return lax.custom_linear_solve(hessian, right, solve, symmetric=True)

@@ -1,0 +1,1 @@
+"""Alignment of trajectories and KITTI's drift."""

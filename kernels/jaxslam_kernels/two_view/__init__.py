@@ -1,0 +1,1 @@
+"""Two views: fundamental matrix, homography, epipolar distances."""

@@ -1,0 +1,29 @@
+"""A third of a round of the room, at a size at which places are recognised, and a tracker for it."""
+
+import functools
+
+from small_scene import Clip
+
+from jaxslam.config.schema import TrackConfig
+from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
+from jaxslam.sensors.frame import Frame
+
+WIDTH, HEIGHT, FPS, FRAMES = 320, 240, 15.0, 166
+TRACK = TrackConfig(
+    num_points=256, num_levels=3, num_keyframes=6, num_sources=2, points_per_source=96, num_hypotheses=32, cell_px=16
+)
+
+
+def room() -> Clip:
+    """The recording; the list of frames is the caller's own."""
+    return Clip(_source(), _frames())
+
+
+@functools.cache
+def _source() -> SyntheticDataset:
+    return SyntheticDataset(SyntheticConfig(width=WIDTH, height=HEIGHT, frames=FRAMES, people=0, path="loop", fps=FPS))
+
+
+@functools.cache
+def _frames() -> tuple[Frame, ...]:
+    return tuple(_source()[index] for index in range(FRAMES))

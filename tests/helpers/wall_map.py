@@ -1,0 +1,42 @@
+"""A wall of points in keyframes that show it from here and there, for tests of which of them are wanted."""
+
+import numpy as np
+from small_map import CAMERA, features, png, sightings
+
+from jaxslam.geometry.so3 import axis_rotation
+from jaxslam.map.edit import with_keyframe, with_points, with_sightings
+from jaxslam.map.types import NONE, Keyframe, Map, MapPoints, empty_map
+
+POINTS = 100
+
+
+def at(x: float = 0.0, z: float = 0.0, turn: float = 0.0) -> np.ndarray:
+    """A pose that was moved to the right and ahead, and then turned about the vertical."""
+    return np.concatenate([axis_rotation(1, np.array(turn)), [x, 0, z]])
+
+
+def seen_from(poses: list[np.ndarray], shown: list[int], submaps: list[int] | None = None) -> Map:
+    """A wall of points two metres ahead of the origin, in keyframes that each show so many of them."""
+    rng = np.random.default_rng(0)
+    made = empty_map(CAMERA)
+    submaps = [0] * len(poses) if submaps is None else submaps
+    for number, (pose, submap) in enumerate(zip(poses, submaps, strict=True)):
+        first = submap not in made.submap
+        parent = NONE if first else int(made.ids[made.submap == submap][0])
+        made = with_keyframe(made, Keyframe(number, number, features(rng, POINTS), png(number)), pose, parent, submap)
+    for submap in sorted(set(submaps)):
+        ids = made.next_point + np.arange(POINTS)
+        maker = int(made.ids[made.submap == submap][0])
+        X = np.concatenate([rng.uniform(-0.5, 0.5, (2, POINTS)), np.full((1, POINTS), 2.0)])
+        whole = np.ones(POINTS, np.float32)
+        none, no_descriptor = np.zeros(POINTS, bool), np.zeros((POINTS, 32), np.uint8)
+        made_by, static = np.full(POINTS, maker, np.int64), np.zeros(POINTS, np.int8)
+        made = with_points(made, MapPoints(ids, X, whole, no_descriptor, none, made_by, static))
+        for number in np.flatnonzero(np.array(submaps) == submap):
+            some = ids[: shown[number]]
+            by_feature = np.where(np.arange(len(some)) % 2, NONE, np.arange(len(some)))
+            made = with_sightings(made, sightings(made, np.full(len(some), number), some, by_feature, rng))
+    return made
+
+
+BEHIND = at(z=4.0, turn=np.pi)

@@ -1,0 +1,107 @@
+"""Presets built around a network, on a machine without it: refused, or marked in everything they leave behind."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from command_line import failing
+from small_scene import HEIGHT, SETTINGS, WIDTH
+
+from jaxslam.cli.entry_point import main
+from jaxslam.config.schema import load_config, presets
+from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset, write_tum
+from jaxslam.errors import MissingModelError
+from jaxslam.semantics import no_detections
+from jaxslam.semantics.from_config import detector_of, preset_needs_network, why_no_network
+from jaxslam.slam.slam import Slam
+
+refused = failing(code=2)
+
+NEEDED_BY = {
+    *("ngd", "ngd-detector", "ngd-propagation"),
+    *("occlusion", "occlusion-masks"),
+    *("usd", "usd-published", "usd-segmentation"),
+    *("rts", "rts-published", "rts-semantics", "rts-semantics-epipolar"),
+    "trs-semantics",
+}
+pytestmark = pytest.mark.usefixtures("models_cache")
+
+
+ROOM = SyntheticDataset(SyntheticConfig(width=WIDTH, height=HEIGHT, frames=3, people=0))
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recordings") / "room"
+    write_tum(ROOM, folder)
+    return folder
+
+
+class TestPresets:
+    @pytest.mark.parametrize("preset", presets())
+    def test_that_need_a_network(self, preset: str) -> None:
+        """The preset says whether it does; without one, it is an error to build its detector."""
+        semantics = load_config(preset).semantics
+        assert preset_needs_network(preset) == (preset in NEEDED_BY)
+        if preset not in NEEDED_BY:
+            assert detector_of(semantics) is None
+            return
+        with pytest.raises(MissingModelError, match="to download it: jaxslam models get yolox-nano"):
+            detector_of(semantics)
+        assert detector_of(replace(semantics, missing_model="allow")) is None
+        assert detector_of(replace(semantics, model=None)) is None
+
+    def test_another_network_than_the_default_is_needed(self) -> None:
+        """Whoever names one wants it."""
+        with pytest.raises(MissingModelError, match=r"semantics.model: yolox-tiny is not on this machine"):
+            detector_of(load_config(overrides=["semantics.model=yolox-tiny"]).semantics)
+
+    @pytest.mark.parametrize(
+        ("overrides", "why"),
+        [
+            ((), "yolox-nano not on this machine"),
+            (("semantics.model=null",), "semantics.model is null"),
+            (("semantics.model=yolox-tiny", "semantics.missing_model=allow"), "yolox-tiny not on this machine"),
+        ],
+    )
+    def test_why_there_is_none(self, overrides: tuple[str, ...], why: str) -> None:
+        assert why_no_network(load_config(overrides=overrides).semantics) == why
+
+
+class TestSlam:
+    def test_refuses(self) -> None:
+        with pytest.raises(MissingModelError, match=r"semantics.missing_model=allow"):
+            Slam(ROOM.camera, load_config("ngd"))
+
+    def test_takes_a_detector_instead(self) -> None:
+        """A function of the user's own is as good as the network."""
+        with Slam(ROOM.camera, load_config("ngd"), detector=lambda image: no_detections()) as slam:
+            assert slam.without_network is None
+
+    def test_says_so(self, caplog: pytest.LogCaptureFixture) -> None:
+        with Slam(ROOM.camera, load_config("ngd", overrides=["semantics.missing_model=allow"])) as slam:
+            assert slam.without_network == "yolox-nano not on this machine"
+        assert "jaxslam models get yolox-nano" in caplog.text
+
+
+class TestCommands:
+    @pytest.mark.parametrize("command", [("run", "--preset"), ("compare", "--presets")])
+    def test_refuse(
+        self, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: tuple[str, str]
+    ) -> None:
+        """One line with the command that gets the network, code 2, and no folder of results."""
+        line = refused(capsys, command[0], str(recording), command[1], "ngd", "--out", str(tmp_path / "out"))
+        assert "to download it: jaxslam models get yolox-nano" in line
+        assert "--allow-missing-model" in line
+        assert not (tmp_path / "out").exists()
+
+    def test_go_on_if_allowed(self, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        chosen = ["--preset", "ngd", "--allow-missing-model", "--set", *SETTINGS]
+        main(["run", str(recording), "--out", str(tmp_path), *chosen])
+        summary = json.loads((tmp_path / "summary.json").read_text())
+        assert (summary["model"], summary["without_network"]) == ("yolox-nano", "yolox-nano not on this machine")
+        out = capsys.readouterr().out
+        assert "yolox-nano not on this machine" in out
+        assert "…" not in out
+        assert all(len(line) <= 80 for line in out.splitlines() if line.startswith("  "))

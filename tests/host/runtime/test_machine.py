@@ -1,0 +1,25 @@
+"""What a process says of the machine it runs on, on every system."""
+
+import sys
+
+from jaxslam.runtime.compile_cache import threads, usable_cores
+from jaxslam.runtime.machine import cpu_model, machine, peak_rss_mb
+
+
+def test_machine_is_told() -> None:
+    told = machine()
+    assert told["cpu"] == cpu_model() != ""
+    assert (told["cores"], told["threads"]) == (usable_cores(), threads())
+    assert told["versions"]["python"] == sys.version.split()[0]
+    assert set(told["versions"]) > {"jaxslam", "jax", "jaxlib", "numpy"}
+
+
+def test_memory_is_the_most_there_was() -> None:
+    """In megabytes: what is written and given back stays in the figure."""
+    before = peak_rss_mb()
+    assert 20 < before < 1e5
+    block = bytearray(b"x") * 200_000_000
+    after = peak_rss_mb()
+    del block
+    assert after >= max(before, 200)
+    assert peak_rss_mb() >= after

@@ -1,0 +1,97 @@
+"""When a keyframe is made: as soon as there is a reason, or at the right moment after."""
+
+from functools import partial
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxlie import SE3
+
+from jaxslam import load_config
+from jaxslam.sensors.camera import Camera
+from jaxslam.tracking.from_config import track_params, track_plan
+from jaxslam.tracking.keyframe_decision import Candidate, keyframe_reason
+from jaxslam.tracking.state import KeyframeReason
+from jaxslam.tracking.step import init_state
+
+N = 64
+CAMERA = Camera("test", 64, 48, 50.0, 50.0, 31.5, 23.5, depth_scale_per_m=5000.0)
+CONFIG = load_config(overrides=(f"track.num_points={N}", "track.num_levels=2", "track.keyframe_points_below=0.5"))
+PARAMS = track_params(CAMERA, CONFIG.track)
+AS_NEEDED = track_plan(CONFIG.track)
+SPARING = AS_NEEDED._replace(keyframe_choice="sparing")
+DUE_S = CONFIG.track.keyframe_least_s
+PATIENCE_S = CONFIG.track.keyframe_patience_s
+
+
+def _reason(
+    plan=SPARING,
+    *,
+    moved_m=1.0,
+    since_s=1.0,
+    overlap=0.5,
+    movable=0.0,
+    tracked=N,
+    weak=False,
+    lost=False,
+    started=False,
+) -> KeyframeReason:
+    """Why a frame is kept that shows points 2 m away, after the camera has moved since a keyframe at the origin."""
+    state = init_state(48, 64, plan)
+    rng = np.random.default_rng(0)
+    X_world = jnp.asarray(rng.uniform([-1, -1, 2], [1, 1, 2.1], (N, 3)).T, jnp.float32)
+    state = state._replace(keyframes=state.keyframes._replace(made=jnp.ones((), jnp.int32)))
+    pose = jnp.array([1, 0, 0, 0, moved_m, 0, 0], jnp.float32)
+    number = lambda value: jnp.asarray(value, jnp.float32)
+    points = state.points._replace(X_world=X_world, age=jnp.full(N, 5, jnp.int32))
+    candidate = Candidate(
+        T_world_cam=SE3(pose),
+        points=points,
+        tracked=jnp.arange(N) < tracked,
+        overlap=number(overlap),
+        lost=jnp.asarray(lost),
+        weak=jnp.asarray(weak),
+        started=jnp.asarray(started),
+        since_keyframe_s=number(since_s),
+        movable=number(movable),
+    )
+    return KeyframeReason(int(keyframe_reason(state, candidate, PARAMS, plan)))
+
+
+@pytest.mark.parametrize("plan", [AS_NEEDED, SPARING])
+def test_a_new_area_is_a_reason(plan) -> None:
+    assert _reason(plan) == KeyframeReason.NEW_AREA
+    assert _reason(plan, overlap=0.9) == KeyframeReason.NONE
+
+
+def test_not_soon_after_the_last_one() -> None:
+    soon = 0.5 * DUE_S
+    assert _reason(AS_NEEDED, since_s=soon, overlap=0.75) == KeyframeReason.NEW_AREA
+    assert _reason(since_s=soon, overlap=0.75) == KeyframeReason.NONE
+    assert _reason(since_s=DUE_S + 1e-3, overlap=0.75) == KeyframeReason.NEW_AREA
+    assert _reason(since_s=soon, overlap=0.2) == KeyframeReason.NEW_AREA  # hardly anything is left of it
+
+
+def test_not_without_motion() -> None:
+    assert _reason(AS_NEEDED, moved_m=0.01) == KeyframeReason.NEW_AREA
+    assert _reason(moved_m=0.01) == KeyframeReason.NONE
+    assert _reason(moved_m=0.01, since_s=60.0, overlap=0.9) == KeyframeReason.NONE  # not for the time alone either
+    assert _reason(moved_m=0.3, since_s=60.0, overlap=0.9) == KeyframeReason.TIME
+
+
+def test_not_while_much_may_move_unless_that_lasts() -> None:
+    assert _reason(since_s=DUE_S + 1e-3, movable=0.5) == KeyframeReason.NONE
+    assert _reason(since_s=DUE_S + PATIENCE_S + 1e-3, movable=0.5) == KeyframeReason.NEW_AREA
+    assert _reason(AS_NEEDED, since_s=DUE_S + 1e-3, movable=0.5) == KeyframeReason.NEW_AREA
+
+
+@pytest.mark.parametrize("plan", [AS_NEEDED, SPARING])
+def test_at_once_when_points_are_few(plan) -> None:
+    at_a_bad_moment = partial(_reason, plan, since_s=0.01, moved_m=0.0, movable=0.9, overlap=0.9)
+    assert at_a_bad_moment(tracked=N // 5) == KeyframeReason.FEW_POINTS
+    assert at_a_bad_moment(tracked=N) == KeyframeReason.NONE
+
+
+def test_lost_and_started() -> None:
+    assert _reason(lost=True) == KeyframeReason.NONE
+    assert _reason(started=True, since_s=0.0, moved_m=0.0) == KeyframeReason.STARTED

@@ -1,0 +1,143 @@
+"""Derivatives through ten tracked frames, in float64: forward mode, reverse mode and finite differences agree.
+
+Which points agree, and which keyframes are looked into, are constants of the derivative. Searches run to the end
+(`TrackPlan.exact`): those that stop early are functions of where they start too.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+from jaxtyping import Array
+from quick_compile import quick_compile
+from small_scene import PLAN, Clip, at, clip, new_state, params, stacked, truth_from_start
+
+from jaxslam.sensors.frame_arrays import FrameArrays
+from jaxslam.tracking.state import TrackState
+from jaxslam.tracking.step import track_step
+
+BEFORE, STEPS = 10, 10
+EXACT = PLAN.exact()
+
+
+class Inputs(NamedTuple):
+    """What the loss is differentiated by; `image` scales one random change of all pictures."""
+
+    camera: Array
+    weight: Array
+    X_world: Array
+    loss_scale: Array
+    pixel_sigma: Array
+    readout_s: Array
+    image: Array
+
+
+DIFFERENCE = Inputs(
+    camera=jnp.asarray(1e-4),
+    weight=jnp.asarray(1e-2),
+    X_world=jnp.asarray(1e-5),
+    loss_scale=jnp.asarray(3e-3),
+    pixel_sigma=jnp.asarray(1e-3),
+    readout_s=jnp.asarray(1e-4),
+    image=jnp.asarray(1e-2),
+)
+"""Steps that change the loss by 2e-7 or more: the tolerances of searches and solvers change it by up to 2e-11."""
+
+
+class Problem(NamedTuple):
+    inputs: Inputs
+    gradient: Inputs
+    loss: Callable[[Inputs], Array]
+    slope: Callable[[Inputs], Array]
+    """Directional derivative, by forward mode."""
+    counted: Array
+    """Which points exist."""
+
+    def direction(self, seed: int) -> Inputs:
+        """A random change of every input, of the size of one."""
+        random = np.random.default_rng(seed)
+        return jax.tree.map(lambda array: jnp.asarray(random.normal(size=array.shape)), self.inputs)
+
+
+@pytest.fixture(scope="module")
+def problem() -> Iterator[Problem]:
+    recording = clip()
+    with jax.enable_x64(True):
+        yield _problem(recording)
+
+
+def _problem(recording: Clip) -> Problem:
+    frames = stacked(recording.frames[: BEFORE + STEPS], np.float64, np.float64)
+    given = params(np.float64)._replace(readout_s=jnp.asarray(0.005))
+    step = quick_compile(track_step, static_argnums=3)
+    state = new_state(np.float64, np.float64)
+    for index in range(BEFORE):
+        state, _ = step(state, at(frames, index), given, EXACT)
+    given = given._replace(refill_below=jnp.zeros(()), keyframe_below=jnp.zeros(()))
+    window = jax.tree.map(lambda array: array[BEFORE:], frames)
+    change = jnp.asarray(np.random.default_rng(0).normal(size=window.image.shape))
+    truth = jnp.asarray(truth_from_start(recording.source.ground_truth)[BEFORE : BEFORE + STEPS, :3, 3])
+
+    def loss(inputs: Inputs) -> Array:
+        fx, fy, cx, cy = inputs.camera
+        changed = given._replace(
+            intrinsics=given.intrinsics._replace(fx=fx, fy=fy, cx=cx, cy=cy),
+            loss_scale=inputs.loss_scale,
+            pixel_sigma=inputs.pixel_sigma,
+            readout_s=inputs.readout_s,
+        )
+
+        def advance(state: TrackState, frame: FrameArrays) -> tuple[TrackState, Array]:
+            state, output = track_step(state, frame, changed, EXACT)
+            return state, output.T_world_cam.translation()
+
+        points = state.points._replace(weight=inputs.weight, X_world=inputs.X_world)
+        seen = window._replace(image=window.image + inputs.image * change)
+        _, positions = lax.scan(advance, state._replace(points=points), seen)
+        return jnp.sum(jnp.square(positions - truth))
+
+    camera = given.intrinsics
+    inputs = Inputs(
+        camera=jnp.stack([camera.fx, camera.fy, camera.cx, camera.cy]),
+        weight=0.9 * state.points.weight,
+        X_world=state.points.X_world,
+        loss_scale=given.loss_scale,
+        pixel_sigma=given.pixel_sigma,
+        readout_s=given.readout_s,
+        image=jnp.zeros(()),
+    )
+    gradient = quick_compile(jax.grad(loss))(inputs)
+    forward = quick_compile(lambda direction: jax.jvp(loss, (inputs,), (direction,))[1])
+    return Problem(inputs, gradient, quick_compile(loss), forward, state.points.valid)
+
+
+class TestGradient:
+    @pytest.mark.parametrize("name", Inputs._fields)
+    def test_equals_finite_differences(self, problem: Problem, name: str) -> None:
+        along = getattr(problem.direction(seed=2), name)
+        h = float(getattr(DIFFERENCE, name))
+        moved = lambda step: problem.inputs._replace(**{name: getattr(problem.inputs, name) + step * along})
+        expected = (float(problem.loss(moved(h))) - float(problem.loss(moved(-h)))) / (2 * h)
+        derivative = float(jnp.vdot(getattr(problem.gradient, name), along))
+        print(f"{name}: derivative {derivative:.6e}, finite difference {expected:.6e}")
+        assert abs(expected) > 0
+        assert derivative == pytest.approx(expected, rel=1e-3)
+
+    def test_forward_equals_reverse(self, problem: Problem) -> None:
+        """Along a random change of everything, scaled so that every input contributes as much as any other."""
+        shares = jax.tree.map(jnp.vdot, problem.gradient, problem.direction(seed=1))
+        assert all(float(share) != 0 for share in shares)
+        direction = jax.tree.map(lambda along, share: along / jnp.abs(share), problem.direction(seed=1), shares)
+        expected = sum(float(jnp.vdot(a, b)) for a, b in zip(problem.gradient, direction, strict=True))
+        assert float(problem.slope(direction)) == pytest.approx(expected, abs=1e-6)
+
+    def test_is_finite(self, problem: Problem) -> None:
+        for name, gradient in problem.gradient._asdict().items():
+            assert jnp.isfinite(gradient).all(), name
+
+    def test_points_without_a_slot_have_none(self, problem: Problem) -> None:
+        assert not jnp.where(problem.counted, 0, problem.gradient.weight).any()

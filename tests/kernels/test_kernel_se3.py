@@ -1,0 +1,85 @@
+"""Transforms against NumPy's 4x4 matrices, under strict promotion."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxlie import SE3
+from jaxslam_kernels.se3 import between, cross_matrix, displacement, moved, to_camera, to_world
+from scipy.linalg import expm
+
+
+def random_pose(seed, dtype: type = np.float64):
+    values = np.random.default_rng(seed).normal(size=7)
+    values[:4] /= np.linalg.norm(values[:4])
+    return SE3(jnp.asarray(values, dtype))
+
+
+def hat(tangent):
+    x, y, z = tangent[3:]
+    return np.block([[np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]), tangent[:3, None]], [np.zeros((1, 4))]])
+
+
+@pytest.fixture(autouse=True)
+def float64():
+    with jax.enable_x64(True):
+        yield
+
+
+class TestTransform:
+    def test_shapes(self):
+        X = jnp.ones((3, 5), jnp.float32)
+        T = random_pose(0, np.float32)
+        assert to_camera(T, X).shape == to_world(T, X).shape == (3, 5)
+        assert displacement(T, T).shape == (6,)
+        assert displacement(T, T).dtype == to_world(T, X).dtype == jnp.float32
+
+    @pytest.mark.parametrize("size", [1e-9, 1e-3, 1.0])
+    def test_matches_reference(self, size):
+        A, B = random_pose(1), random_pose(2)
+        tangent = size * np.random.default_rng(3).normal(size=6)
+        np.testing.assert_allclose(
+            between(A, B).as_matrix(), np.linalg.inv(A.as_matrix()) @ np.asarray(B.as_matrix()), atol=1e-12
+        )
+        there = moved(A, jnp.asarray(tangent))
+        np.testing.assert_allclose(there.as_matrix(), np.asarray(A.as_matrix()) @ expm(hat(tangent)), atol=1e-12)
+        np.testing.assert_allclose(displacement(A, there), tangent, atol=1e-12)
+
+    def test_points_return(self):
+        A, X = random_pose(4), jnp.asarray(np.random.default_rng(5).normal(size=(3, 20)))
+        world = np.asarray(A.as_matrix()) @ np.vstack([X, np.ones((1, 20))])
+        np.testing.assert_allclose(to_world(A, X), world[:3], atol=1e-12)
+        np.testing.assert_allclose(to_camera(A, to_world(A, X)), X, atol=1e-12)
+
+    @pytest.mark.parametrize("size", [0.0, 1e-7, 0.7])
+    def test_gradient(self, size):
+        A, direction = random_pose(6), np.random.default_rng(7).normal(size=6)
+        loss = lambda tangent: jnp.sum(displacement(A, moved(A, tangent)) * direction)
+        at = jnp.asarray(size * np.random.default_rng(8).normal(size=6))
+        # The displacement undoes the move: the gradient is the direction itself, also where nothing moves.
+        # (jaxlie cancels digits just above its switch to a series, 3e-8 at 1e-7.)
+        np.testing.assert_allclose(jax.grad(loss)(at), direction, atol=1e-7)
+        np.testing.assert_allclose(jax.jacfwd(loss)(at), direction, atol=1e-7)
+
+    def test_vmap_equals_loop(self):
+        tangents = jnp.asarray(np.random.default_rng(9).normal(size=(4, 6)))
+        A = random_pose(10)
+        batched = jax.vmap(lambda t: moved(A, t).wxyz_xyz)(tangents)
+        np.testing.assert_allclose(batched, [moved(A, t).wxyz_xyz for t in tangents], atol=1e-14)
+
+    def test_single_trace(self):
+        step = eqx.filter_jit(eqx.debug.assert_max_traces(displacement, max_traces=1))
+        for seed in range(3):
+            step(random_pose(seed), random_pose(seed + 1))
+
+    def test_degenerate(self):
+        nothing = displacement(random_pose(11), random_pose(11))
+        np.testing.assert_allclose(nothing, 0, atol=1e-15)
+        half_turn = moved(SE3.identity(), jnp.asarray([0, 0, 0, np.pi, 0, 0]))
+        assert np.isfinite(displacement(SE3.identity(), half_turn)).all()
+
+    def test_cross_matrix(self):
+        u, v = jnp.asarray(np.random.default_rng(3).normal(size=(2, 3)))
+        np.testing.assert_allclose(cross_matrix(u) @ v, np.cross(u, v), atol=1e-15)
+        assert cross_matrix(u.astype(jnp.float32)).dtype == jnp.float32
