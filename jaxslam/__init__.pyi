@@ -1,9 +1,9 @@
 from .config.schema import Config as Config
 from .config.schema import load_config as load_config
 from .datasets import open_dataset as open_dataset
-from .dynamics.cue import Scene as Scene
-from .dynamics.cue import Verdict as Verdict
-from .dynamics.cue import judge as judge
+from .dynamics.cue import CueInput as CueInput
+from .dynamics.cue import CueResult as CueResult
+from .dynamics.cue import threshold_evidence as threshold_evidence
 from .errors import JaxSlamError as JaxSlamError
 from .runtime.compile_cache import enable_compile_cache as enable_compile_cache
 from .runtime.compile_cache import prefer_one_thread as prefer_one_thread
@@ -17,7 +17,7 @@ from .sensors.frame_arrays import stack_frames as stack_frames
 from .sensors.rectification import RectifiedPair as RectifiedPair
 from .sensors.stereo_rig import Lens as Lens
 from .sensors.stereo_rig import Rig as Rig
-from .slam.frame_result import Tracked as Tracked
+from .slam.frame_result import FrameResult as FrameResult
 from .slam.slam import Slam as Slam
 from .tracking.batch import track_clips as track_clips
 from .tracking.cue_registry import with_cue_params as with_cue_params
@@ -35,7 +35,7 @@ from .tracking.state import TrackPlan as TrackPlan
 from .tracking.state import TrackReason as TrackReason
 from .tracking.state import TrackState as TrackState
 from .tracking.state import TrackStatus as TrackStatus
-from .tracking.step import Followed as Followed
+from .tracking.step import FlowResult as FlowResult
 from .tracking.step import follow_points as follow_points
 from .tracking.step import init_state as init_state
 from .tracking.step import track_followed as track_followed

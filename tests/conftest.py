@@ -95,7 +95,7 @@ def _number_of_threads_stays():
         os.environ["NPROC"] = chosen
 
 
-_MOST_MAPS = 20_000
+_MAX_MAPS = 20_000
 """Of memory, after which compiled programs are dropped: a process may have 65,530 on Linux. A small program takes 7, a
 tracker with its map 5,200, and what is compiled beyond the limit crashes or hangs the process."""
 
@@ -105,6 +105,6 @@ def _compiled_programs_are_few():
     """Those of earlier files are compiled again, or loaded from the disk, where they are needed."""
     yield
     maps = Path("/proc/self/maps")
-    if maps.is_file() and maps.read_bytes().count(b"\n") > _MOST_MAPS:
+    if maps.is_file() and maps.read_bytes().count(b"\n") > _MAX_MAPS:
         jax.clear_caches()
         gc.collect()

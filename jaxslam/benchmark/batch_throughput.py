@@ -14,7 +14,7 @@ from jaxslam.config.schema import TrackConfig
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.runtime.compile_cache import threads
 from jaxslam.runtime.machine import peak_rss_mb
-from jaxslam.runtime.trace_cache import traced_once
+from jaxslam.runtime.trace_cache import cached_trace
 from jaxslam.sensors.frame_arrays import FrameArrays, stack_frames
 from jaxslam.tracking.batch import TrackedClips, track_clips
 from jaxslam.tracking.from_config import track_params, track_plan
@@ -26,7 +26,7 @@ from jaxslam.trajectory.trajectory import Trajectory
 DIFFERENT = 8
 """Rooms that are rendered; of more clips some are the same."""
 _PATHS = ("xyz", "rpy", "halfsphere", "loop")
-_MOST_PEOPLE = 2
+_MAX_PEOPLE = 2
 _AT_ONCE = 4
 """Clips a program where programs share the cores; 2 or 8 are as fast."""
 
@@ -100,7 +100,7 @@ def make_task(count: int, frames: int, width: int, height: int) -> Task:
     """
     config = partial(SyntheticConfig, frames=frames, width=width, height=height)
     datasets = [
-        SyntheticDataset(config(seed=seed, path=_PATHS[seed % len(_PATHS)], people=seed % (_MOST_PEOPLE + 1)))
+        SyntheticDataset(config(seed=seed, path=_PATHS[seed % len(_PATHS)], people=seed % (_MAX_PEOPLE + 1)))
         for seed in range(count)
     ]
     rooms = [Room(stack_frames([room[index] for index in range(frames)]), room.ground_truth) for room in datasets]
@@ -174,8 +174,8 @@ def _batch(clips: Sequence[FrameArrays], task: Task, way: Way) -> TrackedClips:
     return track_clips(clips, task.params, task.plan, at_once=way.at_once, threads=way.threads)
 
 
-_new_state = jax.jit(traced_once(init_state), static_argnames=("height", "width", "plan"))
-_step_alone = jax.jit(traced_once(track_step), static_argnames="plan", donate_argnames="state")
+_new_state = jax.jit(cached_trace(init_state), static_argnames=("height", "width", "plan"))
+_step_alone = jax.jit(cached_trace(track_step), static_argnames="plan", donate_argnames="state")
 
 
 def loop(clips: Iterable[FrameArrays], task: Task) -> TrackedClips:

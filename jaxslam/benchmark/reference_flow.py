@@ -9,33 +9,33 @@ from jaxtyping import Float32, UInt8
 
 from jaxslam.datasets import Dataset
 from jaxslam.errors import DatasetError, FrameError
-from jaxslam.sensors.frame import to_grey
+from jaxslam.sensors.frame import to_gray
 
 NUM_CORNERS, WINDOW_PX, LEVELS = 1000, 21, 4
 CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.03)
 """Ten steps, or until one is shorter than 0.03 pixels."""
 _PAIRS, _CALLS = 8, 3
 
-Grey = UInt8[np.ndarray, "h w"]
+Gray = UInt8[np.ndarray, "h w"]
 Corners = Float32[np.ndarray, "n 1 2"] | Float32[np.ndarray, "n 2"]
 
 
 def corners_of(image: np.ndarray, seed: int = 0) -> Corners:
-    """A thousand corners at most of a colour or grey image, pixels; points anywhere in one that has none.
+    """A thousand corners at most of a color or gray image, pixels; points anywhere in one that has none.
 
     Args:
         image: `(h, w, 3)` RGB or `(h, w)`.
         seed: Of points anywhere.
     """
-    grey = to_grey(image)
-    corners: Corners | None = cv2.goodFeaturesToTrack(grey, NUM_CORNERS, 0.001, 7)
+    gray = to_gray(image)
+    corners: Corners | None = cv2.goodFeaturesToTrack(gray, NUM_CORNERS, 0.001, 7)
     if corners is None:
-        places = np.random.default_rng(seed).uniform(0, min(grey.shape), (NUM_CORNERS, 1, 2))
+        places = np.random.default_rng(seed).uniform(0, min(gray.shape), (NUM_CORNERS, 1, 2))
         return places.astype(np.float32)
     return corners
 
 
-def opencv_flow(before: Grey, after: Grey, corners: Corners) -> Corners:
+def opencv_flow(before: Gray, after: Gray, corners: Corners) -> Corners:
     """Where the corners are in the next image, with both pyramids."""
     found, _, _ = cv2.calcOpticalFlowPyrLK(
         before,
@@ -49,7 +49,7 @@ def opencv_flow(before: Grey, after: Grey, corners: Corners) -> Corners:
     return found
 
 
-def flow_ms(before: Grey, after: Grey, corners: Corners) -> float:
+def flow_ms(before: Gray, after: Gray, corners: Corners) -> float:
     """Milliseconds that it takes, once."""
     began = time.perf_counter()
     opencv_flow(before, after, corners)
@@ -86,6 +86,6 @@ def _of_part_ms(dataset: Dataset, part: range) -> float | None:
 
 
 def _of_pair_ms(dataset: Dataset, index: int) -> float:
-    a, b = (to_grey(dataset[min(i, len(dataset) - 1)].image) for i in (index, index + 1))
+    a, b = (to_gray(dataset[min(i, len(dataset) - 1)].image) for i in (index, index + 1))
     corners = corners_of(a, index)
     return float(np.median([flow_ms(a, b, corners) for _ in range(_CALLS)]))

@@ -17,7 +17,7 @@ import cv2
 import jax
 import numpy as np
 
-_LEAST_ROUNDS = 5
+_MIN_ROUNDS = 5
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ def _rounds(rounds: int, most_s: float) -> Iterator[int]:
     """The numbers of the rounds for which there is time."""
     began = time.perf_counter()
     for number in range(rounds):
-        if number >= _LEAST_ROUNDS and time.perf_counter() - began > most_s:
+        if number >= _MIN_ROUNDS and time.perf_counter() - began > most_s:
             return
         yield number
 

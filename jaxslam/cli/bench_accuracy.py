@@ -11,8 +11,8 @@ import tyro
 from jaxslam.benchmark.machine_names import cpu_name, machine_of, versions_of
 from jaxslam.benchmark.reports.markdown import table
 from jaxslam.benchmark.suites.accuracy_ruler import (
-    MOST_MEAN,
-    MOST_RECORDING,
+    MAX_MEAN,
+    MAX_RECORDING,
     Accuracy,
     AccuracyBaseline,
     Compared,
@@ -35,7 +35,7 @@ from jaxslam.runtime.machine import machine
 _SUITE, _REPORT = "accuracy", "accuracy.md"
 _OUT = Path("results") / "bench" / _SUITE
 _COLUMNS = ("recording", "tracked, %", "ATE, mm", "worst", "was, mm", "ratio", "by chance", "equal")
-_MOST_WORKERS = 2
+_MAX_WORKERS = 2
 
 _Results = Sequence[Mapping[str, Any]]
 
@@ -88,7 +88,7 @@ class AccuracyRuler(RunsOfSuite):
                 raise BenchmarkError(f"--results-from: expected a folder with results, got '{self.results_from}'")
             return results, self.results_from
         out = self.out or _OUT
-        workers = self.workers or min(_MOST_WORKERS, usable_cores())
+        workers = self.workers or min(_MAX_WORKERS, usable_cores())
         return replace(self, out=out, workers=workers if self.runs_here else None).results(self.suite), out
 
     def _made(self, results: _Results, sequences: Mapping[str, Any], now: Mapping[str, Any]) -> AccuracyBaseline:
@@ -169,7 +169,7 @@ def _words(reading: Accuracy, baseline: AccuracyBaseline, results: _Results, fil
     number = sum(row.ratio is not None for row in reading.recordings)
     words = [
         f"Geometric mean of the ratios over {number} recordings: {mean} (by chance {low:.3f} - {high:.3f});"
-        f" not worse up to {MOST_MEAN:g}, a recording up to {MOST_RECORDING:g}.",
+        f" not worse up to {MAX_MEAN:g}, a recording up to {MAX_RECORDING:g}.",
         f"Baseline: {file.name}, {baseline.commit}, {baseline.machine}; {baseline.versions}. {baseline.reason}",
     ]
     here = machine_of(results), versions_of(results)

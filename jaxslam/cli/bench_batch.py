@@ -22,7 +22,7 @@ from jaxslam.runtime.machine import machine
 _JSON, _MARKDOWN, _PICTURE = "batch.json", "batch.md", "batch.png"
 _LEFT_OUT = ("loop", "worst, m")
 """Columns for which there is no room in a terminal."""
-_FEWEST_FRAMES, _LEAST_PX, _MOST_PX = 3, 64, 8192
+_FEWEST_FRAMES, _MIN_PX, _MAX_PX = 3, 64, 8192
 
 
 @dataclass(frozen=True)
@@ -83,9 +83,9 @@ class Batch(WithJson):
             raise BenchmarkError(f"--rounds: expected at least 1, got {self.rounds}")
         found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", self.size)
         sides = tuple(map(int, found.groups())) if found else ()
-        if not sides or not all(_LEAST_PX <= side <= _MOST_PX for side in sides):
+        if not sides or not all(_MIN_PX <= side <= _MAX_PX for side in sides):
             raise BenchmarkError(
-                f"--size: expected WIDTHxHEIGHT of {_LEAST_PX} to {_MOST_PX} pixels each, got '{self.size}'"
+                f"--size: expected WIDTHxHEIGHT of {_MIN_PX} to {_MAX_PX} pixels each, got '{self.size}'"
             )
         return sides[0], sides[1]
 

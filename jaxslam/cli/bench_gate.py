@@ -16,7 +16,7 @@ from jaxslam.cli.bench import RunsOfSuite
 from jaxslam.cli.console import plain_console, print_json
 from jaxslam.errors import BenchmarkError
 
-_MOST_AGAIN = 2
+_MAX_AGAIN = 2
 _OUT = Path("results") / "bench" / "gate"
 
 
@@ -57,7 +57,7 @@ class Gate(RunsOfSuite):
                 f"Here: {other}. Errors may differ as those of seeds do; times of other machines are left out."
             )
         worse = complaints(before, results)
-        for again in range(1, 1 + _MOST_AGAIN):
+        for again in range(1, 1 + _MAX_AGAIN):
             slow = sorted({complaint.row for complaint in worse if complaint.of_time})
             if not slow:
                 break

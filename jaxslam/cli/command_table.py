@@ -81,7 +81,7 @@ COMMANDS = (
         ("run",),
         "run:Run",
         "Track a recording and, if it has ground truth, evaluate.",
-        "The dataset kind and the cameras of TUM (fr1, fr2, fr3) and Bonn are recognised from the folder.",
+        "The dataset kind and the cameras of TUM (fr1, fr2, fr3) and Bonn are recognized from the folder.",
     ),
     Command(
         ("compare",),
@@ -130,7 +130,7 @@ COMMANDS = (
         "eval:Eval",
         "Compare an estimated trajectory with the truth: ATE, RPE and KITTI's figures.",
         "KITTI's t_rel and r_rel are for paths of 100 m or more. Formats (TUM, KITTI, EuRoC's ground truth) are"
-        " recognised.",
+        " recognized.",
     ),
     Command(
         ("doctor",),
@@ -152,11 +152,11 @@ COMMANDS = (
     ),
     Command(("models", "get"), "models:GetModel", "Download a network, or go on with a download that was cut."),
     Command(
-        ("models", "list"), "models:ListModels", "Print the known networks: size, licence, adapter, where they are."
+        ("models", "list"), "models:ListModels", "Print the known networks: size, license, adapter, where they are."
     ),
     Command(("data",), None, "Public recordings to track: list them, get one."),
     Command(("data", "get"), "data:GetRecording", "Download a recording and unpack it, or go on with a cut download."),
-    Command(("data", "list"), "data:ListRecordings", "Print the known recordings: size, licence, where they are."),
+    Command(("data", "list"), "data:ListRecordings", "Print the known recordings: size, license, where they are."),
 )
 
 

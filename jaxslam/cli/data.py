@@ -72,7 +72,7 @@ class GetRecording:
             raise DatasetError(f"{recording.name} cannot be downloaded alone; {recording.how}. See {recording.page}")
         folder = self.out or recordings_dir()
         target, archive = folder / recording.name, folder / recording.archive
-        plain_console.print(f"{recording.dataset}, licence: {recording.licence}, see {recording.page}")
+        plain_console.print(f"{recording.dataset}, license: {recording.license}, see {recording.page}")
         _fetch_and_unpack(recording, recording.url, archive, target)
         if not self.keep_archive:
             _delete(archive)
@@ -89,9 +89,9 @@ def _listed(recording: Recording, folder: Path | None) -> dict[str, Any]:
 
 def _print_dataset(shown: Sequence[Recording], found: Mapping[str, Path], *, urls: bool) -> None:
     """Print the recordings of one dataset, and in lines of their own, to be copied, where they are or come from."""
-    licences = " or ".join(dict.fromkeys(recording.licence for recording in shown))
+    licenses = " or ".join(dict.fromkeys(recording.license for recording in shown))
     pages = " or ".join(dict.fromkeys(recording.page for recording in shown))
-    table = make_table(f"{shown[0].dataset}, licence: {licences}, see {pages}", "name", "size", "here", left=3)
+    table = make_table(f"{shown[0].dataset}, license: {licenses}, see {pages}", "name", "size", "here", left=3)
     for recording in shown:
         table.add_row(recording.name, _size(recording), "yes" if recording.name in found else "no")
     plain_console.print(table)

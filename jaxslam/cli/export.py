@@ -40,21 +40,21 @@ class Export(WithJson):
         wanted = [path for path in (self.ply, self.colmap, self.trajectory) if path is not None]
         if not wanted:
             raise ConfigError("export: expected at least one of --ply FILE, --colmap FOLDER, --trajectory FILE")
-        map = one_submap(whole, self.submap)
+        slam_map = one_submap(whole, self.submap)
         if self.ply is not None:
-            write_ply(self.ply, map, keyframes=True)
+            write_ply(self.ply, slam_map, keyframes=True)
         if self.colmap is not None:
-            write_colmap(self.colmap, map)
+            write_colmap(self.colmap, slam_map)
         if self.trajectory is not None:
-            write_keyframe_trajectory(self.trajectory, map)
-        keyframes, points, paths = len(map.ids), len(map.points.ids), [str(path) for path in wanted]
-        others = sorted({*whole.submap.tolist()} - {*map.submap.tolist()})
+            write_keyframe_trajectory(self.trajectory, slam_map)
+        keyframes, points, paths = len(slam_map.ids), len(slam_map.points.ids), [str(path) for path in wanted]
+        others = sorted({*whole.submap.tolist()} - {*slam_map.submap.tolist()})
         if self.json:
-            figures = {"submap": map.world_submap, "other_submaps": others}
+            figures = {"submap": slam_map.world_submap, "other_submaps": others}
             print_json(figures | {"keyframes": keyframes, "map_points": points, "files": paths})
             return
         console.print(f"{keyframes} keyframes, {points} points: {', '.join(paths)}")
         if others:
             console.print(
-                f"Submap {map.world_submap}; left out, each in a world of its own: submaps {others} (--submap N)"
+                f"Submap {slam_map.world_submap}; left out, each in a world of its own: submaps {others} (--submap N)"
             )

@@ -35,12 +35,12 @@ class ListModels(WithJson):
         if self.json:
             print_json([_listed(model, files[model.name]) for model in KNOWN_MODELS.values()])
             return
-        table = make_table("Known models", "name", "size", "licence", "adapter", "here", left=5)
+        table = make_table("Known models", "name", "size", "license", "adapter", "here", left=5)
         for model in KNOWN_MODELS.values():
             size = "-" if model.size_bytes is None else f"{model.size_bytes / 1e6:.1f} MB"
             mark = " (default)" if model.name == DEFAULT_MODEL else ""
             absent = "no" if model.url else "to be made"
-            table.add_row(model.name + mark, size, model.licence, model.adapter, "yes" if files[model.name] else absent)
+            table.add_row(model.name + mark, size, model.license, model.adapter, "yes" if files[model.name] else absent)
         plain_console.print(table)
         for name, file in files.items():
             if file is not None:
@@ -72,7 +72,7 @@ class GetModel:
             raise ModelError(f"{model.name} cannot be downloaded; {model.how}. Then place the file at {target}")
         _download(model, model.url, target)
         checked = "as expected" if model.sha256 else "which nobody has checked: no published one is known"
-        plain_console.print(f"{model.name}: {target}, {model.licence}, see {model.page}")
+        plain_console.print(f"{model.name}: {target}, {model.license}, see {model.page}")
         plain_console.print(f"SHA-256 {sha256_of(target)}, {checked}")
         if local_file(model) != target:
             plain_console.print(f"Used before it is, as JAXSLAM_MODELS says: {local_file(model)}")

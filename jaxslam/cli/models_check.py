@@ -38,7 +38,7 @@ class CheckModel(WithJson):
     labels: str = "person"
     """What to look for, separated by commas."""
     adapter: str | None = None
-    """What reads the outputs of the network; recognised from them if not given."""
+    """What reads the outputs of the network; recognized from them if not given."""
     min_score: float = 0.3
     """Leave out what is less sure than this, 0 to 1."""
     prompt_encoder: str | None = None

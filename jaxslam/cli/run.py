@@ -161,13 +161,13 @@ class Run(OfRecording):
         from jaxslam.slam.slam import Slam  # noqa: PLC0415
 
         if self.localize_only and self.map is None:
-            raise ConfigError("--localize-only: needs the map to localise in: --map FILE")
+            raise ConfigError("--localize-only: needs the map to localize in: --map FILE")
         if self.localize_only and self.dense:
             raise ConfigError("--dense: a map that stays as it is, by --localize-only, gets no dense one")
         config, dataset = self.settings(self.preset, *_dense(self.dense)), self.opened()
         prefer_one_thread()  # nothing else computes while a recording is tracked
         start = None if self.map is None else load_map(self.map)
-        slam = Slam(dataset.camera, config, map=start, localize_only=self.localize_only)
+        slam = Slam(dataset.camera, config, slam_map=start, localize_only=self.localize_only)
         viewer = make_viewer(slam, dataset, live=self.viz, path=self.rrd)
         summary = track(dataset, slam, self.preset, self.folder(), viewer, save_map=self.save_map, quiet=self.json)
         if self.json:

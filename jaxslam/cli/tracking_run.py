@@ -17,7 +17,7 @@ from jaxslam.errors import ConfigError, one_line
 from jaxslam.io.atomic_files import check_writable, make_folder
 from jaxslam.results.run_results import RESULT_FILES, RunInfo, write_results
 from jaxslam.sensors.frame import Frame
-from jaxslam.slam.frame_result import FrameRecord, Rejected, Tracked
+from jaxslam.slam.frame_result import FrameRecord, FrameResult, Rejected
 from jaxslam.slam.slam import Slam
 from jaxslam.trajectory.evaluation import Evaluation
 from jaxslam.visualization.snapshots import RunPictures
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-_OnFrame: TypeAlias = Callable[[Frame | None, Tracked | Rejected], None]
+_OnFrame: TypeAlias = Callable[[Frame | None, FrameResult | Rejected], None]
 
 
 @dataclass
@@ -41,7 +41,7 @@ class _Meter:
     records: list[FrameRecord] = field(default_factory=list)
     statuses: dict[str, int] = field(default_factory=dict)
 
-    def __call__(self, frame: Frame | None, result: Tracked | Rejected) -> None:
+    def __call__(self, frame: Frame | None, result: FrameResult | Rejected) -> None:
         self.records.append(FrameRecord.of(result))
         for watcher in self.watchers:
             watcher(frame, result)

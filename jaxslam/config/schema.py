@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import yaml
 
-from jaxslam.config.validation import Checked, Range, checked_value, field_hints, section_of
+from jaxslam.config.validation import Range, ValidatedConfig, checked_value, field_hints, section_of
 from jaxslam.errors import ConfigError, nearest, one_line
 from jaxslam.io.yaml_files import parse_yaml, read_mapping
 
@@ -23,7 +23,7 @@ Share = Range(at_least=0, at_most=1)
 
 
 @dataclass(frozen=True)
-class TrackConfig(Checked):
+class TrackConfig(ValidatedConfig):
     """The tracker: what happens to every frame. Whole numbers are sizes: changing one compiles anew."""
 
     num_points: Annotated[int, Range(at_least=32, at_most=4096)] = 512
@@ -32,8 +32,8 @@ class TrackConfig(Checked):
     """Levels of the image pyramid; one more follows motions twice as fast."""
     num_keyframes: Annotated[int, Range(at_least=1, at_most=64)] = 12
     """Latest keyframes kept to look points up in again."""
-    num_recalled: Annotated[int, Range(at_least=0, at_most=64)] = 4
-    """Further keyframes to look into, recalled from the map where the camera comes back."""
+    num_reloaded: Annotated[int, Range(at_least=0, at_most=64)] = 4
+    """Further keyframes to look into, reloaded from the map where the camera comes back."""
     num_sources: Annotated[int, Range(at_least=0, at_most=8)] = 2
     """How many of the keyframes are looked into in a frame; 0 for following from frame to frame alone."""
     points_per_source: Annotated[int, Range(at_least=16, at_most=2048)] = 160
@@ -44,18 +44,18 @@ class TrackConfig(Checked):
     """Side of the grid cells that each get at most one new corner, pixels, even."""
     new_points: Literal["always", "keyframes"] = "always"
     """In which frames new points are sought, where there are few."""
-    hold_to_map: Literal["weak", "keyframes", "always"] = "weak"
+    match_map: Literal["weak", "keyframes", "always"] = "weak"
     """Which frames are matched with the map by their ORB features too: those where few points are followed, besides
     them keyframes, or all. All that flow has lost are in any case."""
 
     depth_sigma_m: Annotated[float, Positive] = 0.005
-    """Standard deviation of measured depth close to the camera, metres."""
+    """Standard deviation of measured depth close to the camera, meters."""
     depth_sigma_per_m2: Annotated[float, Range(at_least=0)] = 0.007
-    """Its growth with the square of depth, a metre. Larger than a pixel's noise: neighbours share their errors."""
+    """Its growth with the square of depth, a meter. Larger than a pixel's noise: neighbors share their errors."""
     min_depth_m: Annotated[float, Positive] = 0.3
-    """Nearest depth believed, metres."""
+    """Nearest depth believed, meters."""
     max_depth_m: Annotated[float, Positive] = 6.0
-    """Farthest depth believed, metres."""
+    """Farthest depth believed, meters."""
     disparity_sigma_px: Annotated[float, Positive] = 1.0
     """Standard deviation of the disparity of a stereo pair, pixels; it stands for the noise of depth there.
 
@@ -82,7 +82,7 @@ class TrackConfig(Checked):
     """Below this many points a pose is `WEAK`."""
     min_share: Annotated[float, Share] = 0.3
     """Smallest share of the followed points that must agree on the pose."""
-    refill_below: Annotated[float, Share] = 0.8
+    detect_below: Annotated[float, Share] = 0.8
     """New points are sought when fewer than this share of `num_points` is alive."""
     keyframe_below: Annotated[float, Share] = 0.8
     """A keyframe is made when no kept one shows more than this share of its points,"""
@@ -94,9 +94,9 @@ class TrackConfig(Checked):
     """when the last one was made so many seconds ago,"""
     keyframe_weak_after_s: Annotated[float, Positive] = 0.3
     """or so many while tracking is weak or has few points."""
-    keyframe_choice: Literal["as_needed", "sparing"] = "as_needed"
+    keyframe_policy: Literal["as_needed", "sparing"] = "as_needed"
     """Make a keyframe as soon as there is a reason, or at the right moment after (USD-SLAM): unless points are few,"""
-    keyframe_least_s: Annotated[float, Range(at_least=0)] = 0.3
+    keyframe_min_s: Annotated[float, Range(at_least=0)] = 0.3
     """not before so many seconds have gone since the last one, fewer the less is left in view of it,"""
     keyframe_motion: Annotated[float, Range(at_least=0)] = 0.05
     """nor before points have moved by this part of their depth, for the camera,"""
@@ -117,7 +117,7 @@ class TrackConfig(Checked):
 
 
 @dataclass(frozen=True)
-class MappingConfig(Checked):
+class MappingConfig(ValidatedConfig):
     """The map: what becomes of keyframes, beside tracking. Whole numbers are sizes or counts."""
 
     num_features: Annotated[int, Range(at_least=100, at_most=8000)] = 1000
@@ -127,7 +127,7 @@ class MappingConfig(Checked):
     scale_factor: Annotated[float, Range(above=1, at_most=2)] = 1.2
     """From one of these levels to the next."""
     fast_threshold: Annotated[int, Range(at_least=1, at_most=255)] = 20
-    """Contrast of a corner, grey values."""
+    """Contrast of a corner, gray values."""
     min_fast_threshold: Annotated[int, Range(at_least=1, at_most=255)] = 7
     """The same where there is no such corner."""
     search_px: Annotated[float, Positive] = 3.0
@@ -143,7 +143,7 @@ class MappingConfig(Checked):
 
 
 @dataclass(frozen=True)
-class SemanticsConfig(Checked):
+class SemanticsConfig(ValidatedConfig):
     """Finding what may move by a network, and following it."""
 
     model: str | None = "yolox-nano"
@@ -183,11 +183,11 @@ class SemanticsConfig(Checked):
 
 
 @dataclass(frozen=True)
-class TrajectoryCueConfig(Checked):
+class TrajectoryCueConfig(ValidatedConfig):
     """Whether points go from frame to frame as they would at rest (RTS-SLAM)."""
 
     tolerance_m: Annotated[float, Positive] = 0.02
-    """Distance from there that says nothing, metres,"""
+    """Distance from there that says nothing, meters,"""
     tolerance_per_m: Annotated[float, Range(at_least=0)] = 0.04
     """and its growth with depth: three standard deviations of the difference of two depths, up to 1.5 m. With 0.02 the
     noise of depth takes 1 % of the points at rest, and rooms where people sit have 3.9 instead of 1.9 mm of error."""
@@ -196,7 +196,7 @@ class TrajectoryCueConfig(Checked):
 
 
 @dataclass(frozen=True)
-class EpipolarCueConfig(Checked):
+class EpipolarCueConfig(ValidatedConfig):
     """Whether points are on the lines on which they would be at rest (RTS-SLAM)."""
 
     limit_px: Annotated[float, Positive] = 1.0
@@ -212,7 +212,7 @@ class EpipolarCueConfig(Checked):
 
 
 @dataclass(frozen=True)
-class ClusterCueConfig(Checked):
+class ClusterCueConfig(ValidatedConfig):
     """Whether the points of a surface are on average where the map has them (TRS-SLAM)."""
 
     num_regions: Annotated[int, Range(at_least=2, at_most=128)] = 24
@@ -236,7 +236,7 @@ class ClusterCueConfig(Checked):
 
 
 @dataclass(frozen=True)
-class MotionConfig(Checked):
+class MotionConfig(ValidatedConfig):
     """Whether what may move does: what masks show stays in while it stands still (USD-SLAM)."""
 
     enabled: bool = False
@@ -260,11 +260,11 @@ class MotionConfig(Checked):
     moving_frames: Annotated[int, Range(at_least=1)] = 2
     """and in which it must move to be taken to move again."""
     as_published: bool = False
-    """Motion in metres from frame to frame, its limit from mean and standard deviation; points are counted alone."""
+    """Motion in meters from frame to frame, its limit from mean and standard deviation; points are counted alone."""
 
 
 @dataclass(frozen=True)
-class OcclusionConfig(Checked):
+class OcclusionConfig(ValidatedConfig):
     """Points of the map that something passed before and that are there again count more (Occlusion SLAM)."""
 
     enabled: bool = False
@@ -280,16 +280,16 @@ _CueName = Literal["trajectory", "epipolar", "clusters"]
 
 
 @dataclass(frozen=True)
-class DynamicsConfig(Checked):
+class DynamicsConfig(ValidatedConfig):
     """Finding what moves without a network."""
 
-    newcomers: bool = False
+    new_surfaces: bool = False
     """Leave out what has come before surfaces that were seen earlier: people, doors, things that are carried."""
     cues: tuple[_CueName, ...] = ("clusters",)
     """What else tells points that move, each with a veto."""
     reach_px: Annotated[int, Range(at_least=0, at_most=100)] = 12
     """How far around a point that moves by its cues the map gets nothing, on surfaces as far away as it is."""
-    even_votes: bool = True
+    balance_regions: bool = True
     """Give no surface more of a say than an even share where the pose is sought: whoever carries a large box has most
     of the points, and the room behind it most of the surfaces. They are those of `clusters`."""
     temperature: Annotated[float, Range(at_least=0)] = 0.0
@@ -302,16 +302,16 @@ class DynamicsConfig(Checked):
 
 
 @dataclass(frozen=True)
-class DenseConfig(Checked):
-    """A dense map of what stands still, coloured, made of the depth of keyframes beside tracking."""
+class DenseConfig(ValidatedConfig):
+    """A dense map of what stands still, colored, made of the depth of keyframes beside tracking."""
 
     enabled: bool = False
     """Make one."""
     voxel_m: Annotated[float, Positive] | None = None
-    """Side of a voxel, each of which has one point, metres; if not set, a 300th of the farthest depth believed: 2 cm
+    """Side of a voxel, each of which has one point, meters; if not set, a 300th of the farthest depth believed: 2 cm
     for cameras that measure depth."""
     cell_m: Annotated[float, Positive] | None = None
-    """Side of the smallest cells of the octree, metres; if not set, two and a half voxels."""
+    """Side of the smallest cells of the octree, meters; if not set, two and a half voxels."""
     pixel_step: Annotated[int, Range(at_least=1, at_most=16)] = 2
     """One pixel of depth in so many is used, in rows and in columns."""
     max_points: Annotated[int, Range(at_least=1000, at_most=5_000_000)] = 400_000
@@ -342,7 +342,7 @@ class DenseConfig(Checked):
 
 
 @dataclass(frozen=True)
-class RunConfig(Checked):
+class RunConfig(ValidatedConfig):
     """How a recording or a live stream is run."""
 
     deterministic: bool = True
@@ -353,9 +353,9 @@ class RunConfig(Checked):
     seed: Annotated[int, Range(at_least=0, at_most=2**32 - 1)] = 0
     """Seed of every random choice."""
     on_loss: Literal["hold", "predict", "submap"] = "submap"
-    """What to do while lost, until the place is recognised: `hold` the last pose, `predict` it with constant velocity
+    """What to do while lost, until the place is recognized: `hold` the last pose, `predict` it with constant velocity
     for a second, or hold it and after `track.restart_after` frames start a new `submap` there, which becomes one with
-    the map when a place of it is recognised."""
+    the map when a place of it is recognized."""
     prefetch_frames: Annotated[int, Range(at_least=1, at_most=64)] = 4
     """Frames of a recording decoded ahead of the tracker."""
 
@@ -366,7 +366,7 @@ class RunConfig(Checked):
 
 
 @dataclass(frozen=True)
-class Config(Checked):
+class Config(ValidatedConfig):
     """Everything that can be set."""
 
     track: TrackConfig = field(default_factory=TrackConfig)
@@ -375,6 +375,18 @@ class Config(Checked):
     semantics: SemanticsConfig = field(default_factory=SemanticsConfig)
     dynamics: DynamicsConfig = field(default_factory=DynamicsConfig)
     dense: DenseConfig = field(default_factory=DenseConfig)
+
+
+_RENAMED = {
+    "dynamics.even_votes": "dynamics.balance_regions",
+    "dynamics.newcomers": "dynamics.new_surfaces",
+    "track.hold_to_map": "track.match_map",
+    "track.keyframe_choice": "track.keyframe_policy",
+    "track.keyframe_least_s": "track.keyframe_min_s",
+    "track.num_recalled": "track.num_reloaded",
+    "track.refill_below": "track.detect_below",
+}
+"""Earlier names of settings, and the present name of each."""
 
 
 def load_config(preset: str = "default", file: str | Path | None = None, overrides: Sequence[str] = ()) -> Config:
@@ -402,7 +414,7 @@ def load_config(preset: str = "default", file: str | Path | None = None, overrid
     return config
 
 
-def to_yaml(config: Checked) -> str:
+def to_yaml(config: ValidatedConfig) -> str:
     """Every setting as YAML; `load_config(file=...)` reads it back to an equal `Config`."""
     return yaml.safe_dump(_plain(dataclasses.asdict(config)), sort_keys=False)
 
@@ -411,7 +423,7 @@ def updated(section: _Section, changes: Mapping[str, Any], path: str = "") -> _S
     """`section` with `changes` made to it, nested mappings changing nested sections.
 
     Args:
-        section: An instance of a frozen dataclass derived from `Checked`.
+        section: An instance of a frozen dataclass derived from `ValidatedConfig`.
         changes: Values by field name.
         path: Dotted name of the section, for messages.
 
@@ -422,6 +434,8 @@ def updated(section: _Section, changes: Mapping[str, Any], path: str = "") -> _S
     values: dict[str, Any] = {}
     for key, value in changes.items():
         name = f"{path}.{key}" if path else str(key)
+        if name in _RENAMED:
+            raise ConfigError(f"{name}: renamed, use {_RENAMED[name]}")
         if key not in hints:
             raise ConfigError(f"{one_line(name, 80)}: unknown key{nearest(str(key), hints)}")
         values[key] = _updated_value(hints[key], getattr(section, key), value, name)

@@ -42,7 +42,7 @@ class Range:
 
 
 @dataclass(frozen=True)
-class Checked:
+class ValidatedConfig:
     """Base of dataclasses that refuse a field of the wrong type or out of range, however they are built.
 
     Annotations may be `int`, `float`, `bool`, `str`, `Literal`, `tuple`, another dataclass, a union of these

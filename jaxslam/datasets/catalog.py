@@ -1,4 +1,4 @@
-"""Public recordings: where they come from, under which licence, and where they lie here."""
+"""Public recordings: where they come from, under which license, and where they lie here."""
 
 import difflib
 import os
@@ -11,12 +11,12 @@ from typing import Annotated, Any, ClassVar, Literal
 import platformdirs
 
 from jaxslam.config.schema import configs_dir
-from jaxslam.config.validation import Checked, Range, field_hints
+from jaxslam.config.validation import Range, ValidatedConfig, field_hints
 from jaxslam.errors import DatasetError, JaxSlamError
 from jaxslam.io.yaml_files import check_keys, read_yaml
 
 _DEPTH = 3
-_NEEDED = ("dataset", "kind", "licence", "page", "about")
+_NEEDED = ("dataset", "kind", "license", "page", "about")
 _MARKS = ("rgb.txt", "times.txt", "mav0/cam0/data.csv", "pose_left.txt")
 """Files of which one is in every recording of the layouts of TUM, KITTI, EuRoC and TartanAir."""
 _SHORTENED = ((re.compile(r"\Argbd_dataset_freiburg"), "fr"), (re.compile(r"\Argbd_bonn_"), "bonn_"))
@@ -25,14 +25,14 @@ _SHA256 = re.compile(r"[0-9a-f]{64}\Z")
 
 
 @dataclass(frozen=True)
-class Recording(Checked):
+class Recording(ValidatedConfig):
     """A public recording.
 
     Attributes:
         name: What commands call it, and the name of its folder when unpacked (KITTI's `kitti_05`: `sequences/05`).
         dataset: What it is part of.
         kind: Which loader opens it.
-        licence: As its page words it.
+        license: As its page words it.
         page: Who made it.
         about: What is to be seen.
         url: Where its archive is published, .tgz or .zip; `None` if it cannot be had alone.
@@ -52,7 +52,7 @@ class Recording(Checked):
     name: str
     dataset: str
     kind: Literal["tum", "bonn", "kitti"]
-    licence: str
+    license: str
     page: str
     about: str
     url: str | None = None
@@ -80,7 +80,7 @@ class Recording(Checked):
 
 
 def known_recordings(path: Path | None = None) -> dict[str, Recording]:
-    """The catalogue, by name.
+    """The catalog, by name.
 
     Args:
         path: The file; the packaged one if not given.

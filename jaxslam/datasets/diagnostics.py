@@ -13,13 +13,13 @@ from jaxslam.datasets import Associated, Dataset, open_dataset
 from jaxslam.errors import JaxSlamError
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.depth_checks import contradiction_of_depth, is_plausible
-from jaxslam.sensors.frame import Frame, to_grey
+from jaxslam.sensors.frame import Frame, to_gray
 from jaxslam.sensors.image_checks import image_fault
 from jaxslam.sensors.stereo_checks import look_over
 from jaxslam.trajectory.trajectory import associate
 
 _SAMPLED_PAIRS = 8
-_USUAL_DEPTH_SCALES = (1000.0, 5000.0)  # millimetres; TUM and Bonn
+_USUAL_DEPTH_SCALES = (1000.0, 5000.0)  # millimeters; TUM and Bonn
 
 
 class Level(StrEnum):
@@ -131,7 +131,7 @@ def _association(dataset: Dataset) -> Iterator[Finding]:
     if not isinstance(dataset, Associated):
         return
     color, depth = dataset.unmatched
-    first, second = ("left", "right") if dataset.camera.is_stereo else ("colour", "depth")
+    first, second = ("left", "right") if dataset.camera.is_stereo else ("color", "depth")
     text = f"{color} {first} and {depth} {second} images have no partner in time and are left out"
     share = max(color, depth) / (len(dataset) + max(color, depth))
     yield _graded(share > 0.05, "association", text, "fewer frames, more motion between them; is it the same clock?")
@@ -144,7 +144,7 @@ def _calibration(camera: Camera) -> Iterator[Finding]:
     oddities = [
         (not 30 <= view <= 120, f"a field of view of {view:.0f} degrees (is fx of another image size?)"),
         (abs(camera.fx / camera.fy - 1) > 0.05, f"fx {camera.fx:g} and fy {camera.fy:g} far apart"),
-        (max(off_x, off_y) > 0.1, f"a principal point ({camera.cx:g}, {camera.cy:g}) far from the centre"),
+        (max(off_x, off_y) > 0.1, f"a principal point ({camera.cx:g}, {camera.cy:g}) far from the center"),
         (not _is_monotonic(camera), "a distortion that folds the image over inside its corners"),
     ]
     odd = [text for is_odd, text in oddities if is_odd]
@@ -162,7 +162,7 @@ def _is_monotonic(camera: Camera) -> bool:
 
 
 def _sample(dataset: Dataset) -> tuple[list[Frame], list[Finding]]:
-    """Neighbouring frames at a few places, and a finding for each that cannot be read."""
+    """Neighboring frames at a few places, and a finding for each that cannot be read."""
     starts = np.linspace(0, max(len(dataset) - 2, 0), _SAMPLED_PAIRS).astype(int)
     frames, findings = [], []
     for index in sorted({int(i) for start in starts for i in (start, start + 1) if i < len(dataset)}):
@@ -174,14 +174,14 @@ def _sample(dataset: Dataset) -> tuple[list[Frame], list[Finding]]:
 
 
 def _images(frames: Sequence[Frame]) -> Iterator[Finding]:
-    greys = [to_grey(frame.image) for frame in frames]
-    if not greys:
+    grays = [to_gray(frame.image) for frame in frames]
+    if not grays:
         return
-    faults = Counter(fault for fault in map(image_fault, greys) if fault)
-    if repeated := sum(np.array_equal(one, other) for one, other in pairwise(greys)):
+    faults = Counter(fault for fault in map(image_fault, grays) if fault)
+    if repeated := sum(np.array_equal(one, other) for one, other in pairwise(grays)):
         faults["the same as the one before"] = repeated
     odd = [f"{count} {fault}" for fault, count in faults.items()]
-    text = f"{', '.join(odd) or 'sharp and well lit'}, of {len(greys)} sampled"
+    text = f"{', '.join(odd) or 'sharp and well lit'}, of {len(grays)} sampled"
     yield _graded(bool(odd), "images", text, "such frames give the tracker few points or none")
 
 
@@ -198,7 +198,7 @@ def _depth(depths: Sequence[np.ndarray], scale: float | None) -> Iterator[Findin
     near, median, far = np.percentile(measured, (2, 50, 98))
     text = f"median {median:.2f} m, 96 % between {near:.2f} and {far:.2f} m"
     if scale is not None:
-        text += f", at {scale:g} counts a metre"
+        text += f", at {scale:g} counts a meter"
     contradiction = next(filter(None, map(contradiction_of_depth, depths)), "")
     yield _graded(
         bool(contradiction) or not is_plausible(near, median, far),

@@ -1,4 +1,4 @@
-"""What recordings of two image files a frame have in common: colour and depth, or left and right."""
+"""What recordings of two image files a frame have in common: color and depth, or left and right."""
 
 import functools
 from abc import ABC, abstractmethod
@@ -87,7 +87,7 @@ def check_stereo(camera: Camera) -> None:
         CameraError: If it is none.
     """
     if not camera.is_stereo:
-        raise CameraError(f"camera '{camera.name}': baseline_m: expected metres for a stereo pair, got none")
+        raise CameraError(f"camera '{camera.name}': baseline_m: expected meters for a stereo pair, got none")
 
 
 def check_present(files: Sequence[tuple[Path, Path]]) -> None:

@@ -65,7 +65,7 @@ class Associated(Protocol):
 
 
 class Fit(IntEnum):
-    """How surely a loader recognises a folder; the surest loader opens it."""
+    """How surely a loader recognizes a folder; the surest loader opens it."""
 
     NO = 0
     FOLDERS = 1

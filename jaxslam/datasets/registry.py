@@ -19,7 +19,7 @@ def open_dataset(
 
     Args:
         path: Its folder.
-        kind: One of `dataset_kinds()`, or `auto` to recognise it by its files and name.
+        kind: One of `dataset_kinds()`, or `auto` to recognize it by its files and name.
         camera: A camera, the name of a known one or a camera file; for raw images of two cameras a rectified pair or
             its file. `None` takes `camera.yaml` in the folder or, without one, the camera that the folder tells.
 

@@ -1,4 +1,4 @@
-"""The dense map: coloured points of what stands still, and where space is free."""
+"""The dense map: colored points of what stands still, and where space is free."""
 
 import lazy_loader
 

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float32, Int, Int32
 
-from jaxslam.dense.depth_view import View
+from jaxslam.dense.depth_view import DepthView
 from jaxslam.geometry.se3 import to_local
 
 
@@ -34,7 +34,7 @@ class RowBoxes:
         """Forget all."""
         self._low[:], self._high[:] = np.inf, -np.inf
 
-    def in_view(self, T_world_cam: np.ndarray, view: View, voxel_m: float) -> Int32[np.ndarray, " b"]:
+    def in_view(self, T_world_cam: np.ndarray, view: DepthView, voxel_m: float) -> Int32[np.ndarray, " b"]:
         """Blocks of which a camera may see something, up to the farthest depth believed."""
         used = np.flatnonzero(self._low[0] <= self._high[0])
         low, high = self._low[:, used] - voxel_m, self._high[:, used] + voxel_m

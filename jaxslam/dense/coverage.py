@@ -10,15 +10,15 @@ from collections import deque
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxslam.dense.depth_view import View
+from jaxslam.dense.depth_view import DepthView
 from jaxslam.geometry.se3 import between, transform
 from jaxslam.sensors.camera import Camera
 
 _COLUMNS = 32
 """Of pixels that are looked at."""
-_MOST = 32
+_MAX = 32
 """Keyframes, the newest ones; a place that was seen before those is seen anew."""
-_LEAST_PIXELS = 24
+_MIN_PIXELS = 24
 """With depth; with fewer, nothing is said."""
 
 
@@ -33,10 +33,10 @@ class SeenArea:
             nearest_m: Nearest depth believed.
             farthest_m: Farthest.
         """
-        self._view = View(camera, max(1, camera.width // _COLUMNS), farthest_m, nearest_m)
+        self._view = DepthView(camera, max(1, camera.width // _COLUMNS), farthest_m, nearest_m)
         half = 0.5 / np.array([self._view.intrinsics.fx, self._view.intrinsics.fy], np.float64)
         self._least, self._most = self._view.rays.min(axis=1) - half, self._view.rays.max(axis=1) + half
-        self._keyframes: deque[np.ndarray] = deque(maxlen=_MOST)
+        self._keyframes: deque[np.ndarray] = deque(maxlen=_MAX)
 
     def add(self, T_world_cam: Float[np.ndarray, "7"]) -> None:
         """Take in the pose of a keyframe."""
@@ -48,13 +48,13 @@ class SeenArea:
         """How much of a frame any of the keyframes shows, 0 to 1; 1 where there is too little depth to say.
 
         Args:
-            depth: Metres; 0 where missing.
+            depth: Meters; 0 where missing.
             ignore: Where something moves or may.
             T_world_cam: Where the frame was taken.
         """
         small = np.ascontiguousarray(self._view.every(depth), np.float32)
         usable = np.flatnonzero(self._view.is_believed(small, self._view.every(ignore)))
-        if len(usable) < _LEAST_PIXELS:
+        if len(usable) < _MIN_PIXELS:
             return 1.0
         X = self._view.points(small, usable).astype(np.float64)
         shown = np.zeros(len(usable), bool)

@@ -10,16 +10,16 @@ import cv2
 import numpy as np
 
 from jaxslam.config.schema import DenseConfig
-from jaxslam.dense.depth_view import View
-from jaxslam.dense.key_objects import Neighbour, object_boxes, points_inside
+from jaxslam.dense.depth_view import DepthView
+from jaxslam.dense.key_objects import Neighbor, object_boxes, points_inside
 from jaxslam.dense.keyframe_depths import KeyframeDepths, Poses
 from jaxslam.dense.keyframe_poses import distance
 from jaxslam.dense.occupancy import Occupancy, occupancy
 from jaxslam.dense.point_cloud import DenseCloud
-from jaxslam.dense.voxel_layer import Part, VoxelLayer
+from jaxslam.dense.voxel_layer import VoxelLayer, VoxelPart
 from jaxslam.errors import MapFileError
 from jaxslam.geometry.se3 import IDENTITY
-from jaxslam.map.dynamic_removal import Movers
+from jaxslam.map.dynamic_removal import DynamicObservations
 from jaxslam.map.types import Map
 from jaxslam.runtime.stage_timer import StageTimes, Stopwatch
 from jaxslam.semantics import Detector
@@ -31,25 +31,25 @@ _VOXELS_DEEP = 300
 _CELL_VOXELS = 2.5
 _KEY_SHARE = 0.25
 """Side of the voxels of key objects, in others."""
-_LEAST_MOVE_VOXELS = 0.25
-"""A keyframe that moves a point by less, two metres away, stays where it is."""
+_MIN_MOVE_VOXELS = 0.25
+"""A keyframe that moves a point by less, two meters away, stays where it is."""
 _NUM_LOOKS = 4
 """Earlier keyframes that new points are compared with."""
 _KEY_POINTS = 131_072
-"""Points of key objects in a keyframe and its neighbours, at most."""
+"""Points of key objects in a keyframe and its neighbors, at most."""
 
 
-class Shown(NamedTuple):
+class DenseKeyframe(NamedTuple):
     """A keyframe and what it sees, copied.
 
     Attributes:
         keyframe: Its id.
         image: `(h, w, 3)` RGB or `(h, w)`.
-        depth: `(h, w)` metres; of a pair rough.
-        pair: Left and right image, grey, of a pair.
+        depth: `(h, w)` meters; of a pair rough.
+        pair: Left and right image, gray, of a pair.
         ignore: `(h, w)` where something moves or may.
         T_cam_depth: `(7,)` from where depth was taken, seen from where the image was.
-        neighbours: Frames before.
+        neighbors: Frames before.
     """
 
     keyframe: int
@@ -58,14 +58,14 @@ class Shown(NamedTuple):
     pair: tuple[np.ndarray, np.ndarray] | None
     ignore: np.ndarray
     T_cam_depth: np.ndarray
-    neighbours: tuple[Neighbour, ...]
+    neighbors: tuple[Neighbor, ...]
 
 
-class Look(NamedTuple):
+class DepthGlance(NamedTuple):
     """What a frame between keyframes sees, at the size of what is kept.
 
     Attributes:
-        depth: `(h, w)` metres.
+        depth: `(h, w)` meters.
         ignore: `(h, w)` where something moves or may.
         T_world_cam: `(7,)` where depth was taken.
     """
@@ -84,7 +84,7 @@ class DenseFigures(NamedTuple):
         frozen: Keyframes that are forgotten, whose points move no more.
         moved: Times that the points of a keyframe were moved with it.
         coarsened: Times that voxels became twice as large.
-        measured: Pixels with depth to be believed in all keyframes put in, and in all parts of neighbours.
+        measured: Pixels with depth to be believed in all keyframes put in, and in all parts of neighbors.
         working_mb: Memory in use, megabytes.
     """
 
@@ -127,7 +127,7 @@ class DenseMap:
         """
         self.sparse: Map | None = None
         self._config, self._farthest_m, self._times = config, farthest_m, times or StageTimes()
-        self._view = View(camera, config.pixel_step, farthest_m, nearest_m)
+        self._view = DepthView(camera, config.pixel_step, farthest_m, nearest_m)
         self._small = self._view.halved()
         voxel_m = config.voxel_m or farthest_m / _VOXELS_DEEP
         self._first_voxel_m, self._cell_m = voxel_m, config.cell_m or _CELL_VOXELS * voxel_m
@@ -137,7 +137,7 @@ class DenseMap:
         if key_detector is not None:
             fine_m = _KEY_SHARE * voxel_m
             self._keys = VoxelLayer(config.key_points, config.keyframe_points, _KEY_POINTS, fine_m, farthest_m)
-            self._whole = View(camera, 1, farthest_m, nearest_m)
+            self._whole = DepthView(camera, 1, farthest_m, nearest_m)
         self.has_keys = key_detector is not None
         self._layers = [self._layer] if self._keys is None else [self._layer, self._keys]
         self._stereo = DenseDepth(camera) if camera.is_stereo else None
@@ -150,11 +150,11 @@ class DenseMap:
         for layer in self._layers:
             layer.compile(self._view, self._small, _NUM_LOOKS)
 
-    def look_of(self, depth: np.ndarray, ignore: np.ndarray, T_world_cam: np.ndarray) -> Look:
+    def look_of(self, depth: np.ndarray, ignore: np.ndarray, T_world_cam: np.ndarray) -> DepthGlance:
         """What `look` needs of a whole depth image, copied; from any thread."""
-        return Look(self._small.every(depth).copy(), self._small.every(ignore).copy(), T_world_cam)
+        return DepthGlance(self._small.every(depth).copy(), self._small.every(ignore).copy(), T_world_cam)
 
-    def add(self, shown: Shown) -> None:
+    def add(self, shown: DenseKeyframe) -> None:
         """Put in what a keyframe sees."""
         whole, watch = shown.depth, self._times.stopwatch()
         if shown.pair is not None and self._stereo is not None:
@@ -180,13 +180,13 @@ class DenseMap:
         if self._keys is not None and pose is not None:
             self._add_keys(self._keys, shown, whole, depth, poses, watch)
 
-    def look(self, seen: Look) -> None:
+    def look(self, seen: DepthGlance) -> None:
         """Take in what a frame between keyframes sees past."""
         watch = self._times.stopwatch()
         self._see_past(self._small.cleaned(seen.depth, seen.ignore), seen.T_world_cam, self._small)
         watch.ends("dense: look")
 
-    def remove(self, movers: Movers) -> None:
+    def remove(self, movers: DynamicObservations) -> None:
         """Take out what a keyframe shows under a mask that has come late."""
         if not self._kept.remove_under(movers.keyframe, movers.mask):
             return
@@ -209,9 +209,9 @@ class DenseMap:
     def cloud(self) -> DenseCloud:
         """The points as they are now, in the submap with most keyframes."""
         shown = [layer.shown() for layer in self._layers]
-        points, colours, counts = (np.concatenate(column) for column in zip(*shown, strict=True))
+        points, colors, counts = (np.concatenate(column) for column in zip(*shown, strict=True))
         is_key = np.arange(len(points)) >= len(shown[0][0])
-        return DenseCloud(points, colours, counts, is_key, self._layer.voxel_m)
+        return DenseCloud(points, colors, counts, is_key, self._layer.voxel_m)
 
     def depths(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """Depth of the keyframes that are kept, and where it was taken, for `cells`."""
@@ -244,7 +244,7 @@ class DenseMap:
             working_mb=(sum(layer.nbytes for layer in self._layers) + self._kept.nbytes) / 1e6,
         )
 
-    def _put_in(self, layer: VoxelLayer, keyframe: int, part: Part, poses: Poses, watch: Stopwatch) -> None:
+    def _put_in(self, layer: VoxelLayer, keyframe: int, part: VoxelPart, poses: Poses, watch: Stopwatch) -> None:
         """Put the points of a keyframe into a layer."""
         pose, past = poses[keyframe], None
         if pose is None:
@@ -258,7 +258,7 @@ class DenseMap:
         layer.make_room()
         watch.ends("dense: put in")
 
-    def _see_past(self, depth: np.ndarray, pose: np.ndarray, view: View) -> None:
+    def _see_past(self, depth: np.ndarray, pose: np.ndarray, view: DepthView) -> None:
         """Take in which voxels of all layers a depth image sees again, and which it sees past."""
         looks = view.looks(depth)
         for layer in self._layers:
@@ -270,25 +270,31 @@ class DenseMap:
         return int(np.count_nonzero(good & ~ignore))
 
     def _add_keys(
-        self, keys: VoxelLayer, shown: Shown, whole: np.ndarray, depth: np.ndarray, poses: Poses, watch: Stopwatch
+        self,
+        keys: VoxelLayer,
+        shown: DenseKeyframe,
+        whole: np.ndarray,
+        depth: np.ndarray,
+        poses: Poses,
+        watch: Stopwatch,
     ) -> None:
-        """Put in the key objects that the network sees in a keyframe, from it and from its neighbours."""
+        """Put in the key objects that the network sees in a keyframe, from it and from its neighbors."""
         assert self._key_detector is not None
         image = shown.image if shown.image.ndim == 3 else np.repeat(shown.image[..., None], 3, axis=2)
         found = self._key_detector(image)
         watch.ends("dense: find key objects")
-        own = Neighbour(shown.image, whole, shown.ignore, IDENTITY)
+        own = Neighbor(shown.image, whole, shown.ignore, IDENTITY)
         boxes = object_boxes(found, depth, self._view)
-        parts = [points_inside(boxes, frame, self._whole) for frame in (own, *shown.neighbours)]
-        X, colours = (np.concatenate(column, axis=1) for column in zip(*parts, strict=True))
+        parts = [points_inside(boxes, frame, self._whole) for frame in (own, *shown.neighbors)]
+        X, colors = (np.concatenate(column, axis=1) for column in zip(*parts, strict=True))
         self._measured += X.shape[1] - parts[0][0].shape[1]
-        self._put_in(keys, shown.keyframe, keys.reduce(*_sampled(X, colours)), poses, self._times.stopwatch())
+        self._put_in(keys, shown.keyframe, keys.reduce(*_sampled(X, colors)), poses, self._times.stopwatch())
         watch.ends("dense: key objects")
 
     def _move(self, poses: Poses, at_most: int) -> int:
         """Move the points of keyframes that have moved by most; gives how many were."""
         moves = [(distance(self._layer.parts[id].T_world_cam, pose), -id) for id, pose in poses.items()]
-        least = _LEAST_MOVE_VOXELS * self._layer.voxel_m
+        least = _MIN_MOVE_VOXELS * self._layer.voxel_m
         chosen = [-id for way, id in sorted(moves, reverse=True)[:at_most] if way > least]
         for id in chosen:
             for layer in self._layers:
@@ -310,9 +316,9 @@ class DenseMap:
             self._frozen += 1
 
 
-def _sampled(X: np.ndarray, colours: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _sampled(X: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points, evenly thinned out if there are too many."""
     if X.shape[1] <= _KEY_POINTS:
-        return X, colours
+        return X, colors
     chosen = np.linspace(0, X.shape[1] - 1, _KEY_POINTS).astype(np.int64)
-    return X[:, chosen], colours[:, chosen]
+    return X[:, chosen], colors[:, chosen]

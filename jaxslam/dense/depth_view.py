@@ -6,14 +6,14 @@ from typing import NamedTuple
 import cv2
 import jax
 import numpy as np
-from jaxslam_kernels.camera import Intrinsics, normalise
+from jaxslam_kernels.camera import Intrinsics, normalize
 from jaxtyping import Bool, Float, Float32, Shaped, UInt8
 
 from jaxslam.sensors.camera import Camera
-from jaxslam.sensors.downscale import Raster, Reduced
+from jaxslam.sensors.downscale import Downscaler, ImageGrid
 
 _EDGE_SHARE, _EDGE_M = 0.025, 0.04
-"""Depth that differs by more around a pixel, a share for each pixel of the step and metres, is that of an outline:
+"""Depth that differs by more around a pixel, a share for each pixel of the step and meters, is that of an outline:
 there a sensor mixes near and far."""
 _THREE = np.ones((3, 3), np.uint8)
 
@@ -22,7 +22,7 @@ class Looks(NamedTuple):
     """Depth images as voxels are compared with them.
 
     Attributes:
-        depth: `(..., h, w)` metres, 0 where missing.
+        depth: `(..., h, w)` meters, 0 where missing.
         least: `(..., h, w)` the least around each pixel; 0 where some is missing.
     """
 
@@ -30,14 +30,14 @@ class Looks(NamedTuple):
     least: np.ndarray
 
 
-class View:
+class DepthView:
     """The pixels of a camera that the dense map uses.
 
     Attributes:
         step: One in so many.
         shape: Rows and columns of them.
         intrinsics: Of the camera in these pixels.
-        rays: `(2, h w)` where the ray of each meets the plane one metre ahead.
+        rays: `(2, h w)` where the ray of each meets the plane one meter ahead.
         borders: `(2, 2)` left and top, right and bottom of all that any pixel may see, in that plane.
         nearest_m: Nearest depth believed.
         farthest_m: Farthest.
@@ -45,10 +45,10 @@ class View:
 
     def __init__(self, camera: Camera, step: int, farthest_m: float, nearest_m: float) -> None:
         """Use one pixel in so many, and depth within bounds."""
-        reduced = Reduced(Raster.of(camera), max(8, camera.width // step))
+        reduced = Downscaler(ImageGrid.of(camera), max(8, camera.width // step))
         self._begin((reduced,), farthest_m, nearest_m)
 
-    def _begin(self, reduced: tuple[Reduced, ...], farthest_m: float, nearest_m: float) -> None:
+    def _begin(self, reduced: tuple[Downscaler, ...], farthest_m: float, nearest_m: float) -> None:
         """Use the pixels that are left when images are made smaller, one time after the other."""
         self._reduced = reduced
         self.step = math.prod(once.step for once in reduced)
@@ -56,20 +56,20 @@ class View:
         self.intrinsics: Intrinsics = intrinsics
         v, u = np.mgrid[: self.shape[0], : self.shape[1]].astype(np.float32)
         self.rays: Float32[np.ndarray, "2 n"] = np.array(
-            jax.jit(normalise)(self.intrinsics, np.stack([u.ravel(), v.ravel()]))
+            jax.jit(normalize)(self.intrinsics, np.stack([u.ravel(), v.ravel()]))
         )
         pixel = 1 / np.array([self.intrinsics.fx, self.intrinsics.fy], np.float32)
         self.borders = np.stack([self.rays.min(axis=1) - pixel, self.rays.max(axis=1) + pixel])
         self.nearest_m, self.farthest_m = nearest_m, farthest_m
 
-    def halved(self) -> "View":
+    def halved(self) -> "DepthView":
         """The view of every second of these pixels."""
-        half = View.__new__(View)
-        last = Reduced(self._reduced[-1].raster, max(8, self.shape[1] // 2))
+        half = DepthView.__new__(DepthView)
+        last = Downscaler(self._reduced[-1].raster, max(8, self.shape[1] // 2))
         half._begin((*self._reduced, last), self.farthest_m, self.nearest_m)
         return half
 
-    def every(self, image: Shaped[np.ndarray, "*colours h w"]) -> Shaped[np.ndarray, "*colours _h _w"]:
+    def every(self, image: Shaped[np.ndarray, "*colors h w"]) -> Shaped[np.ndarray, "*colors _h _w"]:
         """The pixels of a larger image that are used; a view of them."""
         for once in self._reduced:
             image = once.every(image)
@@ -79,17 +79,17 @@ class View:
         """The pixels used of an image of the view that this one was halved from."""
         return self._reduced[-1].every(image)
 
-    def colours(self, image: np.ndarray) -> UInt8[np.ndarray, "3 n"]:
-        """Colours of the pixels used, of an RGB or a grey image."""
+    def colors(self, image: np.ndarray) -> UInt8[np.ndarray, "3 n"]:
+        """Colors of the pixels used, of an RGB or a gray image."""
         small = self.every(np.moveaxis(image, -1, 0)) if image.ndim == 3 else self.every(image)[None]
         return np.broadcast_to(small, (3, *self.shape)).reshape(3, -1)
 
     def cloud(
         self, depth: Float32[np.ndarray, "_h _w"], image: np.ndarray
     ) -> tuple[Float32[np.ndarray, "3 n"], UInt8[np.ndarray, "3 n"]]:
-        """Points where there is depth, in the axes of the camera, with their colours."""
+        """Points where there is depth, in the axes of the camera, with their colors."""
         seen = np.flatnonzero(depth)
-        return self.points(depth, seen), self.colours(image)[:, seen]
+        return self.points(depth, seen), self.colors(image)[:, seen]
 
     def points(
         self, depth: Float32[np.ndarray, "_h _w"], which: Shaped[np.ndarray, " k"]
@@ -159,7 +159,7 @@ def _eroded(image: np.ndarray) -> np.ndarray:
 
 
 def _distorted(intrinsics: Intrinsics, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Columns and rows of normalised coordinates, by OpenCV."""
+    """Columns and rows of normalized coordinates, by OpenCV."""
     K = np.array([[intrinsics.fx, 0, intrinsics.cx], [0, intrinsics.fy, intrinsics.cy], [0, 0, 1]], np.float64)
     rays = np.concatenate([xy, np.ones_like(xy[:1])]).T.astype(np.float64)
     if not len(rays):

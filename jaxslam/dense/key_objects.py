@@ -1,8 +1,8 @@
 """Key objects at full density: points inside them from a keyframe and from frames shortly before it.
 
 Source: RTS-SLAM (Sensors 2026), Algorithm 2, lines 5 to 14. The paper finds "corresponding object regions" in the
-neighbours and does not say how. Here the network looks at the keyframe alone; depth in its boxes gives each object a
-box in space, and what neighbours see in that is of the object. So a neighbour costs no look of the network, and what
+neighbors and does not say how. Here the network looks at the keyframe alone; depth in its boxes gives each object a
+box in space, and what neighbors see in that is of the object. So a neighbor costs no look of the network, and what
 stands before or behind an object stays out in all frames.
 """
 
@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from jaxslam.dense.depth_view import View
+from jaxslam.dense.depth_view import DepthView
 from jaxslam.geometry.se3 import between, transform
 from jaxslam.masks.box_to_mask import add_box
 from jaxslam.semantics import Detections
@@ -25,12 +25,12 @@ _FEWEST = 50
 """Points of an object with fewer say nothing of its size."""
 
 
-class Neighbour(NamedTuple):
+class Neighbor(NamedTuple):
     """A frame before a keyframe.
 
     Attributes:
         image: `(h, w, 3)` or `(h, w)`.
-        depth: `(h, w)` metres.
+        depth: `(h, w)` meters.
         ignore: `(h, w)` where something moves or may.
         pose: `(7,)` where the tracker had it; seen from the keyframe once it goes with one.
     """
@@ -41,12 +41,12 @@ class Neighbour(NamedTuple):
     pose: np.ndarray
 
 
-class Neighbours:
+class Neighbors:
     """Some of the latest frames, evenly spread."""
 
     def __init__(self, window: int, count: int) -> None:
         """Keep so many out of the latest `window` frames."""
-        self._kept: deque[tuple[int, Neighbour]] = deque(maxlen=max(count, 1))
+        self._kept: deque[tuple[int, Neighbor]] = deque(maxlen=max(count, 1))
         self._every, self._window, self._count = max(1, window // max(count, 1)), window, count
 
     def see(
@@ -59,9 +59,9 @@ class Neighbours:
     ) -> None:
         """Take in a frame that was tracked; it is copied if it is one of those kept."""
         if self._count and frame % self._every == 0:
-            self._kept.append((frame, Neighbour(image.copy(), depth.copy(), ignore.copy(), pose)))
+            self._kept.append((frame, Neighbor(image.copy(), depth.copy(), ignore.copy(), pose)))
 
-    def before(self, frame: int, pose: np.ndarray) -> tuple[Neighbour, ...]:
+    def before(self, frame: int, pose: np.ndarray) -> tuple[Neighbor, ...]:
         """Those in the window before a keyframe, as seen from it."""
         return tuple(
             kept._replace(pose=between(pose, kept.pose))
@@ -70,7 +70,9 @@ class Neighbours:
         )
 
 
-def object_boxes(found: Detections, depth: Float32[np.ndarray, "_h _w"], view: View) -> Float32[np.ndarray, "k 2 3"]:
+def object_boxes(
+    found: Detections, depth: Float32[np.ndarray, "_h _w"], view: DepthView
+) -> Float32[np.ndarray, "k 2 3"]:
     """Boxes in space, in the axes of the camera, of what was found in a keyframe.
 
     Args:
@@ -94,18 +96,18 @@ def object_boxes(found: Detections, depth: Float32[np.ndarray, "_h _w"], view: V
 
 
 def points_inside(
-    boxes: Float32[np.ndarray, "k 2 3"], frame: Neighbour, view: View
+    boxes: Float32[np.ndarray, "k 2 3"], frame: Neighbor, view: DepthView
 ) -> tuple[Float32[np.ndarray, "3 n"], UInt8[np.ndarray, "3 n"]]:
-    """Points of a frame inside boxes, in the axes of the keyframe, with their colours.
+    """Points of a frame inside boxes, in the axes of the keyframe, with their colors.
 
     Args:
         boxes: In the axes of the keyframe.
         frame: Seen from there.
         view: All pixels of its image.
     """
-    X, colours = view.cloud(view.depth(frame.depth, frame.ignore), frame.image)
+    X, colors = view.cloud(view.depth(frame.depth, frame.ignore), frame.image)
     X = transform(frame.pose, X).astype(np.float32)
     inside = np.zeros(X.shape[1], bool)
     for low, high in boxes:
         inside |= (np.abs(X - 0.5 * (low + high)[:, None]) < 0.5 * (high - low)[:, None]).all(axis=0)
-    return X[:, inside], colours[:, inside]
+    return X[:, inside], colors[:, inside]

@@ -6,7 +6,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt16
 
-from jaxslam.dense.depth_view import Looks, View
+from jaxslam.dense.depth_view import DepthView, Looks
 from jaxslam.dense.keyframe_poses import poses_of
 from jaxslam.geometry.se3 import IDENTITY, angle, between, compose
 from jaxslam.map.types import Map, has
@@ -19,7 +19,7 @@ _NEAR_M, _NEAR_RAD = 1.5, 0.6
 _COUNTS = 65535
 
 
-class _Kept(NamedTuple):
+class _StoredDepth(NamedTuple):
     """Of a keyframe.
 
     Attributes:
@@ -34,9 +34,9 @@ class _Kept(NamedTuple):
 class KeyframeDepths:
     """Depth images of keyframes, the oldest first."""
 
-    def __init__(self, view: View) -> None:
+    def __init__(self, view: DepthView) -> None:
         """Keep the pixels of a view, which is half of that of the images given."""
-        self._view, self._kept = view, dict[int, _Kept]()
+        self._view, self._kept = view, dict[int, _StoredDepth]()
 
     def __len__(self) -> int:
         return len(self._kept)
@@ -44,7 +44,7 @@ class KeyframeDepths:
     def add(self, keyframe: int, depth: Float32[np.ndarray, "_h _w"], T_cam_depth: Float[np.ndarray, "7"]) -> None:
         """Keep every second pixel of a depth image, in 65,535 steps up to the farthest depth."""
         small = self._view.of_finer(depth)
-        self._kept[keyframe] = _Kept(
+        self._kept[keyframe] = _StoredDepth(
             np.rint(small * np.float32(_COUNTS / self._view.farthest_m)).astype(np.uint16), T_cam_depth
         )
 
@@ -64,23 +64,23 @@ class KeyframeDepths:
         del self._kept[oldest]
         return oldest
 
-    def poses(self, map: Map | None) -> Poses:
+    def poses(self, slam_map: Map | None) -> Poses:
         """Where each keyframe is in the submap with most keyframes."""
         poses: dict[int, np.ndarray | None] = dict.fromkeys(self._kept)
         ids = np.array(list(self._kept), np.int64)
-        if map is None or not len(map.ids) or not len(ids):
+        if slam_map is None or not len(slam_map.ids) or not len(ids):
             return poses
-        numbers, counts = np.unique(map.submap, return_counts=True)
-        ids = ids[has(map.ids, ids) | np.isin(ids, map.culled.ids)]
-        in_map, submaps = poses_of(map, ids)
+        numbers, counts = np.unique(slam_map.submap, return_counts=True)
+        ids = ids[has(slam_map.ids, ids) | np.isin(ids, slam_map.culled.ids)]
+        in_map, submaps = poses_of(slam_map, ids)
         shown = submaps == numbers[np.argmax(counts)]
         in_map = compose(in_map, np.stack([self._kept[id].T_cam_depth for id in ids.tolist()]))
         poses.update(zip(ids[shown].tolist(), in_map[shown], strict=True))
         return poses
 
     def shown(self, poses: Poses) -> tuple[list[Float32[np.ndarray, "h w"]], list[np.ndarray]]:
-        """Depth, metres, and poses of all that have one."""
-        there = [(self._metres(id), pose) for id, pose in poses.items() if pose is not None]
+        """Depth, meters, and poses of all that have one."""
+        there = [(self._meters(id), pose) for id, pose in poses.items() if pose is not None]
         return [depth for depth, _ in there], [pose for _, pose in there]
 
     def around(self, keyframe: int, poses: Poses, count: int) -> tuple[Looks, Float[np.ndarray, "k 7"]] | None:
@@ -98,7 +98,7 @@ class KeyframeDepths:
         chosen = near[np.unique(np.linspace(0, len(near) - 1, count).astype(int))]
         depths = np.zeros((count, *self._view.shape), np.float32)
         for slot, index in enumerate(chosen.tolist()):
-            depths[slot] = self._metres(others[index][0])
+            depths[slot] = self._meters(others[index][0])
         at = np.tile(IDENTITY, (count, 1))
         at[: len(chosen)] = there[chosen]
         return Looks(depths, np.stack([self._view.looks(depth).least for depth in depths])), at
@@ -112,5 +112,5 @@ class KeyframeDepths:
         """What they take up."""
         return sum(kept.depth.nbytes for kept in self._kept.values())
 
-    def _metres(self, keyframe: int) -> Float32[np.ndarray, "h w"]:
+    def _meters(self, keyframe: int) -> Float32[np.ndarray, "h w"]:
         return self._kept[keyframe].depth.astype(np.float32) * np.float32(self._view.farthest_m / _COUNTS)

@@ -17,7 +17,7 @@ from jaxslam.geometry.so3 import matrices
 HIT, MISS = np.float32(np.log(0.7 / 0.3)), np.float32(np.log(0.4 / 0.6))
 LEAST, MOST = np.float32(np.log(0.12 / 0.88)), np.float32(np.log(0.97 / 0.03))
 """OctoMap's probabilities of a hit and of a ray that goes through, and its bounds, as log-odds."""
-_MOST_CELLS = 2**26
+_MAX_CELLS = 2**26
 """Of the box around all that is seen; with more, cells become twice as large."""
 _MARGIN_CELLS = 2
 
@@ -38,7 +38,7 @@ class Occupancy(NamedTuple):
     known: Bool[np.ndarray, "x y z"]
 
     def at(self, points: Float[np.ndarray, "n 3"]) -> Float32[np.ndarray, " n"]:
-        """Log-odds at points in metres; not a number where nothing is known."""
+        """Log-odds at points in meters; not a number where nothing is known."""
         index = np.floor(np.asarray(points, np.float64) / self.cell_m).astype(np.int64) - self.first
         inside = np.all((index >= 0) & (index < np.array(self.log_odds.shape)), axis=1)
         x, y, z = np.where(inside[:, None], index, 0).T
@@ -52,9 +52,9 @@ def occupancy(
     """The cells that depth images say something of.
 
     Args:
-        depths: `k` images of `n` pixels, metres, 0 where missing.
+        depths: `k` images of `n` pixels, meters, 0 where missing.
         poses: Where each was taken, `T_world_cam`.
-        rays: Where the ray of each pixel meets the plane one metre ahead of the camera.
+        rays: Where the ray of each pixel meets the plane one meter ahead of the camera.
         cell_m: Side of a cell; doubled until the box around all of them has no more than 67 million.
 
     Raises:
@@ -69,7 +69,7 @@ def occupancy(
     while True:
         first = np.floor(low.min(axis=0) / cell_m).astype(np.int64) - _MARGIN_CELLS
         shape = np.floor(high.max(axis=0) / cell_m).astype(np.int64) - first + 1 + _MARGIN_CELLS
-        if np.prod(shape.astype(np.float64)) <= _MOST_CELLS:
+        if np.prod(shape.astype(np.float64)) <= _MAX_CELLS:
             break
         cell_m *= 2
     log_odds, known = np.zeros(np.prod(shape), np.float32), np.zeros(np.prod(shape), bool)
@@ -89,7 +89,7 @@ def _add_scan(
     log_odds: np.ndarray,
     known: np.ndarray,
     ends: np.ndarray,
-    centre: np.ndarray,
+    center: np.ndarray,
     first: np.ndarray,
     shape: np.ndarray,
     cell_m: float,
@@ -97,7 +97,7 @@ def _add_scan(
     """Take in one depth image: a step of a cell along each ray, up to the cell before its end."""
     if not ends.shape[1]:
         return
-    start = ((centre / cell_m) - first).astype(np.float32)[:, None]
+    start = ((center / cell_m) - first).astype(np.float32)[:, None]
     way = ends / np.float32(cell_m) - first.astype(np.float32)[:, None] - start
     length = np.linalg.norm(way, axis=0)
     # Longest first, so that the rays that still go on are always the first ones.

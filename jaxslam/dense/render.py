@@ -22,7 +22,7 @@ _WIDTH, _HEIGHT = 960, 720
 _BACKGROUND, _PATH_RGB = 24, (255, 160, 0)
 _VIEW = 0.9
 """Tangent of half the angle of the perspective view, along a row."""
-_MOST_SPLAT_PX = 6
+_MAX_SPLAT_PX = 6
 _HEADROOM_M = 0.3
 """What is so far above the camera is left out from the top: a ceiling."""
 
@@ -33,7 +33,7 @@ class _Screen(NamedTuple):
     Attributes:
         uv: `(2, n)` pixels.
         depth: `(n,)` how far behind the screen; what is not above 0 is not seen.
-        pixel_per_m: `(n,)` pixels a metre there.
+        pixel_per_m: `(n,)` pixels a meter there.
     """
 
     uv: np.ndarray
@@ -46,12 +46,12 @@ class _Stand(NamedTuple):
 
     Attributes:
         axes: `(3, 3)` rows: right, down, ahead.
-        centre: `(3,)` the middle of what is looked at.
+        center: `(3,)` the middle of what is looked at.
         extent_m: How far that reaches to either side.
     """
 
     axes: np.ndarray
-    centre: np.ndarray
+    center: np.ndarray
     extent_m: float
 
 
@@ -89,7 +89,7 @@ def picture(cloud: DenseCloud, T_world_cam: Float[np.ndarray, "k 7"]) -> UInt8[n
 
 
 def _part(cloud: DenseCloud, which: np.ndarray) -> DenseCloud:
-    arrays = cloud.points[which], cloud.colours[which], cloud.counts[which], cloud.is_key[which]
+    arrays = cloud.points[which], cloud.colors[which], cloud.counts[which], cloud.is_key[which]
     return DenseCloud(*arrays, cloud.voxel_m)
 
 
@@ -119,7 +119,7 @@ def _ahead(X: np.ndarray, stand: _Stand) -> _Screen:
     right, down, ahead = stand.axes
     cos, sin = np.cos(np.pi / 6), np.sin(np.pi / 6)
     axes = np.stack([right, down * cos - ahead * sin, ahead * cos + down * sin])
-    eye = stand.centre - 1.9 * stand.extent_m * axes[2]
+    eye = stand.center - 1.9 * stand.extent_m * axes[2]
     x, y, z = ((X - eye) @ axes.T).T
     seen = np.where(z > 0.1, z, np.inf)
     focal = 0.5 * _WIDTH / _VIEW
@@ -129,7 +129,7 @@ def _ahead(X: np.ndarray, stand: _Stand) -> _Screen:
 def _from_above(X: np.ndarray, stand: _Stand) -> _Screen:
     """Without perspective, from the top; what the camera looks at is up."""
     scale = 0.46 * min(_WIDTH, _HEIGHT) / stand.extent_m
-    x, y, z = ((X - stand.centre) @ stand.axes.T).T
+    x, y, z = ((X - stand.center) @ stand.axes.T).T
     uv = np.stack([0.5 * _WIDTH + scale * x, 0.5 * _HEIGHT - scale * z])
     return _Screen(uv, y + 100 * stand.extent_m, np.full(len(X), scale))
 
@@ -140,7 +140,7 @@ def _drawn(screen: _Screen, cloud: DenseCloud) -> UInt8[np.ndarray, "h w 3"]:
     order = np.argsort(-screen.depth)
     order = order[screen.depth[order] > 0.1]
     voxels_m = np.where(cloud.is_key, 0.25, 1.0) * cloud.voxel_m
-    side = np.clip(np.ceil(screen.pixel_per_m * voxels_m), 1, _MOST_SPLAT_PX).astype(np.int64)[order]
+    side = np.clip(np.ceil(screen.pixel_per_m * voxels_m), 1, _MAX_SPLAT_PX).astype(np.int64)[order]
     column, row = np.clip(np.nan_to_num(screen.uv[:, order]), -1e6, 1e6).astype(np.int64)
     most = int(side.max(initial=1))
     # The same order for all pixels of a square: the last of those written to a pixel is the nearest.
@@ -153,7 +153,7 @@ def _drawn(screen: _Screen, cloud: DenseCloud) -> UInt8[np.ndarray, "h w 3"]:
     nearest = np.full(len(panel), -1, np.int64)
     np.maximum.at(nearest, (v * _WIDTH + u)[covers], point)
     some = nearest >= 0
-    panel[some] = cloud.colours[order][nearest[some]]
+    panel[some] = cloud.colors[order][nearest[some]]
     return panel.reshape(_HEIGHT, _WIDTH, 3)
 
 

@@ -12,7 +12,7 @@ from jaxslam_kernels.depth.voxel_hash import NO_ROW
 from jaxtyping import Bool, Float32, Int, Int32, UInt8
 
 from jaxslam.dense.block_bounds import RowBoxes
-from jaxslam.dense.depth_view import Looks, View
+from jaxslam.dense.depth_view import DepthView, Looks
 from jaxslam.dense.voxel_programs import (
     MISS,
     ROWS,
@@ -33,7 +33,7 @@ HIT = np.float32(0.85)
 """Log-odds of a voxel that a keyframe has a point in: a probability of 0.7, OctoMap's."""
 _GONE = -1.0
 """Points in voxels with less do not go with their keyframe when it is moved."""
-_MOST_PAST = 3
+_MAX_PAST = 3
 """Earlier keyframes that see past a new point of which no more count: something may have been put there since."""
 _FULL, _STILL_FULL = 0.9, 0.7
 """Shares of the voxels in use from which free ones are forgotten, and with which voxels become larger."""
@@ -41,19 +41,19 @@ _SIZES = 4
 """Sizes that points to be reduced are brought to. The search for voxels goes over all of them at once."""
 
 
-class Part(NamedTuple):
+class VoxelPart(NamedTuple):
     """What a keyframe has in the grid.
 
     Attributes:
         X_cam: `(3, m)` in units of the layer, int16.
-        colour: `(3, m)` uint8.
+        color: `(3, m)` uint8.
         counts: `(m,)` float16.
         rows: `(m,)` of the grid; `NO_ROW` of points that have left it.
         T_world_cam: `(7,)` where the keyframe was when they were put there; `None` while they are not in the grid.
     """
 
     X_cam: np.ndarray
-    colour: np.ndarray
+    color: np.ndarray
     counts: np.ndarray
     rows: Int32[np.ndarray, " m"]
     T_world_cam: np.ndarray | None
@@ -61,7 +61,7 @@ class Part(NamedTuple):
     @property
     def nbytes(self) -> int:
         """What it takes up."""
-        return self.X_cam.nbytes + self.colour.nbytes + self.counts.nbytes + self.rows.nbytes
+        return self.X_cam.nbytes + self.color.nbytes + self.counts.nbytes + self.rows.nbytes
 
 
 class VoxelLayer:
@@ -84,30 +84,30 @@ class VoxelLayer:
             farthest_m: No point of a keyframe is further from it along any axis but by the view of its camera.
         """
         self.voxel_m = voxel_m
-        self.parts: dict[int, Part] = {}
+        self.parts: dict[int, VoxelPart] = {}
         self._capacity, self._part_points, self._cloud_size = capacity, part_points, cloud_size(part_points)
         self._sizes = [-(-most_points * count // _SIZES) for count in range(1, _SIZES + 1)]
         self.unit_m = np.float32(4 * farthest_m / 32767)  # views are up to 150 degrees wide
         self._grid, self._boxes = empty_grid(capacity), RowBoxes(capacity, ROWS)
 
-    def reduce(self, X_cam: Float32[np.ndarray, "3 n"], colours: UInt8[np.ndarray, "3 n"]) -> Part:
+    def reduce(self, X_cam: Float32[np.ndarray, "3 n"], colors: UInt8[np.ndarray, "3 n"]) -> VoxelPart:
         """The points of a keyframe, one a voxel in its own axes; voxels are larger if there are too many."""
         voxel_m, count = self.voxel_m, X_cam.shape[1]
         size = next(size for size in self._sizes if size >= count)
-        X_cam, colours = padded(X_cam, size, axis=1), padded(colours, size, axis=1)
+        X_cam, colors = padded(X_cam, size, axis=1), padded(colors, size, axis=1)
         while True:
             cloud, num = reduced(
-                X_cam, colours, np.int32(count), np.float32(voxel_m), self.unit_m, capacity=self._part_points
+                X_cam, colors, np.int32(count), np.float32(voxel_m), self.unit_m, capacity=self._part_points
             )
             num = int(num)
             if num <= self._part_points:
                 break
             voxel_m *= 1.05 * np.sqrt(num / self._part_points)  # surfaces have so many
-        X, colour, counts = (np.asarray(array)[..., :num].copy() for array in cloud)
-        return Part(X, colour, counts, np.full(num, NO_ROW, np.int32), None)
+        X, color, counts = (np.asarray(array)[..., :num].copy() for array in cloud)
+        return VoxelPart(X, color, counts, np.full(num, NO_ROW, np.int32), None)
 
     def put(
-        self, keyframe: int, part: Part, T_world_cam: np.ndarray, past: Int[np.ndarray, " m"] | None = None
+        self, keyframe: int, part: VoxelPart, T_world_cam: np.ndarray, past: Int[np.ndarray, " m"] | None = None
     ) -> None:
         """Put the points of a keyframe into the grid.
 
@@ -119,7 +119,7 @@ class VoxelLayer:
         """
         evidence = np.full(self._cloud_size, HIT)
         if past is not None:
-            evidence[: len(past)] += np.float32(MISS) * np.minimum(past, _MOST_PAST)
+            evidence[: len(past)] += np.float32(MISS) * np.minimum(past, _MAX_PAST)
         pose, before = T_world_cam.astype(np.float32), int(self._grid.table.num)
         self._grid, rows = put(self._grid, self._cloud(part), evidence, pose, np.float32(self.voxel_m))
         rows = np.array(rows)[: len(part.rows)]
@@ -127,7 +127,7 @@ class VoxelLayer:
         self._boxes.add(rows[new], transform(pose, part.X_cam[:, new] * self.unit_m))
         self.parts[keyframe] = part._replace(rows=rows, T_world_cam=T_world_cam)
 
-    def take_out(self, keyframe: int, which: Bool[np.ndarray, " m"] | None = None) -> Part:
+    def take_out(self, keyframe: int, which: Bool[np.ndarray, " m"] | None = None) -> VoxelPart:
         """Take points of a keyframe out of the grid: all, or some for good; gives what is left of it."""
         part = self.parts[keyframe]
         if part.T_world_cam is None:
@@ -157,14 +157,16 @@ class VoxelLayer:
         """Leave the points of a keyframe where they are, for good."""
         del self.parts[keyframe]
 
-    def look(self, looks: Looks, T_world_cam: np.ndarray, view: View) -> None:
+    def look(self, looks: Looks, T_world_cam: np.ndarray, view: DepthView) -> None:
         """Take in which voxels a frame sees again, and which it sees past."""
         blocks = self._boxes.in_view(T_world_cam, view, self.voxel_m)
         count, blocks = np.int32(len(blocks)), padded(blocks, len(self._boxes))
         pose, size = T_world_cam.astype(np.float32), np.float32(self.voxel_m)
         self._grid = looked(self._grid, blocks, count, pose, *looks, view.intrinsics, size)
 
-    def past(self, part: Part, T_world_cam: np.ndarray, looks: Looks, poses: np.ndarray, view: View) -> np.ndarray:
+    def past(
+        self, part: VoxelPart, T_world_cam: np.ndarray, looks: Looks, poses: np.ndarray, view: DepthView
+    ) -> np.ndarray:
         """`(m,)` how many of `(k, h, w)` depth images, taken at `(k, 7)` poses, see past the points of a keyframe."""
         arrays = T_world_cam.astype(np.float32), looks.depth, looks.least, poses.astype(np.float32), view.intrinsics
         return np.asarray(num_past(self._cloud(part), *arrays))[: len(part.counts)]
@@ -178,15 +180,15 @@ class VoxelLayer:
             self._rebuild(2)
 
     def shown(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Points `(n, 3)`, colours `(n, 3)` and counts `(n,)` of voxels that have some and are not free."""
+        """Points `(n, 3)`, colors `(n, 3)` and counts `(n,)` of voxels that have some and are not free."""
         num = int(self._grid.table.num)
         voxels = all_centroids(self._grid, np.float32(self.voxel_m))
         keep = (np.asarray(voxels.counts)[:num] > 0) & (np.asarray(self._grid.sums)[:num, 7] > 0)
-        X, colour, count = (np.asarray(array)[..., :num][..., keep] for array in voxels[:3])
-        colour = np.clip(np.rint(colour), 0, 255).astype(np.uint8)
-        return np.ascontiguousarray(X.T), np.ascontiguousarray(colour.T), count
+        X, color, count = (np.asarray(array)[..., :num][..., keep] for array in voxels[:3])
+        color = np.clip(np.rint(color), 0, 255).astype(np.uint8)
+        return np.ascontiguousarray(X.T), np.ascontiguousarray(color.T), count
 
-    def compile(self, view: View, small: View, num_looks: int) -> None:
+    def compile(self, view: DepthView, small: DepthView, num_looks: int) -> None:
         """Compile all that is needed, on a grid that holds nothing.
 
         Args:
@@ -215,11 +217,11 @@ class VoxelLayer:
         """Memory in use for the parts of keyframes."""
         return sum(part.nbytes for part in self.parts.values())
 
-    def _cloud(self, part: Part) -> Cloud:
+    def _cloud(self, part: VoxelPart) -> Cloud:
         """A part at the size that programs are compiled for."""
         size = self._cloud_size
-        X, colour = padded(part.X_cam, size, axis=1), padded(part.colour, size, axis=1)
-        return Cloud(X, colour, padded(part.counts, size), np.int32(len(part.counts)), self.unit_m)  # pyright: ignore[reportArgumentType]
+        X, color = padded(part.X_cam, size, axis=1), padded(part.color, size, axis=1)
+        return Cloud(X, color, padded(part.counts, size), np.int32(len(part.counts)), self.unit_m)  # pyright: ignore[reportArgumentType]
 
     def _rebuild(self, factor: int) -> None:
         """The same grid with larger voxels, or as large ones, without those that are free."""
@@ -234,5 +236,5 @@ class VoxelLayer:
                 self.parts[keyframe] = part._replace(rows=new[part.rows])
 
 
-def _at(part: Part, which: Bool[np.ndarray, " m"]) -> Part:
-    return Part(part.X_cam[:, which], part.colour[:, which], part.counts[which], part.rows[which], part.T_world_cam)
+def _at(part: VoxelPart, which: Bool[np.ndarray, " m"]) -> VoxelPart:
+    return VoxelPart(part.X_cam[:, which], part.color[:, which], part.counts[which], part.rows[which], part.T_world_cam)

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxlie import SE3
 from jaxslam_kernels.camera import Intrinsics
-from jaxslam_kernels.depth.free_space import SeenFrom, seen_from
+from jaxslam_kernels.depth.free_space import Visibility, classify_visibility
 from jaxslam_kernels.depth.voxel_grid import (
-    Colours,
+    Colors,
     VoxelGrid,
     Voxels,
     centroids,
@@ -31,8 +31,8 @@ from jaxslam_kernels.se3 import to_world
 from jaxslam_kernels.types import Points, Weights
 from jaxtyping import Array, Float, Float16, Float32, Int, Int16, Int32, UInt8
 
-from jaxslam.runtime.compile_cache import IN_ITS_THREAD
-from jaxslam.runtime.trace_cache import traced_once
+from jaxslam.runtime.compile_cache import SINGLE_THREAD
+from jaxslam.runtime.trace_cache import cached_trace
 
 ROWS = 1024
 """Rows of the grid in a block: small, so that few of a block in view are out of it."""
@@ -41,7 +41,7 @@ MISS, SEEN = -0.85, 0.4
 """Log-odds of a voxel that a depth image sees past: 0.4 as a probability in OctoMap, for rays that graze a surface;
 here it must be clearly behind, and says as much as a point does. And of one that has a surface where its points are."""
 _SAME_SHARE, _SAME_M = 0.03, 0.03
-"""Differences of depth that are none, a share and metres: sensors are a percent or two off at four metres."""
+"""Differences of depth that are none, a share and meters: sensors are a percent or two off at four meters."""
 _State = TypeVar("_State")
 
 
@@ -50,14 +50,14 @@ class Cloud(NamedTuple):
 
     Attributes:
         X_cam: `(3, m)` in units, int16.
-        colour: `(3, m)` uint8.
+        color: `(3, m)` uint8.
         counts: `(m,)` float16, 0 beyond the last point.
         num: Points.
         unit_m: Of the coordinates.
     """
 
     X_cam: Int16[Array, "3 m"]
-    colour: UInt8[Array, "3 m"]
+    color: UInt8[Array, "3 m"]
     counts: Float16[Array, " m"]
     num: Int32[Array, ""]
     unit_m: Float32[Array, ""]
@@ -67,10 +67,10 @@ class Cloud(NamedTuple):
         """`m`."""
         return self.counts.shape[0]
 
-    def block(self, start: Array) -> tuple[Points, Colours, Weights]:
-        """Points in metres, colours and counts of a block."""
-        X, colour, counts = (_cut(array, start).astype(self.unit_m.dtype) for array in self[:3])
-        return X * self.unit_m, colour, counts
+    def block(self, start: Array) -> tuple[Points, Colors, Weights]:
+        """Points in meters, colors and counts of a block."""
+        X, color, counts = (_cut(array, start).astype(self.unit_m.dtype) for array in self[:3])
+        return X * self.unit_m, color, counts
 
 
 def cloud_size(points: int) -> int:
@@ -78,11 +78,11 @@ def cloud_size(points: int) -> int:
     return -(-points // _POINTS) * _POINTS
 
 
-@partial(jax.jit, static_argnames="capacity", compiler_options=IN_ITS_THREAD)
-@traced_once
+@partial(jax.jit, static_argnames="capacity", compiler_options=SINGLE_THREAD)
+@cached_trace
 def reduced(
     X_cam: Float32[Array, "3 n"],
-    colour: UInt8[Array, "3 n"],
+    color: UInt8[Array, "3 n"],
     num: Int32[Array, ""],
     voxel_m: Float32[Array, ""],
     unit_m: Float32[Array, ""],
@@ -91,13 +91,13 @@ def reduced(
 ) -> tuple[tuple[Array, Array, Array], Int32[Array, ""]]:
     """The first `num` of some points, one a voxel, as a `Part` keeps them; and how many there are."""
     mask = jnp.arange(X_cam.shape[1], dtype=jnp.int32) < num
-    voxels = reduced_cloud(X_cam, colour.astype(X_cam.dtype), mask, voxel_m, capacity=capacity)
+    voxels = reduced_cloud(X_cam, color.astype(X_cam.dtype), mask, voxel_m, capacity=capacity)
     X = jnp.clip(jnp.round(voxels.X / unit_m), -32767, 32767).astype(jnp.int16)
-    return (X, jnp.round(voxels.colour).astype(jnp.uint8), voxels.counts.astype(jnp.float16)), voxels.num
+    return (X, jnp.round(voxels.color).astype(jnp.uint8), voxels.counts.astype(jnp.float16)), voxels.num
 
 
-@partial(jax.jit, donate_argnums=0, compiler_options=IN_ITS_THREAD)
-@traced_once
+@partial(jax.jit, donate_argnums=0, compiler_options=SINGLE_THREAD)
+@cached_trace
 def put(
     grid: VoxelGrid, cloud: Cloud, evidence: Float[Array, " m"], pose: Float[Array, "7"], voxel_m: Float[Array, ""]
 ) -> tuple[VoxelGrid, Int[Array, " m"]]:
@@ -105,16 +105,16 @@ def put(
 
     def add(start: Array, so_far: tuple[VoxelGrid, Array]) -> tuple[VoxelGrid, Array]:
         grid, rows = so_far
-        X_cam, colour, count = cloud.block(start)
+        X_cam, color, count = cloud.block(start)
         X, odds = to_world(SE3(pose), X_cam), _cut(evidence, start)
-        grid, there = with_cloud(grid, X, colour, count, odds, voxel_m)
+        grid, there = with_cloud(grid, X, color, count, odds, voxel_m)
         return grid, lax.dynamic_update_slice(rows, there, (start,))
 
     return _over_blocks(cloud, add, (grid, jnp.full(cloud.size, NO_ROW, jnp.int32)))
 
 
-@partial(jax.jit, donate_argnums=0, compiler_options=IN_ITS_THREAD)
-@traced_once
+@partial(jax.jit, donate_argnums=0, compiler_options=SINGLE_THREAD)
+@cached_trace
 def taken_out(
     grid: VoxelGrid,
     rows: Int[Array, " m"],
@@ -126,15 +126,15 @@ def taken_out(
     """The grid without the points of a part that have a row."""
 
     def take(start: Array, grid: VoxelGrid) -> VoxelGrid:
-        X_cam, colour, count = cloud.block(start)
+        X_cam, color, count = cloud.block(start)
         X, odds = to_world(SE3(pose), X_cam), _cut(evidence, start)
-        return changed(grid, _cut(rows, start), X, colour, -count, odds, voxel_m)
+        return changed(grid, _cut(rows, start), X, color, -count, odds, voxel_m)
 
     return _over_blocks(cloud, take, grid)
 
 
-@partial(jax.jit, donate_argnums=0, compiler_options=IN_ITS_THREAD)
-@traced_once
+@partial(jax.jit, donate_argnums=0, compiler_options=SINGLE_THREAD)
+@cached_trace
 def looked(
     grid: VoxelGrid,
     blocks: Int[Array, " b"],
@@ -160,8 +160,8 @@ def looked(
     return grid._replace(sums=lax.fori_loop(0, num, look, grid.sums))
 
 
-@partial(jax.jit, compiler_options=IN_ITS_THREAD)
-@traced_once
+@partial(jax.jit, compiler_options=SINGLE_THREAD)
+@cached_trace
 def num_past(
     cloud: Cloud,
     pose: Float[Array, "7"],
@@ -182,21 +182,21 @@ def num_past(
 
 
 @jax.jit
-@traced_once
+@cached_trace
 def all_centroids(grid: VoxelGrid, voxel_m: Float[Array, ""]) -> Voxels:
     """The points of all rows."""
     return centroids(grid, jnp.zeros((), jnp.int32), voxel_m, size=len(grid.sums))
 
 
 @partial(jax.jit, static_argnums=3)
-@traced_once
+@cached_trace
 def rebuilt(
     grid: VoxelGrid, old_m: Float[Array, ""], new_m: Float[Array, ""], capacity: int
 ) -> tuple[VoxelGrid, Int[Array, " c"], Points]:
     """The grid with voxels of another side, without free ones; the new row of each old one, and its point."""
     voxels = centroids(grid, jnp.zeros((), jnp.int32), old_m, size=capacity)
     count = jnp.where(grid.log_odds > 0, voxels.counts, 0)
-    return *with_cloud(empty_grid(capacity), voxels.X, voxels.colour, count, grid.log_odds, new_m), voxels.X
+    return *with_cloud(empty_grid(capacity), voxels.X, voxels.color, count, grid.log_odds, new_m), voxels.X
 
 
 def _over_blocks(cloud: Cloud, step: Callable[[Array, _State], _State], begin: _State) -> _State:
@@ -209,6 +209,6 @@ def _cut(array: Array, start: Array) -> Array:
     return lax.dynamic_slice_in_dim(array, start, _POINTS, axis=array.ndim - 1)
 
 
-def _seen(X: Points, pose: Array, depth: Array, least: Array, intrinsics: Intrinsics) -> SeenFrom:
+def _seen(X: Points, pose: Array, depth: Array, least: Array, intrinsics: Intrinsics) -> Visibility:
     limits = jnp.float32(_SAME_SHARE), jnp.float32(_SAME_M)
-    return seen_from(X, SE3(pose), depth, least, intrinsics, same_share=limits[0], same_m=limits[1])
+    return classify_visibility(X, SE3(pose), depth, least, intrinsics, same_share=limits[0], same_m=limits[1])

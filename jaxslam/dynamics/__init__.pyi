@@ -1,10 +1,10 @@
 from .cue import Cue as Cue
-from .cue import Scene as Scene
-from .cue import Verdict as Verdict
-from .cue import combined as combined
-from .cue import judge as judge
+from .cue import CueInput as CueInput
+from .cue import CueResult as CueResult
+from .cue import combine_cues as combine_cues
+from .cue import threshold_evidence as threshold_evidence
 from .object_motion import MotionState as MotionState
 from .occlusion import PointState as PointState
+from .regions import RegionCueResult as RegionCueResult
 from .regions import RegionPlan as RegionPlan
 from .regions import Regions as Regions
-from .regions import RegionVerdict as RegionVerdict

@@ -15,8 +15,8 @@ from jaxslam_kernels.robust import loss_value
 from jaxslam_kernels.se3 import to_camera
 from jaxslam_kernels.types import Mask, Scalar, Weights
 
-from jaxslam.dynamics.cue import Scene, Verdict, judge
-from jaxslam.dynamics.regions import Regions, RegionVerdict, mean_of_regions, of_points
+from jaxslam.dynamics.cue import CueInput, CueResult, threshold_evidence
+from jaxslam.dynamics.regions import RegionCueResult, Regions, mean_of_regions, of_points
 
 
 class ClusterParams(NamedTuple):
@@ -40,7 +40,7 @@ class ClusterParams(NamedTuple):
     temperature: Scalar
 
 
-ClusterCue: TypeAlias = Callable[[Scene, ClusterParams], Verdict]
+ClusterCue: TypeAlias = Callable[[CueInput, ClusterParams], CueResult]
 
 
 @lru_cache  # the same function for the same choice: another one would be compiled anew
@@ -52,7 +52,7 @@ def make_cluster_cue(as_published: bool = False) -> ClusterCue:
             pose, which a large mover does not raise.
     """
 
-    def cluster_cue(scene: Scene, params: ClusterParams) -> Verdict:
+    def cluster_cue(scene: CueInput, params: ClusterParams) -> CueResult:
         """How large the mean error of each point's region is, in thresholds.
 
         Args:
@@ -69,24 +69,24 @@ def make_cluster_cue(as_published: bool = False) -> ClusterCue:
     return cluster_cue
 
 
-def _verdict(scene: Scene, regions: Regions, params: ClusterParams, as_published: bool) -> Verdict:
+def _verdict(scene: CueInput, regions: Regions, params: ClusterParams, as_published: bool) -> CueResult:
     error, known = _robust_errors(scene, params)
     mean, number = mean_of_regions(error, known, regions)
     counts = known if as_published else known & scene.agrees
     overall = jnp.sum(jnp.where(counts, error, 0)) / jnp.maximum(jnp.sum(counts, dtype=error.dtype), 1)
     limit = jnp.maximum(params.times_mean * overall, jnp.square(params.least_px))
     enough = (number >= params.fewest) & (limit > 0)
-    weight, evidence, judged, _ = judge(mean / jnp.where(limit > 0, limit, 1), enough, params.temperature)
+    weight, evidence, judged, _ = threshold_evidence(mean / jnp.where(limit > 0, limit, 1), enough, params.temperature)
     one, none = jnp.ones_like(overall), jnp.zeros_like(overall)
-    return Verdict(
+    return CueResult(
         weight=of_points(weight, regions, one),
         evidence=of_points(evidence, regions, none),
         known=of_points(judged, regions, jnp.zeros((), bool)),
-        regions=RegionVerdict(weight, evidence, judged),
+        regions=RegionCueResult(weight, evidence, judged),
     )
 
 
-def _robust_errors(scene: Scene, params: ClusterParams) -> tuple[Weights, Mask]:
+def _robust_errors(scene: CueInput, params: ClusterParams) -> tuple[Weights, Mask]:
     """Robust squared reprojection errors of the points at the pose, pixels squared, and which are known.
 
     Of where they were a while ago, as the points of a keyframe in the paper: the places of followed points are measured

@@ -14,10 +14,10 @@ from jaxslam_kernels.camera import Intrinsics
 from jaxslam_kernels.types import Mask, Pixels, Points, Scalar, Weights
 from jaxtyping import Array, Float, Key
 
-from jaxslam.dynamics.regions import Regions, RegionVerdict
+from jaxslam.dynamics.regions import RegionCueResult, Regions
 
 
-class Scene(NamedTuple):
+class CueInput(NamedTuple):
     """What is known of `n` points between two frames, before the pose of the second is refined.
 
     Attributes:
@@ -27,10 +27,10 @@ class Scene(NamedTuple):
         masked: `(n,)` which are there in both and under a mask: they do not count, whatever is said of them.
         agrees: `(n,)` which of those that are followed agree with `T_world_cam`.
         weight: `(n,)` how much each counts before anything is said of it.
-        depth_before: `(n,)` metres in the frame before, 0 where not measured.
-        depth: `(n,)` metres now, 0 where not measured.
-        X_world: `(3, n)` where they are in the world, metres, as measured over the last few frames.
-        X_anchor: `(3, n)` where they were up to half a second ago, metres.
+        depth_before: `(n,)` meters in the frame before, 0 where not measured.
+        depth: `(n,)` meters now, 0 where not measured.
+        X_world: `(3, n)` where they are in the world, meters, as measured over the last few frames.
+        X_anchor: `(3, n)` where they were up to half a second ago, meters.
         T_world_before: Pose of the camera in the frame before.
         T_world_cam: Its pose now, as most points have it.
         intrinsics: The camera. The tracker's is one without lens distortion and with a global shutter.
@@ -57,7 +57,7 @@ class Scene(NamedTuple):
     regions: Regions | None = None
 
 
-class Verdict(NamedTuple):
+class CueResult(NamedTuple):
     """What a cue says of each point.
 
     Attributes:
@@ -70,14 +70,14 @@ class Verdict(NamedTuple):
     weight: Weights
     evidence: Weights
     known: Mask
-    regions: RegionVerdict | None = None
+    regions: RegionCueResult | None = None
 
 
-Cue: TypeAlias = Callable[[Scene, Any], Verdict]
+Cue: TypeAlias = Callable[[CueInput, Any], CueResult]
 """A pure function of what is known and of its own parameters, a pytree. `TrackPlan.cues` takes any of them."""
 
 
-def judge(evidence: Weights, known: Mask, temperature: Scalar) -> Verdict:
+def threshold_evidence(evidence: Weights, known: Mask, temperature: Scalar) -> CueResult:
     """A verdict by the limit, which is 1.
 
     Args:
@@ -91,10 +91,10 @@ def judge(evidence: Weights, known: Mask, temperature: Scalar) -> Verdict:
     smooth = temperature > 0
     soft = jax.nn.sigmoid((1 - measured) / jnp.where(smooth, temperature, 1))
     weight = jnp.where(smooth, soft, (measured <= 1).astype(measured.dtype))
-    return Verdict(jnp.where(known, weight, 1), measured, known)
+    return CueResult(jnp.where(known, weight, 1), measured, known)
 
 
-def combined(verdicts: Sequence[Verdict], weight: Weights) -> Weights:
+def combine_cues(verdicts: Sequence[CueResult], weight: Weights) -> Weights:
     """`(n,)` the weights times those of all verdicts: every cue has a veto, as every layer has in RTS-SLAM.
 
     Args:

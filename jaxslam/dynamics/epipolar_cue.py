@@ -14,7 +14,7 @@ from jaxslam_kernels.two_view.epipolar import epipolar_distances, fundamental_of
 from jaxslam_kernels.two_view.fundamental import FundamentalResult, FundamentalStatus, ransac_fundamental
 from jaxslam_kernels.types import Mask, Scalar
 
-from jaxslam.dynamics.cue import Scene, Verdict, judge
+from jaxslam.dynamics.cue import CueInput, CueResult, threshold_evidence
 
 
 class EpipolarParams(NamedTuple):
@@ -35,7 +35,7 @@ class EpipolarParams(NamedTuple):
     temperature: Scalar
 
 
-EpipolarCue: TypeAlias = Callable[[Scene, EpipolarParams], Verdict]
+EpipolarCue: TypeAlias = Callable[[CueInput, EpipolarParams], CueResult]
 
 
 @lru_cache  # the same function for the same number: another one would be compiled anew
@@ -47,7 +47,7 @@ def make_epipolar_cue(num_hypotheses: int = 32) -> EpipolarCue:
     besides. With it a quarter of the hypotheses do, and a third of the steps.
     """
 
-    def epipolar_cue(scene: Scene, params: EpipolarParams) -> Verdict:
+    def epipolar_cue(scene: CueInput, params: EpipolarParams) -> CueResult:
         """How far each point is from its line, in limits.
 
         Nothing is said in a frame whose motion does not determine the matrix: a camera that stands or turns on the
@@ -57,12 +57,12 @@ def make_epipolar_cue(num_hypotheses: int = 32) -> EpipolarCue:
         found = _matrix(scene, judged, params, num_hypotheses)
         trusted = (found.status == FundamentalStatus.OK) | (found.status == FundamentalStatus.NOT_CONVERGED)
         distance = epipolar_distances(found.F, scene.uv_before, scene.uv)
-        return judge(distance / params.limit_px, judged & trusted, params.temperature)
+        return threshold_evidence(distance / params.limit_px, judged & trusted, params.temperature)
 
     return epipolar_cue
 
 
-def _matrix(scene: Scene, judged: Mask, params: EpipolarParams, num_hypotheses: int) -> FundamentalResult:
+def _matrix(scene: CueInput, judged: Mask, params: EpipolarParams, num_hypotheses: int) -> FundamentalResult:
     outside = judged & ~scene.masked
     enough = jnp.sum(outside, dtype=scene.uv.dtype) > params.fewest_outside
     voters = jnp.where(enough, outside, judged)
@@ -78,6 +78,6 @@ def _matrix(scene: Scene, judged: Mask, params: EpipolarParams, num_hypotheses: 
     )
 
 
-def _clear_of_border(scene: Scene, border_px: Scalar) -> Mask:
+def _clear_of_border(scene: CueInput, border_px: Scalar) -> Mask:
     low, high = border_px, (scene.size - 1)[:, None] - border_px
     return ((scene.uv_before >= low) & (scene.uv_before <= high) & (scene.uv >= low) & (scene.uv <= high)).all(axis=0)

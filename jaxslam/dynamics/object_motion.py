@@ -13,8 +13,8 @@ from jaxslam_kernels.scene_flow import flow_length, group_motion, scene_flow, up
 from jaxslam_kernels.types import Mask, Pixels, Points, Scalar, Weights
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from jaxslam.dynamics.cue import judge
-from jaxslam.dynamics.regions import RegionVerdict
+from jaxslam.dynamics.cue import threshold_evidence
+from jaxslam.dynamics.regions import RegionCueResult
 
 Labels = UInt8[Array, "h w"]
 """Number of the thing that may move at each pixel, from 1; 0 where there is none."""
@@ -28,7 +28,7 @@ class MotionPlan(NamedTuple):
         reserved: Slots of points that are kept free for points on them.
         dense_cell_px: Side of the cells that each get at most one new corner where things take up over half of the
             picture, even: more points from what is left of it.
-        as_published: Whether motion is measured in metres from frame to frame, its limit from mean and standard
+        as_published: Whether motion is measured in meters from frame to frame, its limit from mean and standard
             deviation, and the points of a thing are counted alone.
     """
 
@@ -39,7 +39,7 @@ class MotionPlan(NamedTuple):
 
 
 class MotionParams(NamedTuple):
-    """Of `judge_motion`; scalars.
+    """Of `classify_motion`; scalars.
 
     Attributes:
         sigmas: A point moves if it moves more than points at rest do by so many standard deviations.
@@ -84,7 +84,7 @@ class MotionState(NamedTuple):
     """
 
     there: Mask
-    verdict: RegionVerdict
+    verdict: RegionCueResult
     memory: MotionMemory
 
     @property
@@ -109,7 +109,7 @@ class MotionState(NamedTuple):
         """`(n,)` points on things that stand still."""
         return self.there & (self.of_point > 0) & ~self.moves()[self.of_point]
 
-    def watched(self) -> Mask:
+    def monitored(self) -> Mask:
         """`(n,)` points on things that move."""
         return self.there & self.moves()[self.of_point]
 
@@ -118,9 +118,9 @@ class MeasuredPoints(NamedTuple):
     """Points in the world and in a frame.
 
     Attributes:
-        X_world: `(3, n)` metres, where they were.
-        X_cam: `(3, n)` metres, where they are in the axes of the camera.
-        sigma: `(3, n)` standard deviation of that, metres.
+        X_world: `(3, n)` meters, where they were.
+        X_cam: `(3, n)` meters, where they are in the axes of the camera.
+        sigma: `(3, n)` standard deviation of that, meters.
         there: `(n,)` which are known in both.
     """
 
@@ -143,7 +143,7 @@ def labels_at(labels: Labels, uv: Pixels) -> Int[Array, " n"]:
     return jnp.where((row >= 0) & (column >= 0), there, 0)  # negative indices count from the end
 
 
-def judge_motion(
+def classify_motion(
     points: MeasuredPoints,
     of_point: Int[Array, " n"],
     background: Weights,
@@ -155,8 +155,8 @@ def judge_motion(
 ) -> MotionState:
     """Which things stand still, given the pose that what cannot move has.
 
-    Lengths are in standard deviations of where a point is measured, not in metres as published: pixels are worth
-    millimetres across the line of sight and depth is worth centimetres along it, so that in metres a limit of what
+    Lengths are in standard deviations of where a point is measured, not in meters as published: pixels are worth
+    millimeters across the line of sight and depth is worth centimeters along it, so that in meters a limit of what
     depth shows hides what goes by. And a thing whose points have gone the same way on average moves though no single
     one does by the limit: noise of the mean of `n` points is `1 / sqrt(n)` of theirs.
 
@@ -182,12 +182,12 @@ def judge_motion(
     mean_limit = params.least + limit / jnp.sqrt(jnp.maximum(groups.number, 1))
     evidence = by_share if as_published else jnp.maximum(by_share, groups.mean / mean_limit)
     known = (groups.number >= params.fewest) & (limit > 0)
-    verdict = RegionVerdict(*judge(evidence, known, params.temperature)[:3])
+    verdict = RegionCueResult(*threshold_evidence(evidence, known, params.temperature)[:3])
     return MotionState(points.there, verdict, _remembered(verdict, of_point, before, params))
 
 
 def _remembered(
-    verdict: RegionVerdict, of_point: Int[Array, " n"], before: MotionMemory, params: MotionParams
+    verdict: RegionCueResult, of_point: Int[Array, " n"], before: MotionMemory, params: MotionParams
 ) -> MotionMemory:
     """The memory of each thing after this frame; that of a new one is of what moves.
 

@@ -8,13 +8,13 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxslam.dynamics.cue import Verdict
+from jaxslam.dynamics.cue import CueResult
 
 _DEPTH_STEP, _DEPTH_STEP_M = 0.05, 0.05
-"""Largest difference of depth on one surface: a share of depth, and metres besides."""
+"""Largest difference of depth on one surface: a share of depth, and meters besides."""
 
 
-def moving_points(verdicts: Sequence[Verdict]) -> Bool[np.ndarray, " n"]:
+def moving_points(verdicts: Sequence[CueResult]) -> Bool[np.ndarray, " n"]:
     """`(n,)` the points of which cues know that they rather move, by the product of their weights."""
     weight, known = 1.0, np.zeros((), bool)
     for verdict in verdicts:
@@ -29,7 +29,7 @@ def mask_around(
 
     Args:
         uv: Pixels; what is outside the image is left out.
-        depth: Metres, 0 where missing.
+        depth: Meters, 0 where missing.
         reach_px: How far around, in rows and in columns.
     """
     height, width = depth.shape
@@ -40,8 +40,8 @@ def mask_around(
     steps = np.arange(-reach_px, reach_px + 1)
     rows = np.clip(v[:, None] + steps, 0, height - 1)[:, :, None]
     columns = np.clip(u[:, None] + steps, 0, width - 1)[:, None, :]
-    around, centre = depth[rows, columns], there[:, None, None]
-    alike = np.abs(around - centre) <= _DEPTH_STEP * centre + _DEPTH_STEP_M
-    which, row, column = np.nonzero(alike | (centre <= 0) | (around <= 0))
+    around, center = depth[rows, columns], there[:, None, None]
+    alike = np.abs(around - center) <= _DEPTH_STEP * center + _DEPTH_STEP_M
+    which, row, column = np.nonzero(alike | (center <= 0) | (around <= 0))
     mask[rows[which, row, 0], columns[which, 0, column]] = True
     return mask

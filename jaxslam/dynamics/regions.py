@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 _PER_LIMIT = 0.25
 Centers = Float[Array, "3 k"]
-"""Of regions, in the axes of the camera, metres; not finite where none is known."""
+"""Of regions, in the axes of the camera, meters; not finite where none is known."""
 
 
 class RegionPlan(NamedTuple):
@@ -43,7 +43,7 @@ class Regions(NamedTuple):
     Attributes:
         of_pixel: `(h', w')` region of one pixel in each block of `step_px` by `step_px`; -1 for none, without depth.
         of_point: `(n,)` region of each point; -1 for none.
-        centers: `(3, k)` metres, in the axes of the camera; not finite for a region without pixels.
+        centers: `(3, k)` meters, in the axes of the camera; not finite for a region without pixels.
         num_pixels: `(k,)` pixels looked at that are in each.
     """
 
@@ -53,8 +53,8 @@ class Regions(NamedTuple):
     num_pixels: Int[Array, " k"]
 
 
-class RegionVerdict(NamedTuple):
-    """What a cue says of each region; as `Verdict`, `(k,)` each.
+class RegionCueResult(NamedTuple):
+    """What a cue says of each region; as `CueResult`, `(k,)` each.
 
     Attributes:
         weight: 0 for what moves to 1 for what is at rest; 1 where nothing is known.
@@ -92,9 +92,9 @@ def find_regions(
 
     Args:
         key: Of random choices: where regions begin of which nothing is known.
-        depth: `(h, w)` metres, 0 where missing.
+        depth: `(h, w)` meters, 0 where missing.
         before: Centers in the last frame.
-        X_cam: `(3, n)` points whose regions are asked for, in the axes of the camera, at its centre where not known.
+        X_cam: `(3, n)` points whose regions are asked for, in the axes of the camera, at its center where not known.
         intrinsics: The camera; lens distortion, which moves a whole region alike, may be left out.
         plan: Static.
     """
@@ -110,7 +110,7 @@ def find_regions(
     return Regions(found.label.reshape(sampled.shape), _nearest(X_cam, centers), centers, found.counts)
 
 
-def region_weights(verdicts: Sequence[RegionVerdict]) -> Float[Array, " k"]:
+def region_weights(verdicts: Sequence[RegionCueResult]) -> Float[Array, " k"]:
     """`(k,)` the product of the weights of verdicts on the same regions, at least one."""
     weight = verdicts[0].weight
     for verdict in verdicts[1:]:
@@ -119,7 +119,7 @@ def region_weights(verdicts: Sequence[RegionVerdict]) -> Float[Array, " k"]:
 
 
 def remembered_weights(
-    regions: Regions, verdicts: Sequence[RegionVerdict], before: Float[Array, " k"], plan: RegionPlan
+    regions: Regions, verdicts: Sequence[RegionCueResult], before: Float[Array, " k"], plan: RegionPlan
 ) -> Float[Array, " k"]:
     """`(k,)` what is remembered of regions: below one half, one moves whatever is said of it now.
 
@@ -150,7 +150,7 @@ def remembered_weights(
 
 def lasting_weights(
     regions: Regions,
-    verdicts: Sequence[RegionVerdict],
+    verdicts: Sequence[RegionCueResult],
     before: Float[Array, " k"],
     agreeing: Mask,
     plan: RegionPlan,
@@ -192,7 +192,7 @@ def mean_of_regions(values: Weights, counts: Mask, regions: Regions) -> tuple[Fl
     return sums / jnp.maximum(number, 1), number
 
 
-def even_votes(weights: Weights, regions: Regions) -> Weights:
+def balance_regions(weights: Weights, regions: Regions) -> Weights:
     """`(n,)` weights with which no region has more of a say than an even share; what is in none keeps its own.
 
     A textured box before the camera has most of the points, and a room behind it most of the surfaces.

@@ -11,7 +11,7 @@ from jaxslam_kernels.camera import Intrinsics, back_project
 from jaxslam_kernels.se3 import between, to_camera, to_world
 from jaxslam_kernels.types import Mask, Pixels, Points, Scalar, Weights
 
-from jaxslam.dynamics.cue import Scene, Verdict, judge
+from jaxslam.dynamics.cue import CueInput, CueResult, threshold_evidence
 
 
 class TrajectoryParams(NamedTuple):
@@ -31,7 +31,7 @@ class TrajectoryParams(NamedTuple):
     temperature: Scalar
 
 
-def trajectory_cue(scene: Scene, params: TrajectoryParams) -> Verdict:
+def trajectory_cue(scene: CueInput, params: TrajectoryParams) -> CueResult:
     """How far each point is from where it would be at rest, in tolerances.
 
     The paper compares the lengths of two ways: that of the point in the axes of the camera, and that of the camera.
@@ -54,13 +54,13 @@ def trajectory_cue(scene: Scene, params: TrajectoryParams) -> Verdict:
     published = jnp.abs(_length(now - before) - camera_m)
     apart_m = jnp.where(params.as_published > 0.5, published, _length(now - carried))
     tolerance_m = params.tolerance_m + params.tolerance_per_m * jnp.minimum(scene.depth_before, scene.depth)
-    return judge(apart_m / jnp.where(known, tolerance_m, 1), known, params.temperature)
+    return threshold_evidence(apart_m / jnp.where(known, tolerance_m, 1), known, params.temperature)
 
 
 def _in_camera(uv: Pixels, depth: Weights, known: Mask, intrinsics: Intrinsics) -> Points:
-    """Points in camera axes; those that are not known on the optical axis, a metre away."""
-    centre = jnp.stack([intrinsics.cx, intrinsics.cy])[:, None]
-    return back_project(intrinsics, jnp.where(known, uv, centre), jnp.where(known, depth, 1))
+    """Points in camera axes; those that are not known on the optical axis, a meter away."""
+    center = jnp.stack([intrinsics.cx, intrinsics.cy])[:, None]
+    return back_project(intrinsics, jnp.where(known, uv, center), jnp.where(known, depth, 1))
 
 
 def _length(way: Points) -> Weights:

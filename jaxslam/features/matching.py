@@ -12,7 +12,7 @@ NEAR = 50
 _BITS = 256
 _TURN_BINS = 30
 _TURN_PEAKS = 3
-_LEAST_PEAK = 0.1
+_MIN_PEAK = 0.1
 """Bins of the turn between two images, how many of the fullest are kept, and their least size relative to the
 fullest: `HISTO_LENGTH` and `ComputeThreeMaxima` of ORB-SLAM."""
 _OCTAVES_APART = 1
@@ -73,7 +73,7 @@ def same_turn(turn: Float32[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
     bins = np.round(turn * (_TURN_BINS / (2 * np.pi))).astype(np.int64) % _TURN_BINS
     counts = np.bincount(bins, minlength=_TURN_BINS)
     fullest = np.argsort(-counts, kind="stable")[:_TURN_PEAKS]
-    return np.isin(bins, fullest[counts[fullest] >= _LEAST_PEAK * counts[fullest[0]]])
+    return np.isin(bins, fullest[counts[fullest] >= _MIN_PEAK * counts[fullest[0]]])
 
 
 def predicted_octave(
@@ -83,8 +83,8 @@ def predicted_octave(
 
     Args:
         octave: `(n,)` where they were found.
-        depth_then: `(n,)` their depth there, metres, positive.
-        depth_now: `(n,)` their depth where they are to be found, metres, positive.
+        depth_then: `(n,)` their depth there, meters, positive.
+        depth_now: `(n,)` their depth where they are to be found, meters, positive.
         plan: How features are found.
     """
     change = np.log(depth_then / depth_now) / np.log(plan.scale_factor)
@@ -106,7 +106,7 @@ def match_by_projection(
 
     Args:
         predicted_uv: `(2, p)` pixels of the ideal camera, as `features.uv`. A point that is not finite is not sought.
-        octave: `(p,)` of `predicted_octave`; features of neighbouring octaves are looked at too.
+        octave: `(p,)` of `predicted_octave`; features of neighboring octaves are looked at too.
         descriptor: Of the points.
         features: Of the image.
         radius_px: How far to look at octave 0; further for coarser features, which are located less exactly.

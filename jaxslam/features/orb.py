@@ -1,4 +1,4 @@
-"""ORB features of an image: what can be recognised from other places and later."""
+"""ORB features of an image: what can be recognized from other places and later."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -7,15 +7,15 @@ import cv2
 import jax
 import numpy as np
 from jaxslam_kernels.camera import to_pixels
-from jaxslam_kernels.depth.sampling import believable, sample_depth
+from jaxslam_kernels.depth.sampling import sample_depth, valid_depth
 from jaxslam_kernels.image.pyramid import build_pyramid
 from jaxslam_kernels.types import Pixels, Weights
 from jaxtyping import Array, Bool, Float, Float32, UInt8
 
 from jaxslam.runtime.padding import padded
-from jaxslam.runtime.trace_cache import traced_once
+from jaxslam.runtime.trace_cache import cached_trace
 from jaxslam.sensors.frame_arrays import FrameArrays
-from jaxslam.tracking.measurement import RIGHT_LEVELS, View, match_depth, observe
+from jaxslam.tracking.measurement import RIGHT_LEVELS, PreparedFrame, match_depth, measure
 from jaxslam.tracking.state import TrackParams
 
 DESCRIPTOR_BYTES = 32
@@ -25,7 +25,7 @@ _BORDER_PX = 19
 _CLEARANCE_PX = 8
 """How far from what is to be ignored the middle of a patch must be, pixels of its level: most comparisons of a
 descriptor lie within it."""
-_MOST_CANDIDATES = 12
+_MAX_CANDIDATES = 12
 """Corners a level looked at for every feature wanted; it bounds the time that noise and gravel take."""
 
 
@@ -33,15 +33,15 @@ class Features(NamedTuple):
     """ORB features of one image, `n` of them.
 
     Attributes:
-        seen_uv: Where they are, pixels of the distorted image.
+        uv_raw: Where they are, pixels of the distorted image.
         uv: Where an ideal pinhole camera without distortion and rolling shutter would have seen them, pixels.
-        depth: Metres, 0 where there is none to believe.
+        depth: Meters, 0 where there is none to believe.
         octave: Level of the scale pyramid, 0 the finest.
         angle: Direction of the patch, radians, from u towards v.
         descriptor: 256 bits each.
     """
 
-    seen_uv: Float32[np.ndarray, "2 n"]
+    uv_raw: Float32[np.ndarray, "2 n"]
     uv: Float32[np.ndarray, "2 n"]
     depth: Float32[np.ndarray, " n"]
     octave: UInt8[np.ndarray, " n"]
@@ -56,7 +56,7 @@ class FeaturePlan(NamedTuple):
         num_features: At most so many.
         num_levels: Levels of the scale pyramid.
         scale_factor: From one level to the next.
-        fast_threshold: Contrast of a corner, grey values.
+        fast_threshold: Contrast of a corner, gray values.
         min_fast_threshold: The same in cells that have no such corner.
     """
 
@@ -80,7 +80,7 @@ class FeaturePlan(NamedTuple):
 class Patches(NamedTuple):
     """Features as found in the image, without geometry; as in `Features`."""
 
-    seen_uv: Float32[np.ndarray, "2 n"]
+    uv_raw: Float32[np.ndarray, "2 n"]
     octave: UInt8[np.ndarray, " n"]
     angle: Float32[np.ndarray, " n"]
     descriptor: UInt8[np.ndarray, "n 32"]
@@ -96,18 +96,18 @@ def features_of(
 
     Args:
         frame: Its image is uint8; nothing is taken where it says `ignore`.
-        twist: `(6,)` velocity of the camera in its own axes, metres a second then radians a second.
+        twist: `(6,)` velocity of the camera in its own axes, meters a second then radians a second.
         params: Camera, readout time, and the depths that are believed.
         plan: How features are found.
     """
     patches = extract(np.asarray(frame.image), np.asarray(frame.ignore), plan)
     num = len(patches.octave)
-    fixed_size = padded(patches.seen_uv, plan.num_features, axis=1)  # compiled once
+    fixed_size = padded(patches.uv_raw, plan.num_features, axis=1)  # compiled once
     uv, depth = jax.device_get(_ideal(fixed_size, twist.astype(np.float32), frame, params))
-    return Features(patches.seen_uv, uv[:, :num], depth[:num], *patches[1:])
+    return Features(patches.uv_raw, uv[:, :num], depth[:num], *patches[1:])
 
 
-def extract(grey: np.ndarray, ignore: np.ndarray | None = None, plan: FeaturePlan = DEFAULT_PLAN) -> Patches:
+def extract(gray: np.ndarray, ignore: np.ndarray | None = None, plan: FeaturePlan = DEFAULT_PLAN) -> Patches:
     """ORB features, well spread over the image.
 
     Every level of the pyramid has its quota and a grid of as many cells. The best corner of every cell comes first,
@@ -117,17 +117,17 @@ def extract(grey: np.ndarray, ignore: np.ndarray | None = None, plan: FeaturePla
     ORB-SLAM's (Mur-Artal et al. 2015).
 
     Args:
-        grey: `(h, w)` uint8.
+        gray: `(h, w)` uint8.
         ignore: `(h, w)` bool, true where no feature may be.
         plan: How many, and where.
     """
     clearance = None if ignore is None or not ignore.any() else _distance_to(ignore)
-    levels = zip(_pyramid(grey, plan), plan.quotas(), strict=True)
-    found = [_extract_level(grey, picture, clearance, int(quota), plan) for picture, quota in levels]
+    levels = zip(_pyramid(gray, plan), plan.quotas(), strict=True)
+    found = [_extract_level(gray, picture, clearance, int(quota), plan) for picture, quota in levels]
     found = [patches._replace(octave=patches.octave + np.uint8(level)) for level, patches in enumerate(found)]
-    seen_uv, octave, angle, descriptor = zip(*found, strict=True)
+    uv_raw, octave, angle, descriptor = zip(*found, strict=True)
     return Patches(
-        np.concatenate(seen_uv, axis=1), np.concatenate(octave), np.concatenate(angle), np.concatenate(descriptor)
+        np.concatenate(uv_raw, axis=1), np.concatenate(octave), np.concatenate(angle), np.concatenate(descriptor)
     )
 
 
@@ -137,13 +137,13 @@ def _distance_to(ignore: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
 
 
 def _extract_level(
-    grey: np.ndarray, picture: np.ndarray, clearance: np.ndarray | None, quota: int, plan: FeaturePlan
+    gray: np.ndarray, picture: np.ndarray, clearance: np.ndarray | None, quota: int, plan: FeaturePlan
 ) -> Patches:
     """Features of one level, called octave 0."""
     if min(picture.shape) <= 2 * _BORDER_PX or quota == 0:
         return _no_patches()
     orb = cv2.ORB.create(
-        nfeatures=_MOST_CANDIDATES * quota,
+        nfeatures=_MAX_CANDIDATES * quota,
         nlevels=1,
         edgeThreshold=_BORDER_PX,
         scoreType=cv2.ORB_FAST_SCORE,
@@ -155,22 +155,22 @@ def _extract_level(
     response = np.array([corner.response for corner in corners], np.float32)
     clear = np.arange(len(corners))
     if clearance is not None:
-        column, row = np.round(_in_image(uv, picture, grey)).astype(np.int64)
-        clear = np.flatnonzero(clearance[row, column] > _CLEARANCE_PX * grey.shape[0] / picture.shape[0])
+        column, row = np.round(_in_image(uv, picture, gray)).astype(np.int64)
+        clear = np.flatnonzero(clearance[row, column] > _CLEARANCE_PX * gray.shape[0] / picture.shape[0])
     chosen = clear[_spread(uv[:, clear], response[clear], picture.shape, quota, plan.fast_threshold)]
     if not len(chosen):
         return _no_patches()
     kept, descriptor = orb.compute(picture, [corners[index] for index in chosen])
     angle = np.radians(np.array([corner.angle for corner in kept], np.float32))
-    seen_uv = _in_image(_positions(kept), picture, grey)
-    return Patches(seen_uv, np.zeros(len(kept), np.uint8), angle, descriptor)
+    uv_raw = _in_image(_positions(kept), picture, gray)
+    return Patches(uv_raw, np.zeros(len(kept), np.uint8), angle, descriptor)
 
 
-def _pyramid(grey: np.ndarray, plan: FeaturePlan) -> list[np.ndarray]:
+def _pyramid(gray: np.ndarray, plan: FeaturePlan) -> list[np.ndarray]:
     """Every level made from the one before, so that fine texture is smoothed away and not sampled."""
-    pictures = [np.ascontiguousarray(grey)]
+    pictures = [np.ascontiguousarray(gray)]
     for scale in plan.scale(np.arange(1, plan.num_levels)):
-        height, width = (max(round(side / float(scale)), 1) for side in grey.shape)
+        height, width = (max(round(side / float(scale)), 1) for side in gray.shape)
         pictures.append(cv2.resize(pictures[-1], (width, height)))
     return pictures
 
@@ -179,9 +179,9 @@ def _positions(corners: Sequence[cv2.KeyPoint]) -> Float32[np.ndarray, "2 n"]:
     return np.asarray(cv2.KeyPoint.convert(corners), np.float32).reshape(-1, 2).T
 
 
-def _in_image(uv: np.ndarray, picture: np.ndarray, grey: np.ndarray) -> Float32[np.ndarray, "2 n"]:
+def _in_image(uv: np.ndarray, picture: np.ndarray, gray: np.ndarray) -> Float32[np.ndarray, "2 n"]:
     """Where pixels of a shrunk picture are in the image: the outer edges of both coincide, not their first pixels."""
-    ratio = np.array([[grey.shape[1] / picture.shape[1]], [grey.shape[0] / picture.shape[0]]], np.float32)
+    ratio = np.array([[gray.shape[1] / picture.shape[1]], [gray.shape[0] / picture.shape[0]]], np.float32)
     return (uv + np.float32(0.5)) * ratio - np.float32(0.5)
 
 
@@ -209,8 +209,8 @@ def _spread(
 
 def no_features() -> Features:
     """Features of an image that has none."""
-    seen_uv, *rest = _no_patches()
-    return Features(seen_uv, seen_uv, np.zeros(0, np.float32), *rest)
+    uv_raw, *rest = _no_patches()
+    return Features(uv_raw, uv_raw, np.zeros(0, np.float32), *rest)
 
 
 def _no_patches() -> Patches:
@@ -223,16 +223,14 @@ def _no_patches() -> Patches:
 
 
 @jax.jit
-@traced_once
-def _ideal(
-    seen_uv: Pixels, twist: Float[Array, "6"], frame: FrameArrays, params: TrackParams
-) -> tuple[Pixels, Weights]:
+@cached_trace
+def _ideal(uv_raw: Pixels, twist: Float[Array, "6"], frame: FrameArrays, params: TrackParams) -> tuple[Pixels, Weights]:
     """Pixels of the ideal camera, and depth; of a pair by matching."""
-    believed = believable(frame.depth, params.min_depth_m, params.max_depth_m)
-    rough, matched = sample_depth(believed, seen_uv), None
+    believed = valid_depth(frame.depth, params.min_depth_m, params.max_depth_m)
+    rough, matched = sample_depth(believed, uv_raw), None
     if frame.right is not None:
-        pyramid = build_pyramid(frame.image, num_levels=RIGHT_LEVELS, dtype=seen_uv.dtype)
-        view = View(frame, pyramid, believed, frame.dt_s).with_right()
-        matched = match_depth(view, seen_uv, rough, rough > 0, params, known_point=False)
-    seen = observe(seen_uv, rough, twist, believed, frame.depth_delay_s, params, matched=matched)
+        pyramid = build_pyramid(frame.image, num_levels=RIGHT_LEVELS, dtype=uv_raw.dtype)
+        view = PreparedFrame(frame, pyramid, believed, frame.dt_s).with_right()
+        matched = match_depth(view, uv_raw, rough, rough > 0, params, known_point=False)
+    seen = measure(uv_raw, rough, twist, believed, frame.depth_delay_s, params, matched=matched)
     return to_pixels(params.intrinsics, seen.xy), seen.depth

@@ -13,9 +13,9 @@ from jaxslam_kernels.types import Pixels, Points, Weights
 from jaxtyping import Float64, Int64
 
 from jaxslam.features.orb import FeaturePlan, Features
-from jaxslam.runtime.compile_cache import SOON_COMPILED
+from jaxslam.runtime.compile_cache import FAST_COMPILE
 from jaxslam.runtime.padding import padded
-from jaxslam.runtime.trace_cache import traced_once
+from jaxslam.runtime.trace_cache import cached_trace
 from jaxslam.tracking.measurement import depth_sigma
 from jaxslam.tracking.state import TrackParams
 
@@ -29,7 +29,7 @@ what is seen in a small part of the image may be a thing that is there twice."""
 _CELL = 0.15
 """Side of such a cell in focal lengths, 9 degrees: 48 of them in an image of 640 x 480 pixels and 525 focal length."""
 MAX_SIGMA_M = 0.03
-"""Largest standard deviation of the position in any direction, metres."""
+"""Largest standard deviation of the position in any direction, meters."""
 _SIGMA_PX = 1.0
 """Standard deviation of a feature of octave 0, each coordinate."""
 _CHI2_GATES = (9.21, 11.34)
@@ -40,7 +40,7 @@ class Matches(NamedTuple):
     """Points found among the features of an image; padded with weight 0 to a fixed size.
 
     Attributes:
-        X: `(3, n)` where the points are, in the axes the pose is sought in, metres.
+        X: `(3, n)` where the points are, in the axes the pose is sought in, meters.
         depth_then: `(n,)` depth from which that was measured, whose error counts too; 0 for a point better known.
         uv: `(2, n)` the features, pixels of the ideal camera.
         depth: `(n,)` measured there, 0 for none.
@@ -157,12 +157,12 @@ def pinhole(params: TrackParams) -> tuple[np.ndarray, np.ndarray]:
 
 def _cells(uv: np.ndarray, params: TrackParams) -> int:
     """How many cells of the image hold one of the pixels."""
-    focal, centre = pinhole(params)
-    return np.unique(np.floor((uv - centre) / (_CELL * focal)), axis=1).shape[1]
+    focal, center = pinhole(params)
+    return np.unique(np.floor((uv - center) / (_CELL * focal)), axis=1).shape[1]
 
 
-@partial(jax.jit, compiler_options=SOON_COMPILED)
-@traced_once
+@partial(jax.jit, compiler_options=FAST_COMPILE)
+@cached_trace
 def _refined(T_origin_cam: SE3, matches: Matches, params: TrackParams) -> PoseRefinement:
     return refine_pose(
         T_origin_cam,

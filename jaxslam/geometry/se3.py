@@ -77,7 +77,7 @@ def angle(T: np.ndarray) -> np.ndarray:
     return 2 * np.arctan2(np.linalg.norm(T[..., 1:4], axis=-1), np.abs(T[..., 0]))
 
 
-def moved(T: np.ndarray, tangent: np.ndarray) -> np.ndarray:
+def retract(T: np.ndarray, tangent: np.ndarray) -> np.ndarray:
     """`(7,)` transform after a small motion in its own axes: translation, then rotation vector, each by itself."""
     turn = np.linalg.norm(tangent[3:])
     axis = np.sinc(turn / (2 * np.pi)) * 0.5 * tangent[3:]

@@ -72,7 +72,7 @@ def unpack(
     owners and permissions. One process at a time for a target.
 
     Args:
-        archive: A .tgz or .zip file, recognised by its content.
+        archive: A .tgz or .zip file, recognized by its content.
         target: What the folder becomes; must not be there yet. Folders above it are made.
         holds: Files that must be in the folder.
         max_bytes: Of all files when unpacked.

@@ -23,7 +23,7 @@ Progress: TypeAlias = Callable[[int, int | None], None]
 _CHUNK_BYTES = 1 << 16
 _TRANSIENT = frozenset({408, 425, 429, 500, 502, 503, 504})  # HTTP statuses that may be others in a moment
 _TIMEOUT_S = 20.0
-_MOST_BYTES = 1 << 36
+_MAX_BYTES = 1 << 36
 """Of a file whose length neither the server nor the caller knows; it could have no end."""
 _CHANGED = "the file on the server has changed"
 
@@ -218,11 +218,11 @@ def _append(wanted: _Wanted, response: Any, offset: int, total: int | None) -> N
             done += len(chunk)
             if wanted.progress is not None:
                 wanted.progress(done, total)
-            if done > (_MOST_BYTES if total is None else total):
+            if done > (_MAX_BYTES if total is None else total):
                 break
-    if total is None and done > _MOST_BYTES:
+    if total is None and done > _MAX_BYTES:
         wanted.forget()
-        raise DownloadError(f"the server gives more than {_MOST_BYTES} bytes and does not say how many there are")
+        raise DownloadError(f"the server gives more than {_MAX_BYTES} bytes and does not say how many there are")
     if total is not None and done > total:
         wanted.forget()
         raise DownloadError(f"expected {total} bytes, the server gives more")

@@ -7,7 +7,7 @@ import time
 import urllib.request
 from typing import Any
 
-_LEAST_BYTES_PER_S = 1000
+_MIN_BYTES_PER_S = 1000
 """A server that gives less would not be done with a recording in a month."""
 
 
@@ -38,7 +38,7 @@ class _PacedReader(io.RawIOBase):
         self._num_bytes += num_bytes
         passed_s = time.monotonic() - self._began_s
         if num_bytes and passed_s > self._timeout_s:
-            if self._num_bytes < _LEAST_BYTES_PER_S * passed_s:
+            if self._num_bytes < _MIN_BYTES_PER_S * passed_s:
                 raise TooSlowError(f"the server gave {self._num_bytes} bytes in {passed_s:.1f} s")
             self._began_s, self._num_bytes = time.monotonic(), 0
         return num_bytes

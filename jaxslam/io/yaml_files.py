@@ -9,7 +9,7 @@ import yaml
 
 from jaxslam.errors import JaxSlamError, nearest, one_line
 
-_MOST_CHARACTERS = 1 << 17
+_MAX_CHARACTERS = 1 << 17
 """Of a file: more take PyYAML longer than a second. What people write by hand has a tenth of it."""
 _OPENCV_HEADER = re.compile(r"\A%YAML:[^\n]*")
 _FLOAT_TAG, _BOOL_TAG = "tag:yaml.org,2002:float", "tag:yaml.org,2002:bool"
@@ -67,8 +67,8 @@ def parse_yaml(text: str, origin: str, error: type[JaxSlamError]) -> Any:
         JaxSlamError: Of class `error`, naming `origin` and the line, if it is no YAML, a key stands twice, or it is too
             long or nested too deep.
     """
-    if len(text) > _MOST_CHARACTERS:
-        raise error(f"{origin}: expected at most {_MOST_CHARACTERS} characters of YAML, got {len(text)}")
+    if len(text) > _MAX_CHARACTERS:
+        raise error(f"{origin}: expected at most {_MAX_CHARACTERS} characters of YAML, got {len(text)}")
     try:
         content = yaml.load(_OPENCV_HEADER.sub("", text), Loader=_Loader)
         num_values = _num_values(content, {})
@@ -79,8 +79,8 @@ def parse_yaml(text: str, origin: str, error: type[JaxSlamError]) -> Any:
         raise error(f"{origin}: not readable as YAML: {one_line(problem)}") from None
     except RecursionError:
         raise error(f"{origin}: not readable as YAML: nested too deep, or holds itself") from None
-    if num_values > _MOST_CHARACTERS:
-        raise error(f"{origin}: expected at most {_MOST_CHARACTERS} values, got {num_values:.3g} by aliases")
+    if num_values > _MAX_CHARACTERS:
+        raise error(f"{origin}: expected at most {_MAX_CHARACTERS} values, got {num_values:.3g} by aliases")
     return content
 
 

@@ -49,10 +49,10 @@ class PlaceIndex:
         self._added: set[int] = set()
 
     @classmethod
-    def from_map(cls, map: Map) -> "PlaceIndex":
+    def from_map(cls, slam_map: Map) -> "PlaceIndex":
         """An index of all keyframes of a map."""
         index = cls()
-        for keyframe in map.keyframes:
+        for keyframe in slam_map.keyframes:
             index.add(keyframe.id, keyframe.features)
         return index
 
@@ -164,7 +164,7 @@ def _votes(block: _Block, descriptor: UInt8[np.ndarray, "n 32"]) -> Int64[np.nda
     """Features and the keyframes of a block that hold one like them; some pairs come more than once."""
     sought, entries = [np.zeros(0, np.int64)], [np.zeros(0, np.int32)]
     for wanted, keys, order in zip(_keys(descriptor), block.keys, block.order, strict=True):
-        by_key = np.argsort(wanted)  # neighbouring searches then touch the same memory
+        by_key = np.argsort(wanted)  # neighboring searches then touch the same memory
         start = np.searchsorted(keys, wanted[by_key])
         count = np.searchsorted(keys, wanted[by_key], side="right") - start
         within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)

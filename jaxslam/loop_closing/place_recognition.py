@@ -1,4 +1,4 @@
-"""Recognising a place: where an image was taken, relative to a keyframe that shows the same place."""
+"""Recognizing a place: where an image was taken, relative to a keyframe that shows the same place."""
 
 from collections.abc import Set
 from functools import partial
@@ -17,13 +17,13 @@ from jaxslam.features.pose_from_matches import Matches, fit_pose, matches_depth_
 from jaxslam.geometry.se3 import IDENTITY, to_local
 from jaxslam.loop_closing.place_index import PlaceIndex
 from jaxslam.map.types import Keyframe, Map, has
-from jaxslam.runtime.compile_cache import SOON_COMPILED
-from jaxslam.runtime.trace_cache import traced_once
+from jaxslam.runtime.compile_cache import FAST_COMPILE
+from jaxslam.runtime.trace_cache import cached_trace
 from jaxslam.tracking.state import TrackParams
 
 MIN_AGREEING = 12
 """Fewest matches of descriptors alone that agree on a pose."""
-_MOST_MATCHES = 512
+_MAX_MATCHES = 512
 _HYPOTHESES = 256
 _GATE_SIGMAS = 3.0
 _GUIDED_PX = 8.0
@@ -32,10 +32,10 @@ _GUIDED_RATIO = 0.9
 
 
 class Recognition(NamedTuple):
-    """A place recognised.
+    """A place recognized.
 
     Attributes:
-        keyframe: Id of the keyframe it was recognised in.
+        keyframe: Id of the keyframe it was recognized in.
         T_keyframe_cam: `wxyz_xyz`, the pose of the camera in the axes of the keyframe.
         covariance: Of the pose in the tangent space at the camera: translation (m), then rotation (rad). Errors that
             features have in common are not in it.
@@ -52,8 +52,8 @@ class Recognition(NamedTuple):
     pairs: Int64[np.ndarray, "2 k"]
 
 
-def recognise(
-    map: Map,
+def recognize(
+    slam_map: Map,
     index: PlaceIndex,
     features: Features,
     params: TrackParams,
@@ -68,18 +68,18 @@ def recognise(
     A wrong place is worse than none: enough features, spread over the image, must agree with one pose.
 
     Args:
-        map: Holds the keyframes. Those of the index that are not in it are passed over.
+        slam_map: Holds the keyframes. Those of the index that are not in it are passed over.
         index: Of its keyframes.
         features: Of the image.
         params: Camera, of which ideal pixels leave the pinhole, and the errors of its depth.
-        exclude: Keyframes not to be recognised, such as the latest ones.
+        exclude: Keyframes not to be recognized, such as the latest ones.
         limit: Most keyframes looked at, the most alike first.
         seed: Of random choices.
         plan: How features were found.
     """
     for keyframe_id, _ in index.query(features, exclude, limit):
-        if has(map.ids, np.array([keyframe_id]))[0]:
-            found = verify(map.keyframe(keyframe_id), features, params, seed=seed, plan=plan)
+        if has(slam_map.ids, np.array([keyframe_id]))[0]:
+            found = verify(slam_map.keyframe(keyframe_id), features, params, seed=seed, plan=plan)
             if found is not None:
                 return found
     return None
@@ -88,14 +88,14 @@ def recognise(
 def verify(
     keyframe: Keyframe, features: Features, params: TrackParams, *, seed: int = 0, plan: FeaturePlan = DEFAULT_PLAN
 ) -> Recognition | None:
-    """Where an image was taken, relative to one keyframe, if it certainly shows the same place; as in `recognise`."""
+    """Where an image was taken, relative to one keyframe, if it certainly shows the same place; as in `recognize`."""
     source = keyframe.features
     pairs = _by_descriptor(source, features)
     if pairs.shape[1] < MIN_AGREEING:
         return None
     key = jax.random.fold_in(jax.random.key(seed), keyframe.id)
     coarse: PnpResult = jax.device_get(
-        _agreed(key, _matches(source, features, pairs, _MOST_MATCHES, params, plan), params)
+        _agreed(key, _matches(source, features, pairs, _MAX_MATCHES, params, plan), params)
     )
     if coarse.status > PoseStatus.NOT_CONVERGED:
         return None
@@ -112,7 +112,7 @@ def _by_descriptor(source: Features, features: Features) -> Int64[np.ndarray, "2
     pairs = match_descriptors(source, features)
     pairs = pairs[:, source.depth[pairs[0]] > 0]
     distance = hamming_pairs(source.descriptor[pairs[0]], features.descriptor[pairs[1]])
-    return pairs[:, np.argsort(distance, kind="stable")[:_MOST_MATCHES]]
+    return pairs[:, np.argsort(distance, kind="stable")[:_MAX_MATCHES]]
 
 
 def _where_expected(
@@ -123,9 +123,9 @@ def _where_expected(
     X_cam = to_local(T_keyframe_cam, _in_camera(source, params)[:, known])
     in_front = X_cam[2] > float(params.min_depth_m)
     known, X_cam = known[in_front], X_cam[:, in_front]
-    focal, centre = pinhole(params)
+    focal, center = pinhole(params)
     pairs = match_by_projection(
-        X_cam[:2] / X_cam[2] * focal + centre,
+        X_cam[:2] / X_cam[2] * focal + center,
         predicted_octave(source.octave[known], source.depth[known], X_cam[2], plan),
         source.descriptor[known],
         features,
@@ -139,9 +139,9 @@ def _where_expected(
 
 
 def _in_camera(features: Features, params: TrackParams) -> Float64[np.ndarray, "3 n"]:
-    """Where features are in the axes of their camera; at its centre without depth."""
-    focal, centre = pinhole(params)
-    return np.concatenate([(features.uv - centre) / focal, np.ones((1, len(features.depth)))]) * features.depth
+    """Where features are in the axes of their camera; at its center without depth."""
+    focal, center = pinhole(params)
+    return np.concatenate([(features.uv - center) / focal, np.ones((1, len(features.depth)))]) * features.depth
 
 
 def _matches(
@@ -152,8 +152,8 @@ def _matches(
     return matches_of(X, source.depth[then], features, now, plan, capacity=capacity)
 
 
-@partial(jax.jit, compiler_options=SOON_COMPILED)
-@traced_once
+@partial(jax.jit, compiler_options=FAST_COMPILE)
+@cached_trace
 def _agreed(key: Key[Array, ""], matches: Matches, params: TrackParams) -> PnpResult:
     return ransac_pnp(
         key,
@@ -170,9 +170,9 @@ def _agreed(key: Key[Array, ""], matches: Matches, params: TrackParams) -> PnpRe
 
 
 def compile_recognition(params: TrackParams, plan: FeaturePlan = DEFAULT_PLAN) -> None:
-    """Compile all that `recognise` needs, so that nothing is compiled while frames come."""
+    """Compile all that `recognize` needs, so that nothing is compiled while frames come."""
     nothing: Any = np.zeros((2, 0), np.int64)
     empty = no_features()
     key = jax.random.fold_in(jax.random.key(0), 0)
-    jax.block_until_ready(_agreed(key, _matches(empty, empty, nothing, _MOST_MATCHES, params, plan), params))
+    jax.block_until_ready(_agreed(key, _matches(empty, empty, nothing, _MAX_MATCHES, params, plan), params))
     fit_pose(IDENTITY, _matches(empty, empty, nothing, plan.num_features, params, plan), params)

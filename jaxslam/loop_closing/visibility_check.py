@@ -9,10 +9,10 @@ from jaxslam.sensors.camera import Camera
 _NEAR_PX = 8.0
 _SAME_SHARE, _SAME_M = 0.1, 0.02
 """Difference of depth up to which two are the same, as a share of it and besides."""
-_LEAST_COMPARED = 50
+_MIN_COMPARED = 50
 
 
-def seen_through(camera: Camera, source: Features, target: Features, T_source_target: np.ndarray) -> float:
+def see_through_ratio(camera: Camera, source: Features, target: Features, T_source_target: np.ndarray) -> float:
     """Share of the surfaces of one keyframe that another would have to see through, of those it could see.
 
     What is nearer there than expected may hide a surface, or have come there. What is farther contradicts: a thing
@@ -30,14 +30,14 @@ def seen_through(camera: Camera, source: Features, target: Features, T_source_ta
     """
     from scipy.spatial import KDTree  # noqa: PLC0415 - see `late_imports`
 
-    focal, centre = np.array([[camera.fx], [camera.fy]]), np.array([[camera.cx], [camera.cy]])
+    focal, center = np.array([[camera.fx], [camera.fy]]), np.array([[camera.cx], [camera.cy]])
     known, measured = source.depth > 0, target.depth > 0
     if not known.any() or not measured.any():
         return 0.0
-    rays = np.concatenate([(source.uv[:, known] - centre) / focal, np.ones((1, np.count_nonzero(known)))])
+    rays = np.concatenate([(source.uv[:, known] - center) / focal, np.ones((1, np.count_nonzero(known)))])
     X = to_local(T_source_target, rays * source.depth[known])
     X = X[:, X[2] > _SAME_M]
-    uv = X[:2] / X[2] * focal + centre
+    uv = X[:2] / X[2] * focal + center
     apart, nearest = (
         np.asarray(a) for a in KDTree(target.uv[:, measured].T).query(uv.T, distance_upper_bound=_NEAR_PX)
     )
@@ -46,4 +46,4 @@ def seen_through(camera: Camera, source: Features, target: Features, T_source_ta
     farther = target.depth[measured][nearest[close]] - expected
     bound = _SAME_SHARE * expected + _SAME_M
     through, same = np.count_nonzero(farther > bound), np.count_nonzero(np.abs(farther) <= bound)
-    return through / (through + same) if through + same >= _LEAST_COMPARED else 0.0
+    return through / (through + same) if through + same >= _MIN_COMPARED else 0.0

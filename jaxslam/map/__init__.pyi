@@ -5,4 +5,4 @@ from .types import Keyframe as Keyframe
 from .types import Loops as Loops
 from .types import Map as Map
 from .types import MapPoints as MapPoints
-from .types import Sightings as Sightings
+from .types import Observations as Observations

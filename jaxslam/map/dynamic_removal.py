@@ -14,7 +14,7 @@ from jaxslam.map.edit import without_points
 from jaxslam.map.types import NONE, Keyframe, Map, has
 
 
-class Movers(NamedTuple):
+class DynamicObservations(NamedTuple):
     """What may move in a keyframe.
 
     Attributes:
@@ -28,14 +28,14 @@ class Movers(NamedTuple):
     tracks: Int64[np.ndarray, " n"]
 
 
-def under(mask: Bool[np.ndarray, "h w"], seen_uv: Num[np.ndarray, "2 n"]) -> Bool[np.ndarray, " n"]:
+def under(mask: Bool[np.ndarray, "h w"], uv_raw: Num[np.ndarray, "2 n"]) -> Bool[np.ndarray, " n"]:
     """Which pixels of the image, as seen, are under a mask; those beyond its border count as on it."""
     limits = np.array(mask.shape[::-1])[:, None] - 1
-    column, row = np.clip(np.round(seen_uv), 0, limits).astype(np.int64)
+    column, row = np.clip(np.round(uv_raw), 0, limits).astype(np.int64)
     return mask[row, column]
 
 
-def without_movers(map: Map, keyframe_id: int, mask: Bool[np.ndarray, "h w"]) -> Map:
+def without_dynamic(slam_map: Map, keyframe_id: int, mask: Bool[np.ndarray, "h w"]) -> Map:
     """The map without what a keyframe shows under a mask.
 
     The features there leave the keyframe, and the points that it saw there leave the map, with all that was seen of
@@ -44,29 +44,29 @@ def without_movers(map: Map, keyframe_id: int, mask: Bool[np.ndarray, "h w"]) ->
     Raises:
         KeyError: If the keyframe is not in the map.
     """
-    keyframe, seen = map.keyframe(keyframe_id), map.sightings
-    stays = ~under(mask, keyframe.features.seen_uv)
+    keyframe, seen = slam_map.keyframe(keyframe_id), slam_map.observations
+    stays = ~under(mask, keyframe.features.uv_raw)
     mine = np.flatnonzero(seen.keyframe == keyframe_id)
-    hidden = under(mask, seen.seen_uv[:, mine])
+    hidden = under(mask, seen.uv_raw[:, mine])
     by_feature = seen.feature[mine] != NONE
     hidden[by_feature] |= ~stays[seen.feature[mine][by_feature]]
-    map = without_points(map, np.unique(seen.point[mine[hidden]]))
-    return _with_features(map, keyframe, stays)
+    slam_map = without_points(slam_map, np.unique(seen.point[mine[hidden]]))
+    return _with_features(slam_map, keyframe, stays)
 
 
-def without_known(map: Map, point_ids: np.ndarray) -> Map:
+def without_dynamic_points(slam_map: Map, point_ids: np.ndarray) -> Map:
     """Remove those of some points that are in the map."""
     known = np.unique(point_ids)
-    return without_points(map, known[has(map.points.ids, known)])
+    return without_points(slam_map, known[has(slam_map.points.ids, known)])
 
 
-def _with_features(map: Map, keyframe: Keyframe, stays: Bool[np.ndarray, " n"]) -> Map:
+def _with_features(slam_map: Map, keyframe: Keyframe, stays: Bool[np.ndarray, " n"]) -> Map:
     """The map with only some features of a keyframe; no point may be seen by the others."""
-    row, features, seen = map.row(keyframe.id), keyframe.features, map.sightings
+    row, features, seen = slam_map.row(keyframe.id), keyframe.features, slam_map.observations
     kept = {name: array[..., stays] for name, array in features._asdict().items() if name != "descriptor"}
     left = Features(descriptor=features.descriptor[stays], **kept)
     number = np.cumsum(stays, dtype=np.int32) - 1
     feature, renumbered = seen.feature.copy(), (seen.keyframe == keyframe.id) & (seen.feature != NONE)
     feature[renumbered] = number[feature[renumbered]]
-    keyframes = (*map.keyframes[:row], keyframe._replace(features=left), *map.keyframes[row + 1 :])
-    return map._replace(keyframes=keyframes, sightings=seen._replace(feature=feature))
+    keyframes = (*slam_map.keyframes[:row], keyframe._replace(features=left), *slam_map.keyframes[row + 1 :])
+    return slam_map._replace(keyframes=keyframes, observations=seen._replace(feature=feature))

@@ -17,21 +17,21 @@ from jaxslam.map.types import (
     Loops,
     Map,
     MapPoints,
-    Sightings,
+    Observations,
+    observations_at,
     point_submaps,
     points_at,
     rows,
-    sightings_at,
-    standing,
+    surviving_keyframes,
 )
 from jaxslam.map.validate import Record, number_problems
 
 
-def with_keyframe(map: Map, keyframe: Keyframe, T_world_cam: np.ndarray, parent: int, submap: int) -> Map:
+def with_keyframe(slam_map: Map, keyframe: Keyframe, T_world_cam: np.ndarray, parent: int, submap: int) -> Map:
     """Add a keyframe.
 
     Args:
-        map: The map.
+        slam_map: The map.
         keyframe: With the map's next id.
         T_world_cam: `(7,)` its pose.
         parent: Id of a keyframe of the same submap; `NONE` if this is the first of a submap.
@@ -40,44 +40,44 @@ def with_keyframe(map: Map, keyframe: Keyframe, T_world_cam: np.ndarray, parent:
     Raises:
         ValueError: If the id is not the next one, the parent is in another submap, or a number is out of range.
     """
-    if keyframe.id != map.next_keyframe:
-        raise ValueError(f"keyframe.id: expected the next one, {map.next_keyframe}, got {keyframe.id}")
-    if parent != NONE and map.submap[map.row(parent)] != submap:
+    if keyframe.id != slam_map.next_keyframe:
+        raise ValueError(f"keyframe.id: expected the next one, {slam_map.next_keyframe}, got {keyframe.id}")
+    if parent != NONE and slam_map.submap[slam_map.row(parent)] != submap:
         raise ValueError(f"parent: keyframe {parent} is not in submap {submap}")
-    if parent == NONE and (map.submap == submap).any():
+    if parent == NONE and (slam_map.submap == submap).any():
         raise ValueError(f"parent: submap {submap} has a first keyframe already")
     _require_sound(keyframe.features)
-    return map._replace(
-        keyframes=(*map.keyframes, keyframe),
-        ids=np.append(map.ids, np.int64(keyframe.id)),
-        T_world_cam=np.concatenate([map.T_world_cam, _poses(T_world_cam)]),
-        parent=np.append(map.parent, np.int64(parent)),
-        submap=np.append(map.submap, np.int32(submap)),
-        next_keyframe=map.next_keyframe + 1,
+    return slam_map._replace(
+        keyframes=(*slam_map.keyframes, keyframe),
+        ids=np.append(slam_map.ids, np.int64(keyframe.id)),
+        T_world_cam=np.concatenate([slam_map.T_world_cam, _poses(T_world_cam)]),
+        parent=np.append(slam_map.parent, np.int64(parent)),
+        submap=np.append(slam_map.submap, np.int32(submap)),
+        next_keyframe=slam_map.next_keyframe + 1,
     )
 
 
-def with_points(map: Map, points: MapPoints) -> Map:
+def with_points(slam_map: Map, points: MapPoints) -> Map:
     """Add points, whose ids go on from the map's next one.
 
     Raises:
         ValueError: If the ids do not, or a number is out of range.
         KeyError: If one was made by a keyframe that was never in the map.
     """
-    after = map.next_point + len(points.ids)
-    if not np.array_equal(points.ids, np.arange(map.next_point, after)):
-        raise ValueError(f"points.ids: expected {map.next_point} to {after - 1} in order")
-    standing(map, points.made_by)
+    after = slam_map.next_point + len(points.ids)
+    if not np.array_equal(points.ids, np.arange(slam_map.next_point, after)):
+        raise ValueError(f"points.ids: expected {slam_map.next_point} to {after - 1} in order")
+    surviving_keyframes(slam_map, points.reference_keyframe)
     _require_sound(points)
     joined = {
         name: _joined(old, getattr(points, name), axis=0 if name == "descriptor" else -1)
-        for name, old in map.points._asdict().items()
+        for name, old in slam_map.points._asdict().items()
     }
-    return map._replace(points=MapPoints(**joined), next_point=after)
+    return slam_map._replace(points=MapPoints(**joined), next_point=after)
 
 
-def with_sightings(map: Map, sightings: Sightings) -> Map:
-    """Add sightings; where two contradict, the first stays and old ones come before new ones.
+def with_observations(slam_map: Map, observations: Observations) -> Map:
+    """Add observations; where two contradict, the first stays and old ones come before new ones.
 
     Two contradict if they are of the same point in the same keyframe, or of the same feature of it.
 
@@ -86,22 +86,22 @@ def with_sightings(map: Map, sightings: Sightings) -> Map:
             of range.
         KeyError: If a keyframe or a point is not in the map.
     """
-    _require_sound(sightings)
-    at = rows(map.ids, sightings.keyframe)
-    if (map.submap[at] != point_submaps(map)[rows(map.points.ids, sightings.point)]).any():
+    _require_sound(observations)
+    at = rows(slam_map.ids, observations.keyframe)
+    if (slam_map.submap[at] != point_submaps(slam_map)[rows(slam_map.points.ids, observations.point)]).any():
         raise ValueError("a keyframe cannot see a point of another submap")
     involved, which = np.unique(at, return_inverse=True)
-    num_features = np.array([len(map.keyframes[row].features.octave) for row in involved], np.int64)
-    wrong = (sightings.feature < NONE) | (sightings.feature >= num_features[which])
+    num_features = np.array([len(slam_map.keyframes[row].features.octave) for row in involved], np.int64)
+    wrong = (observations.feature < NONE) | (observations.feature >= num_features[which])
     if wrong.any():
-        raise ValueError(f"keyframe {sightings.keyframe[wrong][0]} has no feature {sightings.feature[wrong][0]}")
-    rivals = np.isin(map.sightings.keyframe, sightings.keyframe)
-    both = _sightings_joined(sightings_at(map.sightings, rivals), sightings)
-    new = sightings_at(sightings, _first_of_rivals(both)[int(rivals.sum()) :])
-    return map._replace(sightings=_sightings_joined(map.sightings, new))
+        raise ValueError(f"keyframe {observations.keyframe[wrong][0]} has no feature {observations.feature[wrong][0]}")
+    rivals = np.isin(slam_map.observations.keyframe, observations.keyframe)
+    both = _joined_observations(observations_at(slam_map.observations, rivals), observations)
+    new = observations_at(observations, _first_of_rivals(both)[int(rivals.sum()) :])
+    return slam_map._replace(observations=_joined_observations(slam_map.observations, new))
 
 
-def with_loop(map: Map, source: int, target: int, T_source_target: np.ndarray, information: np.ndarray) -> Map:
+def with_loop(slam_map: Map, source: int, target: int, T_source_target: np.ndarray, information: np.ndarray) -> Map:
     """Add the relative pose of two keyframes, `(7,)`, and its inverse covariance, `(6, 6)`.
 
     Raises:
@@ -110,24 +110,24 @@ def with_loop(map: Map, source: int, target: int, T_source_target: np.ndarray, i
     """
     if source == target:
         raise ValueError(f"a loop cannot lead from keyframe {source} to itself")
-    ends = rows(map.ids, np.array([source, target]))
+    ends = rows(slam_map.ids, np.array([source, target]))
     _require_finite(information)
     loops = Loops(
-        source=np.append(map.loops.source, map.ids[ends[0]]),
-        target=np.append(map.loops.target, map.ids[ends[1]]),
-        T_source_target=np.concatenate([map.loops.T_source_target, _poses(T_source_target)]),
-        information=np.concatenate([map.loops.information, np.asarray(information, np.float64)[None]]),
+        source=np.append(slam_map.loops.source, slam_map.ids[ends[0]]),
+        target=np.append(slam_map.loops.target, slam_map.ids[ends[1]]),
+        T_source_target=np.concatenate([slam_map.loops.T_source_target, _poses(T_source_target)]),
+        information=np.concatenate([slam_map.loops.information, np.asarray(information, np.float64)[None]]),
     )
-    return map._replace(loops=loops)
+    return slam_map._replace(loops=loops)
 
 
-def moved(
-    map: Map, keyframe_ids: np.ndarray, T_world_cam: np.ndarray, point_ids: np.ndarray, X_world: np.ndarray
+def with_positions(
+    slam_map: Map, keyframe_ids: np.ndarray, T_world_cam: np.ndarray, point_ids: np.ndarray, X_world: np.ndarray
 ) -> Map:
     """Give keyframes and points new places.
 
     Args:
-        map: The map.
+        slam_map: The map.
         keyframe_ids: `(m,)` ids.
         T_world_cam: `(m, 7)` their poses.
         point_ids: `(q,)` ids.
@@ -138,26 +138,26 @@ def moved(
         KeyError: If one is not in the map.
     """
     if len(keyframe_ids):
-        poses = map.T_world_cam.copy()
-        poses[rows(map.ids, keyframe_ids)] = _poses(T_world_cam)
-        map = map._replace(T_world_cam=poses)
+        poses = slam_map.T_world_cam.copy()
+        poses[rows(slam_map.ids, keyframe_ids)] = _poses(T_world_cam)
+        slam_map = slam_map._replace(T_world_cam=poses)
     if len(point_ids):
         _require_finite(X_world)
-        places = map.points.X_world.copy()
-        places[:, rows(map.points.ids, point_ids)] = X_world
-        map = map._replace(points=map.points._replace(X_world=places))
-    return map
+        places = slam_map.points.X_world.copy()
+        places[:, rows(slam_map.points.ids, point_ids)] = X_world
+        slam_map = slam_map._replace(points=slam_map.points._replace(X_world=places))
+    return slam_map
 
 
-def fused(map: Map, keep: np.ndarray, drop: np.ndarray) -> Map:
-    """Make one point of two: sightings of `drop[i]` become those of `keep[i]`, and `drop[i]` goes.
+def with_fused_points(slam_map: Map, keep: np.ndarray, drop: np.ndarray) -> Map:
+    """Make one point of two: observations of `drop[i]` become those of `keep[i]`, and `drop[i]` goes.
 
     Points linked by several pairs become one, the lowest of those not dropped. It takes over the place and weight of
     the one seen most often, a descriptor if it has none, and the highest state: what passed before one of them passed
-    before the thing that all of them are. Of two sightings in one keyframe the first stays.
+    before the thing that all of them are. Of two observations in one keyframe the first stays.
 
     Args:
-        map: The map.
+        slam_map: The map.
         keep: `(f,)` ids of points.
         drop: `(f,)` ids of points.
 
@@ -166,23 +166,25 @@ def fused(map: Map, keep: np.ndarray, drop: np.ndarray) -> Map:
         KeyError: If one is not in the map.
     """
     if not len(keep):
-        return map
-    into = _representatives(map, rows(map.points.ids, keep), rows(map.points.ids, drop))
-    submaps = point_submaps(map)
+        return slam_map
+    into = _representatives(slam_map, rows(slam_map.points.ids, keep), rows(slam_map.points.ids, drop))
+    submaps = point_submaps(slam_map)
     if (submaps != submaps[into]).any():
         raise ValueError("points of different submaps cannot be one")
-    changed = np.isin(map.sightings.point, [keep, drop])
-    point = map.sightings.point.copy()
-    point[changed] = map.points.ids[into[rows(map.points.ids, point[changed])]]
-    seen = map.sightings._replace(point=point)
+    changed = np.isin(slam_map.observations.point, [keep, drop])
+    point = slam_map.observations.point.copy()
+    point[changed] = slam_map.points.ids[into[rows(slam_map.points.ids, point[changed])]]
+    seen = slam_map.observations._replace(point=point)
     stays = ~changed
-    stays[changed] = _first_of_rivals(sightings_at(seen, changed))
-    points = _with_best_known(_with_descriptors(map.points, into), into, map.sightings.point)
+    stays[changed] = _first_of_rivals(observations_at(seen, changed))
+    points = _with_best_known(_with_descriptors(slam_map.points, into), into, slam_map.observations.point)
     points = _with_highest_state(points, into)
-    return map._replace(points=points_at(points, into == np.arange(len(into))), sightings=sightings_at(seen, stays))
+    return slam_map._replace(
+        points=points_at(points, into == np.arange(len(into))), observations=observations_at(seen, stays)
+    )
 
 
-def with_states(map: Map, point_ids: np.ndarray, states: np.ndarray) -> Map:
+def with_states(slam_map: Map, point_ids: np.ndarray, states: np.ndarray) -> Map:
     """Give points new states, a `PointState` each.
 
     Raises:
@@ -190,65 +192,69 @@ def with_states(map: Map, point_ids: np.ndarray, states: np.ndarray) -> Map:
         KeyError: If a point is not in the map.
     """
     if not len(point_ids):
-        return map
+        return slam_map
     if not np.isin(states, list(PointState)).all():
         raise ValueError(f"states: expected {min(PointState)} to {max(PointState)}")
-    state = map.points.state.copy()
-    state[rows(map.points.ids, point_ids)] = states
-    return map._replace(points=map.points._replace(state=state))
+    state = slam_map.points.state.copy()
+    state[rows(slam_map.points.ids, point_ids)] = states
+    return slam_map._replace(points=slam_map.points._replace(state=state))
 
 
-def without_points(map: Map, point_ids: np.ndarray) -> Map:
-    """Remove points and all their sightings."""
-    stays = np.ones(len(map.points.ids), bool)
-    stays[rows(map.points.ids, point_ids)] = False
-    seen = ~np.isin(map.sightings.point, point_ids)
-    return map._replace(points=points_at(map.points, stays), sightings=sightings_at(map.sightings, seen))
+def without_points(slam_map: Map, point_ids: np.ndarray) -> Map:
+    """Remove points and all their observations."""
+    stays = np.ones(len(slam_map.points.ids), bool)
+    stays[rows(slam_map.points.ids, point_ids)] = False
+    seen = ~np.isin(slam_map.observations.point, point_ids)
+    return slam_map._replace(
+        points=points_at(slam_map.points, stays), observations=observations_at(slam_map.observations, seen)
+    )
 
 
-def without_sightings(map: Map, mask: np.ndarray) -> Map:
-    """Remove the sightings where an `(s,)` mask is true; points stay, even those that nobody sees any more."""
-    return map._replace(sightings=sightings_at(map.sightings, ~mask))
+def without_observations(slam_map: Map, mask: np.ndarray) -> Map:
+    """Remove the observations where an `(s,)` mask is true; points stay, even those that nobody sees any more."""
+    return slam_map._replace(observations=observations_at(slam_map.observations, ~mask))
 
 
-def without_keyframe(map: Map, keyframe_id: int) -> Map:
-    """Remove a keyframe, its sightings, and all points that no keyframe sees then.
+def without_keyframe(slam_map: Map, keyframe_id: int) -> Map:
+    """Remove a keyframe, its observations, and all points that no keyframe sees then.
 
     Its place is held in `culled`, relative to its parent, or for the first of a submap to the child that shares most
     points with it, which then is the first. Its other children hang on the keyframe that shares most points with them
-    or, if there is none, where it hung. Loops that end in it end in its anchor.
+    or, if there is none, where it anchored. Loops that end in it end in its anchor.
 
     Raises:
         ValueError: If it is the only keyframe of its submap.
     """
-    row = map.row(keyframe_id)
-    anchor = new_anchor(map, keyframe_id)
-    T_anchor_keyframe = between(map.T_world_cam[map.row(anchor)], map.T_world_cam[row])
+    row = slam_map.row(keyframe_id)
+    anchor = new_anchor(slam_map, keyframe_id)
+    T_anchor_keyframe = between(slam_map.T_world_cam[slam_map.row(anchor)], slam_map.T_world_cam[row])
     culled = Culled(
-        ids=np.append(map.culled.ids, map.ids[row]),
-        anchor=np.append(map.culled.anchor, np.int64(anchor)),
-        T_anchor_keyframe=np.concatenate([map.culled.T_anchor_keyframe, T_anchor_keyframe[None]]),
+        ids=np.append(slam_map.culled.ids, slam_map.ids[row]),
+        anchor=np.append(slam_map.culled.anchor, np.int64(anchor)),
+        T_anchor_keyframe=np.concatenate([slam_map.culled.T_anchor_keyframe, T_anchor_keyframe[None]]),
     )
-    stays, seen = map.ids != keyframe_id, map.sightings.keyframe != keyframe_id
-    sightings = sightings_at(map.sightings, seen)
-    return map._replace(
-        keyframes=map.keyframes[:row] + map.keyframes[row + 1 :],
-        ids=map.ids[stays],
-        T_world_cam=map.T_world_cam[stays],
-        parent=parents_without(map, keyframe_id, anchor)[stays],
-        submap=map.submap[stays],
-        points=points_at(map.points, np.isin(map.points.ids, sightings.point)),
-        sightings=sightings,
-        loops=_loops_without(map.loops, keyframe_id, anchor, T_anchor_keyframe),
+    stays, seen = slam_map.ids != keyframe_id, slam_map.observations.keyframe != keyframe_id
+    observations = observations_at(slam_map.observations, seen)
+    return slam_map._replace(
+        keyframes=slam_map.keyframes[:row] + slam_map.keyframes[row + 1 :],
+        ids=slam_map.ids[stays],
+        T_world_cam=slam_map.T_world_cam[stays],
+        parent=parents_without(slam_map, keyframe_id, anchor)[stays],
+        submap=slam_map.submap[stays],
+        points=points_at(slam_map.points, np.isin(slam_map.points.ids, observations.point)),
+        observations=observations,
+        loops=_loops_without(slam_map.loops, keyframe_id, anchor, T_anchor_keyframe),
         culled=culled,
     )
 
 
-def transformed(map: Map, T_new_old: np.ndarray, submap: int, into: int, parent: int = NONE, child: int = NONE) -> Map:
+def transformed(
+    slam_map: Map, T_new_old: np.ndarray, submap: int, into: int, parent: int = NONE, child: int = NONE
+) -> Map:
     """Carry all keyframes and points of a submap rigidly into the frame of another, or of the same.
 
     Args:
-        map: The map.
+        slam_map: The map.
         T_new_old: `(7,)` from the frame of `submap` to that of `into`.
         submap: Number of a submap.
         into: Number of the submap that they belong to then.
@@ -261,26 +267,26 @@ def transformed(map: Map, T_new_old: np.ndarray, submap: int, into: int, parent:
         KeyError: If one is not in the map.
     """
     T = _poses(T_new_old)[0]
-    inside, points = map.submap == submap, point_submaps(map) == submap
-    poses, places, parents = map.T_world_cam.copy(), map.points.X_world.copy(), map.parent.copy()
+    inside, points = slam_map.submap == submap, point_submaps(slam_map) == submap
+    poses, places, parents = slam_map.T_world_cam.copy(), slam_map.points.X_world.copy(), slam_map.parent.copy()
     poses[inside] = compose(T, poses[inside])
     places[:, points] = transform(T, places[:, points])
-    there = (map.submap == into) & ~inside
+    there = (slam_map.submap == into) & ~inside
     if there.any() and inside.any():
         if parent == NONE:
-            parent = int(map.ids[there & (map.parent == NONE)][0])
-        if not there[map.row(parent)]:
+            parent = int(slam_map.ids[there & (slam_map.parent == NONE)][0])
+        if not there[slam_map.row(parent)]:
             raise ValueError(f"parent: keyframe {parent} is not in submap {into}")
         if child != NONE:
-            if not inside[map.row(child)]:
+            if not inside[slam_map.row(child)]:
                 raise ValueError(f"child: keyframe {child} is not in submap {submap}")
-            parents = parents_from(map, child)
+            parents = parents_from(slam_map, child)
         parents[inside & (parents == NONE)] = parent
-    return map._replace(
+    return slam_map._replace(
         T_world_cam=poses,
         parent=parents,
-        submap=np.where(inside, np.int32(into), map.submap),
-        points=map.points._replace(X_world=places),
+        submap=np.where(inside, np.int32(into), slam_map.submap),
+        points=slam_map.points._replace(X_world=places),
     )
 
 
@@ -306,17 +312,19 @@ def _joined(old: np.ndarray, new: np.ndarray, axis: int = -1) -> np.ndarray:
     return np.concatenate([old, new], axis=axis, dtype=old.dtype, casting="same_kind")
 
 
-def _sightings_joined(old: Sightings, new: Sightings) -> Sightings:
-    return Sightings(*map(_joined, old, new))
+def _joined_observations(old: Observations, new: Observations) -> Observations:
+    return Observations(*map(_joined, old, new))
 
 
-def _first_of_rivals(sightings: Sightings) -> np.ndarray:
-    """`(s,)` which sightings stay if each in turn stays unless it contradicts one that does."""
-    stays, undecided = np.zeros(len(sightings.point), bool), np.arange(len(sightings.point))
-    by_feature = np.where(sightings.feature == NONE, -2 - undecided, sightings.feature)  # `NONE` is nobody's rival
+def _first_of_rivals(observations: Observations) -> np.ndarray:
+    """`(s,)` which observations stay if each in turn stays unless it contradicts one that does."""
+    stays, undecided = np.zeros(len(observations.point), bool), np.arange(len(observations.point))
+    by_feature = np.where(
+        observations.feature == NONE, -2 - undecided, observations.feature
+    )  # `NONE` is nobody's rival
     while len(undecided):
-        pair = _group(sightings.keyframe[undecided], sightings.point[undecided])
-        feature = _group(sightings.keyframe[undecided], by_feature[undecided])
+        pair = _group(observations.keyframe[undecided], observations.point[undecided])
+        feature = _group(observations.keyframe[undecided], by_feature[undecided])
         first = _is_first(pair) & _is_first(feature)
         stays[undecided[first]] = True
         undecided = undecided[~(np.isin(pair, pair[first]) | np.isin(feature, feature[first]))]
@@ -335,12 +343,12 @@ def _is_first(groups: np.ndarray) -> np.ndarray:
     return first
 
 
-def _representatives(map: Map, keep: np.ndarray, drop: np.ndarray) -> np.ndarray:
+def _representatives(slam_map: Map, keep: np.ndarray, drop: np.ndarray) -> np.ndarray:
     """`(p,)` the row of the point that each becomes, its own for most."""
     from scipy.sparse import coo_array  # noqa: PLC0415 - see `late_imports`
     from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
 
-    count = len(map.points.ids)
+    count = len(slam_map.points.ids)
     links = coo_array((np.ones(len(keep), np.int8), (keep, drop)), shape=(count, count))
     group = connected_components(links, directed=False)[1]
     dropped = np.zeros(count, bool)
@@ -351,11 +359,11 @@ def _representatives(map: Map, keep: np.ndarray, drop: np.ndarray) -> np.ndarray
 
 def _with_descriptors(points: MapPoints, into: np.ndarray) -> MapPoints:
     """Points without a descriptor take over that of the first one that becomes them."""
-    givers = np.flatnonzero(points.recognisable & ~points.recognisable[into])
+    givers = np.flatnonzero(points.has_descriptor & ~points.has_descriptor[into])
     takers, first = np.unique(into[givers], return_index=True)
-    descriptor, recognisable = points.descriptor.copy(), points.recognisable.copy()
-    descriptor[takers], recognisable[takers] = descriptor[givers[first]], True
-    return points._replace(descriptor=descriptor, recognisable=recognisable)
+    descriptor, recognizable = points.descriptor.copy(), points.has_descriptor.copy()
+    descriptor[takers], recognizable[takers] = descriptor[givers[first]], True
+    return points._replace(descriptor=descriptor, has_descriptor=recognizable)
 
 
 def _with_best_known(points: MapPoints, into: np.ndarray, seen: np.ndarray) -> MapPoints:

@@ -14,78 +14,78 @@ import numpy as np
 from jaxslam.errors import MapFileError
 from jaxslam.geometry.se3 import inverse, rotate
 from jaxslam.io.atomic_files import write_atomically
-from jaxslam.map.types import Keyframe, Map, point_submaps, points_at, rows, sightings_at
+from jaxslam.map.types import Keyframe, Map, observations_at, point_submaps, points_at, rows
 from jaxslam.sensors.camera import Camera
 from jaxslam.trajectory.trajectory import Trajectory, write_tum
 
 PathLike: TypeAlias = str | os.PathLike[str]
 
-_UNKNOWN_GREY = 128
+_UNKNOWN_GRAY = 128
 _KEYFRAME_RGB = (255, 128, 0)
-_COLMAP_CENTRE = 0.5
-"""What COLMAP calls the centre of the top-left pixel; ours is 0."""
+_COLMAP_CENTER = 0.5
+"""What COLMAP calls the center of the top-left pixel; ours is 0."""
 
 _VERTEX = np.dtype(
     [
         *((axis, "<f4") for axis in "xyz"),
         *((channel, "u1") for channel in ("red", "green", "blue")),
         ("weight", "<f4"),
-        ("sightings", "<f4"),  # COLMAP reads no integers
+        ("observations", "<f4"),  # COLMAP reads no integers
     ]
 )
 _PLY_TYPES = {"<f4": "float", "|u1": "uchar"}
 
 
-def write_ply(path: PathLike, map: Map, submap: int | None = None, *, keyframes: bool = False) -> None:
-    """Write the points as a binary PLY: place in metres, grey value, weight, and number of sightings.
+def write_ply(path: PathLike, slam_map: Map, submap: int | None = None, *, keyframes: bool = False) -> None:
+    """Write the points as a binary PLY: place in meters, gray value, weight, and number of observations.
 
     Args:
         path: Where to write; the file appears whole or not at all.
-        map: The map.
+        slam_map: The map.
         submap: Number of the submap; by default the one with most keyframes.
-        keyframes: Whether to add the centres of the keyframes as orange points, with the number of points they see.
+        keyframes: Whether to add the centers of the keyframes as orange points, with the number of points they see.
 
     Raises:
         MapFileError: If the file cannot be written, there is no such submap, or an image cannot be decoded.
     """
-    part = one_submap(map, submap)
+    part = one_submap(slam_map, submap)
     vertices = np.zeros(len(part.points.ids), _VERTEX)
     vertices["x"], vertices["y"], vertices["z"] = part.points.X_world
-    vertices["red"] = vertices["green"] = vertices["blue"] = _greys(part)
+    vertices["red"] = vertices["green"] = vertices["blue"] = _grays(part)
     vertices["weight"] = part.points.weight
-    vertices["sightings"] = _counts(part.points.ids, part.sightings.point)
+    vertices["observations"] = _counts(part.points.ids, part.observations.point)
     if keyframes:
-        centres = np.zeros(len(part.ids), _VERTEX)
-        centres["x"], centres["y"], centres["z"] = part.T_world_cam[:, 4:].T
-        centres["red"], centres["green"], centres["blue"] = _KEYFRAME_RGB
-        centres["weight"] = 1
-        centres["sightings"] = _counts(part.ids, part.sightings.keyframe)
-        vertices = np.concatenate([vertices, centres])
+        centers = np.zeros(len(part.ids), _VERTEX)
+        centers["x"], centers["y"], centers["z"] = part.T_world_cam[:, 4:].T
+        centers["red"], centers["green"], centers["blue"] = _KEYFRAME_RGB
+        centers["weight"] = 1
+        centers["observations"] = _counts(part.ids, part.observations.keyframe)
+        vertices = np.concatenate([vertices, centers])
     properties = [f"property {_PLY_TYPES[_VERTEX[name].str]} {name}" for name in _VERTEX.names or ()]
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}", *properties, "end_header\n"]
     write_atomically(path, "\n".join(header).encode() + vertices.tobytes(), MapFileError)
 
 
-def write_colmap(folder: PathLike, map: Map, submap: int | None = None) -> None:
+def write_colmap(folder: PathLike, slam_map: Map, submap: int | None = None) -> None:
     """Write the map as COLMAP has it: `sparse/0/{cameras,images,points3D}.txt` and `images/*.png` in a folder.
 
-    The camera is a pinhole without distortion, the pixels are those of such a camera, `Sightings.uv`, and the images
+    The camera is a pinhole without distortion, the pixels are those of such a camera, `Observations.uv`, and the images
     are undistorted: residuals are then the same as in the map, where rolling shutter and distortion are corrected in
     the pixels, and dense methods take such models as they are. COLMAP counts pixels from the corner of the image: all
     are half a pixel more than here. Ids are those of the map plus one. Points that no keyframe sees are left out.
 
     Args:
         folder: Where to write; made if missing. Files of an earlier export are replaced, one by one.
-        map: The map.
+        slam_map: The map.
         submap: Number of the submap; by default the one with most keyframes.
 
     Raises:
         MapFileError: If a file cannot be written, there is no such submap, or an image cannot be decoded.
     """
-    part = one_submap(map, submap)
-    part = part._replace(points=points_at(part.points, np.isin(part.points.ids, part.sightings.point)))
-    order = np.lexsort((part.sightings.point, part.sightings.keyframe))
-    part = part._replace(sightings=sightings_at(part.sightings, order))
+    part = one_submap(slam_map, submap)
+    part = part._replace(points=points_at(part.points, np.isin(part.points.ids, part.observations.point)))
+    order = np.lexsort((part.observations.point, part.observations.keyframe))
+    part = part._replace(observations=observations_at(part.observations, order))
     model, images = Path(folder) / "sparse" / "0", Path(folder) / "images"
     for path in (model, images):
         try:
@@ -103,46 +103,46 @@ def write_colmap(folder: PathLike, map: Map, submap: int | None = None) -> None:
         write_atomically(model / f"{name}.txt", "".join(f"{line}\n" for line in lines).encode(), MapFileError)
 
 
-def write_keyframe_trajectory(path: PathLike, map: Map, submap: int | None = None) -> None:
+def write_keyframe_trajectory(path: PathLike, slam_map: Map, submap: int | None = None) -> None:
     """Write the poses of the keyframes in the TUM format, in the order of time.
 
     Raises:
         MapFileError: If there is no such submap.
         TrajectoryError: If the file cannot be written.
     """
-    part = one_submap(map, submap)
+    part = one_submap(slam_map, submap)
     stamps = np.array([keyframe.timestamp_ns for keyframe in part.keyframes], np.int64)
     order = np.argsort(stamps, kind="stable")
     write_tum(path, Trajectory(stamps[order], part.T_world_cam[order]))
 
 
-def one_submap(map: Map, submap: int | None = None) -> Map:
+def one_submap(slam_map: Map, submap: int | None = None) -> Map:
     """The part of a map that is in one world; an empty map stays as it is.
 
     Args:
-        map: The map.
+        slam_map: The map.
         submap: Number of the submap; by default the one with most keyframes.
 
     Raises:
         MapFileError: If there is no such submap.
     """
-    numbers, counts = np.unique(map.submap, return_counts=True)
+    numbers, counts = np.unique(slam_map.submap, return_counts=True)
     if submap is None:
         if not len(numbers):
-            return map
+            return slam_map
         submap = int(numbers[np.argmax(counts)])
     if submap not in numbers:
         raise MapFileError(f"submap: expected one of {numbers.tolist()}, got {submap}")
-    inside = map.submap == submap
-    seen = inside[rows(map.ids, map.sightings.keyframe)]
-    return map._replace(
-        keyframes=tuple(keyframe for keyframe, own in zip(map.keyframes, inside, strict=True) if own),
-        ids=map.ids[inside],
-        T_world_cam=map.T_world_cam[inside],
-        parent=map.parent[inside],
-        submap=map.submap[inside],
-        points=points_at(map.points, point_submaps(map) == submap),
-        sightings=sightings_at(map.sightings, seen),
+    inside = slam_map.submap == submap
+    seen = inside[rows(slam_map.ids, slam_map.observations.keyframe)]
+    return slam_map._replace(
+        keyframes=tuple(keyframe for keyframe, own in zip(slam_map.keyframes, inside, strict=True) if own),
+        ids=slam_map.ids[inside],
+        T_world_cam=slam_map.T_world_cam[inside],
+        parent=slam_map.parent[inside],
+        submap=slam_map.submap[inside],
+        points=points_at(slam_map.points, point_submaps(slam_map) == submap),
+        observations=observations_at(slam_map.observations, seen),
     )
 
 
@@ -159,19 +159,19 @@ def _decoded(keyframe: Keyframe) -> np.ndarray:
     return image
 
 
-def _greys(map: Map) -> np.ndarray:
-    """`(p,)` grey value of each point where a keyframe first saw it."""
-    greys = np.full(len(map.points.ids), _UNKNOWN_GREY, np.uint8)
-    points, first = np.unique(map.sightings.point, return_index=True)
-    seen = sightings_at(map.sightings, first)
-    for keyframe in map.keyframes:
+def _grays(slam_map: Map) -> np.ndarray:
+    """`(p,)` gray value of each point where a keyframe first saw it."""
+    grays = np.full(len(slam_map.points.ids), _UNKNOWN_GRAY, np.uint8)
+    points, first = np.unique(slam_map.observations.point, return_index=True)
+    seen = observations_at(slam_map.observations, first)
+    for keyframe in slam_map.keyframes:
         own = seen.keyframe == keyframe.id
         if own.any():
             image = _decoded(keyframe)
-            u, v = np.rint(seen.seen_uv[:, own]).astype(np.int64)
+            u, v = np.rint(seen.uv_raw[:, own]).astype(np.int64)
             u, v = np.clip(u, 0, image.shape[1] - 1), np.clip(v, 0, image.shape[0] - 1)
-            greys[rows(map.points.ids, points[own])] = image[v, u]
-    return greys
+            grays[rows(slam_map.points.ids, points[own])] = image[v, u]
+    return grays
 
 
 def _undistorted(keyframe: Keyframe, camera: Camera) -> bytes:
@@ -189,54 +189,56 @@ def _image_name(keyframe_id: int) -> str:
 
 def _camera_lines(camera: Camera) -> Iterator[str]:
     yield "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[] as fx, fy, cx, cy"
-    centre = f"{camera.cx + _COLMAP_CENTRE} {camera.cy + _COLMAP_CENTRE}"
-    yield f"1 PINHOLE {camera.width} {camera.height} {camera.fx} {camera.fy} {centre}"
+    center = f"{camera.cx + _COLMAP_CENTER} {camera.cy + _COLMAP_CENTER}"
+    yield f"1 PINHOLE {camera.width} {camera.height} {camera.fx} {camera.fy} {center}"
 
 
-def _image_lines(map: Map) -> Iterator[str]:
+def _image_lines(slam_map: Map) -> Iterator[str]:
     """Two lines a keyframe: its pose, world to camera, and its pixels."""
     yield "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"
     yield "# POINTS2D[] as (X, Y, POINT3D_ID)"
-    us, vs = (map.sightings.uv.astype(np.float64) + _COLMAP_CENTRE).tolist()
-    points = (map.sightings.point + 1).tolist()
-    poses = inverse(map.T_world_cam).tolist()
-    for number, pose, start, end in zip(map.ids.tolist(), poses, *_bounds(map), strict=True):
+    us, vs = (slam_map.observations.uv.astype(np.float64) + _COLMAP_CENTER).tolist()
+    points = (slam_map.observations.point + 1).tolist()
+    poses = inverse(slam_map.T_world_cam).tolist()
+    for number, pose, start, end in zip(slam_map.ids.tolist(), poses, *_bounds(slam_map), strict=True):
         yield f"{number + 1} {_words(pose)} 1 {_image_name(number)}"
         yield " ".join([f"{us[row]} {vs[row]} {points[row]}" for row in range(start, end)])
 
 
-def _point_lines(map: Map) -> Iterator[str]:
+def _point_lines(slam_map: Map) -> Iterator[str]:
     yield "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)"
-    point = rows(map.points.ids, map.sightings.point)
-    counts = np.bincount(point, minlength=len(map.points.ids))
-    errors = (np.bincount(point, _pixel_errors(map), len(counts)) / counts).tolist()
-    entries = _track_entries(map)[np.argsort(point, kind="stable")].tolist()
+    point = rows(slam_map.points.ids, slam_map.observations.point)
+    counts = np.bincount(point, minlength=len(slam_map.points.ids))
+    errors = (np.bincount(point, _pixel_errors(slam_map), len(counts)) / counts).tolist()
+    entries = _track_entries(slam_map)[np.argsort(point, kind="stable")].tolist()
     ends = np.cumsum(counts)
-    greys, places = _greys(map).tolist(), map.points.X_world.T.tolist()
+    grays, places = _grays(slam_map).tolist(), slam_map.points.X_world.T.tolist()
     for row, (start, end) in enumerate(zip((ends - counts).tolist(), ends.tolist(), strict=True)):
         track = " ".join([f"{image} {index}" for image, index in entries[start:end]])
-        colour = " ".join([str(greys[row])] * 3)
-        yield f"{map.points.ids[row] + 1} {_words(places[row])} {colour} {errors[row]} {track}"
+        color = " ".join([str(grays[row])] * 3)
+        yield f"{slam_map.points.ids[row] + 1} {_words(places[row])} {color} {errors[row]} {track}"
 
 
-def _track_entries(map: Map) -> np.ndarray:
-    """`(s, 2)` image of each sighting, and which of the image's pixels it is."""
-    starts = np.repeat(_bounds(map)[0], _counts(map.ids, map.sightings.keyframe))
-    return np.column_stack([map.sightings.keyframe + 1, np.arange(len(starts)) - starts])
+def _track_entries(slam_map: Map) -> np.ndarray:
+    """`(s, 2)` image of each observation, and which of the image's pixels it is."""
+    starts = np.repeat(_bounds(slam_map)[0], _counts(slam_map.ids, slam_map.observations.keyframe))
+    return np.column_stack([slam_map.observations.keyframe + 1, np.arange(len(starts)) - starts])
 
 
-def _bounds(map: Map) -> tuple[np.ndarray, np.ndarray]:
-    """Where the sightings of each keyframe begin and end, if they are sorted by keyframe."""
-    return np.searchsorted(map.sightings.keyframe, map.ids), np.searchsorted(map.sightings.keyframe, map.ids, "right")
+def _bounds(slam_map: Map) -> tuple[np.ndarray, np.ndarray]:
+    """Where the observations of each keyframe begin and end, if they are sorted by keyframe."""
+    return np.searchsorted(slam_map.observations.keyframe, slam_map.ids), np.searchsorted(
+        slam_map.observations.keyframe, slam_map.ids, "right"
+    )
 
 
-def _pixel_errors(map: Map) -> np.ndarray:
+def _pixel_errors(slam_map: Map) -> np.ndarray:
     """`(s,)` pixels between where a point was seen and where it should have been."""
-    T_cam_world = inverse(map.T_world_cam)[rows(map.ids, map.sightings.keyframe)]
-    X_world = map.points.X_world[:, rows(map.points.ids, map.sightings.point)]
+    T_cam_world = inverse(slam_map.T_world_cam)[rows(slam_map.ids, slam_map.observations.keyframe)]
+    X_world = slam_map.points.X_world[:, rows(slam_map.points.ids, slam_map.observations.point)]
     x, y, z = (rotate(T_cam_world, X_world.T) + T_cam_world[:, 4:]).T
-    u, v = map.camera.fx * x / z + map.camera.cx, map.camera.fy * y / z + map.camera.cy
-    return np.hypot(u - map.sightings.uv[0], v - map.sightings.uv[1])
+    u, v = slam_map.camera.fx * x / z + slam_map.camera.cx, slam_map.camera.fy * y / z + slam_map.camera.cy
+    return np.hypot(u - slam_map.observations.uv[0], v - slam_map.observations.uv[1])
 
 
 def _words(numbers: Sequence[float]) -> str:

@@ -3,9 +3,9 @@
 Its first member, `header.json`, holds
 
     format           "jaxslam map"
-    version          2
+    version          3
     camera           the fields of `jaxslam.Camera`, by name
-    counts           how many keyframes k, points p, sightings s, loops l, culled keyframes c, features n of all
+    counts           how many keyframes k, points p, observations s, loops l, culled keyframes c, features n of all
                      keyframes together, and bytes b of all images together
     next_keyframe    next id of a keyframe
     next_point       next id of a point
@@ -13,41 +13,41 @@ Its first member, `header.json`, holds
 The others are arrays, each `NAME.npy`, little-endian, in C order:
 
     keyframes.ids                  int64    (k)        ascending
-    keyframes.T_world_cam          float64  (k, 7)     qw qx qy qz x y z, metres
+    keyframes.T_world_cam          float64  (k, 7)     qw qx qy qz x y z, meters
     keyframes.parent               int64    (k)        id in the spanning tree; -1 for the first of a submap
     keyframes.submap               int32    (k)
     keyframes.timestamp_ns         int64    (k)        nanoseconds
     keyframes.feature_offsets      int64    (k + 1)    the features of keyframe i are offsets[i] to offsets[i + 1]
     keyframes.image_offsets        int64    (k + 1)    the same for the bytes of its image
-    features.seen_uv               float32  (2, n)     pixels of the distorted image
+    features.uv_raw                float32  (2, n)     pixels of the distorted image
     features.uv                    float32  (2, n)     pixels of an ideal pinhole camera
-    features.depth                 float32  (n)        metres; 0 unknown
+    features.depth                 float32  (n)        meters; 0 unknown
     features.octave                uint8    (n)        level of the scale pyramid
     features.angle                 float32  (n)        radians, from u towards v
     features.descriptor            uint8    (n, 32)    ORB
-    images.png                     uint8    (b)        one grey PNG a keyframe
+    images.png                     uint8    (b)        one gray PNG a keyframe
     points.ids                     int64    (p)        ascending
-    points.X_world                 float64  (3, p)     metres
+    points.X_world                 float64  (3, p)     meters
     points.weight                  float32  (p)        0 to 1
     points.descriptor              uint8    (p, 32)    ORB; zeros for none
-    points.recognisable            bool     (p)        whether there is a descriptor
-    points.made_by                 int64    (p)        id of a keyframe
+    points.has_descriptor            bool     (p)        whether there is a descriptor
+    points.reference_keyframe      int64    (p)        id of a keyframe
     points.state                   int8     (p)        0 static, 1 blocked, 2 occluded; not in version 1: 0 there
-    sightings.keyframe             int64    (s)        id
-    sightings.point                int64    (s)        id
-    sightings.feature              int32    (s)        index in the keyframe; -1 for none
-    sightings.seen_uv              float32  (2, s)     pixels of the distorted image
-    sightings.uv                   float32  (2, s)     pixels of an ideal pinhole camera
-    sightings.depth                float32  (s)        metres; 0 unknown
-    sightings.sigma_px             float32  (s)        pixels
-    sightings.weight               float32  (s)        0 to 1
+    observations.keyframe             int64    (s)        id
+    observations.point                int64    (s)        id
+    observations.feature              int32    (s)        index in the keyframe; -1 for none
+    observations.uv_raw            float32  (2, s)     pixels of the distorted image
+    observations.uv                   float32  (2, s)     pixels of an ideal pinhole camera
+    observations.depth                float32  (s)        meters; 0 unknown
+    observations.sigma_px             float32  (s)        pixels
+    observations.weight               float32  (s)        0 to 1
     loops.source                   int64    (l)        id of a keyframe
     loops.target                   int64    (l)        id of a keyframe
-    loops.T_source_target          float64  (l, 7)     qw qx qy qz x y z, metres
+    loops.T_source_target          float64  (l, 7)     qw qx qy qz x y z, meters
     loops.information              float64  (l, 6, 6)  inverse covariance, tangent translation first
     culled.ids                     int64    (c)        keyframes that were dropped
     culled.anchor                  int64    (c)        id of the keyframe that holds the place of each
-    culled.T_anchor_keyframe       float64  (c, 7)     qw qx qy qz x y z, metres
+    culled.T_anchor_keyframe       float64  (c, 7)     qw qx qy qz x y z, meters
 
 Any change of these is a new version.
 """
@@ -67,31 +67,38 @@ import numpy as np
 from jaxslam.errors import CameraError, MapFileError, one_line
 from jaxslam.features.orb import Features
 from jaxslam.io.atomic_files import replacing
-from jaxslam.map.types import Culled, Keyframe, Loops, Map, MapPoints, Sightings
+from jaxslam.map.types import Culled, Keyframe, Loops, Map, MapPoints, Observations
 from jaxslam.map.validate import ArrayField, array_fields, problems
 from jaxslam.sensors.camera import Camera
 
 FORMAT = "jaxslam map"
-VERSION = 2
-READABLE = (1, 2)
+VERSION = 3
+READABLE = (1, 2, 3)
 """Versions that `load_map` reads."""
 
 _SINCE = {"points.state": 2}
 """The version that an array came with, if not the first; where it is not in a file it is all zeros."""
 
+_BEFORE_VERSION_3 = {
+    "features.uv_raw": "features.seen_uv",
+    "points.has_descriptor": "points.recognisable",
+    "points.reference_keyframe": "points.made_by",
+}
+"""Arrays that had another name before version 3, where all of `observations` was called `sightings` too."""
+
 _COUNTS = {
     "k": "keyframes",
     "p": "points",
-    "s": "sightings",
+    "s": "observations",
     "l": "loops",
     "c": "culled",
     "n": "features",
     "b": "image_bytes",
 }
-_RECORDS = {"features": Features, "points": MapPoints, "sightings": Sightings, "loops": Loops, "culled": Culled}
+_RECORDS = {"features": Features, "points": MapPoints, "observations": Observations, "loops": Loops, "culled": Culled}
 _HEADER = "header.json"
-_MOST_HEADER_BYTES = 1 << 16
-_MOST_ARRAY_HEADER_BYTES = 1 << 10
+_MAX_HEADER_BYTES = 1 << 16
+_MAX_ARRAY_HEADER_BYTES = 1 << 10
 _END_BYTES = 22
 """Of the record at the end of an archive without a comment."""
 _DAMAGE = (zipfile.BadZipFile, EOFError, ValueError, KeyError, RuntimeError, struct.error)
@@ -106,17 +113,17 @@ class _Header(NamedTuple):
     next_point: int
 
 
-def save_map(path: str | os.PathLike[str], map: Map) -> None:
+def save_map(path: str | os.PathLike[str], slam_map: Map) -> None:
     """Write a map; the file appears whole or not at all, and the same map gives the same bytes.
 
     Raises:
         MapFileError: If the file cannot be written, or the map is not whole.
     """
-    if wrong := problems(map):
+    if wrong := problems(slam_map):
         raise MapFileError(f"{path}: not written: {_first(wrong)}")
-    arrays = _arrays(map)
+    arrays = _arrays(slam_map)
     with replacing(path, MapFileError) as temporary, zipfile.ZipFile(temporary, "w") as archive:
-        archive.writestr(zipfile.ZipInfo(_HEADER), json.dumps(_header(map, arrays), indent=1))
+        archive.writestr(zipfile.ZipInfo(_HEADER), json.dumps(_header(slam_map, arrays), indent=1))
         for name, array in arrays.items():
             member = zipfile.ZipInfo(f"{name}.npy")  # of 1980: the time of writing is no part of a map
             member.file_size = array.nbytes
@@ -154,33 +161,33 @@ def _layout() -> dict[str, ArrayField]:
     return layout | {"images.png": ArrayField(np.dtype(np.uint8), ("b",))}
 
 
-def _header(map: Map, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+def _header(slam_map: Map, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
     lengths = {
-        "k": len(map.ids),
-        "p": len(map.points.ids),
-        "s": len(map.sightings.point),
-        "l": len(map.loops.source),
-        "c": len(map.culled.ids),
+        "k": len(slam_map.ids),
+        "p": len(slam_map.points.ids),
+        "s": len(slam_map.observations.point),
+        "l": len(slam_map.loops.source),
+        "c": len(slam_map.culled.ids),
         "n": len(arrays["features.octave"]),
         "b": len(arrays["images.png"]),
     }
     return {
         "format": FORMAT,
         "version": VERSION,
-        "camera": dataclasses.asdict(map.camera),
+        "camera": dataclasses.asdict(slam_map.camera),
         "counts": {_COUNTS[letter]: length for letter, length in lengths.items()},
-        "next_keyframe": map.next_keyframe,
-        "next_point": map.next_point,
+        "next_keyframe": slam_map.next_keyframe,
+        "next_point": slam_map.next_point,
     }
 
 
-def _arrays(map: Map) -> dict[str, np.ndarray]:
+def _arrays(slam_map: Map) -> dict[str, np.ndarray]:
     """The arrays of a file by their names, in its order."""
-    features = [keyframe.features for keyframe in map.keyframes]
-    images = [keyframe.image_png for keyframe in map.keyframes]
+    features = [keyframe.features for keyframe in slam_map.keyframes]
+    images = [keyframe.image_png for keyframe in slam_map.keyframes]
     keyframes = {
-        **map._asdict(),
-        "timestamp_ns": np.array([keyframe.timestamp_ns for keyframe in map.keyframes], np.int64),
+        **slam_map._asdict(),
+        "timestamp_ns": np.array([keyframe.timestamp_ns for keyframe in slam_map.keyframes], np.int64),
         "feature_offsets": _offsets([len(one.octave) for one in features]),
         "image_offsets": _offsets([len(image) for image in images]),
     }
@@ -188,10 +195,10 @@ def _arrays(map: Map) -> dict[str, np.ndarray]:
         "keyframes": keyframes,
         "features": _joined(features),
         "images": {"png": np.frombuffer(b"".join(images), np.uint8)},
-        "points": map.points._asdict(),
-        "sightings": map.sightings._asdict(),
-        "loops": map.loops._asdict(),
-        "culled": map.culled._asdict(),
+        "points": slam_map.points._asdict(),
+        "observations": slam_map.observations._asdict(),
+        "loops": slam_map.loops._asdict(),
+        "culled": slam_map.culled._asdict(),
     }
     split = {name: name.split(".") for name in _layout()}
     return {name: np.ascontiguousarray(records[record][field]) for name, (record, field) in split.items()}
@@ -223,7 +230,7 @@ def _check_ends(archive: zipfile.ZipFile, path: Path) -> None:
 
 def _read_header(archive: zipfile.ZipFile) -> _Header:
     names = archive.namelist()
-    if _HEADER not in names or archive.getinfo(_HEADER).file_size > _MOST_HEADER_BYTES:
+    if _HEADER not in names or archive.getinfo(_HEADER).file_size > _MAX_HEADER_BYTES:
         raise MapFileError(f"not a jaxslam map: an archive of {', '.join(names[:3]) or 'nothing'}")
     with _opened(archive, _HEADER) as file:
         header = json.loads(file.read())
@@ -237,7 +244,7 @@ def _read_header(archive: zipfile.ZipFile) -> _Header:
     return _Header(
         version=version,
         camera=_camera(_field(header, "camera", dict)),
-        lengths={letter: _count(counts, name) for letter, name in _COUNTS.items()},
+        lengths={letter: _count(counts, _name_in_version(name, version)) for letter, name in _COUNTS.items()},
         next_keyframe=_count(header, "next_keyframe"),
         next_point=_count(header, "next_point"),
     )
@@ -248,6 +255,13 @@ def _field(record: dict[str, Any], name: str, kind: type) -> Any:
     if type(value) is not kind:
         raise MapFileError(f"header: {name}: expected {kind.__name__}, got {value!r:.40}")
     return value
+
+
+def _name_in_version(name: str, version: int) -> str:
+    """The name that an array or a count had in files of a version."""
+    if version >= 3:
+        return name
+    return _BEFORE_VERSION_3.get(name, name.replace("observations", "sightings").replace("uv_raw", "seen_uv"))
 
 
 def _count(record: dict[str, Any], name: str) -> int:
@@ -271,7 +285,8 @@ def _camera(fields: dict[str, Any]) -> Camera:
 def _read_arrays(archive: zipfile.ZipFile, header: _Header, size: int) -> dict[str, np.ndarray]:
     whole = _layout()
     layout = {name: field for name, field in whole.items() if _SINCE.get(name, 1) <= header.version}
-    expected = {_HEADER, *(f"{name}.npy" for name in layout)}
+    named = {name: _name_in_version(name, header.version) for name in layout}
+    expected = {_HEADER, *(f"{name}.npy" for name in named.values())}
     if sorted(archive.namelist()) != sorted(expected):
         odd = ", ".join(sorted(expected ^ set(archive.namelist()))) or "one twice"
         raise MapFileError(f"unknown or missing members: {odd}")
@@ -280,7 +295,7 @@ def _read_arrays(archive: zipfile.ZipFile, header: _Header, size: int) -> dict[s
     announced = sum(layout[name].dtype.itemsize * math.prod(shape) for name, shape in shapes.items())
     if announced > size:
         raise MapFileError(f"announces {announced} bytes of arrays in a file of {size}")
-    arrays = {name: _read_array(archive, name, layout[name].dtype, shape) for name, shape in shapes.items()}
+    arrays = {name: _read_array(archive, named[name], layout[name].dtype, shape) for name, shape in shapes.items()}
     missing = {name: whole[name] for name in whole.keys() - layout.keys()}
     return arrays | {name: np.zeros(field.shape(lengths), field.dtype) for name, field in missing.items()}
 
@@ -302,7 +317,7 @@ def _read_array_header(file: IO[bytes], name: str) -> tuple[Any, Any, np.dtype]:
     """Shape, order of Fortran, and type, as NumPy's format 1.0 says; NumPy itself would first try to repair them."""
     text = file.read(int.from_bytes(file.read(2), "little"))
     try:
-        header = ast.literal_eval(text.decode("ascii")) if len(text) <= _MOST_ARRAY_HEADER_BYTES else {}
+        header = ast.literal_eval(text.decode("ascii")) if len(text) <= _MAX_ARRAY_HEADER_BYTES else {}
         return header["shape"], header["fortran_order"], np.dtype(str(header["descr"]))
     except (ValueError, SyntaxError, TypeError, KeyError, MemoryError, RecursionError):
         raise MapFileError(f"{name}: expected the header of a NumPy array, got {text!r:.40}") from None
@@ -327,7 +342,7 @@ def _assembled(header: _Header, arrays: dict[str, np.ndarray]) -> Map:
         camera=header.camera,
         keyframes=tuple(map(Keyframe, ids, stamps, features, images)),
         points=MapPoints(**_record(arrays, "points")),
-        sightings=Sightings(**_record(arrays, "sightings")),
+        observations=Observations(**_record(arrays, "observations")),
         loops=Loops(**_record(arrays, "loops")),
         culled=Culled(**_record(arrays, "culled")),
         next_keyframe=header.next_keyframe,

@@ -5,32 +5,32 @@ import numpy as np
 from jaxslam.map.types import NONE, Map, covisible, rows
 
 
-def children(map: Map, keyframe_id: int) -> np.ndarray:
+def children(slam_map: Map, keyframe_id: int) -> np.ndarray:
     """Ids, ascending, of the keyframes that hang on one in the spanning tree."""
-    return map.ids[map.parent == keyframe_id]
+    return slam_map.ids[slam_map.parent == keyframe_id]
 
 
-def subtree(map: Map, keyframe_id: int) -> np.ndarray:
+def subtree(slam_map: Map, keyframe_id: int) -> np.ndarray:
     """Ids, ascending, of a keyframe and of all that hang on it, directly or not."""
     from scipy.sparse import csr_array  # noqa: PLC0415 - see `late_imports`
     from scipy.sparse.csgraph import breadth_first_order  # noqa: PLC0415
 
-    hangs = np.flatnonzero(map.parent != NONE)
-    above = rows(map.ids, map.parent[hangs])
-    below = csr_array((np.ones(len(hangs), np.int8), (above, hangs)), shape=(len(map.ids), len(map.ids)))
-    return np.sort(map.ids[breadth_first_order(below, map.row(keyframe_id), return_predecessors=False)])
+    hangs = np.flatnonzero(slam_map.parent != NONE)
+    above = rows(slam_map.ids, slam_map.parent[hangs])
+    below = csr_array((np.ones(len(hangs), np.int8), (above, hangs)), shape=(len(slam_map.ids), len(slam_map.ids)))
+    return np.sort(slam_map.ids[breadth_first_order(below, slam_map.row(keyframe_id), return_predecessors=False)])
 
 
-def parents_from(map: Map, keyframe_id: int) -> np.ndarray:
+def parents_from(slam_map: Map, keyframe_id: int) -> np.ndarray:
     """`(k,)` parents if a keyframe were the first of its submap: those above it hang on it, each on the one before."""
-    parent, above, below = map.parent.copy(), int(keyframe_id), NONE
+    parent, above, below = slam_map.parent.copy(), int(keyframe_id), NONE
     while above != NONE:
-        row = map.row(above)
-        parent[row], below, above = below, above, int(map.parent[row])
+        row = slam_map.row(above)
+        parent[row], below, above = below, above, int(slam_map.parent[row])
     return parent
 
 
-def new_anchor(map: Map, keyframe_id: int) -> int:
+def new_anchor(slam_map: Map, keyframe_id: int) -> int:
     """Id of the keyframe that holds the place of one that goes.
 
     Its parent, or for the first of a submap the child that shares most points with it.
@@ -38,30 +38,30 @@ def new_anchor(map: Map, keyframe_id: int) -> int:
     Raises:
         ValueError: If it is the only one of its submap.
     """
-    parent = map.parent[map.row(keyframe_id)]
+    parent = slam_map.parent[slam_map.row(keyframe_id)]
     if parent != NONE:
         return int(parent)
-    below = children(map, keyframe_id)
+    below = children(slam_map, keyframe_id)
     if not len(below):
         raise ValueError(f"keyframe {keyframe_id} is the only one of its submap")
-    near, _ = covisible(map, keyframe_id, at_least=1)
+    near, _ = covisible(slam_map, keyframe_id, at_least=1)
     near = near[np.isin(near, below)]
     return int(near[0] if len(near) else below[0])
 
 
-def parents_without(map: Map, keyframe_id: int, anchor: int) -> np.ndarray:
+def parents_without(slam_map: Map, keyframe_id: int, anchor: int) -> np.ndarray:
     """`(k,)` parents after a keyframe went and `anchor` took its place.
 
     Its children hang on the keyframe that shares most points with them and does not itself hang on them, or if there
     is none on `anchor`.
     """
-    parent = map.parent.copy()
-    if map.parent[map.row(keyframe_id)] == NONE:
-        parent[map.row(anchor)] = NONE
-    orphans = children(map, keyframe_id)
+    parent = slam_map.parent.copy()
+    if slam_map.parent[slam_map.row(keyframe_id)] == NONE:
+        parent[slam_map.row(anchor)] = NONE
+    orphans = children(slam_map, keyframe_id)
     for orphan in orphans[orphans != anchor].tolist():
-        near, _ = covisible(map, orphan, at_least=1)
-        below = subtree(map._replace(parent=parent), orphan)
+        near, _ = covisible(slam_map, orphan, at_least=1)
+        below = subtree(slam_map._replace(parent=parent), orphan)
         allowed = near[~np.isin(near, below) & (near != keyframe_id)]
-        parent[map.row(orphan)] = allowed[0] if len(allowed) else anchor
+        parent[slam_map.row(orphan)] = allowed[0] if len(allowed) else anchor
     return parent

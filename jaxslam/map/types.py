@@ -28,8 +28,8 @@ class Keyframe(NamedTuple):
     Attributes:
         id: Its number.
         timestamp_ns: Its time, nanoseconds.
-        features: What can be recognised in it.
-        image_png: The grey image, losslessly compressed.
+        features: What can be recognized in it.
+        image_png: The gray image, losslessly compressed.
     """
 
     id: int
@@ -43,11 +43,11 @@ class MapPoints(NamedTuple):
 
     Attributes:
         ids: Ascending.
-        X_world: Metres.
+        X_world: Meters.
         weight: How much each counts, 0 to 1.
-        descriptor: ORB descriptor of the points that can be recognised, zeros for the others.
-        recognisable: Which have a descriptor; the others are only followed and looked up by their picture.
-        made_by: Id of the keyframe that made each.
+        descriptor: ORB descriptor of the points that can be recognized, zeros for the others.
+        recognizable: Which have a descriptor; the others are only followed and looked up by their picture.
+        reference_keyframe: Id of the keyframe that made each.
         state: A `PointState` of each: whether something that moves has passed before it.
     """
 
@@ -55,21 +55,21 @@ class MapPoints(NamedTuple):
     X_world: Float64[np.ndarray, "3 p"]
     weight: Float32[np.ndarray, " p"]
     descriptor: UInt8[np.ndarray, "p 32"]
-    recognisable: Bool[np.ndarray, " p"]
-    made_by: Int64[np.ndarray, " p"]
+    has_descriptor: Bool[np.ndarray, " p"]
+    reference_keyframe: Int64[np.ndarray, " p"]
     state: Int8[np.ndarray, " p"]
 
 
-class Sightings(NamedTuple):
+class Observations(NamedTuple):
     """Which keyframe saw which point where; a keyframe sees a point at most once.
 
     Attributes:
         keyframe: Ids.
         point: Ids.
         feature: Index among the features of the keyframe; `NONE` for a point that was followed by optical flow.
-        seen_uv: As seen, pixels of the distorted image.
+        uv_raw: As seen, pixels of the distorted image.
         uv: As an ideal pinhole camera without distortion and rolling shutter would have seen it, pixels.
-        depth: Metres, 0 where there was none to believe.
+        depth: Meters, 0 where there was none to believe.
         sigma_px: Standard deviation of `uv`, pixels.
         weight: How much each counts, 0 to 1.
     """
@@ -77,7 +77,7 @@ class Sightings(NamedTuple):
     keyframe: Int64[np.ndarray, " s"]
     point: Int64[np.ndarray, " s"]
     feature: Int32[np.ndarray, " s"]
-    seen_uv: Float32[np.ndarray, "2 s"]
+    uv_raw: Float32[np.ndarray, "2 s"]
     uv: Float32[np.ndarray, "2 s"]
     depth: Float32[np.ndarray, " s"]
     sigma_px: Float32[np.ndarray, " s"]
@@ -85,7 +85,7 @@ class Sightings(NamedTuple):
 
 
 class Loops(NamedTuple):
-    """Relative poses measured where a place was recognised.
+    """Relative poses measured where a place was recognized.
 
     Attributes:
         source: Ids of the keyframes in whose frame was measured.
@@ -125,7 +125,7 @@ class Map(NamedTuple):
         parent: `(k,)` id of each one's parent in the spanning tree; `NONE` for the first of a submap.
         submap: `(k,)` number of the submap each belongs to; those of one submap share a world frame.
         points: The points.
-        sightings: Who saw what.
+        observations: Who saw what.
         loops: Loops closed so far.
         culled: Keyframes dropped so far.
         next_keyframe: The next id of a keyframe.
@@ -139,7 +139,7 @@ class Map(NamedTuple):
     parent: Int64[np.ndarray, " k"]
     submap: Int32[np.ndarray, " k"]
     points: MapPoints
-    sightings: Sightings
+    observations: Observations
     loops: Loops
     culled: Culled
     next_keyframe: int
@@ -181,7 +181,7 @@ def empty_map(camera: Camera) -> Map:
         parent=none,
         submap=np.zeros(0, np.int32),
         points=empty_points(),
-        sightings=empty_sightings(),
+        observations=empty_observations(),
         loops=Loops(none, none, np.zeros((0, 7)), np.zeros((0, 6, 6))),
         culled=Culled(none, none, np.zeros((0, 7))),
         next_keyframe=0,
@@ -196,19 +196,19 @@ def empty_points() -> MapPoints:
         X_world=np.zeros((3, 0)),
         weight=np.zeros(0, np.float32),
         descriptor=np.zeros((0, DESCRIPTOR_BYTES), np.uint8),
-        recognisable=np.zeros(0, bool),
-        made_by=np.zeros(0, np.int64),
+        has_descriptor=np.zeros(0, bool),
+        reference_keyframe=np.zeros(0, np.int64),
         state=np.zeros(0, np.int8),
     )
 
 
-def empty_sightings() -> Sightings:
-    """No sightings."""
-    return Sightings(
+def empty_observations() -> Observations:
+    """No observations."""
+    return Observations(
         keyframe=np.zeros(0, np.int64),
         point=np.zeros(0, np.int64),
         feature=np.zeros(0, np.int32),
-        seen_uv=np.zeros((2, 0), np.float32),
+        uv_raw=np.zeros((2, 0), np.float32),
         uv=np.zeros((2, 0), np.float32),
         depth=np.zeros(0, np.float32),
         sigma_px=np.zeros(0, np.float32),
@@ -235,38 +235,40 @@ def rows(ids: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     return np.searchsorted(ids, wanted)
 
 
-def visibility(map: Map) -> "csr_array":
+def visibility(slam_map: Map) -> "csr_array":
     """`(k, p)` matrix of ones where a keyframe saw a point, rows and columns as in the map."""
     from scipy.sparse import csr_array  # noqa: PLC0415 - see `late_imports`
 
-    at = (rows(map.ids, map.sightings.keyframe), rows(map.points.ids, map.sightings.point))
-    return csr_array((np.ones(len(at[0]), np.int32), at), shape=(len(map.ids), len(map.points.ids)))
+    at = (rows(slam_map.ids, slam_map.observations.keyframe), rows(slam_map.points.ids, slam_map.observations.point))
+    return csr_array((np.ones(len(at[0]), np.int32), at), shape=(len(slam_map.ids), len(slam_map.points.ids)))
 
 
-def covisible(map: Map, keyframe_id: int, at_least: int = 15) -> tuple[np.ndarray, np.ndarray]:
+def covisible(slam_map: Map, keyframe_id: int, at_least: int = 15) -> tuple[np.ndarray, np.ndarray]:
     """The keyframes that saw the same points as one of them: the covisibility graph around it.
 
     Args:
-        map: The map.
+        slam_map: The map.
         keyframe_id: A keyframe in it.
         at_least: Fewest points in common.
 
     Returns:
         Ids, most points in common first, and how many they are; without the keyframe itself.
     """
-    mine = np.unique(map.sightings.point[map.sightings.keyframe == keyframe_id])
-    others = map.sightings.keyframe[has(mine, map.sightings.point)]
+    mine = np.unique(slam_map.observations.point[slam_map.observations.keyframe == keyframe_id])
+    others = slam_map.observations.keyframe[has(mine, slam_map.observations.point)]
     ids, counts = np.unique(others[others != keyframe_id], return_counts=True)
     order = np.lexsort((-ids, -counts))
     order = order[counts[order] >= at_least]
     return ids[order], counts[order]
 
 
-def neighbourhood(map: Map, keyframe_id: int, at_least: int = 15, at_most: int = 20) -> tuple[np.ndarray, np.ndarray]:
+def neighborhood(
+    slam_map: Map, keyframe_id: int, at_least: int = 15, at_most: int = 20
+) -> tuple[np.ndarray, np.ndarray]:
     """The part of the map around a keyframe: what is matched and adjusted together.
 
     Args:
-        map: The map.
+        slam_map: The map.
         keyframe_id: A keyframe in it.
         at_least: Fewest points in common with it.
         at_most: Most keyframes besides it.
@@ -275,32 +277,32 @@ def neighbourhood(map: Map, keyframe_id: int, at_least: int = 15, at_most: int =
         Ids of the keyframe, then of those that share most points with it; and, ascending, of the points that they saw.
         Its parent in the spanning tree comes along even if it shares too few.
     """
-    near = covisible(map, keyframe_id, at_least)[0][:at_most]
-    parent = map.parent[map.row(keyframe_id)]
+    near = covisible(slam_map, keyframe_id, at_least)[0][:at_most]
+    parent = slam_map.parent[slam_map.row(keyframe_id)]
     if parent != NONE and parent not in near:
         near = np.append(near[: at_most - 1], parent)
     ids = np.append(np.int64(keyframe_id), near)
-    return ids, np.unique(map.sightings.point[np.isin(map.sightings.keyframe, ids)])
+    return ids, np.unique(slam_map.observations.point[np.isin(slam_map.observations.keyframe, ids)])
 
 
-def standing(map: Map, keyframe_ids: np.ndarray) -> np.ndarray:
+def surviving_keyframes(slam_map: Map, keyframe_ids: np.ndarray) -> np.ndarray:
     """For each keyframe its own id, or for one that was culled, of the keyframe in the map that holds its place.
 
     Raises:
         KeyError: If one was never in this map.
     """
-    order = np.argsort(map.culled.ids)
-    culled, anchor = map.culled.ids[order], map.culled.anchor[order]
+    order = np.argsort(slam_map.culled.ids)
+    culled, anchor = slam_map.culled.ids[order], slam_map.culled.anchor[order]
     ids = np.array(keyframe_ids, np.int64)
-    while (gone := ~has(map.ids, ids)).any():
+    while (gone := ~has(slam_map.ids, ids)).any():
         ids[gone] = anchor[rows(culled, ids[gone])]
     return ids
 
 
-def point_submaps(map: Map) -> np.ndarray:
+def point_submaps(slam_map: Map) -> np.ndarray:
     """`(p,)` submap of each point: that of the keyframe that made it."""
-    makers, which = np.unique(map.points.made_by, return_inverse=True)
-    return map.submap[rows(map.ids, standing(map, makers))][which]
+    makers, which = np.unique(slam_map.points.reference_keyframe, return_inverse=True)
+    return slam_map.submap[rows(slam_map.ids, surviving_keyframes(slam_map, makers))][which]
 
 
 def points_at(points: MapPoints, index: np.ndarray) -> MapPoints:
@@ -309,6 +311,6 @@ def points_at(points: MapPoints, index: np.ndarray) -> MapPoints:
     return MapPoints(X_world=points.X_world[:, index], **columns)
 
 
-def sightings_at(sightings: Sightings, index: np.ndarray) -> Sightings:
-    """The sightings in these rows, or where this mask is true."""
-    return Sightings(*(array[..., index] for array in sightings))
+def observations_at(observations: Observations, index: np.ndarray) -> Observations:
+    """The observations in these rows, or where this mask is true."""
+    return Observations(*(array[..., index] for array in observations))

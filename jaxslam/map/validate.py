@@ -8,9 +8,9 @@ from jaxtyping import AbstractArray
 
 from jaxslam.dynamics.occlusion import PointState
 from jaxslam.features.orb import Features
-from jaxslam.map.types import NONE, Culled, Loops, Map, MapPoints, Sightings, has, point_submaps, rows
+from jaxslam.map.types import NONE, Culled, Loops, Map, MapPoints, Observations, has, point_submaps, rows
 
-Record: TypeAlias = Map | MapPoints | Sightings | Loops | Culled | Features
+Record: TypeAlias = Map | MapPoints | Observations | Loops | Culled | Features
 
 _UNIT = 1e-6
 """How far from 1 the length of a quaternion may be."""
@@ -46,29 +46,29 @@ def array_fields(record: type) -> dict[str, ArrayField]:
     }
 
 
-def problems(map: Map) -> list[str]:
+def problems(slam_map: Map) -> list[str]:
     """All that is wrong with a map, in words; nothing, if it is whole.
 
     Types and shapes come first; if one is wrong, nothing else is looked at.
     """
-    wrong = list(_structure(map))
+    wrong = list(_structure(slam_map))
     if not wrong:
-        wrong = [*_identity(map), *_numbers(map)]
-    return wrong or [*_tree(map), *_sightings(map)]
+        wrong = [*_identity(slam_map), *_numbers(slam_map)]
+    return wrong or [*_tree(slam_map), *_observations(slam_map)]
 
 
-def _records(map: Map) -> dict[str, Record]:
+def _records(slam_map: Map) -> dict[str, Record]:
     """All records of a map, and what to put before the names of their arrays."""
-    records: dict[str, Record] = {"": map, "points.": map.points, "sightings.": map.sightings}
-    records |= {"loops.": map.loops, "culled.": map.culled}
-    return records | {f"keyframe {keyframe.id}: ": keyframe.features for keyframe in map.keyframes}
+    records: dict[str, Record] = {"": slam_map, "points.": slam_map.points, "observations.": slam_map.observations}
+    records |= {"loops.": slam_map.loops, "culled.": slam_map.culled}
+    return records | {f"keyframe {keyframe.id}: ": keyframe.features for keyframe in slam_map.keyframes}
 
 
-def _structure(map: Map) -> Iterator[str]:
+def _structure(slam_map: Map) -> Iterator[str]:
     """Types and shapes."""
-    lengths = {"k": len(map.keyframes), "p": len(map.points.ids), "s": len(map.sightings.point)}
-    lengths |= {"l": len(map.loops.source), "c": len(map.culled.ids)}
-    for prefix, record in _records(map).items():
+    lengths = {"k": len(slam_map.keyframes), "p": len(slam_map.points.ids), "s": len(slam_map.observations.point)}
+    lengths |= {"l": len(slam_map.loops.source), "c": len(slam_map.culled.ids)}
+    for prefix, record in _records(slam_map).items():
         if isinstance(record, Features):
             lengths["n"] = len(record.octave)
         for name, field in array_fields(type(record)).items():
@@ -77,29 +77,32 @@ def _structure(map: Map) -> Iterator[str]:
                 yield f"{prefix}{name}: expected {field.dtype} {shape}, got {array.dtype} {array.shape}"
 
 
-def _identity(map: Map) -> Iterator[str]:
+def _identity(slam_map: Map) -> Iterator[str]:
     """Ids that ascend, were given, and exist where they are mentioned."""
-    if map.ids.tolist() != [keyframe.id for keyframe in map.keyframes]:
+    if slam_map.ids.tolist() != [keyframe.id for keyframe in slam_map.keyframes]:
         yield "ids: not those of the keyframes"
-    for name, ids, after in (("ids", map.ids, map.next_keyframe), ("points.ids", map.points.ids, map.next_point)):
+    for name, ids, after in (
+        ("ids", slam_map.ids, slam_map.next_keyframe),
+        ("points.ids", slam_map.points.ids, slam_map.next_point),
+    ):
         if (np.diff(ids) <= 0).any() or ((ids < 0) | (ids >= after)).any():
             yield f"{name}: expected them to ascend from 0 and end before {after}"
-    culled = np.sort(map.culled.ids)
+    culled = np.sort(slam_map.culled.ids)
     if (
         (np.diff(culled) == 0).any()
-        or np.isin(culled, map.ids).any()
-        or ((culled < 0) | (culled >= map.next_keyframe)).any()
+        or np.isin(culled, slam_map.ids).any()
+        or ((culled < 0) | (culled >= slam_map.next_keyframe)).any()
     ):
         yield "culled.ids: one is given twice, or still in the map, or was never given"
-    known = np.concatenate([map.ids, culled])
+    known = np.concatenate([slam_map.ids, culled])
     mentions = {
-        "parent": (map.parent, np.append(map.ids, NONE)),
-        "points.made_by": (map.points.made_by, known),
-        "sightings.keyframe": (map.sightings.keyframe, map.ids),
-        "sightings.point": (map.sightings.point, map.points.ids),
-        "loops.source": (map.loops.source, map.ids),
-        "loops.target": (map.loops.target, map.ids),
-        "culled.anchor": (map.culled.anchor, known),
+        "parent": (slam_map.parent, np.append(slam_map.ids, NONE)),
+        "points.reference_keyframe": (slam_map.points.reference_keyframe, known),
+        "observations.keyframe": (slam_map.observations.keyframe, slam_map.ids),
+        "observations.point": (slam_map.observations.point, slam_map.points.ids),
+        "loops.source": (slam_map.loops.source, slam_map.ids),
+        "loops.target": (slam_map.loops.target, slam_map.ids),
+        "culled.anchor": (slam_map.culled.anchor, known),
     }
     for name, (ids, among) in mentions.items():
         if not np.isin(ids, among).all():
@@ -113,65 +116,65 @@ def number_problems(record: Record, prefix: str = "") -> list[str]:
         for name, array in record._asdict().items()
         if isinstance(array, np.ndarray) and array.dtype.kind == "f" and not np.isfinite(array).all()
     ]
-    if isinstance(record, MapPoints | Sightings) and ((record.weight < 0) | (record.weight > 1)).any():
+    if isinstance(record, MapPoints | Observations) and ((record.weight < 0) | (record.weight > 1)).any():
         wrong.append(f"{prefix}weight: expected 0 to 1")
     if isinstance(record, MapPoints) and not np.isin(record.state, list(PointState)).all():
         wrong.append(f"{prefix}state: expected {min(PointState)} to {max(PointState)}")
-    if isinstance(record, Sightings | Features) and (record.depth < 0).any():
+    if isinstance(record, Observations | Features) and (record.depth < 0).any():
         wrong.append(f"{prefix}depth: expected 0 or more")
-    if isinstance(record, Sightings) and (record.sigma_px <= 0).any():
+    if isinstance(record, Observations) and (record.sigma_px <= 0).any():
         wrong.append(f"{prefix}sigma_px: expected more than 0")
     return wrong
 
 
-def _numbers(map: Map) -> Iterator[str]:
+def _numbers(slam_map: Map) -> Iterator[str]:
     """Numbers in their ranges, and unit quaternions."""
-    for prefix, record in _records(map).items():
+    for prefix, record in _records(slam_map).items():
         yield from number_problems(record, prefix)
-    poses = {"T_world_cam": map.T_world_cam, "loops.T_source_target": map.loops.T_source_target}
-    poses["culled.T_anchor_keyframe"] = map.culled.T_anchor_keyframe
+    poses = {"T_world_cam": slam_map.T_world_cam, "loops.T_source_target": slam_map.loops.T_source_target}
+    poses["culled.T_anchor_keyframe"] = slam_map.culled.T_anchor_keyframe
     for name, T in poses.items():
         if (np.abs(np.linalg.norm(T[:, :4], axis=1) - 1) > _UNIT).any():
             yield f"{name}: a quaternion is not of unit length"
-    places = {name: T[:, 4:] for name, T in poses.items()} | {"points.X_world": map.points.X_world}
+    places = {name: T[:, 4:] for name, T in poses.items()} | {"points.X_world": slam_map.points.X_world}
     for name, X in places.items():
         if (np.abs(X) > _FARTHEST_M).any():
             yield f"{name}: expected coordinates of at most {_FARTHEST_M:g} m, got {np.abs(X).max():g}"
 
 
-def _tree(map: Map) -> Iterator[str]:
+def _tree(slam_map: Map) -> Iterator[str]:
     """One tree a submap, loops between two keyframes, and culled ones that are held by something."""
-    roots = map.parent == NONE
-    parent = np.arange(len(map.ids))
-    parent[~roots] = rows(map.ids, map.parent[~roots])
+    roots = slam_map.parent == NONE
+    parent = np.arange(len(slam_map.ids))
+    parent[~roots] = rows(slam_map.ids, slam_map.parent[~roots])
     if not roots[_ends(parent)].all():
         yield "parent: goes round in a circle"
-    if (map.submap != map.submap[parent]).any() or len(np.unique(map.submap)) != roots.sum():
+    if (slam_map.submap != slam_map.submap[parent]).any() or len(np.unique(slam_map.submap)) != roots.sum():
         yield "parent: expected one tree in each submap"
-    if (map.loops.source == map.loops.target).any():
+    if (slam_map.loops.source == slam_map.loops.target).any():
         yield "loops: one leads from a keyframe to itself"
 
 
-def _sightings(map: Map) -> Iterator[str]:
-    seen = map.sightings
+def _observations(slam_map: Map) -> Iterator[str]:
+    seen = slam_map.observations
     if _repeats(seen.keyframe, seen.point):
-        yield "sightings: a keyframe sees a point twice"
+        yield "observations: a keyframe sees a point twice"
     by_feature = seen.feature != NONE
     if _repeats(seen.keyframe[by_feature], seen.feature[by_feature]):
-        yield "sightings: two points are one feature"
-    at = rows(map.ids, seen.keyframe)
-    num_features = np.array([len(keyframe.features.octave) for keyframe in map.keyframes], np.int64)
+        yield "observations: two points are one feature"
+    at = rows(slam_map.ids, seen.keyframe)
+    num_features = np.array([len(keyframe.features.octave) for keyframe in slam_map.keyframes], np.int64)
     if ((seen.feature < NONE) | (seen.feature >= num_features[at])).any():
-        yield "sightings.feature: the keyframe has no such feature"
-    if _circle_of_culled(map):
+        yield "observations.feature: the keyframe has no such feature"
+    if _circle_of_culled(slam_map):
         yield "culled.anchor: goes round in a circle"
-    elif (map.submap[at] != point_submaps(map)[rows(map.points.ids, seen.point)]).any():
-        yield "sightings: a keyframe sees a point of another submap"
+    elif (slam_map.submap[at] != point_submaps(slam_map)[rows(slam_map.points.ids, seen.point)]).any():
+        yield "observations: a keyframe sees a point of another submap"
 
 
-def _circle_of_culled(map: Map) -> bool:
-    order = np.argsort(map.culled.ids)
-    ids, anchor = map.culled.ids[order], map.culled.anchor[order]
+def _circle_of_culled(slam_map: Map) -> bool:
+    order = np.argsort(slam_map.culled.ids)
+    ids, anchor = slam_map.culled.ids[order], slam_map.culled.anchor[order]
     inner = has(ids, anchor)
     following = np.arange(len(ids))
     following[inner] = rows(ids, anchor[inner])

@@ -6,28 +6,28 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 from jaxslam_kernels.bundle.bundle_adjust import BundleAdjustment, BundleStatus, bundle_adjust
-from jaxslam_kernels.bundle.cost import Observations
+from jaxslam_kernels.bundle.cost import Observations as BundleObservations
 from jaxslam_kernels.types import Scalar
 from jaxtyping import Array, Bool, Float
 
 from jaxslam.dynamics.occlusion import state_weights
 from jaxslam.geometry.se3 import between, compose, inverse, rotate, to_local, transform
-from jaxslam.map.edit import moved, without_sightings
-from jaxslam.map.types import NONE, Map, Sightings, covisible, has, rows, sightings_at
-from jaxslam.runtime.compile_cache import SOON_COMPILED
+from jaxslam.map.edit import with_positions, without_observations
+from jaxslam.map.types import NONE, Map, Observations, covisible, has, observations_at, rows
+from jaxslam.runtime.compile_cache import FAST_COMPILE
 from jaxslam.runtime.padding import padded
-from jaxslam.runtime.trace_cache import traced_once
+from jaxslam.runtime.trace_cache import cached_trace
 
 _NUM_FIXED = 4
 """Keyframes outside the window that hold it in place."""
 _POINT_SIZES = (512, 1536)
 """Points a window has room for; each size is compiled once."""
-_SIGHTINGS_A_POINT = 6
-_LEAST_KEYFRAMES = 4
+_OBSERVATIONS_A_POINT = 6
+_MIN_KEYFRAMES = 4
 """Below that tracking knows better: it has followed the points through all frames in between. With people in two or
 three keyframes, adjusting made 4.1 mm of 2.6 in the synthetic room."""
 _OUTLIER_CHI2 = 11.3
-"""Squared whitened error over which a sighting is dropped: 1 % of good ones with three residuals."""
+"""Squared whitened error over which a observation is dropped: 1 % of good ones with three residuals."""
 
 
 class AdjustPlan(NamedTuple):
@@ -37,8 +37,8 @@ class AdjustPlan(NamedTuple):
         window: Keyframes that move.
         max_steps: Bound on the steps of the solver.
         loss_scale: Scale of the Cauchy loss, in standard deviations.
-        depth_sigma_m: Standard deviation of measured depth close to the camera, metres.
-        depth_sigma_per_m2: Its growth with the square of depth, a metre.
+        depth_sigma_m: Standard deviation of measured depth close to the camera, meters.
+        depth_sigma_per_m2: Its growth with the square of depth, a meter.
         occluded_weight: How much OCCLUDED points count, where others count 1.
     """
 
@@ -56,32 +56,32 @@ class _Window(NamedTuple):
     num_free: int
     points: np.ndarray
     """Ids, ascending."""
-    sightings: Sightings
+    observations: Observations
     """Of the points in the keyframes,"""
     row: np.ndarray
     """and the row of each in the map."""
 
 
-def adjust_around(map: Map, keyframe_id: int, plan: AdjustPlan, movable: np.ndarray | None = None) -> Map:
+def adjust_around(slam_map: Map, keyframe_id: int, plan: AdjustPlan, movable: np.ndarray | None = None) -> Map:
     """The map with a keyframe, those covisible with it and their points where they fit what was seen best.
 
-    Sightings that do not fit are dropped. What the window does not move stays; a window that cannot be solved leaves
+    Observations that do not fit are dropped. What the window does not move stays; a window that cannot be solved leaves
     the map as it was.
 
     Args:
-        map: The map, or a part of it.
+        slam_map: The map, or a part of it.
         keyframe_id: The keyframe.
         plan: How.
         movable: Ids, ascending, of the keyframes that may move: of a part, those whose points are all here. By default
             all may.
     """
-    window = _window(map, keyframe_id, plan, map.ids if movable is None else movable)
+    window = _window(slam_map, keyframe_id, plan, slam_map.ids if movable is None else movable)
     if window is None:
-        return map
-    reference = map.T_world_cam[map.row(keyframe_id)]
-    poses, X = _solve_input(map, window, reference)
+        return slam_map
+    reference = slam_map.T_world_cam[slam_map.row(keyframe_id)]
+    poses, X = _solve_input(slam_map, window, reference)
     size = next(
-        size for size in _POINT_SIZES if size >= len(window.points) and size * _SIGHTINGS_A_POINT >= len(window.row)
+        size for size in _POINT_SIZES if size >= len(window.points) and size * _OBSERVATIONS_A_POINT >= len(window.row)
     )
     num_cameras = plan.window + _NUM_FIXED
     free = np.arange(num_cameras) < window.num_free
@@ -89,18 +89,18 @@ def adjust_around(map: Map, keyframe_id: int, plan: AdjustPlan, movable: np.ndar
         _adjust(
             padded(poses, num_cameras, axis=0, fill=_identity_row()),
             padded(X, size, axis=1, fill=0),
-            _observations(map, window, size, plan),
+            _observations(slam_map, window, size, plan),
             ~free,
             np.float32(plan.loss_scale),
             max_steps=plan.max_steps,
         )
     )
     if solution.status not in (BundleStatus.OK, BundleStatus.NOT_CONVERGED):
-        return map
-    return _put_back(map, window, reference, solution)
+        return slam_map
+    return _put_back(slam_map, window, reference, solution)
 
 
-def adjust_all(map: Map, plan: AdjustPlan, movable: np.ndarray, sweeps: int = 2) -> Map:
+def adjust_all(slam_map: Map, plan: AdjustPlan, movable: np.ndarray, sweeps: int = 2) -> Map:
     """The map adjusted window by window, over some keyframes (ids, ascending) and over again.
 
     They as one problem would need a Schur complement of all keyframes; windows that overlap by half pass on what a
@@ -108,8 +108,8 @@ def adjust_all(map: Map, plan: AdjustPlan, movable: np.ndarray, sweeps: int = 2)
     """
     for _ in range(sweeps):
         for keyframe_id in movable[:: max(plan.window // 2, 1)].tolist():
-            map = adjust_around(map, keyframe_id, plan, movable)
-    return map
+            slam_map = adjust_around(slam_map, keyframe_id, plan, movable)
+    return slam_map
 
 
 def compile_adjustment(plan: AdjustPlan) -> None:
@@ -118,72 +118,72 @@ def compile_adjustment(plan: AdjustPlan) -> None:
     poses = padded(_identity_row()[None], num_cameras, axis=0, fill=_identity_row())
     for size in _POINT_SIZES:
         X, free = np.zeros((3, size), np.float32), np.zeros(num_cameras, bool)
-        nothing = _no_observations(size * _SIGHTINGS_A_POINT)
+        nothing = _no_observations(size * _OBSERVATIONS_A_POINT)
         jax.block_until_ready(_adjust(poses, X, nothing, free, np.float32(plan.loss_scale), max_steps=plan.max_steps))
 
 
-def _no_observations(room: int) -> Observations:
+def _no_observations(room: int) -> BundleObservations:
     plane: Any = np.zeros((3, room), np.float32)
     index: Any = np.zeros(room, np.int32)
-    return Observations(index, index, plane[:2], plane[0], plane, plane[0], plane[0] > 0)
+    return BundleObservations(index, index, plane[:2], plane[0], plane, plane[0], plane[0] > 0)
 
 
-def _window(map: Map, keyframe_id: int, plan: AdjustPlan, movable: np.ndarray) -> _Window | None:
+def _window(slam_map: Map, keyframe_id: int, plan: AdjustPlan, movable: np.ndarray) -> _Window | None:
     """The window, or nothing if there is nothing to hold it or to move."""
-    near, _ = covisible(map, keyframe_id)
-    submap = map.submap[map.row(keyframe_id)]
-    near = near[(map.submap[rows(map.ids, near)] == submap) & has(movable, near)]
+    near, _ = covisible(slam_map, keyframe_id)
+    submap = slam_map.submap[slam_map.row(keyframe_id)]
+    near = near[(slam_map.submap[rows(slam_map.ids, near)] == submap) & has(movable, near)]
     free = np.concatenate([[keyframe_id], near[: plan.window - 1]])
-    first = map.parent[rows(map.ids, free)] == NONE  # it never moves: the frame of the submap is where it is
+    first = slam_map.parent[rows(slam_map.ids, free)] == NONE  # it never moves: the frame of the submap is where it is
     first, free = free[first], free[~first]
-    of_window = np.isin(map.sightings.keyframe, free)
-    points, counts = np.unique(map.sightings.point[of_window], return_counts=True)
-    others = ~of_window & has(points, map.sightings.point)
-    outside, shared = np.unique(map.sightings.keyframe[others], return_counts=True)
+    of_window = np.isin(slam_map.observations.keyframe, free)
+    points, counts = np.unique(slam_map.observations.point[of_window], return_counts=True)
+    others = ~of_window & has(points, slam_map.observations.point)
+    outside, shared = np.unique(slam_map.observations.keyframe[others], return_counts=True)
     held = outside[np.lexsort((outside, -shared, ~np.isin(outside, first)))][:_NUM_FIXED]
-    if not len(free) or not len(held) or len(free) + len(held) < _LEAST_KEYFRAMES:
+    if not len(free) or not len(held) or len(free) + len(held) < _MIN_KEYFRAMES:
         return None
     keyframes = np.concatenate([free, held])
-    of_both = np.isin(map.sightings.keyframe, keyframes) & has(points, map.sightings.point)
-    points, counts = np.unique(map.sightings.point[of_both], return_counts=True)
+    of_both = np.isin(slam_map.observations.keyframe, keyframes) & has(points, slam_map.observations.point)
+    points, counts = np.unique(slam_map.observations.point[of_both], return_counts=True)
     points, counts = points[counts > 1], counts[counts > 1]
     best = np.argsort(-counts, kind="stable")[: _POINT_SIZES[-1]]
-    best = best[np.cumsum(counts[best]) <= _POINT_SIZES[-1] * _SIGHTINGS_A_POINT]
+    best = best[np.cumsum(counts[best]) <= _POINT_SIZES[-1] * _OBSERVATIONS_A_POINT]
     points = np.sort(points[best])
-    row = np.flatnonzero(of_both & has(points, map.sightings.point))
+    row = np.flatnonzero(of_both & has(points, slam_map.observations.point))
     if not len(row):
         return None
-    return _Window(keyframes, len(free), points, sightings_at(map.sightings, row), row)
+    return _Window(keyframes, len(free), points, observations_at(slam_map.observations, row), row)
 
 
-def _solve_input(map: Map, window: _Window, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _solve_input(slam_map: Map, window: _Window, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Poses and points in the axes of the reference, so that float32 does however far away the world's origin is."""
-    poses = between(reference[None, :], map.T_world_cam[rows(map.ids, window.keyframes)])
-    X = to_local(reference, map.points.X_world[:, rows(map.points.ids, window.points)])
+    poses = between(reference[None, :], slam_map.T_world_cam[rows(slam_map.ids, window.keyframes)])
+    X = to_local(reference, slam_map.points.X_world[:, rows(slam_map.points.ids, window.points)])
     return poses.astype(np.float32), X.astype(np.float32)
 
 
-def _observations(map: Map, window: _Window, size: int, plan: AdjustPlan) -> Observations:
-    camera, seen = map.camera, window.sightings
-    room = size * _SIGHTINGS_A_POINT
+def _observations(slam_map: Map, window: _Window, size: int, plan: AdjustPlan) -> BundleObservations:
+    camera, seen = slam_map.camera, window.observations
+    room = size * _OBSERVATIONS_A_POINT
     slots = np.argsort(window.keyframes)
     row = slots[np.searchsorted(window.keyframes[slots], seen.keyframe)]
     sigma_depth = plan.depth_sigma_m + plan.depth_sigma_per_m2 * np.square(seen.depth)
     focal = np.array([[camera.fx], [camera.fy]])
-    centre = np.array([[camera.cx], [camera.cy]])
+    center = np.array([[camera.cx], [camera.cy]])
     point_row = np.searchsorted(window.points, seen.point)
-    at = rows(map.points.ids, seen.point)
-    weight = seen.weight * map.points.weight[at]
+    at = rows(slam_map.points.ids, seen.point)
+    weight = seen.weight * slam_map.points.weight[at]
     if plan.occluded_weight != 1:
-        weight = weight * state_weights(map.points.state[at], plan.occluded_weight)
+        weight = weight * state_weights(slam_map.points.state[at], plan.occluded_weight)
     of_depth = np.divide(1, sigma_depth, out=np.zeros_like(sigma_depth), where=seen.depth > 0)
     precision = np.concatenate([focal / seen.sigma_px, of_depth[None, :]])
     fit: Any = lambda array, dtype: padded(array.astype(dtype), room, axis=-1, fill=0)
     valid: Any = np.arange(room) < len(row)
-    return Observations(
+    return BundleObservations(
         camera=fit(row, np.int32),
         point=fit(point_row, np.int32),
-        xy=fit((seen.uv - centre) / focal, np.float32),
+        xy=fit((seen.uv - center) / focal, np.float32),
         depth=fit(seen.depth, np.float32),
         precision=fit(precision, np.float32),
         weights=fit(weight, np.float32),
@@ -191,12 +191,12 @@ def _observations(map: Map, window: _Window, size: int, plan: AdjustPlan) -> Obs
     )
 
 
-@partial(jax.jit, static_argnames="max_steps", compiler_options=SOON_COMPILED)
-@traced_once
+@partial(jax.jit, static_argnames="max_steps", compiler_options=FAST_COMPILE)
+@cached_trace
 def _adjust(
     poses: Float[Array, "k 7"],
     X: Float[Array, "3 n"],
-    observations: Observations,
+    observations: BundleObservations,
     fixed: Bool[Array, " k"],
     loss_scale: Scalar,
     *,
@@ -207,29 +207,29 @@ def _adjust(
     )
 
 
-def _put_back(map: Map, window: _Window, reference: np.ndarray, solution: Any) -> Map:
+def _put_back(slam_map: Map, window: _Window, reference: np.ndarray, solution: Any) -> Map:
     poses = compose(reference[None, :], solution.poses[: window.num_free].astype(np.float64))
     good = solution.determined[: len(window.points)]
     X_world = transform(reference, solution.X_world[:, : len(window.points)].astype(np.float64))
     free = window.keyframes[: window.num_free]
-    lone, along = _moved_along(map, free, poses)
+    lone, along = _moved_along(slam_map, free, poses)
     ids, places = np.concatenate([window.points[good], lone]), np.concatenate([X_world[:, good], along], axis=1)
-    map = moved(map, free, poses, ids, places)
-    wrong = np.zeros(len(map.sightings.keyframe), bool)
+    slam_map = with_positions(slam_map, free, poses, ids, places)
+    wrong = np.zeros(len(slam_map.observations.keyframe), bool)
     wrong[window.row] = ~(solution.chi2[: len(window.row)] < _OUTLIER_CHI2)
-    return without_sightings(map, wrong)
+    return without_observations(slam_map, wrong)
 
 
-def _moved_along(map: Map, keyframe_ids: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _moved_along(slam_map: Map, keyframe_ids: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The points that only one of some keyframes sees, and where they are when it has its new pose."""
-    row = rows(map.points.ids, map.sightings.point)
-    once = np.bincount(row, minlength=len(map.points.ids))[row] == 1
+    row = rows(slam_map.points.ids, slam_map.observations.point)
+    once = np.bincount(row, minlength=len(slam_map.points.ids))[row] == 1
     order = np.argsort(keyframe_ids)
-    lone = np.flatnonzero(once & has(keyframe_ids[order], map.sightings.keyframe))
-    which = order[rows(keyframe_ids[order], map.sightings.keyframe[lone])]
-    change = compose(poses, inverse(map.T_world_cam[rows(map.ids, keyframe_ids)]))[which]
-    X_world = rotate(change, map.points.X_world[:, row[lone]].T) + change[:, 4:]
-    return map.sightings.point[lone], X_world.T
+    lone = np.flatnonzero(once & has(keyframe_ids[order], slam_map.observations.keyframe))
+    which = order[rows(keyframe_ids[order], slam_map.observations.keyframe[lone])]
+    change = compose(poses, inverse(slam_map.T_world_cam[rows(slam_map.ids, keyframe_ids)]))[which]
+    X_world = rotate(change, slam_map.points.X_world[:, row[lone]].T) + change[:, 4:]
+    return slam_map.observations.point[lone], X_world.T
 
 
 def _identity_row() -> np.ndarray:

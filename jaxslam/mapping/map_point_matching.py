@@ -7,8 +7,8 @@ import numpy as np
 from jaxslam.features.matching import NEAR, match_by_projection
 from jaxslam.features.orb import FeaturePlan, Features
 from jaxslam.geometry.se3 import to_local
-from jaxslam.map.edit import fused, with_sightings
-from jaxslam.map.types import NONE, Map, Sightings, empty_sightings, rows, sightings_at
+from jaxslam.map.edit import with_fused_points, with_observations
+from jaxslam.map.types import NONE, Map, Observations, empty_observations, observations_at, rows
 
 _MARGIN_PX = 1.0
 _NEAREST_M = 0.1
@@ -16,12 +16,12 @@ _MAX_DEPTH_ERROR = 0.1
 """Largest difference between the depth of a point and that measured at a feature, as a share of it."""
 
 
-class Recognisable(NamedTuple):
+class DescribedPoints(NamedTuple):
     """Points of the map that have a descriptor, with how they looked; `(r,)`, ascending by id.
 
     Attributes:
         ids: Of the points.
-        X_world: `(3, r)` metres.
+        X_world: `(3, r)` meters.
         descriptor: `(r, 32)`.
         size: Size of the feature times its distance: over another distance, its size from there in octave 0's.
     """
@@ -32,26 +32,30 @@ class Recognisable(NamedTuple):
     size: np.ndarray
 
 
-def recognisable_in(map: Map, keyframe_ids: np.ndarray) -> Recognisable:
+def described_points_in(slam_map: Map, keyframe_ids: np.ndarray) -> DescribedPoints:
     """The points with a descriptor that some keyframes see."""
-    seen = np.flatnonzero(np.isin(map.sightings.keyframe, keyframe_ids) & (map.sightings.feature != NONE))
-    ids, first = np.unique(map.sightings.point[seen], return_index=True)
+    seen = np.flatnonzero(
+        np.isin(slam_map.observations.keyframe, keyframe_ids) & (slam_map.observations.feature != NONE)
+    )
+    ids, first = np.unique(slam_map.observations.point[seen], return_index=True)
     seen = seen[first]
-    row = rows(map.points.ids, ids)
-    X_world = map.points.X_world[:, row]
-    distance = np.linalg.norm(X_world - map.T_world_cam[rows(map.ids, map.sightings.keyframe[seen]), 4:].T, axis=0)
-    with_descriptor = map.points.recognisable[row]
-    return Recognisable(
+    row = rows(slam_map.points.ids, ids)
+    X_world = slam_map.points.X_world[:, row]
+    distance = np.linalg.norm(
+        X_world - slam_map.T_world_cam[rows(slam_map.ids, slam_map.observations.keyframe[seen]), 4:].T, axis=0
+    )
+    with_descriptor = slam_map.points.has_descriptor[row]
+    return DescribedPoints(
         ids[with_descriptor],
         X_world[:, with_descriptor],
-        map.points.descriptor[row[with_descriptor]],
-        (map.sightings.sigma_px[seen] * distance)[with_descriptor],
+        slam_map.points.descriptor[row[with_descriptor]],
+        (slam_map.observations.sigma_px[seen] * distance)[with_descriptor],
     )
 
 
 def find_points(
-    map: Map,
-    points: Recognisable,
+    slam_map: Map,
+    points: DescribedPoints,
     features: Features,
     T_world_cam: np.ndarray,
     plan: FeaturePlan,
@@ -62,7 +66,7 @@ def find_points(
     """Find points of the map among the features of a picture taken from about `T_world_cam`.
 
     Args:
-        map: The map; for its camera.
+        slam_map: The map; for its camera.
         points: What to look for.
         features: Of the picture.
         T_world_cam: `(7,)` where it was taken from.
@@ -73,7 +77,7 @@ def find_points(
     Returns:
         `(2, m)` index in `points` and in `features` of each match.
     """
-    camera = map.camera
+    camera = slam_map.camera
     X = to_local(T_world_cam, points.X_world)
     front = X[2] > _NEAREST_M
     z = np.where(front, X[2], 1.0)
@@ -97,15 +101,15 @@ def find_points(
     return np.stack([index, feature])[:, agrees]
 
 
-def feature_sightings(
+def feature_observations(
     keyframe_id: int, features: Features, point_ids: np.ndarray, feature: np.ndarray, plan: FeaturePlan
-) -> Sightings:
-    """Sightings of points at features of a keyframe."""
-    return Sightings(
+) -> Observations:
+    """Observations of points at features of a keyframe."""
+    return Observations(
         keyframe=np.full(len(feature), keyframe_id, np.int64),
         point=point_ids.astype(np.int64),
         feature=feature.astype(np.int32),
-        seen_uv=features.seen_uv[:, feature],
+        uv_raw=features.uv_raw[:, feature],
         uv=features.uv[:, feature],
         depth=features.depth[feature],
         sigma_px=plan.scale(features.octave[feature]).astype(np.float32),
@@ -114,39 +118,41 @@ def feature_sightings(
 
 
 def fuse_duplicates(
-    map: Map, keyframe_id: int, neighbours: np.ndarray, plan: FeaturePlan, *, radius_px: float
+    slam_map: Map, keyframe_id: int, neighbors: np.ndarray, plan: FeaturePlan, *, radius_px: float
 ) -> tuple[Map, np.ndarray, np.ndarray]:
-    """Look for the points of a keyframe in its neighbours: what is there a point already becomes one with it.
+    """Look for the points of a keyframe in its neighbors: what is there a point already becomes one with it.
 
     Args:
-        map: The map, or a part with all that these keyframes saw.
+        slam_map: The map, or a part with all that these keyframes saw.
         keyframe_id: The keyframe.
-        neighbours: Ids of others of its submap.
+        neighbors: Ids of others of its submap.
         plan: How features are found.
         radius_px: As for `find_points`.
 
     Returns:
         The map, and the points that others became one with: ids kept and ids dropped.
     """
-    points = recognisable_in(map, np.array([keyframe_id]))
-    kept, dropped, new = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [empty_sightings()]
-    for neighbour in neighbours.tolist():
-        features = map.keyframe(neighbour).features
-        seen = sightings_at(map.sightings, np.flatnonzero(map.sightings.keyframe == neighbour))
+    points = described_points_in(slam_map, np.array([keyframe_id]))
+    kept, dropped, new = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [empty_observations()]
+    for neighbor in neighbors.tolist():
+        features = slam_map.keyframe(neighbor).features
+        seen = observations_at(slam_map.observations, np.flatnonzero(slam_map.observations.keyframe == neighbor))
         unseen = ~np.isin(points.ids, seen.point)
-        wanted = Recognisable(
+        wanted = DescribedPoints(
             points.ids[unseen], points.X_world[:, unseen], points.descriptor[unseen], points.size[unseen]
         )
-        index, feature = find_points(map, wanted, features, map.pose(neighbour), plan, radius_px=radius_px)
+        index, feature = find_points(slam_map, wanted, features, slam_map.pose(neighbor), plan, radius_px=radius_px)
         point_at = np.full(len(features.octave), NONE, np.int64)
         by_feature = seen.feature != NONE
         point_at[seen.feature[by_feature]] = seen.point[by_feature]
         there, mine = point_at[feature], wanted.ids[index]
         free = there == NONE
-        new.append(feature_sightings(neighbour, features, mine[free], feature[free], plan))
+        new.append(feature_observations(neighbor, features, mine[free], feature[free], plan))
         kept.append(np.minimum(there, mine)[~free])
         dropped.append(np.maximum(there, mine)[~free])
-    map = with_sightings(map, Sightings(*(np.concatenate(columns, axis=-1) for columns in zip(*new, strict=True))))
+    slam_map = with_observations(
+        slam_map, Observations(*(np.concatenate(columns, axis=-1) for columns in zip(*new, strict=True)))
+    )
     drop, first = np.unique(np.concatenate(dropped), return_index=True)
     keep = np.concatenate(kept)[first]
-    return fused(map, keep, drop), keep, drop
+    return with_fused_points(slam_map, keep, drop), keep, drop

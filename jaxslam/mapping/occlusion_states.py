@@ -25,11 +25,11 @@ from jaxslam.dynamics.occlusion import PointState, States, next_states, occluded
 from jaxslam.geometry.se3 import IDENTITY, to_local
 from jaxslam.map.edit import with_states
 from jaxslam.map.types import NONE, Map, has, rows, visibility
-from jaxslam.runtime.compile_cache import IN_ITS_THREAD
+from jaxslam.runtime.compile_cache import SINGLE_THREAD
 from jaxslam.runtime.padding import padded
-from jaxslam.runtime.trace_cache import traced_once
+from jaxslam.runtime.trace_cache import cached_trace
 from jaxslam.sensors.frame_arrays import FrameArrays
-from jaxslam.tracking.measurement import depth_sigma, observe, predict_pixels
+from jaxslam.tracking.measurement import depth_sigma, measure, predict_pixels
 from jaxslam.tracking.state import TrackParams
 
 _DEPTH_SIGMAS, _DEPTH_SHARE = 4.2, 0.02
@@ -37,9 +37,9 @@ _DEPTH_SIGMAS, _DEPTH_SHARE = 4.2, 0.02
 difference of two measurements, and a share of the depth for errors of pose and calibration."""
 _REACH_PX = 2
 """Around a point, all depth must be of one surface: at an edge, pixels of error in the pose would be one of depth."""
-_MOST_BENT = 0.5
+_MAX_BENT = 0.5
 """Share of the picture by which a lens moves a point at most: farther out, its polynomial may fold back inside."""
-_MOST_BLOCKED = 512
+_MAX_BLOCKED = 512
 """Blocked points of earlier keyframes that are followed on; those of the latest, if there are more."""
 _AS_IN_MAP = -1
 
@@ -63,7 +63,7 @@ class _Columns(NamedTuple):
 
     Attributes:
         states: `(n,)` as they are now.
-        X_keyframe: `(3, n)` where they are in the axes of the keyframe, metres.
+        X_keyframe: `(3, n)` where they are in the axes of the keyframe, meters.
         there: `(n,)` which slots hold a point,
         own: `(n,)` and which of them one that the keyframe saw.
     """
@@ -74,7 +74,7 @@ class _Columns(NamedTuple):
     own: Mask
 
 
-class _Shown(NamedTuple):
+class _VisiblePoints(NamedTuple):
     """The points that are looked at, those of a keyframe first.
 
     Attributes:
@@ -95,24 +95,26 @@ class _Shown(NamedTuple):
 class PointStates:
     """Has the states of the points of the reference keyframe go on with every frame; of one thread."""
 
-    def __init__(self, config: OcclusionConfig, params: TrackParams, map: Map, most_points: int) -> None:
+    def __init__(self, config: OcclusionConfig, params: TrackParams, slam_map: Map, most_points: int) -> None:
         """Begin with the states that a map has.
 
         Args:
             config: Settings.
             params: Camera and the errors of its depth.
-            map: To begin with.
+            slam_map: To begin with.
             most_points: That a keyframe to come may see; those of the map may see more.
         """
         self._config, self._params = config, params
-        by_feature = [len(keyframe.features.octave) for keyframe in map.keyframes]
-        tracked = np.bincount(map.sightings.keyframe[map.sightings.feature == NONE], minlength=map.next_keyframe)
-        most = max([most_points, *(np.array(by_feature, np.int64) + tracked[map.ids]).tolist()])
-        self._room = most + _MOST_BLOCKED
+        by_feature = [len(keyframe.features.octave) for keyframe in slam_map.keyframes]
+        tracked = np.bincount(
+            slam_map.observations.keyframe[slam_map.observations.feature == NONE], minlength=slam_map.next_keyframe
+        )
+        most = max([most_points, *(np.array(by_feature, np.int64) + tracked[slam_map.ids]).tolist()])
+        self._room = most + _MAX_BLOCKED
         self._state, self._change = np.zeros(0, np.int8), np.zeros(0, np.int64)
         self._number = 1
-        self._shown: _Shown | None = None
-        self.arrived(map, 0)
+        self._shown: _VisiblePoints | None = None
+        self.arrived(slam_map, 0)
 
     def compile(self, frame: FrameArrays) -> None:
         """Compile what a frame of this size needs."""
@@ -121,12 +123,12 @@ class PointStates:
         jax.block_until_ready(self._after(columns, IDENTITY, np.zeros(6, np.float32), frame))
 
     def see(
-        self, map: Map, keyframe_id: int, T_keyframe_cam: np.ndarray, twist: np.ndarray, arrays: FrameArrays
+        self, slam_map: Map, keyframe_id: int, T_keyframe_cam: np.ndarray, twist: np.ndarray, arrays: FrameArrays
     ) -> float:
         """Take in a frame whose pose is known.
 
         Args:
-            map: The map that arrived last.
+            slam_map: The map that arrived last.
             keyframe_id: The reference keyframe, of that map.
             T_keyframe_cam: `(7,)` where the frame was taken, in its axes.
             twist: `(6,)` velocity of the camera in its own axes.
@@ -135,7 +137,7 @@ class PointStates:
         Returns:
             The share of the points of the keyframe that are OCCLUDED.
         """
-        shown = self._points_of(map, keyframe_id)
+        shown = self._points_of(slam_map, keyframe_id)
         after, counted = self._after(shown.columns, T_keyframe_cam, twist, arrays)
         num_changed, share = np.asarray(counted).tolist()
         if num_changed:
@@ -147,12 +149,12 @@ class PointStates:
         self._shown = shown
         return share
 
-    def weights(self, map: Map, point_ids: np.ndarray) -> Float32[np.ndarray, " n"]:
+    def weights(self, slam_map: Map, point_ids: np.ndarray) -> Float32[np.ndarray, " n"]:
         """How much points of the map that arrived last count beside each other, 1 on average.
 
         Only ratios matter to a pose; with that average, its covariance does not become less where many are OCCLUDED.
         """
-        weights = state_weights(self._of(map, point_ids), self._config.weight)
+        weights = state_weights(self._of(slam_map, point_ids), self._config.weight)
         return weights / weights.mean() if len(weights) else weights
 
     def handed_over(self) -> StateChanges:
@@ -162,38 +164,38 @@ class PointStates:
         self._number += 1
         return changes
 
-    def arrived(self, map: Map, number: int) -> None:
+    def arrived(self, slam_map: Map, number: int) -> None:
         """Take in a new map, which has all changes up to a number."""
-        more = map.next_point - len(self._state)
+        more = slam_map.next_point - len(self._state)
         self._state = np.append(self._state, np.full(more, _AS_IN_MAP, np.int8))
         self._change = np.append(self._change, np.zeros(more, np.int64))
         self._state[self._change <= number] = _AS_IN_MAP
 
-    def _of(self, map: Map, point_ids: np.ndarray) -> np.ndarray:
+    def _of(self, slam_map: Map, point_ids: np.ndarray) -> np.ndarray:
         """The states of points as they are now."""
         ahead = self._state[point_ids]
-        return np.where(ahead == _AS_IN_MAP, map.points.state[rows(map.points.ids, point_ids)], ahead)
+        return np.where(ahead == _AS_IN_MAP, slam_map.points.state[rows(slam_map.points.ids, point_ids)], ahead)
 
-    def _points_of(self, map: Map, keyframe_id: int) -> _Shown:
+    def _points_of(self, slam_map: Map, keyframe_id: int) -> _VisiblePoints:
         """What is looked at, anew for every map and every keyframe."""
         shown = self._shown
-        if shown is not None and shown.map is map and shown.keyframe == keyframe_id:
+        if shown is not None and shown.map is slam_map and shown.keyframe == keyframe_id:
             return shown
-        submap = int(map.submap[map.row(keyframe_id)])
-        own = map.sightings.point[map.sightings.keyframe == keyframe_id]
-        blocked = self._blocked(map) if shown is not None and shown.submap == submap else own[:0]
-        ids = np.concatenate([own, blocked[~np.isin(blocked, own)][:_MOST_BLOCKED]])
-        X_keyframe = to_local(map.pose(keyframe_id), map.points.X_world[:, rows(map.points.ids, ids)])
+        submap = int(slam_map.submap[slam_map.row(keyframe_id)])
+        own = slam_map.observations.point[slam_map.observations.keyframe == keyframe_id]
+        blocked = self._blocked(slam_map) if shown is not None and shown.submap == submap else own[:0]
+        ids = np.concatenate([own, blocked[~np.isin(blocked, own)][:_MAX_BLOCKED]])
+        X_keyframe = to_local(slam_map.pose(keyframe_id), slam_map.points.X_world[:, rows(slam_map.points.ids, ids)])
         columns = self._columns(
-            self._of(map, ids), X_keyframe.astype(np.float32), np.ones(len(ids), bool), np.ones(len(own), bool)
+            self._of(slam_map, ids), X_keyframe.astype(np.float32), np.ones(len(ids), bool), np.ones(len(own), bool)
         )
-        return _Shown(map, keyframe_id, submap, ids, columns)
+        return _VisiblePoints(slam_map, keyframe_id, submap, ids, columns)
 
-    def _blocked(self, map: Map) -> np.ndarray:
+    def _blocked(self, slam_map: Map) -> np.ndarray:
         """Those of the points looked at that are blocked and in the map still, the latest first."""
         ids = self._shown.ids if self._shown is not None else np.zeros(0, np.int64)
-        ids = ids[has(map.points.ids, ids)]
-        return ids[self._of(map, ids) == PointState.BLOCKED]
+        ids = ids[has(slam_map.points.ids, ids)]
+        return ids[self._of(slam_map, ids) == PointState.BLOCKED]
 
     def _columns(self, *columns: np.ndarray) -> _Columns:
         """One column a point, filled up with zeros to the size that the program is compiled for."""
@@ -208,20 +210,20 @@ class PointStates:
         return _after_frame(columns, *motion, *seen, self._params, guard=self._config.guard)
 
 
-def with_changes(map: Map, changes: StateChanges) -> Map:
+def with_changes(slam_map: Map, changes: StateChanges) -> Map:
     """The map with changed states of those points that are in it still."""
-    there = has(map.points.ids, changes.ids)
-    return with_states(map, changes.ids[there], changes.states[there])
+    there = has(slam_map.points.ids, changes.ids)
+    return with_states(slam_map, changes.ids[there], changes.states[there])
 
 
-def occluded_shares(map: Map) -> Float64[np.ndarray, " k"]:
+def occluded_shares(slam_map: Map) -> Float64[np.ndarray, " k"]:
     """The share of the points that each keyframe saw which are OCCLUDED; 0 of none."""
-    seen = visibility(map)
-    return (seen @ (map.points.state == PointState.OCCLUDED)) / np.maximum(seen.sum(axis=1), 1)
+    seen = visibility(slam_map)
+    return (seen @ (slam_map.points.state == PointState.OCCLUDED)) / np.maximum(seen.sum(axis=1), 1)
 
 
-@partial(jax.jit, static_argnames="guard", compiler_options=IN_ITS_THREAD)
-@traced_once
+@partial(jax.jit, static_argnames="guard", compiler_options=SINGLE_THREAD)
+@cached_trace
 def _after_frame(
     columns: _Columns,
     T_keyframe_cam: Float[Array, "7"],
@@ -253,7 +255,7 @@ def _before_the_lens(X_cam: Points, size: Float[Array, "2 1"], params: TrackPara
     """Which points are in front of the camera, and not so far aside that a lens could only seem to show them."""
     nearest = params.min_depth_m / 2
     straight = to_pixels(params.intrinsics, X_cam[:2] / jnp.maximum(X_cam[2:], nearest))
-    near = (straight > -_MOST_BENT * size) & (straight < (1 + _MOST_BENT) * size)
+    near = (straight > -_MAX_BENT * size) & (straight < (1 + _MAX_BENT) * size)
     return (X_cam[2] > nearest) & near.all(axis=0)
 
 
@@ -271,14 +273,14 @@ def _displaced(
     can tell, and what is in doubt counts once.
 
     Args:
-        expected: `(n,)` depth at which they should be, metres.
+        expected: `(n,)` depth at which they should be, meters.
         uv: `(2, n)` where they should be seen, pixels.
         twist: Velocity of the camera in its own axes.
-        depth: Depth image, metres, as it came.
+        depth: Depth image, meters, as it came.
         depth_delay_s: Seconds from the time of the image to that of the depth.
         params: Camera and the errors of its depth.
     """
-    measured = observe(uv, expected, twist, depth, depth_delay_s, params, reach=_REACH_PX).depth
+    measured = measure(uv, expected, twist, depth, depth_delay_s, params, reach=_REACH_PX).depth
     known = (measured > params.min_depth_m) & (measured < params.max_depth_m)
     tolerance = _DEPTH_SIGMAS * depth_sigma(expected, params) + _DEPTH_SHARE * expected
     return known & (jnp.abs(measured - expected) > tolerance)

@@ -18,7 +18,7 @@ _RATIO = 0.8
 """The best match must differ in less than this share of the bits of the second best along the line."""
 _CHI2_LINE, _CHI2_POINT = 3.84, 5.99
 """95 % quantiles of chi squared with one and with two degrees of freedom."""
-_LEAST_PARALLAX = np.deg2rad(2.0)
+_MIN_PARALLAX = np.deg2rad(2.0)
 """Smallest angle between the two rays: with a focal length of 525 pixels, depth is then known to a tenth."""
 _SCALE_FACTOR = 1.5
 """How far the ratio of distances may be from that of the features' sizes, besides a level of the pyramid."""
@@ -31,7 +31,7 @@ class Triangulated(NamedTuple):
     Attributes:
         first: Index of the feature in the first one.
         second: Index of the feature in the second one.
-        X_first: `(3, m)` metres, in the axes of the first.
+        X_first: `(3, m)` meters, in the axes of the first.
     """
 
     first: np.ndarray
@@ -64,7 +64,7 @@ def triangulate(
     X, X_second = np.where(good, X, 1.0), np.where(good, X_second, 1.0)
     near, far = np.linalg.norm(X, axis=0), np.linalg.norm(X_second, axis=0)
     turned = matrices(T_first_second[:4]) @ X_second
-    good &= (X * turned).sum(axis=0) < np.cos(_LEAST_PARALLAX) * near * far
+    good &= (X * turned).sum(axis=0) < np.cos(_MIN_PARALLAX) * near * far
     for local, ray, sigma, index in zip((X, X_second), (a, b), sigmas, pairs, strict=True):
         error = local[:2] / local[2] - ray[:2]
         good &= (error**2).sum(axis=0) < _CHI2_POINT * sigma[index] ** 2
@@ -117,7 +117,7 @@ def _intersections(first: np.ndarray, second: np.ndarray, T_first_second: np.nda
 
 
 def at_baseline(T_world_first: np.ndarray, T_world_second: np.ndarray, depth: np.ndarray) -> bool:
-    """Whether two keyframes are far enough apart for points as far away as those seen (metres, 0 for none)."""
+    """Whether two keyframes are far enough apart for points as far away as those seen (meters, 0 for none)."""
     seen = depth[depth > 0]
     apart = np.linalg.norm(between(T_world_first, T_world_second)[4:])
-    return bool(len(seen) and apart > _LEAST_PARALLAX * np.median(seen))
+    return bool(len(seen) and apart > _MIN_PARALLAX * np.median(seen))

@@ -20,34 +20,34 @@ from jaxtyping import Array, Bool, Float
 
 from jaxslam.geometry.se3 import between, compose
 from jaxslam.runtime.aligned_memory import aligned_array
-from jaxslam.runtime.compile_cache import IN_ITS_THREAD
-from jaxslam.runtime.trace_cache import traced_once
-from jaxslam.sensors.downscale import Raster, Reduced
+from jaxslam.runtime.compile_cache import SINGLE_THREAD
+from jaxslam.runtime.trace_cache import cached_trace
+from jaxslam.sensors.downscale import Downscaler, ImageGrid
 
 _COARSE_WIDTH = 160
 """Images are compared at about so many columns."""
 _AGO_S = (0.27, 0.5)
 """How long ago the frames were taken that tell what is new and what stands still: a walker has moved by half his width,
 and more than a step. With 0.33 s for the latter, masks without detections for a second are worse (Bonn `crowd`, against
-DeepLab, newcomers not added: median IoU 0.35 instead of 0.39): people who pause leave them."""
+DeepLab, new_surfaces not added: median IoU 0.35 instead of 0.39): people who pause leave them."""
 _KEPT_S = 1.0
 _NEW_SHARE = 0.003
-"""Least share of the image that a newcomer covers."""
+"""Least share of the image that a new surface covers."""
 _NEW_RANGE_M = 0.2
 """How much nearer and farther than the surface that is new the rest of it may be."""
 _TIMING_S = 0.0125
 """How well it is known when a row of a depth image was taken: half the readout of a rolling shutter. A camera that
-turns shows edges displaced by that: on TUM `fr1_rpy`, at 2 rad/s, desks had newcomers of 20 pixels along them."""
+turns shows edges displaced by that: on TUM `fr1_rpy`, at 2 rad/s, desks had new_surfaces of 20 pixels along them."""
 _PERCENTILES = (5, 95)
-_LEAST_OVERLAP = 0.1
-"""A piece of a newcomer holds at least this share of the surface that is new."""
+_MIN_OVERLAP = 0.1
+"""A piece of a new surface holds at least this share of the surface that is new."""
 
 
-class Surfaces(NamedTuple):
+class BackgroundSurfaces(NamedTuple):
     """What is known of the pixels of a frame, at the coarse size.
 
     Attributes:
-        depth: `(h, w)` metres, 0 where missing.
+        depth: `(h, w)` meters, 0 where missing.
         outside: `(h, w)` the surface was there, and outside the mask, in the frame the mask is carried on from.
         still: `(h, w)` it has been there for a while.
         unmoved: `(h, w)` it was there a little ago, and outside the mask.
@@ -76,7 +76,7 @@ class _Remembered(NamedTuple):
 class SurfaceMemory:
     """Keeps the depth, masks and poses of the last second, and compares new frames with them."""
 
-    def __init__(self, raster: Raster, farthest_m: float = math.inf) -> None:
+    def __init__(self, raster: ImageGrid, farthest_m: float = math.inf) -> None:
         """Begin with nothing seen.
 
         Args:
@@ -84,7 +84,7 @@ class SurfaceMemory:
             farthest_m: Depth beyond is as good as missing: sensors that see nothing may say that it is far away.
         """
         self._farthest_m = farthest_m
-        self._reduced = Reduced(raster, _COARSE_WIDTH)
+        self._reduced = Downscaler(raster, _COARSE_WIDTH)
         self._intrinsics, shape = self._reduced.raster.intrinsics, self._reduced.raster.shape
         num = 1 + len(_AGO_S)
         self._depth = aligned_array(shape, np.float32)
@@ -103,14 +103,14 @@ class SurfaceMemory:
         turn_rad_per_s: float,
         depth: Float[np.ndarray, "h w"],
         since: tuple[int, Bool[np.ndarray, "h w"]] | None = None,
-    ) -> Surfaces:
+    ) -> BackgroundSurfaces:
         """Compare a frame with those before.
 
         Args:
             time_s: Of the frame.
             T_world_cam: Where the camera was when the depth was taken.
             turn_rad_per_s: How fast it turns.
-            depth: Metres, 0 where missing.
+            depth: Meters, 0 where missing.
             since: Number and mask of the frame that the mask is carried on from.
         """
         coarse = self._reduced.every(depth)
@@ -128,7 +128,7 @@ class SurfaceMemory:
         turns = turn_rad_per_s + (0.0 if before[1] is None else before[1].turn_rad_per_s)
         displaced_px = float(self._intrinsics.fx) * turns * _TIMING_S
         outside, still, unmoved, new = self._compared(poses)
-        return Surfaces(self._depth, outside, still, unmoved, new, displaced_px)
+        return BackgroundSurfaces(self._depth, outside, still, unmoved, new, displaced_px)
 
     def remember(
         self,
@@ -158,9 +158,9 @@ class SurfaceMemory:
         smooth = cv2.medianBlur(drop.view(np.uint8), 3)
         return mask & ~self._reduced.whole(smooth.view(bool)) if smooth.any() else mask
 
-    def with_newcomers(self, mask: Bool[np.ndarray, "h w"], seen: Surfaces) -> Bool[np.ndarray, "h w"]:
+    def with_new_surfaces(self, mask: Bool[np.ndarray, "h w"], seen: BackgroundSurfaces) -> Bool[np.ndarray, "h w"]:
         """A mask with what has come into the picture: what is new, and what hangs together with it."""
-        coming = newcomers(seen, self._reduced.every(mask))
+        coming = new_surfaces(seen, self._reduced.every(mask))
         return mask | self._reduced.whole(coming) if coming.any() else mask
 
     def _about(self, time_s: float, within_s: float) -> _Remembered | None:
@@ -174,7 +174,7 @@ class SurfaceMemory:
         return [np.asarray(each) for each in compared]
 
 
-def newcomers(seen: Surfaces, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+def new_surfaces(seen: BackgroundSurfaces, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Pixels of what has come into the picture and is not in the mask: new surfaces, and the rest of their objects.
 
     The rest has the depth of the new surface, hangs together with it, and is not known to stand where it is.
@@ -193,12 +193,12 @@ def newcomers(seen: Surfaces, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray,
         num_parts, part = cv2.connectedComponents(alike.view(np.uint8), connectivity=4)
         held = np.bincount(part[core], minlength=num_parts)
         held[0] = 0  # the background
-        coming |= (held > _LEAST_OVERLAP * area)[part]
+        coming |= (held > _MIN_OVERLAP * area)[part]
     return coming
 
 
-@partial(jax.jit, compiler_options=IN_ITS_THREAD)
-@traced_once
+@partial(jax.jit, compiler_options=SINGLE_THREAD)
+@cached_trace
 def _compared(
     depth: Float[Array, "h w"],
     depths_then: Float[Array, "k h w"],

@@ -7,18 +7,18 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from jaxslam.sensors.camera import Camera
-from jaxslam.sensors.downscale import Raster, Reduced
+from jaxslam.sensors.downscale import Downscaler, ImageGrid
 
 _WIDTH_PX = 320
 _STEP, _STEP_M = 0.04, 0.03
-"""Difference of depth between neighbours at which one object ends, as a share of depth and besides."""
-_LEAST = 0.002
+"""Difference of depth between neighbors at which one object ends, as a share of depth and besides."""
+_MIN = 0.002
 """Share of the picture that makes an object; less has no points to judge it by."""
 _REACH_PX = 4
 """How far from an object pixels of the mask belong to it that depth does not show, or shows in small pieces."""
 
 
-class Objects(NamedTuple):
+class Instances(NamedTuple):
     """A mask, divided.
 
     Attributes:
@@ -30,22 +30,22 @@ class Objects(NamedTuple):
     rest: Bool[np.ndarray, "h w"]
 
 
-class ObjectFinder:
+class InstanceFinder:
     """Divides masks of one camera's images."""
 
     def __init__(self, camera: Camera, most: int) -> None:
         """Find so many objects at most, up to 255."""
-        self._reduced, self._most = Reduced(Raster.of(camera), _WIDTH_PX), most
+        self._reduced, self._most = Downscaler(ImageGrid.of(camera), _WIDTH_PX), most
 
-    def divided(self, mask: Bool[np.ndarray, "h w"], depth: Float[np.ndarray, "h w"]) -> Objects:
+    def divided(self, mask: Bool[np.ndarray, "h w"], depth: Float[np.ndarray, "h w"]) -> Instances:
         """The objects in a mask.
 
         Args:
             mask: What may move.
-            depth: Metres, 0 where missing.
+            depth: Meters, 0 where missing.
         """
         if not mask.any():
-            return Objects(np.zeros(mask.shape, np.uint8), np.zeros(mask.shape, bool))
+            return Instances(np.zeros(mask.shape, np.uint8), np.zeros(mask.shape, bool))
         small = object_labels(self._reduced.every(mask), self._reduced.every(depth), self._most)
         # Rows and columns that make no whole pixel of the smaller image are in no object.
         whole = np.zeros(mask.shape, np.uint8)
@@ -53,7 +53,7 @@ class ObjectFinder:
         large = np.repeat(np.repeat(small, step, axis=0), step, axis=1)
         whole[: large.shape[0], : large.shape[1]] = large
         whole[~mask] = 0
-        return Objects(whole, mask & (whole == 0))
+        return Instances(whole, mask & (whole == 0))
 
 
 def object_labels(
@@ -63,7 +63,7 @@ def object_labels(
 
     Args:
         mask: What may move.
-        depth: Metres, 0 where missing.
+        depth: Meters, 0 where missing.
         most: Objects at most; the smallest are left out.
     """
     inside = mask & (depth > 0) & ~_steps(depth)
@@ -71,7 +71,7 @@ def object_labels(
     area = stats[:, cv2.CC_STAT_AREA].copy()
     area[0] = 0
     by_size = np.argsort(-area)[:most]
-    large = by_size[area[by_size] >= _LEAST * mask.size]
+    large = by_size[area[by_size] >= _MIN * mask.size]
     number = np.zeros(len(area), np.uint8)
     number[large] = np.arange(1, len(large) + 1)
     labels = number[np.asarray(pieces, np.int32)]
@@ -80,7 +80,7 @@ def object_labels(
 
 
 def _steps(depth: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Pixels whose right or lower neighbour is at another depth."""
+    """Pixels whose right or lower neighbor is at another depth."""
     steps = np.zeros(depth.shape, bool)
     for axis in (0, 1):
         before = depth[:-1] if axis == 0 else depth[:, :-1]

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 CELL_PX = 8
 """Of an image about 320 pixels wide."""
 _WINDOW_PX = 5
-_LEAST_SCORE = 1e-4
+_MIN_SCORE = 1e-4
 """Smaller eigenvalue of the gradient matrix, of a picture from 0 to 1, below which a random pixel does as well."""
 _TURNS = (0.7548776662, 0.5698402910)
 """Of rows and columns of cells: those whose multiples of these add up to least, whole numbers left out, are all over
@@ -21,19 +21,21 @@ _NOT_MASKED = -1
 """Score of a pixel that is not to be chosen; those of corners are 0 up to rounding, or greater."""
 
 
-class Sampled(NamedTuple):
+class SampledPoints(NamedTuple):
     """Points of a mask.
 
     Attributes:
         uv: `(2, k)` pixels, row by row of cells.
-        spacing: How far those of neighbouring cells are apart where they are fewest: 1 if every cell has one.
+        spacing: How far those of neighboring cells are apart where they are fewest: 1 if every cell has one.
     """
 
     uv: Float32[np.ndarray, "2 k"]
     spacing: float
 
 
-def sample_mask(mask: Bool[np.ndarray, "h w"], grey: UInt8[np.ndarray, "h w"], capacity: int, seed: int) -> Sampled:
+def sample_mask(
+    mask: Bool[np.ndarray, "h w"], gray: UInt8[np.ndarray, "h w"], capacity: int, seed: int
+) -> SampledPoints:
     """A masked pixel of every cell that has one: the best corner, or where there is none, a random one.
 
     Only the part of the image around the mask is looked at. If there are more cells than points, large pieces of the
@@ -41,15 +43,15 @@ def sample_mask(mask: Bool[np.ndarray, "h w"], grey: UInt8[np.ndarray, "h w"], c
 
     Args:
         mask: Pixels to choose from.
-        grey: The image.
+        gray: The image.
         capacity: Most points.
         seed: Of the random choice.
     """
     region = _whole_cells(mask)
     inside = mask[region]
     if not inside.size:
-        return Sampled(np.zeros((2, 0), np.float32), 1.0)
-    score = _by_cell(np.where(inside, _corners(grey, region), _NOT_MASKED))
+        return SampledPoints(np.zeros((2, 0), np.float32), 1.0)
+    score = _by_cell(np.where(inside, _corners(gray, region), _NOT_MASKED))
     _rank_at_random(score, np.random.default_rng(seed))
     where = score.argmax(axis=1)
     cells = np.flatnonzero(score[np.arange(len(score)), where] > _NOT_MASKED)
@@ -62,7 +64,7 @@ def sample_mask(mask: Bool[np.ndarray, "h w"], grey: UInt8[np.ndarray, "h w"], c
         chosen, spacing = _shared_out(piece[row, column], turn, capacity)
         row, column = row[chosen], column[chosen]
     top, left = (span.start for span in region)
-    return Sampled(np.stack([left + column, top + row]).astype(np.float32), spacing)
+    return SampledPoints(np.stack([left + column, top + row]).astype(np.float32), spacing)
 
 
 def _shared_out(
@@ -94,10 +96,10 @@ def _cells(begin: int, end: int) -> slice:
     return slice(begin // CELL_PX * CELL_PX, -(-end // CELL_PX) * CELL_PX)
 
 
-def _corners(grey: UInt8[np.ndarray, "h w"], region: tuple[slice, slice]) -> Float32[np.ndarray, "_h _w"]:
+def _corners(gray: UInt8[np.ndarray, "h w"], region: tuple[slice, slice]) -> Float32[np.ndarray, "_h _w"]:
     """Smaller eigenvalues of the gradient matrix in a part of the image, each from all pixels of its window."""
     rows, columns = (slice(max(span.start - _WINDOW_PX, 0), span.stop + _WINDOW_PX) for span in region)
-    score = cv2.cornerMinEigenVal(grey[rows, columns], _WINDOW_PX)
+    score = cv2.cornerMinEigenVal(gray[rows, columns], _WINDOW_PX)
     top, left = region[0].start - rows.start, region[1].start - columns.start
     return score[top:, left:][: region[0].stop - region[0].start, : region[1].stop - region[1].start]
 
@@ -105,9 +107,9 @@ def _corners(grey: UInt8[np.ndarray, "h w"], region: tuple[slice, slice]) -> Flo
 def _rank_at_random(score: Float32[np.ndarray, "cells pixels"], generator: np.random.Generator) -> None:
     """Give masked pixels of cells without texture random scores; drawing them for all cells was a third of the time."""
     best = score.max(axis=1)
-    flat = (best > _NOT_MASKED) & (best <= _LEAST_SCORE)
+    flat = (best > _NOT_MASKED) & (best <= _MIN_SCORE)
     random = generator.random((np.count_nonzero(flat), score.shape[1]), np.float32)
-    score[flat] = np.where(score[flat] > _NOT_MASKED, random * _LEAST_SCORE, _NOT_MASKED)
+    score[flat] = np.where(score[flat] > _NOT_MASKED, random * _MIN_SCORE, _NOT_MASKED)
 
 
 def _by_cell(image: np.ndarray) -> np.ndarray:

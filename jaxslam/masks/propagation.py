@@ -26,37 +26,37 @@ from jaxtyping import Array, Bool, Float, Float32, Int, Int32, UInt8
 
 from jaxslam.masks.point_sampling import sample_mask
 from jaxslam.runtime.aligned_memory import aligned_array
-from jaxslam.runtime.compile_cache import IN_ITS_THREAD
-from jaxslam.runtime.trace_cache import traced_once
+from jaxslam.runtime.compile_cache import SINGLE_THREAD
+from jaxslam.runtime.trace_cache import cached_trace
 
 CAPACITY = 128
 """Most points: of a person who fills a fifth of the image, one in about every other cell."""
 PYRAMID_LEVELS = 3
 _FLOW = FlowPlan(finest=LevelPlan(window=11, iterations=3, tolerance=0.2, accepted=0.5))
 """Objects are moved by whole pixels: flow to a fifth of one, in a smaller window, takes three quarters of the time."""
-_NEIGHBOURS_PX = 20.0
+_NEIGHBORS_PX = 20.0
 """Points of one object are at most so far apart in the image if every cell has one, and farther if fewer have,"""
 _PX_PER_M = 100.0
-"""a metre of depth counting as so many pixels,"""
-_LEAST_NEIGHBOURS = 5
-"""and every one that says anything has so many neighbours, itself included."""
+"""a meter of depth counting as so many pixels,"""
+_MIN_NEIGHBORS = 5
+"""and every one that says anything has so many neighbors, itself included."""
 _GROW_PX = 4
 _DEPTH_TAIL = 20
 """One in so many points of a cluster may be nearer than it, and one farther,"""
 _DEPTH_MARGIN_M = 0.2
 """and so much nearer or farther than the others the object may reach."""
-_LEAST_SHARE = 0.05
+_MIN_SHARE = 0.05
 """A piece of the new mask holds at least this share of the cluster's points."""
 
 
-class Origin(NamedTuple):
+class TrackedMask(NamedTuple):
     """A mask, and the points it is followed by.
 
     Attributes:
         mask: `(h, w)` true where something moves or may.
         uv: `(2, CAPACITY)` pixels in it.
         ok: `(CAPACITY,)` which there are.
-        spacing: How far they are apart, as in `Sampled`.
+        spacing: How far they are apart, as in `SampledPoints`.
         corner: `(2,)` the first column and row of what is true.
         piece: `(h', w')` from there on, the number of the connected piece of each pixel, 0 outside of them.
         num: How many pieces, and one more.
@@ -73,12 +73,12 @@ class Origin(NamedTuple):
     held: Int32[np.ndarray, " n"]
 
 
-class Followed(NamedTuple):
+class MaskFlow(NamedTuple):
     """The points of a mask in a later frame.
 
     Attributes:
         uv: `(2, n)` pixels.
-        depth: `(n,)` there, metres; 0 where there is none.
+        depth: `(n,)` there, meters; 0 where there is none.
         label: `(n,)` the object each belongs to, from 0 on; -1 for none.
     """
 
@@ -87,15 +87,15 @@ class Followed(NamedTuple):
     label: Int[Array, " n"]
 
 
-def make_origin(mask: Bool[np.ndarray, "h w"], grey: UInt8[np.ndarray, "h w"], seed: int) -> Origin:
+def make_origin(mask: Bool[np.ndarray, "h w"], gray: UInt8[np.ndarray, "h w"], seed: int) -> TrackedMask:
     """Choose the points by which a mask is followed.
 
     Args:
         mask: Of a frame.
-        grey: Its image.
+        gray: Its image.
         seed: Of random choices.
     """
-    sampled = sample_mask(mask, grey, CAPACITY, seed)
+    sampled = sample_mask(mask, gray, CAPACITY, seed)
     count, region = sampled.uv.shape[1], _bounded(mask)
     uv, spacing = (aligned_array(shape, np.float32) for shape in ((2, CAPACITY), ()))
     ok = aligned_array((CAPACITY,), np.bool_)
@@ -106,19 +106,19 @@ def make_origin(mask: Bool[np.ndarray, "h w"], grey: UInt8[np.ndarray, "h w"], s
         num, piece = cv2.connectedComponents(region.inside.view(np.uint8), connectivity=4)
     held = np.zeros(CAPACITY, np.int32)
     held[:count] = _at(piece, sampled.uv, region.corner)
-    return Origin(mask, uv, ok, spacing, region.corner, piece, num, held)
+    return TrackedMask(mask, uv, ok, spacing, region.corner, piece, num, held)
 
 
 def follow(
-    origin: Origin, pyramids: Sequence[Pyramid], grey: UInt8[np.ndarray, "h w"], depth: Float32[np.ndarray, "h w"]
-) -> tuple[Pyramid, Followed]:
+    origin: TrackedMask, pyramids: Sequence[Pyramid], gray: UInt8[np.ndarray, "h w"], depth: Float32[np.ndarray, "h w"]
+) -> tuple[Pyramid, MaskFlow]:
     """Follow the points of a mask into a later frame.
 
     Args:
         origin: The mask and its points.
         pyramids: Of the frame they are of and of all before the present one, in order.
-        grey: The present image.
-        depth: Metres, 0 where missing.
+        gray: The present image.
+        depth: Meters, 0 where missing.
 
     Returns:
         The pyramid of the present image, and the points in it.
@@ -126,19 +126,19 @@ def follow(
     uv, ok = origin.uv, origin.ok
     for a, b in itertools.pairwise(pyramids):
         uv, ok = map(np.asarray, _follow_between(a, b, uv, ok))  # for JAX's own, programs would be compiled again
-    return _follow_last(pyramids[-1], grey, uv, ok, depth, origin.spacing)
+    return _follow_last(pyramids[-1], gray, uv, ok, depth, origin.spacing)
 
 
 @jax.jit
-@traced_once
-def as_objects(uv: Pixels, ok: Mask, depth: Float[Array, "h w"], spacing: Float[Array, ""]) -> Followed:
+@cached_trace
+def as_objects(uv: Pixels, ok: Mask, depth: Float[Array, "h w"], spacing: Float[Array, ""]) -> MaskFlow:
     """Points with depth that lie close together, taken for one object.
 
     Args:
         uv: `(2, n)` pixels.
         ok: `(n,)` which of them count.
-        depth: Metres, 0 where missing.
-        spacing: How far they were apart, as in `Sampled`.
+        depth: Meters, 0 where missing.
+        spacing: How far they were apart, as in `SampledPoints`.
     """
     column, row = jnp.round(uv).astype(jnp.int32)
     inside = (row >= 0) & (row < depth.shape[0]) & (column >= 0) & (column < depth.shape[1])
@@ -146,11 +146,11 @@ def as_objects(uv: Pixels, ok: Mask, depth: Float[Array, "h w"], spacing: Float[
     known = ok & inside & jnp.isfinite(z) & (z > 0)
     # As if there was a point in every cell: those of a large mask are farther apart, but no more objects.
     points = jnp.concatenate([uv / spacing, _PX_PER_M * jnp.where(known, z, 0)[None]])
-    label = dbscan(points, known, radius=_NEIGHBOURS_PX, min_points=_LEAST_NEIGHBOURS).label
-    return Followed(uv, jnp.where(known, z, 0), label)
+    label = dbscan(points, known, radius=_NEIGHBORS_PX, min_points=_MIN_NEIGHBORS).label
+    return MaskFlow(uv, jnp.where(known, z, 0), label)
 
 
-def predicted_mask(origin: Origin, followed: Followed, depth: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+def predicted_mask(origin: TrackedMask, followed: MaskFlow, depth: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Where the objects of a mask are after its points have moved.
 
     A piece that is too small for a cluster of points is an object by itself.
@@ -158,12 +158,12 @@ def predicted_mask(origin: Origin, followed: Followed, depth: Float[np.ndarray, 
     Args:
         origin: The mask.
         followed: Its points.
-        depth: Of the new frame, metres, 0 where missing.
+        depth: Of the new frame, meters, 0 where missing.
     """
     uv, z, label = (np.asarray(each) for each in followed)
     new = np.zeros_like(origin.mask)
     points_of_piece = np.bincount(origin.held[origin.ok], minlength=origin.num)
-    small = (points_of_piece[origin.held] < _LEAST_NEIGHBOURS) & (z > 0) & origin.ok
+    small = (points_of_piece[origin.held] < _MIN_NEIGHBORS) & (z > 0) & origin.ok
     objects = [label == cluster for cluster in range(int(label.max(initial=-1)) + 1)]
     objects += [small & (origin.held == piece) for piece in np.unique(origin.held[small])]
     for points in objects:
@@ -211,7 +211,7 @@ def _add_object(
     num, piece = cv2.connectedComponents((around.inside & right_depth).view(np.uint8), connectivity=4)
     hits = np.bincount(_at(piece, now, around.corner), minlength=num)
     hits[0] = 0  # the background
-    new[here] |= _pieces(piece, hits >= min(max(2, _LEAST_SHARE * count), count))
+    new[here] |= _pieces(piece, hits >= min(max(2, _MIN_SHARE * count), count))
 
 
 def _bounded(mask: Bool[np.ndarray, "h w"], corner: np.ndarray | tuple[int, int] = (0, 0)) -> _Region:
@@ -255,19 +255,19 @@ def _flow(before: Pyramid, now: Pyramid, uv: Pixels, ok: Mask) -> tuple[Pixels, 
     return flow.points, flow.ok
 
 
-_follow_between = jax.jit(traced_once(_flow), compiler_options=IN_ITS_THREAD)
+_follow_between = jax.jit(cached_trace(_flow), compiler_options=SINGLE_THREAD)
 
 
-@partial(jax.jit, compiler_options=IN_ITS_THREAD)
-@traced_once
+@partial(jax.jit, compiler_options=SINGLE_THREAD)
+@cached_trace
 def _follow_last(
     before: Pyramid,
-    grey: UInt8[Array, "h w"],
+    gray: UInt8[Array, "h w"],
     uv: Pixels,
     ok: Mask,
     depth: Float[Array, "h w"],
     spacing: Float[Array, ""],
-) -> tuple[Pyramid, Followed]:
+) -> tuple[Pyramid, MaskFlow]:
     """One program for all that the present frame adds: each call takes a tenth of a millisecond by itself."""
-    now = build_pyramid(grey, num_levels=PYRAMID_LEVELS)
+    now = build_pyramid(gray, num_levels=PYRAMID_LEVELS)
     return now, as_objects(*_flow(before, now, uv, ok), depth, spacing)

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from jaxslam.dense.point_cloud import DenseCloud
-from jaxslam.slam.dense_thread import DenseMapping
 from jaxslam.dense.octomap_file import write_bt, write_ot
-from jaxslam.dense.render import write_picture
 from jaxslam.dense.ply_file import write_points
+from jaxslam.dense.point_cloud import DenseCloud
+from jaxslam.dense.render import write_picture
+from jaxslam.slam.dense_thread import DenseMapping
 from jaxslam.trajectory.trajectory import Trajectory
 
 _POINTS = ("map.ply", "dense.png")

@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxslam.errors import TrajectoryError
-from jaxslam.trajectory.evaluation import Evaluation
 from jaxslam.io.atomic_files import write_atomically
 from jaxslam.io.timestamps import decimal_seconds, nanoseconds
 from jaxslam.slam.frame_result import FrameRecord
+from jaxslam.trajectory.evaluation import Evaluation
 
 _COLUMNS = ("timestamp_s", *(field.name for field in fields(FrameRecord) if field.name != "timestamp_ns"))
 _ERROR_COLUMNS = ("timestamp_s", "x_m", "y_m", "z_m", "true_x_m", "true_y_m", "true_z_m", "error_m")

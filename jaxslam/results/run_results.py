@@ -11,21 +11,21 @@ import numpy as np
 
 from jaxslam.config.schema import to_yaml
 from jaxslam.datasets import Dataset
-from jaxslam.results.dense_results import DENSE_FILES, write_dense
 from jaxslam.errors import TrajectoryError
-from jaxslam.trajectory.evaluation import Evaluation, evaluate
 from jaxslam.io.atomic_files import write_atomically
+from jaxslam.map.export import write_keyframe_trajectory
+from jaxslam.mapping.occlusion_states import occluded_shares
+from jaxslam.results.dense_results import DENSE_FILES, write_dense
 from jaxslam.results.frame_table import write_errors, write_frames
 from jaxslam.runtime.machine import machine, peak_rss_mb
-from jaxslam.map.export import write_keyframe_trajectory
-from jaxslam.visualization.mask_gallery import write_mask_pictures
-from jaxslam.mapping.occlusion_states import occluded_shares
-from jaxslam.visualization.snapshots import RunPictures
+from jaxslam.slam.frame_result import FrameRecord
 from jaxslam.slam.slam import Slam
 from jaxslam.tracking.state import TrackStatus
-from jaxslam.slam.frame_result import FrameRecord
+from jaxslam.trajectory.evaluation import Evaluation, evaluate
 from jaxslam.trajectory.trajectory import Trajectory, write_kitti_frames, write_tum
+from jaxslam.visualization.mask_gallery import write_mask_pictures
 from jaxslam.visualization.plots import Snapshot, plot_map, plot_snapshots, plot_trajectory
+from jaxslam.visualization.snapshots import RunPictures
 
 _ALWAYS = ("trajectory.txt", "trajectory_online.txt", "frames.csv", "summary.json", "config.yaml")
 _OF_THE_PATH = ("plot.png", "trajectory_kitti.txt")
@@ -196,7 +196,7 @@ def _summary(
         "dropped_percent": round(100 * dropped / max(len(records), 1), 3),
         "status_counts": dict(sorted(statuses.items())),
         "first_loss_s": (lost[0].timestamp_ns - records[0].timestamp_ns) * 1e-9 if lost else None,
-        "relocalised": statuses[TrackStatus.RELOCALISED.name],
+        "relocalized": statuses[TrackStatus.RELOCALIZED.name],
         "keyframes": len(slam.map.ids),
         "keyframes_made": sum(record.is_keyframe for record in records),
         "map_points": len(slam.map.points.ids),

@@ -19,8 +19,8 @@ def cache_dir() -> Path:
 
 
 _CACHE_ENABLED = "jax_enable_compilation_cache"
-_LEAST_COMPILE, _LEAST_COMPILE_OF_JAX_S = "jax_persistent_cache_min_compile_time_secs", 1.0
-_LEAST_COMPILE_S = 0.05
+_MIN_COMPILE, _MIN_COMPILE_OF_JAX_S = "jax_persistent_cache_min_compile_time_secs", 1.0
+_MIN_COMPILE_S = 0.05
 """Programs that take less are compiled anew, unless the user chose otherwise. With 0.5 some 25 of a run's 40 were,
 every time; with JAX's own limit, a second, even more."""
 
@@ -53,11 +53,11 @@ def enable_compile_cache() -> Path | None:
         jax.config.update(_CACHE_ENABLED, False)
         return None
     jax.config.update("jax_compilation_cache_dir", str(folder))
-    least_s: float = jax.config.values[_LEAST_COMPILE]
+    least_s: float = jax.config.values[_MIN_COMPILE]
     if not _is_writable(folder):
-        jax.config.update(_LEAST_COMPILE, float("inf"))  # JAX warns of every program otherwise
-    elif least_s == _LEAST_COMPILE_OF_JAX_S:
-        jax.config.update(_LEAST_COMPILE, _LEAST_COMPILE_S)
+        jax.config.update(_MIN_COMPILE, float("inf"))  # JAX warns of every program otherwise
+    elif least_s == _MIN_COMPILE_OF_JAX_S:
+        jax.config.update(_MIN_COMPILE, _MIN_COMPILE_S)
     return folder
 
 
@@ -85,13 +85,13 @@ def _is_writable(folder: Path) -> bool:
         return False
 
 
-SOON_COMPILED: dict[str, bool | str] = {"xla_cpu_use_fusion_emitters": False}
+FAST_COMPILE: dict[str, bool | str] = {"xla_cpu_use_fusion_emitters": False}
 """Options of `jax.jit` for a large program of many small parts: they are written by XLA's older generator of code.
 
 The tracker with its map is compiled in 17 s instead of 35 (AMD EPYC, two cores), and a frame takes as long, within 3 %.
 """
 
-IN_ITS_THREAD: dict[str, bool | str] = {"xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"}
+SINGLE_THREAD: dict[str, bool | str] = {"xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"}
 """Options of `jax.jit` for a program that runs beside another: one part after the other, all in the calling thread.
 
 XLA else hands parts that do not depend on each other to a pool of threads, even if that has one thread only, and they
@@ -99,7 +99,7 @@ wait there behind those of other programs: beside optical flow, 0.3 ms of work f
 the machine for itself is faster with the pool: the second part of the tracker's step takes 2.5 ms, and 3.3 without.
 """
 
-MUCH_COMPUTED: dict[str, bool | str] = {"xla_cpu_use_fusion_emitters": True}
+FUSION_EMITTERS: dict[str, bool | str] = {"xla_cpu_use_fusion_emitters": True}
 """Options of `jax.jit` for a program that computes much for every pixel: XLA's newer generator of code, whatever
 `XLA_FLAGS` says. With the older one a frame of a room takes 111 ms instead of 63 (640x480, one thread, AMD EPYC).
 """

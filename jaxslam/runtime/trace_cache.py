@@ -51,7 +51,7 @@ _SETTLED_S = 5.0
 _loaded = time.time()
 
 
-def traced_once(function: Callable[P, R]) -> Callable[P, R]:
+def cached_trace(function: Callable[P, R]) -> Callable[P, R]:
     """The function, which `jax.jit` traces from the disk where it or another process has traced it before.
 
     To be put under `jax.jit`; called without it, it is the function itself. What is static may be numbers, text, flags,

@@ -1,6 +1,6 @@
 """Work that is done beside tracking: in a thread of its own, or in turn on a fixed schedule. One interface for both.
 
-The tracker offers jobs and takes results; it never waits for either, but when it asks to (`drain`).
+The tracker offers jobs and takes results; it never waits for either, but when it asks to (`flush`).
 """
 
 import atexit
@@ -31,7 +31,7 @@ class _Failed(NamedTuple):
 class Worker(Protocol[_Job_contra, _Result]):
     """Does jobs one after the other."""
 
-    def offer(self, job: _Job_contra, frame: int) -> None:
+    def submit(self, job: _Job_contra, frame: int) -> None:
         """Give it a job, in frame number `frame`.
 
         Raises:
@@ -39,7 +39,7 @@ class Worker(Protocol[_Job_contra, _Result]):
         """
         ...
 
-    def take(self, frame: int) -> list[_Result]:
+    def collect(self, frame: int) -> list[_Result]:
         """The results that are there by frame number `frame`, in the order of their jobs, each given out once.
 
         Raises:
@@ -47,8 +47,8 @@ class Worker(Protocol[_Job_contra, _Result]):
         """
         ...
 
-    def drain(self) -> list[_Result]:
-        """Wait for all jobs unless it is closed, and take their results; raises as `take` does."""
+    def flush(self) -> list[_Result]:
+        """Wait for all jobs unless it is closed, and take their results; raises as `collect` does."""
         ...
 
     def stop(self) -> None:
@@ -79,7 +79,7 @@ class InlineWorker(Generic[_Job, _Result]):
         self._outcomes: deque[tuple[int, _Result | _Failed]] = deque()
         self._stopped = False
 
-    def offer(self, job: _Job, frame: int) -> None:
+    def submit(self, job: _Job, frame: int) -> None:
         """Do it."""
         if self._stopped:
             raise RuntimeError(f"{self._name} is closed")
@@ -90,7 +90,7 @@ class InlineWorker(Generic[_Job, _Result]):
             outcome = _Failed(error)
         self._outcomes.append((frame + self._latency, outcome))
 
-    def take(self, frame: int) -> list[_Result]:
+    def collect(self, frame: int) -> list[_Result]:
         """The results whose frame has come."""
         due: deque[_Result | _Failed] = deque()
         while self._outcomes and self._outcomes[0][0] <= frame:
@@ -100,9 +100,9 @@ class InlineWorker(Generic[_Job, _Result]):
         finally:
             self._outcomes.extendleft((frame, outcome) for outcome in reversed(due))
 
-    def drain(self) -> list[_Result]:
+    def flush(self) -> list[_Result]:
         """All results."""
-        return self.take(max((frame for frame, _ in self._outcomes), default=0))
+        return self.collect(max((frame for frame, _ in self._outcomes), default=0))
 
     def stop(self) -> None:
         """Nothing runs."""
@@ -132,7 +132,7 @@ class ThreadWorker(Generic[_Job, _Result]):
         self._stopped = threading.Event()
         self._thread: threading.Thread | None = None
 
-    def offer(self, job: _Job, frame: int) -> None:
+    def submit(self, job: _Job, frame: int) -> None:
         """Queue it."""
         del frame
         if self._stopped.is_set():
@@ -145,16 +145,16 @@ class ThreadWorker(Generic[_Job, _Result]):
             weakref.finalize(self, _stop, self._jobs, self._stopped).atexit = False
         self._jobs.put((self._work, job))
 
-    def take(self, frame: int) -> list[_Result]:
+    def collect(self, frame: int) -> list[_Result]:
         """What is done."""
         del frame
         return _results(self._outcomes)
 
-    def drain(self) -> list[_Result]:
+    def flush(self) -> list[_Result]:
         """Wait until nothing is left to do."""
         if not self._stopped.is_set():
             self._jobs.join()
-        return self.take(0)
+        return self.collect(0)
 
     def stop(self) -> None:
         """The thread ends after the job at hand."""

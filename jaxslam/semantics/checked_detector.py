@@ -9,7 +9,7 @@ from jaxslam.semantics.detections import Detections, Detector
 from jaxslam.semantics.detector import OnnxDetector
 
 
-class WatchedDetector:
+class CheckedDetector:
     """Calls a detector and checks its answers.
 
     Attributes:

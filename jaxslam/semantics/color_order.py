@@ -9,7 +9,7 @@ _PERSON = "person"
 _LOOKS, _EVERY = 3, 2
 _TIMES = 2.0
 _FEWEST_PX = 500
-_LEAST_COLOR = 10
+_MIN_COLOR = 10
 
 
 class ColorOrder:
@@ -60,7 +60,7 @@ def _score(found: Detections) -> float:
 
 def _is_colored(image: UInt8[np.ndarray, "h w 3"]) -> bool:
     sample = image[::16, ::16].astype(np.int16)
-    return int(np.ptp(sample, axis=2).max()) > _LEAST_COLOR
+    return int(np.ptp(sample, axis=2).max()) > _MIN_COLOR
 
 
 def _inside(boxes: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

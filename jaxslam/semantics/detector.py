@@ -64,14 +64,14 @@ def load_detector(
     adapter: str | None = None,
     num_threads: int = 1,
 ) -> OnnxDetector:
-    """Open an ONNX file as a detector; its family is recognised from the graph.
+    """Open an ONNX file as a detector; its family is recognized from the graph.
 
     Args:
         path: The file.
         labels: What to find, by COCO's names ("person", "car", ...); VOC's words for the same are understood.
         min_score: Least score kept, 0 to 1.
         nms_iou: Overlap (intersection over union, 0 to 1) above which the worse of two boxes of a class is dropped.
-        adapter: The family, where it shall not be recognised; see `jaxslam.semantics.adapters.ADAPTERS`.
+        adapter: The family, where it shall not be recognized; see `jaxslam.semantics.adapters.ADAPTERS`.
         num_threads: Threads the network may use.
 
     Raises:

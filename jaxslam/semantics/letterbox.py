@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-Fit: TypeAlias = Literal["corner", "centre", "stretch"]
+Fit: TypeAlias = Literal["corner", "center", "stretch"]
 """Keep the aspect and pad at the right and the bottom, or on both sides; or stretch to the whole input."""
 
 
@@ -42,8 +42,8 @@ def place(
         scale = min(full_width / width, full_height / height)
         inner = (min(max(round(width * scale), 1), full_width), min(max(round(height * scale), 1), full_height))
     resized = cv2.resize(image, inner, interpolation=cv2.INTER_LINEAR)
-    centred = fit == "centre"
-    left, top = ((full_width - inner[0]) // 2, (full_height - inner[1]) // 2) if centred else (0, 0)
+    centered = fit == "center"
+    left, top = ((full_width - inner[0]) // 2, (full_height - inner[1]) // 2) if centered else (0, 0)
     placement = Placement((width, height), (inner[0] / width, inner[1] / height), (left, top))
     if inner == size:
         return resized, placement
@@ -75,7 +75,7 @@ def plane_to_image(
     left, top, right, bottom = window or (0, 0, *placement.size)
     per_input = (plane.shape[1] / input_size[0], plane.shape[0] / input_size[1])
     scale = [a * b for a, b in zip(placement.scale, per_input, strict=True)]
-    # cell centres lie half a cell from the corner that coordinates are measured from
+    # cell centers lie half a cell from the corner that coordinates are measured from
     shift = [
         (start + 0.5) * s + offset * per - 0.5
         for start, s, offset, per in zip((left, top), scale, placement.offset, per_input, strict=True)

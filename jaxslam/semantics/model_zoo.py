@@ -1,4 +1,4 @@
-"""Public networks that the detector can run: where they come from, under which licence, and where they lie here."""
+"""Public networks that the detector can run: where they come from, under which license, and where they lie here."""
 
 import os
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ class KnownModel:
     Attributes:
         name: What commands and settings call it.
         file: Name of its file here.
-        licence: Of the weights, as an SPDX identifier.
+        license: Of the weights, as an SPDX identifier.
         page: Who made it.
         adapter: What reads its outputs.
         about: What it is.
@@ -40,7 +40,7 @@ class KnownModel:
 
     name: str
     file: str
-    licence: str
+    license: str
     page: str
     adapter: str
     about: str
@@ -61,7 +61,7 @@ KNOWN_MODELS: dict[str, KnownModel] = {
             url=f"{_YOLOX}/releases/download/0.1.1rc0/yolox_nano.onnx",
             size_bytes=3_659_407,
             sha256="c789161ed43c8269fcd4e67c67eeeb4e80c622da2eb296a20bc6007bd18a0b7d",
-            licence="Apache-2.0",
+            license="Apache-2.0",
             page=_YOLOX,
             adapter="yolox",
             about="boxes of the 80 COCO classes, 416x416",
@@ -72,7 +72,7 @@ KNOWN_MODELS: dict[str, KnownModel] = {
             url=f"{_YOLOX}/releases/download/0.1.1rc0/yolox_tiny.onnx",
             size_bytes=20_219_662,
             sha256="427cc366d34e27ff7a03e2899b5e3671425c262ea2291f88bb942bc1cc70b0f7",
-            licence="Apache-2.0",
+            license="Apache-2.0",
             page=_YOLOX,
             adapter="yolox",
             about="boxes of the 80 COCO classes, 416x416; slower and better than nano",
@@ -82,7 +82,7 @@ KNOWN_MODELS: dict[str, KnownModel] = {
             file="nanodet-plus-m_416.onnx",
             url=f"{_NANODET}/releases/download/v1.0.0-alpha-1/nanodet-plus-m_416.onnx",
             sha256="59d2f166088889c902f523bf08079391993491324f0d84847e3c4016a8f7cc3d",
-            licence="Apache-2.0",
+            license="Apache-2.0",
             page=_NANODET,
             adapter="nanodet_plus",
             about="boxes of the 80 COCO classes, 416x416",
@@ -90,7 +90,7 @@ KNOWN_MODELS: dict[str, KnownModel] = {
         KnownModel(
             name="nanodet-m",
             file="nanodet_m_320.onnx",
-            licence="Apache-2.0",
+            license="Apache-2.0",
             page=_NANODET,
             adapter="nanodet",
             about="boxes of the 80 COCO classes, 320x320",
@@ -103,7 +103,7 @@ KNOWN_MODELS: dict[str, KnownModel] = {
             url="https://raw.githubusercontent.com/dog-qiuqiu/FastestDet/main/example/onnx-runtime/FastestDet.onnx",
             size_bytes=998_169,
             sha256="31cb14c017fce347cb4c846ec62fdf00d76bb3beecdf4be21e7116ac67feb880",
-            licence="BSD-3-Clause",
+            license="BSD-3-Clause",
             page=_FASTESTDET,
             adapter="fastestdet",
             about="boxes of the 80 COCO classes, 352x352; the fastest, and the least accurate",
@@ -112,7 +112,7 @@ KNOWN_MODELS: dict[str, KnownModel] = {
             KnownModel(
                 name=name,
                 file=file,
-                licence="Apache-2.0",
+                license="Apache-2.0",
                 page=_DEEPLAB,
                 adapter="class_map",
                 about=f"a map of the 21 PASCAL VOC classes, 513x513; MobileNetV2{width}",
@@ -132,7 +132,7 @@ KNOWN_MODELS: dict[str, KnownModel] = {
             KnownModel(
                 name=name,
                 file=f"{name}.onnx",
-                licence="AGPL-3.0",
+                license="AGPL-3.0",
                 page=_ULTRALYTICS,
                 adapter="yolov8_seg" if name.endswith("-seg") else "yolov8",
                 about=about,
@@ -156,7 +156,7 @@ KNOWN_MODELS: dict[str, KnownModel] = {
                 url=url,
                 size_bytes=size_bytes,
                 sha256=sha256,
-                licence="Apache-2.0",
+                license="Apache-2.0",
                 page=page,
                 adapter=adapter,
                 about=about,
@@ -250,7 +250,7 @@ KNOWN_MODELS: dict[str, KnownModel] = {
         KnownModel(
             name="seggpt",
             file="seggpt.onnx",
-            licence="MIT",
+            license="MIT",
             page="https://github.com/baaivision/Painter",
             adapter="in_context",
             about="what is like examples, 448x448; a ViT-L",

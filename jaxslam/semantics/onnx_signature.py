@@ -1,4 +1,4 @@
-"""A network's inputs and outputs: what adapters recognise it by."""
+"""A network's inputs and outputs: what adapters recognize it by."""
 
 from typing import NamedTuple
 
@@ -36,7 +36,7 @@ class Port(NamedTuple):
         return f"{self.name} {self.dtype} {sizes or 'scalar'}"
 
 
-class Colours(NamedTuple):
+class Colors(NamedTuple):
     """How the values of an image enter a network of real numbers: `(value - mean) / std` of 0 to 255."""
 
     bgr: bool = False
@@ -68,11 +68,11 @@ class ImageInput(NamedTuple):
         """`(width, height)` in pixels."""
         return self.width, self.height
 
-    def tensor(self, image: np.ndarray, colours: Colours) -> np.ndarray:
+    def tensor(self, image: np.ndarray, colors: Colors) -> np.ndarray:
         """An RGB image of the input's size as the network takes it; whole numbers stay 0 to 255."""
-        pixels = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if colours.bgr else image
+        pixels = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if colors.bgr else image
         if self.dtype != "uint8":
-            mean, std = (np.asarray(values, np.float32) for values in colours[1:])
+            mean, std = (np.asarray(values, np.float32) for values in colors[1:])
             pixels = (pixels.astype(np.float32) - mean) / std
         if self.channels_first:
             pixels = pixels.transpose(2, 0, 1)

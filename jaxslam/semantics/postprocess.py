@@ -11,7 +11,7 @@ MAX_CANDIDATES = 1000
 """Best proposals that enter non-maximum suppression."""
 MAX_KEPT = 100
 """Detections kept of one image, as in COCO's evaluation."""
-_SLACK = 0.01  # quantised networks reach a little past 0 and 1
+_SLACK = 0.01  # quantized networks reach a little past 0 and 1
 
 
 class Wanted(NamedTuple):

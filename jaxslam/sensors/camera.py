@@ -11,12 +11,12 @@ from jax.typing import DTypeLike
 from jaxslam_kernels.camera import Intrinsics, make_intrinsics
 
 from jaxslam.config.schema import configs_dir
-from jaxslam.config.validation import Checked, Range
+from jaxslam.config.validation import Range, ValidatedConfig
 from jaxslam.errors import CameraError, JaxSlamError, nearest
 from jaxslam.io.atomic_files import write_atomically
 from jaxslam.sensors.camera_formats import read_camera_fields
 
-MOST_BASELINE_M = 10.0
+MAX_BASELINE_M = 10.0
 """Longest baseline of a pair; more is rather millimeters."""
 
 _UNITS = {
@@ -24,20 +24,20 @@ _UNITS = {
     "height": "pixels",
     "fx": "pixels",
     "fy": "pixels",
-    "cx": "pixels, from the centre of the top-left pixel",
+    "cx": "pixels, from the center of the top-left pixel",
     "cy": "pixels",
     "distortion": "k1 k2 p1 p2 k3, as in OpenCV",
-    "depth_scale_per_m": "counts of the depth image a metre",
+    "depth_scale_per_m": "counts of the depth image a meter",
     "fps": "frames a second",
-    "baseline_m": "metres between left and right camera",
-    "far_depth_m": "metres; depth beyond it is not trusted on its own",
+    "baseline_m": "meters between left and right camera",
+    "far_depth_m": "meters; depth beyond it is not trusted on its own",
     "readout_s": "seconds from the first row to the last; 0 for a global shutter",
     "color_order": "of a live stream; image files are always read right",
 }
 
 
 @dataclass(frozen=True)
-class Camera(Checked):
+class Camera(ValidatedConfig):
     """A pinhole camera with OpenCV's radial-tangential distortion.
 
     Attributes:
@@ -46,18 +46,18 @@ class Camera(Checked):
         height: Image height in pixels.
         fx: Focal length along a row in pixels.
         fy: Focal length along a column in pixels.
-        cx: Principal point along a row in pixels, from the centre of the top-left pixel.
+        cx: Principal point along a row in pixels, from the center of the top-left pixel.
         cy: Principal point along a column in pixels.
         distortion: `(k1, k2, p1, p2, k3)` as in OpenCV; zeros for rectified images.
-        depth_scale_per_m: Counts of the integer depth image a metre: 5000.0 for TUM and Bonn, 1000.0 for
-            millimetres; `None` for a camera whose depth comes in metres or from stereo.
+        depth_scale_per_m: Counts of the integer depth image a meter: 5000.0 for TUM and Bonn, 1000.0 for
+            millimeters; `None` for a camera whose depth comes in meters or from stereo.
         fps: Nominal frames a second. Motion models use timestamps; this only where those fit no rate, and at first.
-        baseline_m: Distance between left and right camera in metres, at most 10; `None` if not stereo.
-        far_depth_m: Depth in metres beyond which a measured depth is not trusted on its own (in ORB-SLAM,
+        baseline_m: Distance between left and right camera in meters, at most 10; `None` if not stereo.
+        far_depth_m: Depth in meters beyond which a measured depth is not trusted on its own (in ORB-SLAM,
             `ThDepth` times the baseline); `None` if not known.
-        readout_s: Time in seconds a rolling shutter takes from the first row of a colour image to the last; 0 for a
+        readout_s: Time in seconds a rolling shutter takes from the first row of a color image to the last; 0 for a
             global shutter. `jaxslam.Slam` corrects for it.
-        color_order: Order of the channels in which the camera's driver hands over a colour image.
+        color_order: Order of the channels in which the camera's driver hands over a color image.
 
     Raises:
         CameraError: If a value has the wrong type or is impossible.
@@ -137,7 +137,7 @@ def _cameras_dir() -> Path:
     return configs_dir() / "cameras"
 
 
-def check_axis(whose: str, axis: str, focal: float, centre: float, extent: int) -> None:
+def check_axis(whose: str, axis: str, focal: float, center: float, extent: int) -> None:
     """Refuse a focal length that does not suit the image, or a principal point outside it.
 
     Raises:
@@ -147,10 +147,10 @@ def check_axis(whose: str, axis: str, focal: float, centre: float, extent: int) 
     if not shortest <= focal <= longest:
         raise CameraError(
             f"{whose}.f{axis}: expected pixels that suit an image of {extent}, {shortest:g} to {longest:g},"
-            f" got {focal:g} (millimetres, or relative to the width?)"
+            f" got {focal:g} (millimeters, or relative to the width?)"
         )
-    if not 0 < centre < extent:
-        raise CameraError(f"{whose}.c{axis}: expected a pixel inside the image, 0 to {extent}, got {centre:g}")
+    if not 0 < center < extent:
+        raise CameraError(f"{whose}.c{axis}: expected a pixel inside the image, 0 to {extent}, got {center:g}")
 
 
 def check_baseline(field: str, baseline_m: float) -> None:
@@ -159,9 +159,9 @@ def check_baseline(field: str, baseline_m: float) -> None:
     Raises:
         CameraError: If so.
     """
-    if baseline_m > MOST_BASELINE_M:
+    if baseline_m > MAX_BASELINE_M:
         raise CameraError(
-            f"{field}: expected a baseline in meters, at most {MOST_BASELINE_M:g}, got {baseline_m:g} (millimeters?)"
+            f"{field}: expected a baseline in meters, at most {MAX_BASELINE_M:g}, got {baseline_m:g} (millimeters?)"
         )
 
 

@@ -5,9 +5,9 @@ import numpy as np
 
 from jaxslam.sensors.camera import Camera
 
-_LEAST_PX, _LEAST_SHARE = 1.0, 0.003
+_MIN_PX, _MIN_SHARE = 1.0, 0.003
 """Mean distance, pixels and as a share of the image's width, below which two calibrations may be of one camera."""
-_LEAST_BASELINE = 0.02
+_MIN_BASELINE = 0.02
 """The same for the baseline of a pair, as a share of it."""
 _STEPS = 9
 
@@ -24,10 +24,10 @@ def difference_of_cameras(first: Camera, second: Camera) -> str:
         return f"{sizes[0]} and {sizes[1]} pixels"
     if first.is_stereo and second.is_stereo:
         baselines = first.baseline_m or 0.0, second.baseline_m or 0.0
-        if abs(baselines[0] - baselines[1]) > _LEAST_BASELINE * max(baselines):
+        if abs(baselines[0] - baselines[1]) > _MIN_BASELINE * max(baselines):
             return f"a baseline of {baselines[0]:g} m and one of {baselines[1]:g} m"
     apart_px = distance_of_projections_px(first, second)
-    if apart_px <= max(_LEAST_PX, _LEAST_SHARE * first.width):
+    if apart_px <= max(_MIN_PX, _MIN_SHARE * first.width):
         return ""
     return (
         f"fx {first.fx:.1f} and {second.fx:.1f}, k1 {first.distortion[0]:g} and {second.distortion[0]:g},"

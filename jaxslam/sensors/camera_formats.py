@@ -40,7 +40,7 @@ def read_camera_fields(path: Path, fields: list[str]) -> dict[str, Any]:
     """The values a camera file holds, under the names of `Camera`'s fields; `Camera` checks their types.
 
     Args:
-        path: The file; its format is recognised by its keys.
+        path: The file; its format is recognized by its keys.
         fields: The names of `Camera`'s fields.
 
     Raises:
@@ -75,13 +75,13 @@ def _orb_slam(raw: Mapping[str, Any], keys: Mapping[str, str], path: Path) -> di
     values["distortion"] = [given.get(term, 0.0) for term in _DISTORTION]
     if "Camera.RGB" in raw:
         values["color_order"] = "rgb" if raw["Camera.RGB"] else "bgr"
-    if "depth_scale_per_m" in given:  # both systems take a factor of 0 for "the depth is in metres"
+    if "depth_scale_per_m" in given:  # both systems take a factor of 0 for "the depth is in meters"
         values["depth_scale_per_m"] = given["depth_scale_per_m"] or 1.0
     return values | _lengths(given, keys, path)
 
 
 def _lengths(given: Mapping[str, Any], keys: Mapping[str, str], path: Path) -> dict[str, float]:
-    """Baseline and far depth in metres: `Camera.bf` is baseline times fx, `ThDepth` counts baselines."""
+    """Baseline and far depth in meters: `Camera.bf` is baseline times fx, `ThDepth` counts baselines."""
     numbers = {
         field: _number(given[field], keys[field], path)
         for field in ("fx", "baseline_px_m", "baseline_m", "far_depth_baselines")

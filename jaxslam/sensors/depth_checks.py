@@ -7,7 +7,7 @@ _FEWEST, _SAMPLES = 100, 80
 """Fewest pixels with depth that say something, and rows and columns that are looked at."""
 _FARTHEST_M, _NEAREST_M = 200.0, 0.01
 """Medians beyond are of another unit, whatever the scene."""
-_LEAST_COUNT = 100.0
+_MIN_COUNT = 100.0
 _FACTOR = 5.0
 """Between the usual scales, 1000 and 5000 counts a meter."""
 _STEP_PER_M = 2.89e-3
@@ -15,8 +15,8 @@ _STEP_PER_M = 2.89e-3
 pixels and a baseline of 75 mm: so many meters at one meter, and with the square of the distance. Source: Khoshelham and
 Elberink, "Accuracy and Resolution of Kinect Depth Data", 2012. Medians of images of TUM fr1 and Bonn: 2.87 to 2.93 mm;
 of rendered rooms: 2.85 mm."""
-_STEP_TOLERANCE, _MOST_SPREAD = 0.06, 0.25
-_FEWEST_STEPS, _LEAST_RANGE = 40, 1.3
+_STEP_TOLERANCE, _MAX_SPREAD = 0.06, 0.25
+_FEWEST_STEPS, _MIN_RANGE = 40, 1.3
 _USUAL_M = (0.9, 4.0)
 """Medians of depth between which a scale five times off is not looked for."""
 
@@ -39,7 +39,7 @@ def contradiction_of_depth(depth_m: Float32[np.ndarray, "h w"]) -> str:
     if measured.size < _FEWEST:
         return ""
     median = float(np.median(measured))
-    if median > _LEAST_COUNT and bool(np.all(measured == np.rint(measured))):
+    if median > _MIN_COUNT and bool(np.all(measured == np.rint(measured))):
         return f"whole numbers with a median of {median:.0f} look like millimeters, or counts of the depth image"
     if not _NEAREST_M <= median <= _FARTHEST_M:
         return f"a median of {median:.3g} m looks like another unit, or a depth scale 1000 times off"
@@ -55,10 +55,10 @@ def _measured(depth_m: np.ndarray) -> np.ndarray:
 def _contradiction_of_steps(measured: np.ndarray, median: float) -> str:
     """Structured light whose steps are five times too coarse or too fine for its distances."""
     levels = np.unique(measured).astype(np.float64)
-    if levels.size <= _FEWEST_STEPS or levels[-1] < _LEAST_RANGE * levels[0]:
+    if levels.size <= _FEWEST_STEPS or levels[-1] < _MIN_RANGE * levels[0]:
         return ""
     quarter, step, most = np.percentile(np.diff(levels) / (levels[1:] * levels[:-1]), (25, 50, 75))
-    if most - quarter > _MOST_SPREAD * step:
+    if most - quarter > _MAX_SPREAD * step:
         return ""
     for factor, words in ((_FACTOR, "large"), (1 / _FACTOR, "small")):
         if abs(_STEP_PER_M / (step * factor) - 1) < _STEP_TOLERANCE:

@@ -11,7 +11,7 @@ from jaxslam.runtime.aligned_memory import aligned_array
 from jaxslam.sensors.camera import Camera
 
 
-class Raster(NamedTuple):
+class ImageGrid(NamedTuple):
     """Where the pixels of an image lie.
 
     Attributes:
@@ -23,12 +23,12 @@ class Raster(NamedTuple):
     intrinsics: Intrinsics
 
     @classmethod
-    def of(cls, camera: Camera) -> "Raster":
+    def of(cls, camera: Camera) -> "ImageGrid":
         """The pixels of a camera's images."""
         return cls((camera.height, camera.width), camera.intrinsics(np.float32))
 
 
-class Reduced:
+class Downscaler:
     """Every few pixels of larger images: their middle ones, counted from the top left corner.
 
     Attributes:
@@ -36,13 +36,13 @@ class Reduced:
         raster: Its own pixels. Rows and columns of the larger image that make no whole pixel are left out.
     """
 
-    def __init__(self, fine: Raster, width: int) -> None:
+    def __init__(self, fine: ImageGrid, width: int) -> None:
         """Of about so many columns; never of more pixels than the larger images have."""
         self.step = max(1, round(fine.shape[1] / width))
         self._fine, self._offset = fine.shape, self.step // 2
         height, width = (max(1, side // self.step) for side in fine.shape)
         whole, scale, first = fine.intrinsics, np.float32(1 / self.step), np.float32(self._offset)
-        self.raster = Raster(
+        self.raster = ImageGrid(
             (height, width),
             Intrinsics(
                 whole.fx * scale,
@@ -58,11 +58,11 @@ class Reduced:
         (height, width), first = self.raster.shape, self._offset
         return images[..., first :: self.step, first :: self.step][..., :height, :width]
 
-    def mean(self, grey: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "_h _w"]:
+    def mean(self, gray: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "_h _w"]:
         """A smaller picture, each pixel the mean of those it stands for; a copy, aligned."""
         small = aligned_array(self.raster.shape, np.uint8)
         height, width = (side * self.step for side in self.raster.shape)
-        cv2.resize(grey[:height, :width], self.raster.shape[::-1], dst=small, interpolation=cv2.INTER_AREA)
+        cv2.resize(gray[:height, :width], self.raster.shape[::-1], dst=small, interpolation=cv2.INTER_AREA)
         return small
 
     def whole(self, mask: Bool[np.ndarray, "_h _w"]) -> Bool[np.ndarray, "h w"]:

@@ -13,7 +13,7 @@ _INT64 = np.iinfo(np.int64)
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A colour or grey image with depth, or a rectified pair of images, taken at one time.
+    """A color or gray image with depth, or a rectified pair of images, taken at one time.
 
     Only the structure is checked: a black image, a frozen one or a depth of NaN is a frame like any other,
     and the tracker reports what it makes of it. Arrays are kept as they are, not copied: do not write to them
@@ -22,11 +22,11 @@ class Frame:
     Attributes:
         timestamp_ns: Time of exposure, int nanoseconds on any clock that goes forward. Stamps of arrival will do: where
             they fit no frame rate, the tracker counts frames instead.
-        image: `(height, width, 3)` RGB or `(height, width)` grey, uint8.
-        depth_m: `(height, width)` float32 depth along the optical axis in metres; 0 or NaN where missing. `None` for
+        image: `(height, width, 3)` RGB or `(height, width)` gray, uint8.
+        depth_m: `(height, width)` float32 depth along the optical axis in meters; 0 or NaN where missing. `None` for
             a pair.
         dynamic_mask: `(height, width)` bool, true where something moves or may move; `None` if unknown.
-        depth_timestamp_ns: Time of the depth image where the sensor takes it apart from the colour image, within a
+        depth_timestamp_ns: Time of the depth image where the sensor takes it apart from the color image, within a
             second of it; `None` if both are of one time.
         right: What the right camera of a rectified pair saw, as `image`, the left one, of the same size; `None` for a
             camera that measures depth. With it `depth_m` is no more than where matching begins.
@@ -96,8 +96,8 @@ def check_frame(frame: Frame, width: int, height: int, *, pair: bool = False) ->
         )
 
 
-def to_grey(image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-    """`(height, width)` uint8 grey of an RGB image (ITU-R BT.601 weights); a grey image stays as it is.
+def to_gray(image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+    """`(height, width)` uint8 gray of an RGB image (ITU-R BT.601 weights); a gray image stays as it is.
 
     Args:
         image: `(height, width, 3)` or `(height, width)`.
@@ -123,7 +123,7 @@ def _timestamp(field: str, timestamp_ns: object) -> int:
 
 
 def _check_image(field: str, image: object) -> None:
-    expected = "expected (height, width, 3) RGB or (height, width) grey, uint8"
+    expected = "expected (height, width, 3) RGB or (height, width) gray, uint8"
     if not isinstance(image, np.ndarray):
         raise FrameError(f"{field}: {expected}, got {type(image).__name__}")
     if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3) or image.size == 0:

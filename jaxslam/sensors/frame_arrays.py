@@ -9,15 +9,15 @@ from numpy.typing import ArrayLike, DTypeLike
 
 from jaxslam.errors import FrameError
 from jaxslam.runtime.aligned_memory import aligned_array
-from jaxslam.sensors.frame import Frame, to_grey
+from jaxslam.sensors.frame import Frame, to_gray
 
 
 class FrameArrays(NamedTuple):
     """One frame as the compiled step takes it; NumPy arrays will do.
 
     Attributes:
-        image: `(h, w)` grey, 0 to 255; `uint8`, or floating point to differentiate with respect to it.
-        depth: `(h, w)` metres, floating point; 0 or not finite where missing.
+        image: `(h, w)` gray, 0 to 255; `uint8`, or floating point to differentiate with respect to it.
+        depth: `(h, w)` meters, floating point; 0 or not finite where missing.
         ignore: `(h, w)` true where nothing is to be trusted (people, the robot itself).
         dt_s: Seconds since the frame before.
         depth_delay_s: Seconds from the time of the image to the time of the depth.
@@ -40,20 +40,20 @@ def frame_arrays(frame: Frame, dt_s: float, dtype: DTypeLike = np.float32) -> Fr
     """A frame for `track_step`, as NumPy arrays; nothing that has the right type is copied.
 
     Args:
-        frame: The frame; colour becomes grey. A stereo pair needs rough depth, see `stereo.RoughDepth`.
+        frame: The frame; color becomes gray. A stereo pair needs rough depth, see `stereo.RoughDepth`.
         dt_s: Seconds since the frame before; for the first one any number.
         dtype: Floating-point type of everything but the image, that of state and parameters; float32 if not given,
             also with `jax_enable_x64`.
     """
     ignore = np.zeros(frame.size[::-1], bool) if frame.dynamic_mask is None else frame.dynamic_mask
     depth = _depth(frame).astype(dtype, copy=False)
-    right = None if frame.right is None else to_grey(frame.right)
-    arrays: Any = (to_grey(frame.image), depth, ignore, *_times(frame, dt_s, dtype), right)
+    right = None if frame.right is None else to_gray(frame.right)
+    arrays: Any = (to_gray(frame.image), depth, ignore, *_times(frame, dt_s, dtype), right)
     return FrameArrays(*arrays)
 
 
-def check_grey_range(name: str, image: ArrayLike, error: type[Exception] = ValueError) -> None:
-    """Refuse an image in floating point whose grey values are from 0 to 1 where 0 to 255 is expected.
+def check_gray_range(name: str, image: ArrayLike, error: type[Exception] = ValueError) -> None:
+    """Refuse an image in floating point whose gray values are from 0 to 1 where 0 to 255 is expected.
 
     A black one passes: it is a frame in which nothing is seen.
 
@@ -67,7 +67,7 @@ def check_grey_range(name: str, image: ArrayLike, error: type[Exception] = Value
         return
     least, most = float(values.min()), float(values.max())
     if least >= 0 and 0 < most <= 1:
-        raise error(f"{name}: expected grey values from 0 to 255, got {least:.3g} to {most:.3g}; multiply them by 255")
+        raise error(f"{name}: expected gray values from 0 to 255, got {least:.3g} to {most:.3g}; multiply them by 255")
 
 
 class FrameMemory:
@@ -92,10 +92,10 @@ class FrameMemory:
             dt_s: Seconds since the frame before.
             depth_follows: Whether its depth is given to `hold_depth`, before anything looks at it.
         """
-        to_grey(frame.image, out=self._image)
+        to_gray(frame.image, out=self._image)
         if not depth_follows:
             np.copyto(self._depth, _depth(frame))
-        right = None if self._right is None or frame.right is None else to_grey(frame.right, out=self._right)
+        right = None if self._right is None or frame.right is None else to_gray(frame.right, out=self._right)
         ignore = self._nothing
         if frame.dynamic_mask is not None:
             ignore = self._ignore
@@ -106,7 +106,7 @@ class FrameMemory:
         return FrameArrays(*arrays)
 
     def hold_depth(self, depth_m: np.ndarray) -> None:
-        """Depth `(h, w)` of the frame held, metres."""
+        """Depth `(h, w)` of the frame held, meters."""
         np.copyto(self._depth, depth_m)
 
     def with_movable(self, arrays: FrameArrays, labels: np.ndarray) -> FrameArrays:

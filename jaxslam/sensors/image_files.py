@@ -13,7 +13,7 @@ _AS_STORED = cv2.IMREAD_IGNORE_ORIENTATION  # a calibration speaks of the pixels
 
 
 def read_color(path: Path) -> np.ndarray:
-    """`(height, width, 3)` uint8 RGB; a grey file gives three equal channels.
+    """`(height, width, 3)` uint8 RGB; a gray file gives three equal channels.
 
     Raises:
         DatasetError: If the file is missing, cut short or no image.
@@ -21,8 +21,8 @@ def read_color(path: Path) -> np.ndarray:
     return cv2.cvtColor(_decode(path, cv2.IMREAD_COLOR | _AS_STORED), cv2.COLOR_BGR2RGB)
 
 
-def read_grey(path: Path) -> np.ndarray:
-    """`(height, width)` uint8; a colour file becomes grey.
+def read_gray(path: Path) -> np.ndarray:
+    """`(height, width)` uint8; a color file becomes gray.
 
     Raises:
         DatasetError: If the file is missing, cut short or no image.
@@ -31,7 +31,7 @@ def read_grey(path: Path) -> np.ndarray:
 
 
 def read_depth(path: Path, scale_per_m: float) -> np.ndarray:
-    """`(height, width)` float32 metres from a uint16 file with `scale_per_m` counts a metre; 0 where missing.
+    """`(height, width)` float32 meters from a uint16 file with `scale_per_m` counts a meter; 0 where missing.
 
     Raises:
         DatasetError: If the file is missing, cut short, no image, or its pixels are not one uint16 each.
@@ -43,8 +43,8 @@ def read_depth(path: Path, scale_per_m: float) -> np.ndarray:
     return counts.astype(np.float32) / np.float32(scale_per_m)
 
 
-def read_depth_metres(path: Path) -> np.ndarray:
-    """`(height, width)` float32 metres from a NumPy file of floats; 0 where it is not finite or not positive.
+def read_depth_meters(path: Path) -> np.ndarray:
+    """`(height, width)` float32 meters from a NumPy file of floats; 0 where it is not finite or not positive.
 
     Raises:
         DatasetError: If the file is missing or damaged, or holds no plane of floats.
@@ -55,7 +55,7 @@ def read_depth_metres(path: Path) -> np.ndarray:
         raise DatasetError(f"{path}: cannot be read: {problem}") from None
     if not isinstance(depth_m, np.ndarray) or depth_m.ndim != 2 or depth_m.dtype.kind != "f":
         got = f"{depth_m.dtype} {depth_m.shape}" if isinstance(depth_m, np.ndarray) else type(depth_m).__name__
-        raise DatasetError(f"{path}: expected (height, width) floats, metres, got {got}")
+        raise DatasetError(f"{path}: expected (height, width) floats, meters, got {got}")
     return np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, 0).astype(np.float32)
 
 
@@ -78,7 +78,7 @@ def _decode(path: Path, flags: int) -> np.ndarray:
         content = path.read_bytes()
     except OSError as problem:
         raise DatasetError(f"{path}: cannot be read: {problem.strerror}") from None
-    # libjpeg fills the missing part of a cut file with grey instead of failing
+    # libjpeg fills the missing part of a cut file with gray instead of failing
     is_cut = content.startswith(_JPEG_START) and _JPEG_END not in content[-64:]
     image = None if is_cut or not content else cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     if image is None:

@@ -73,7 +73,7 @@ class RectifiedPair:
 
         Args:
             timestamp_ns: Time of exposure, int nanoseconds.
-            left: `(height, width, 3)` RGB or `(height, width)` grey, uint8.
+            left: `(height, width, 3)` RGB or `(height, width)` gray, uint8.
             right: As `left`.
 
         Raises:
@@ -124,7 +124,7 @@ def _maps(lens: Lens, R: np.ndarray, projection: np.ndarray) -> tuple[np.ndarray
 def _check(side: str, image: object, rig: Rig) -> None:
     if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
         what = image.dtype if isinstance(image, np.ndarray) else type(image).__name__
-        raise FrameError(f"{side}: expected (height, width, 3) RGB or (height, width) grey, uint8, got {what}")
+        raise FrameError(f"{side}: expected (height, width, 3) RGB or (height, width) gray, uint8, got {what}")
     expected = (rig.left.height, rig.left.width)
     if image.shape[:2] != expected:
         got = "x".join(map(str, image.shape[1::-1]))

@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxslam.sensors.camera import Camera
-from jaxslam.sensors.frame import Frame, to_grey
+from jaxslam.sensors.frame import Frame, to_gray
 
-_FEATURES, _LEAST_MATCHES, _RATIO = 600, 30, 0.7
+_FEATURES, _MIN_MATCHES, _RATIO = 600, 30, 0.7
 _QUICK_FEATURES, _QUICK_LEVELS, _QUICK_RATIO = 500, 4, 0.8
-_MOST_OFF_ROW_PX = 1.0
-_MOST_BRIGHTER = 0.25
+_MAX_OFF_ROW_PX = 1.0
+_MAX_BRIGHTER = 0.25
 _NEAR_ZERO_PX = 0.5
 _SURELY_OFF_ROW_PX = 2.0
 """Median distance from the row that no rectified pair has: 0.6 pixels with quick matches in KITTI 06, 0 in rooms."""
@@ -31,24 +31,24 @@ class PairFinding(NamedTuple):
 
 def look_over(frames: Sequence[Frame], camera: Camera) -> Iterator[PairFinding]:
     """Findings about the pairs among some frames of a camera; nothing if there is none."""
-    pairs = [(to_grey(frame.image), to_grey(frame.right)) for frame in frames if frame.right is not None]
+    pairs = [(to_gray(frame.image), to_gray(frame.right)) for frame in frames if frame.right is not None]
     if not pairs or camera.baseline_m is None:
         return
     ratio = float(np.median([left.mean() / max(right.mean(), 1) for left, right in pairs]))
     yield PairFinding(
         "brightness",
-        abs(ratio - 1) > _MOST_BRIGHTER,
+        abs(ratio - 1) > _MAX_BRIGHTER,
         f"the left images are {ratio:.2f} times as bright as the right ones",
         "points are matched badly; is each camera exposed on its own?",
     )
     shifts = np.concatenate([matched_shifts(*pair) for pair in pairs])
-    if len(shifts) < _LEAST_MATCHES:
+    if len(shifts) < _MIN_MATCHES:
         yield PairFinding("rows", True, f"{len(shifts)} matches between left and right", "hardly any point has depth")
         return
     off, on_row = _rows(shifts)
     yield PairFinding(
         "rows",
-        off > _MOST_OFF_ROW_PX,
+        off > _MAX_OFF_ROW_PX,
         f"matches lie {off:.2f} pixels from their rows, the median of {len(shifts)}",
         "the pair is not rectified, or not of this calibration; depth is found for few points, and wrong",
     )
@@ -97,7 +97,7 @@ def contradiction_of_pairs(shifts: Float[np.ndarray, "n 2"]) -> tuple[str, str]:
 def _rows(shifts: Float[np.ndarray, "n 2"]) -> tuple[float, Float[np.ndarray, " m"]]:
     """Median distance of matches from their rows, and the disparities of those near theirs, pixels."""
     off = float(np.median(np.abs(shifts[:, 1])))
-    return off, shifts[np.abs(shifts[:, 1]) < max(3 * off, _MOST_OFF_ROW_PX), 0]
+    return off, shifts[np.abs(shifts[:, 1]) < max(3 * off, _MAX_OFF_ROW_PX), 0]
 
 
 def matched_shifts(
@@ -106,8 +106,8 @@ def matched_shifts(
     """`(n, 2)` how much further right and down features lie in the left image than in the right one, pixels.
 
     Args:
-        left: The grey left image.
-        right: The grey right image.
+        left: The gray left image.
+        right: The gray right image.
         quick: Whether to match ORB features, to a pixel, instead of SIFT features, to a tenth of one.
     """
     finder = cv2.ORB.create(_QUICK_FEATURES, nlevels=_QUICK_LEVELS) if quick else cv2.SIFT.create(_FEATURES)

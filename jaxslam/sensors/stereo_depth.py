@@ -5,11 +5,11 @@ import numpy as np
 
 from jaxslam.errors import CameraError
 from jaxslam.sensors.camera import Camera
-from jaxslam.sensors.frame import to_grey
+from jaxslam.sensors.frame import to_gray
 
 _BLOCK_PX = 7
 _ROUGH_HALVINGS, _DENSE_HALVINGS = 2, 1
-_LEAST_DISPARITY_PX = 1.0
+_MIN_DISPARITY_PX = 1.0
 _UNIT = 16
 """OpenCV's disparities are in sixteenths of a pixel."""
 
@@ -37,7 +37,7 @@ class DenseDepth:
         )
 
     def of(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-        """`(height, width)` float32 metres, 0 where nothing is found."""
+        """`(height, width)` float32 meters, 0 where nothing is found."""
         return _small_depth(self._matcher, left, right, self._focal_baseline, _DENSE_HALVINGS)
 
 
@@ -62,7 +62,7 @@ class RoughDepth:
         self._matcher.setTextureThreshold(5)
 
     def of(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-        """`(height, width)` float32 metres, 0 where nothing is found."""
+        """`(height, width)` float32 meters, 0 where nothing is found."""
         return _small_depth(self._matcher, left, right, self._focal_baseline, _ROUGH_HALVINGS)
 
 
@@ -73,7 +73,7 @@ def _prepared(camera: Camera, halvings: int) -> tuple[float, int]:
         CameraError: If the camera has no baseline, or its images are not rectified.
     """
     if camera.baseline_m is None:
-        raise CameraError(f"camera '{camera.name}': baseline_m: expected metres for a stereo pair, got none")
+        raise CameraError(f"camera '{camera.name}': baseline_m: expected meters for a stereo pair, got none")
     if any(camera.distortion):
         raise CameraError(f"camera '{camera.name}': distortion: expected zeros, as of rectified images")
     # As far as a tenth of the width, and in steps of 16 at the smaller size.
@@ -84,10 +84,10 @@ def _small_depth(
     matcher: cv2.StereoMatcher, left: np.ndarray, right: np.ndarray, focal_baseline: float, halvings: int
 ) -> np.ndarray:
     """Depth at a size halved so often, brought to the whole one."""
-    small = [to_grey(image) for image in (left, right)]
+    small = [to_gray(image) for image in (left, right)]
     for _ in range(halvings):
         small = [cv2.pyrDown(image) for image in small]
     disparity = matcher.compute(*small).astype(np.float32) * np.float32(2**halvings / _UNIT)
-    found = disparity >= _LEAST_DISPARITY_PX
+    found = disparity >= _MIN_DISPARITY_PX
     depth = np.where(found, np.float32(focal_baseline) / np.where(found, disparity, 1), 0)
     return cv2.resize(depth, left.shape[1::-1], interpolation=cv2.INTER_NEAREST)

@@ -5,22 +5,22 @@ from typing import Annotated, ClassVar, Literal, TypeAlias
 
 import numpy as np
 
-from jaxslam.config.validation import Checked, Range
+from jaxslam.config.validation import Range, ValidatedConfig
 from jaxslam.errors import CameraError, JaxSlamError
 from jaxslam.sensors.camera import check_axis, check_baseline
 
 LensModel: TypeAlias = Literal["radtan", "equidistant"]
 
 _TERMS = {"radtan": (0, 4, 5), "equidistant": (0, 4)}
-_LEAST_BASELINE_M = 1e-4
-_MOST_APART_DEG = 60.0
+_MIN_BASELINE_M = 1e-4
+_MAX_APART_DEG = 60.0
 _Extent = Annotated[int, Range(at_least=8, at_most=32768)]
 _Focal = Annotated[float, Range(above=0)]
 _Pose: TypeAlias = tuple[float, float, float, float, float, float, float]
 
 
 @dataclass(frozen=True)
-class Lens(Checked):
+class Lens(ValidatedConfig):
     """One camera of a pair as it is.
 
     Attributes:
@@ -28,7 +28,7 @@ class Lens(Checked):
         height: Image height in pixels.
         fx: Focal length along a row in pixels.
         fy: Focal length along a column in pixels.
-        cx: Principal point along a row in pixels, from the centre of the top-left pixel.
+        cx: Principal point along a row in pixels, from the center of the top-left pixel.
         cy: Principal point along a column in pixels.
         distortion: `(k1, k2, p1, p2)` or `(k1, k2, p1, p2, k3)` of `radtan`, `(k1, k2, k3, k4)` of `equidistant`; none
             if the lens does not distort.
@@ -72,14 +72,14 @@ class Lens(Checked):
 
 
 @dataclass(frozen=True)
-class Rig(Checked):
+class Rig(ValidatedConfig):
     """Two cameras side by side, as a calibration finds them.
 
     Attributes:
         name: What to call the pair in messages.
         left: The left camera.
         right: The right camera, of the same image size and lens model.
-        T_left_right: `qw qx qy qz x y z`, the right camera in the axes of the left one, metres: x is the baseline, and
+        T_left_right: `qw qx qy qz x y z`, the right camera in the axes of the left one, meters: x is the baseline, and
             positive. In ORB-SLAM3 `Stereo.T_c1_c2`.
         fps: Nominal pairs a second.
         far_depth_baselines: Depth beyond which it is not trusted on its own, in baselines (`ThDepth` of ORB-SLAM);
@@ -110,14 +110,14 @@ class Rig(Checked):
                 f"rig '{self.name}': T_left_right: expected a unit quaternion first, got one of {length:g}"
             )
         apart = np.degrees(2 * np.arccos(min(1.0, abs(self.T_left_right[0]) / length)))
-        if apart > _MOST_APART_DEG:
+        if apart > _MAX_APART_DEG:
             raise CameraError(
                 f"rig '{self.name}': T_left_right: expected cameras that look the same way, got {apart:.0f} degrees"
                 " apart"
             )
         x, y, z = self.T_left_right[4:]
-        if np.linalg.norm((x, y, z)) < _LEAST_BASELINE_M:
-            raise CameraError(f"rig '{self.name}': T_left_right: expected a baseline in metres, got {x:g} {y:g} {z:g}")
+        if np.linalg.norm((x, y, z)) < _MIN_BASELINE_M:
+            raise CameraError(f"rig '{self.name}': T_left_right: expected a baseline in meters, got {x:g} {y:g} {z:g}")
         check_baseline(f"rig '{self.name}': T_left_right", float(np.linalg.norm((x, y, z))))
         if x <= max(abs(y), abs(z)):
             raise CameraError(

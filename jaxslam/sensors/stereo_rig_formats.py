@@ -42,7 +42,7 @@ def read_rig(path: Path) -> Rig:
     """Read two cameras and the transform between them.
 
     Args:
-        path: The file; its format is recognised by its keys.
+        path: The file; its format is recognized by its keys.
 
     Raises:
         CameraError: If the file is unreadable, lacks a needed key, has an unknown one (our format), or the calibration

@@ -17,14 +17,14 @@ _OF_RECORDING = ("camera", "timestamps_ns", "__len__", "__getitem__")
 
 
 def check_arguments(
-    camera: object, config: object, map: object, detectors: Mapping[str, object], *, localize_only: bool
+    camera: object, config: object, slam_map: object, detectors: Mapping[str, object], *, localize_only: bool
 ) -> None:
     """Refuse arguments of `Slam` that have the wrong type or do not go together.
 
     Args:
         camera: Expected to be a `Camera`.
         config: Expected to be a `Config`, or `None`.
-        map: Expected to be a `Map` of a camera of the same image size, or `None`.
+        slam_map: Expected to be a `Map` of a camera of the same image size, or `None`.
         detectors: Detectors by the name of their argument; each is expected to be callable, or `None`.
         localize_only: Whether the map stays as it is.
 
@@ -39,11 +39,11 @@ def check_arguments(
     for name, detector in detectors.items():
         if detector is not None and not callable(detector):
             raise TypeError(f"{name}: expected a callable that takes an image, got {type(detector).__name__}")
-    if map is not None:
-        map = _require("map", map, Map, "; Slam.load(path) reads a map file")
-        _check_size(map.camera, camera)
-    if localize_only and (map is None or not len(map.ids)):
-        got = "no map" if map is None else "a map without keyframes"
+    if slam_map is not None:
+        slam_map = _require("map", slam_map, Map, "; Slam.load(path) reads a map file")
+        _check_size(slam_map.camera, camera)
+    if localize_only and (slam_map is None or not len(slam_map.ids)):
+        got = "no map" if slam_map is None else "a map without keyframes"
         raise ConfigError(
             f"localize_only: needs the map to localize in: map=, or Slam.load(path, localize_only=True); got {got}"
         )

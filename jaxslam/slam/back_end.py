@@ -20,58 +20,58 @@ from jaxslam.geometry.se3 import IDENTITY, compose, inverse, transform
 from jaxslam.loop_closing.essential_graph import GraphCompiler
 from jaxslam.loop_closing.loop_detector import LoopClosing, LoopClosure
 from jaxslam.loop_closing.place_index import PlaceIndex
-from jaxslam.loop_closing.place_recognition import compile_recognition, recognise
-from jaxslam.map.dynamic_removal import Movers
+from jaxslam.loop_closing.place_recognition import compile_recognition, recognize
+from jaxslam.map.dynamic_removal import DynamicObservations
 from jaxslam.map.types import NONE, Map, empty_map, has
 from jaxslam.mapping.local_map_tracking import keyframes_in_view, match_local_map
 from jaxslam.mapping.local_mapping import LocalMapping, NewKeyframe, mapping_plan, point_ids, with_new_keyframe
 from jaxslam.mapping.occlusion_states import PointStates, StateChanges
 from jaxslam.runtime.preload import import_scipy
 from jaxslam.runtime.stage_timer import StageTimes
-from jaxslam.runtime.trace_cache import traced_once
+from jaxslam.runtime.trace_cache import cached_trace
 from jaxslam.runtime.worker import Worker, close_all, make_worker
 from jaxslam.semantics import Detector
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame_arrays import FrameArrays
 from jaxslam.slam.dense_thread import DenseMapping
-from jaxslam.slam.keyframe_recall import Recalled, recall
+from jaxslam.slam.keyframe_reload import MapKeyframe, reload_keyframe
 from jaxslam.slam.keyframe_semantics import KeyframeSemantics
-from jaxslam.slam.tracker_map_sync import Hung, MapLink, pose_of, tracks_of
+from jaxslam.slam.tracker_map_sync import AnchoredPose, TrackerMapSync, pose_of, tracks_of
 from jaxslam.tracking.state import TrackOutput, TrackParams, TrackPlan, TrackReason, TrackState, TrackStatus
-from jaxslam.tracking.state_updates import relocated
+from jaxslam.tracking.state_updates import reset_at_pose
 
-_relocated = jax.jit(traced_once(relocated), donate_argnums=0)
+_relocated = jax.jit(cached_trace(reset_at_pose), donate_argnums=0)
 
 _RECALL_EVERY = 10
-"""Frames after which a tracker that only localises gets other keyframes."""
-_MOST_ON_THE_WAY = 2
+"""Frames after which a tracker that only localizes gets other keyframes."""
+_MAX_ON_THE_WAY = 2
 """Keyframes: one that mapping is at, and one that is done when it is looked for next."""
 _PATIENCE_S = 0.02
 """Longest wait for the index of places, while lost; the next frame asks again."""
 
 
-class Placed(NamedTuple):
+class LocalizedPose(NamedTuple):
     """Where a frame was taken, by points of the map found in it.
 
     Attributes:
-        hung: The pose.
+        anchored: The pose.
         num_matched: Points that agree on it.
         covariance: `(6, 6)` in the tangent space at the camera: translation (m), then rotation (rad).
     """
 
-    hung: Hung
+    anchored: AnchoredPose
     num_matched: int
     covariance: np.ndarray
 
 
-class _Look(NamedTuple):
+class _LoopSearch(NamedTuple):
     """A job: look whether a keyframe closes a loop."""
 
     map: Map
     keyframe: int
 
 
-class _Recall(NamedTuple):
+class _Reload(NamedTuple):
     """A job: find and prepare keyframes that show what the camera sees."""
 
     map: Map
@@ -109,9 +109,9 @@ class _MapUpdate(NamedTuple):
     states: int = 0
 
 
-_MapJob: TypeAlias = NewKeyframe | LoopClosure | Movers | StateChanges
-_PlaceJob: TypeAlias = _Look | _Recall | _Replace
-_PlaceResult: TypeAlias = LoopClosure | tuple[Recalled, ...] | None
+_MapJob: TypeAlias = NewKeyframe | LoopClosure | DynamicObservations | StateChanges
+_PlaceJob: TypeAlias = _LoopSearch | _Reload | _Replace
+_PlaceResult: TypeAlias = LoopClosure | tuple[MapKeyframe, ...] | None
 
 
 class BackEnd:
@@ -123,7 +123,7 @@ class BackEnd:
         params: TrackParams,
         plan: TrackPlan,
         config: Config,
-        map: Map | None = None,
+        slam_map: Map | None = None,
         *,
         localize_only: bool = False,
         detector: Detector | None = None,
@@ -137,7 +137,7 @@ class BackEnd:
             params: Of the tracker.
             plan: Of the tracker.
             config: Settings.
-            map: To start with.
+            slam_map: To start with.
             localize_only: Leave the map as it is.
             detector: Finds in keyframes what may move, which leaves them and the map.
             dense: Gets keyframes once they are in the map, and where they go.
@@ -147,7 +147,7 @@ class BackEnd:
         self._params, self._track_plan = params, plan
         self._plan = mapping_plan(camera, config)
         self._camera, self._config, self._localize_only = camera, config, localize_only
-        start = empty_map(camera) if map is None else map
+        start = empty_map(camera) if slam_map is None else slam_map
         self._mapping = LocalMapping(camera, params, self._plan, start)
         self._index, self._lock = PlaceIndex.from_map(start), threading.Lock()
         self._loops = LoopClosing(self._index, params, self._plan.features, self._lock)
@@ -156,13 +156,13 @@ class BackEnd:
         self._semantics = None if detector is None else self._semantics_of(detector)
         self._dense = dense
         self._graphs = GraphCompiler()
-        self._link = MapLink(plan, start)
+        self._link = TrackerMapSync(plan, start)
         most = config.mapping.num_features + self._num_tracks
         occlusion = config.dynamics.occlusion
         self._states = PointStates(occlusion, params, start, most) if occlusion.enabled else None
         self._states_in_map = 0  # number of the changes that the newest map has
         self._arrived: Map | None = None
-        self._waiting: list[Recalled] = []
+        self._waiting: list[MapKeyframe] = []
         self._wanted: set[int] = set()
         self._correction = IDENTITY
         self._features: Features | None = None  # of the present frame, once they have been sought
@@ -200,7 +200,7 @@ class BackEnd:
     @property
     def is_behind(self) -> bool:
         """Whether keyframes wait that mapping has not begun with; never on the schedule of a deterministic run."""
-        return not self._config.run.in_turn and self._link.num_on_the_way > _MOST_ON_THE_WAY
+        return not self._config.run.in_turn and self._link.num_on_the_way > _MAX_ON_THE_WAY
 
     def compile(self, frame: FrameArrays, state: TrackState) -> None:
         """Compile all that is needed while frames of this kind come, with a state that is not needed any more."""
@@ -229,30 +229,30 @@ class BackEnd:
             raise RuntimeError("the tracker is closed; Slam.reset() begins anew")
         self._features = None
         if self._semantics is not None:
-            self._take_movers(*self._semantics.take(frame), frame)
-        self._take_places(self._to_places.take(frame), frame)
-        more = self._take_maps(self._to_mapping.take(frame), frame)
+            self._take_movers(*self._semantics.collect(frame), frame)
+        self._take_places(self._to_places.collect(frame), frame)
+        more = self._take_maps(self._to_mapping.collect(frame), frame)
         if self._dense is not None:
-            self._dense.take(frame)
+            self._dense.collect(frame)
         state = self._carried(state)
         if more:
-            self._offer_recall(self._link.believed(self._link.reference), frame)
+            self._request_reload(self._link.tracker_pose(self._link.reference), frame)
         correction, self._correction = self._correction, IDENTITY
-        return self._with_recalled(state), correction
+        return self._with_reloaded(state), correction
 
-    def told_error(self) -> str:
+    def latest_error(self) -> str:
         """What went wrong in the detector that looks at keyframes; told once, empty if nothing did."""
         error, self._detector_error = self._detector_error, ""
         return error
 
-    def keyframe_made(
+    def insert_keyframe(
         self,
         timestamp_ns: int,
         image: np.ndarray,
         arrays: FrameArrays,
         output: TrackOutput,
         frame: int,
-        recognised: Hung | None,
+        recognized: AnchoredPose | None,
     ) -> None:
         """Hand over a keyframe of the tracker.
 
@@ -262,20 +262,20 @@ class BackEnd:
             arrays: The frame; it is copied.
             output: What the tracker said of it.
             frame: Its number.
-            recognised: Where it is, if tracking began at a place that was recognised.
+            recognized: Where it is, if tracking began at a place that was recognized.
         """
         keyframe = NONE
         if not self._localize_only:
-            new = self._link.keyframe_made(timestamp_ns, _copied(arrays), output, recognised)
+            new = self._link.register_keyframe(timestamp_ns, _copied(arrays), output, recognized)
             keyframe = new.id
             states = None if self._states is None else self._states.handed_over()
             if self._dense is not None:
-                self._dense.keyframe_made(new, image, pose_of(output), frame)
-            self._to_mapping.offer(new._replace(features=self._features, states=states), frame)
+                self._dense.insert_keyframe(new, image, pose_of(output), frame)
+            self._to_mapping.submit(new._replace(features=self._features, states=states), frame)
         if self._semantics is not None:
-            self._semantics.offer(keyframe, image, np.asarray(arrays.depth), tracks_of(output), frame)
+            self._semantics.submit(keyframe, image, np.asarray(arrays.depth), tracks_of(output), frame)
 
-    def held_to_map(
+    def match_local_map(
         self, state: TrackState, arrays: FrameArrays, output: TrackOutput
     ) -> tuple[TrackState, TrackOutput, int]:
         """A frame whose flow is weak, with the pose that points of the map around it give it.
@@ -288,9 +288,9 @@ class BackEnd:
         placed = self._in_local_map(self._features, pose)
         if placed is None:
             return state, output, 0
-        T_world_cam = self._link.pose(placed.hung)
+        T_world_cam = self._link.pose(placed.anchored)
         change = compose(T_world_cam, inverse(pose))
-        state = self._link.moved(state, change, is_keyframe=bool(output.keyframe))
+        state = self._link.apply_correction(state, change, is_keyframe=bool(output.keyframe))
         X_world = transform(change, np.asarray(output.X_world, np.float64))
         fine = placed.num_matched >= self._config.track.weak_inliers
         wxyz_xyz: Any = T_world_cam.astype(np.float32)
@@ -303,17 +303,17 @@ class BackEnd:
         )
         return state, output, placed.num_matched
 
-    def look_at_points(self, arrays: FrameArrays, output: TrackOutput) -> float | None:
+    def update_occlusion(self, arrays: FrameArrays, output: TrackOutput) -> float | None:
         """Take in which points of the reference keyframe a frame that was tracked shows, and which are blocked in it.
 
         Returns:
             The share of them that are OCCLUDED; `None` if the settings do not ask for it, or the map has no keyframe.
         """
-        if self._states is None or (hung := self._link.in_map(pose_of(output))) is None:
+        if self._states is None or (anchored := self._link.in_map(pose_of(output))) is None:
             return None
-        return self._states.see(self.map, hung.keyframe, hung.T_keyframe_cam, np.asarray(output.twist), arrays)
+        return self._states.see(self.map, anchored.keyframe, anchored.T_keyframe_cam, np.asarray(output.twist), arrays)
 
-    def regain(self, arrays: FrameArrays, predicted: np.ndarray | None) -> tuple[Placed | None, bool]:
+    def relocalize(self, arrays: FrameArrays, predicted: np.ndarray | None) -> tuple[LocalizedPose | None, bool]:
         """Where a frame was taken that flow has lost, if the map shows that place.
 
         Args:
@@ -332,24 +332,26 @@ class BackEnd:
         if not self._lock.acquire(timeout=_PATIENCE_S):
             return None, False
         try:
-            found = recognise(self.map, self._index, features, self._params, plan=self._plan.features)
+            found = recognize(self.map, self._index, features, self._params, plan=self._plan.features)
         finally:
             self._lock.release()
         if found is None:
             return None, True
-        return Placed(Hung(found.keyframe, found.T_keyframe_cam), found.num_inliers, found.covariance), False
+        return LocalizedPose(
+            AnchoredPose(found.keyframe, found.T_keyframe_cam), found.num_inliers, found.covariance
+        ), False
 
-    def relocated(self, state: TrackState, recognised: Hung) -> TrackState:
-        """The state of the tracker begun anew where the map recognised a place, with keyframes of it at hand."""
-        self._link.refer_to(recognised.keyframe)
-        pose = self._link.pose(recognised)
-        state = self.restarted(state, pose)
-        self._wait_for(self._recalls(_Recall(self.map, pose, self._link.submap_now(), frozenset())))
+    def reset_at_pose(self, state: TrackState, recognized: AnchoredPose) -> TrackState:
+        """The state of the tracker begun anew where the map recognized a place, with keyframes of it at hand."""
+        self._link.set_reference_keyframe(recognized.keyframe)
+        pose = self._link.pose(recognized)
+        state = self.start_submap(state, pose)
+        self._wait_for(self._reloads(_Reload(self.map, pose, self._link.submap_now(), frozenset())))
         while self._waiting:
-            state = self._with_recalled(state)
+            state = self._with_reloaded(state)
         return state
 
-    def restarted(self, state: TrackState, T_world_cam: np.ndarray) -> TrackState:
+    def start_submap(self, state: TrackState, T_world_cam: np.ndarray) -> TrackState:
         """The state of the tracker begun anew at a pose."""
         self._link.forget_slots()
         self._wait_for(())
@@ -358,19 +360,19 @@ class BackEnd:
     def localize(self, T_world_cam: np.ndarray, frame: int) -> None:
         """Look now and then for keyframes to recall, when none are made any more."""
         if self._localize_only and frame % _RECALL_EVERY == 0:
-            self._offer_recall(T_world_cam, frame)
+            self._request_reload(T_world_cam, frame)
 
-    def hang(self, T_world_cam: np.ndarray) -> Hung:
+    def anchor(self, T_world_cam: np.ndarray) -> AnchoredPose:
         """A pose of the tracker, tied to the map."""
-        return self._link.hang(T_world_cam)
+        return self._link.anchor(T_world_cam)
 
-    def pose(self, hung: Hung) -> np.ndarray:
+    def pose(self, anchored: AnchoredPose) -> np.ndarray:
         """`(7,)` where it is in the map now."""
-        return self._link.pose(hung)
+        return self._link.pose(anchored)
 
-    def submap_of(self, hung: Hung) -> int:
+    def submap_of(self, anchored: AnchoredPose) -> int:
         """Number of the submap that a pose is in now."""
-        return self._link.submap_of(hung.keyframe)
+        return self._link.submap_of(anchored.keyframe)
 
     @property
     def submap_now(self) -> int:
@@ -384,12 +386,12 @@ class BackEnd:
             Exception: What went wrong in a thread. The state is as it was, and nothing else is lost: finish again.
         """
         if self._semantics is not None:
-            self._take_movers(*self._semantics.drain(), 0)
+            self._take_movers(*self._semantics.flush(), 0)
         if self._states is not None and not (self._localize_only or self._closed):
             self._offer_states(self._states)
-        self._take_places(self._to_places.drain(), 0)
-        while self._take_maps(self._to_mapping.drain(), 0):
-            self._take_places(self._to_places.drain(), 0)
+        self._take_places(self._to_places.flush(), 0)
+        while self._take_maps(self._to_mapping.flush(), 0):
+            self._take_places(self._to_places.flush(), 0)
         if self._dense is not None:
             self._dense.finish()
         return self._carried(state)
@@ -401,7 +403,7 @@ class BackEnd:
         dense = () if self._dense is None else (self._dense.worker,)
         close_all((self._to_mapping, self._to_places, *looking, *dense))
 
-    def _in_local_map(self, features: Features, T_world_cam: np.ndarray) -> Placed | None:
+    def _in_local_map(self, features: Features, T_world_cam: np.ndarray) -> LocalizedPose | None:
         """Where a frame was taken that is about at a pose, if the map around shows it."""
         about = self._link.in_map(T_world_cam)
         if about is None:
@@ -411,13 +413,13 @@ class BackEnd:
         )
         if found is None:
             return None
-        return Placed(Hung(about.keyframe, found.T_origin_cam), len(found.agree), found.covariance)
+        return LocalizedPose(AnchoredPose(about.keyframe, found.T_origin_cam), len(found.agree), found.covariance)
 
     def _compile_edits(self, state: TrackState) -> None:
         """Compile the changes to the tracker's state."""
         state = self._link.compile(_relocated(state, np.asarray(IDENTITY, np.float32)))
         if self._semantics is not None:
-            state = self._link.forgotten(state, np.zeros(1, np.int64))
+            state = self._link.drop_points(state, np.zeros(1, np.int64))
         jax.block_until_ready(state)
 
     def _semantics_of(self, detector: Detector) -> KeyframeSemantics:
@@ -444,31 +446,31 @@ class BackEnd:
         before = self._mapping.map
         try:
             if isinstance(job, LoopClosure):
-                map = self._mapping.close_loop(job)
-                return _MapUpdate(map, loops=int(map is not before))
-            if isinstance(job, Movers):
-                map, gone = self._mapping.remove(job)
-                removed = len(before.points.ids) - len(map.points.ids)
-                return _MapUpdate(map, cleaned=job.keyframe, removed=removed, gone=gone)
+                slam_map = self._mapping.close_loop(job)
+                return _MapUpdate(slam_map, loops=int(slam_map is not before))
+            if isinstance(job, DynamicObservations):
+                slam_map, gone = self._mapping.remove(job)
+                removed = len(before.points.ids) - len(slam_map.points.ids)
+                return _MapUpdate(slam_map, cleaned=job.keyframe, removed=removed, gone=gone)
             if isinstance(job, StateChanges):
                 return _MapUpdate(self._mapping.take_states(job), states=job.number)
             return _MapUpdate(self._mapping.add(job), job.id, states=0 if job.states is None else job.states.number)
         except BaseException:
             # What was begun is forgotten; those after a keyframe hang on it, and so it is there, without points.
-            map = with_new_keyframe(before, job, no_features()) if isinstance(job, NewKeyframe) else before
-            self._mapping = LocalMapping(self._camera, self._params, self._plan, map)
+            slam_map = with_new_keyframe(before, job, no_features()) if isinstance(job, NewKeyframe) else before
+            self._mapping = LocalMapping(self._camera, self._params, self._plan, slam_map)
             raise
 
     def _place_job(self, job: _PlaceJob) -> _PlaceResult:
-        if isinstance(job, _Look):
+        if isinstance(job, _LoopSearch):
             return self._loops.look(job.map, job.keyframe)
         if isinstance(job, _Replace):
             return self._loops.replace(job.map, job.keyframe)
-        return self._recalls(job)
+        return self._reloads(job)
 
-    def _recalls(self, job: _Recall) -> tuple[Recalled, ...]:
-        wanted = keyframes_in_view(job.map, job.T_world_cam, job.submap, set(job.known), self._track_plan.num_recalled)
-        return tuple(recall(job.map, keyframe_id, self._track_plan.num_points) for keyframe_id in wanted)
+    def _reloads(self, job: _Reload) -> tuple[MapKeyframe, ...]:
+        wanted = keyframes_in_view(job.map, job.T_world_cam, job.submap, set(job.known), self._track_plan.num_reloaded)
+        return tuple(reload_keyframe(job.map, keyframe_id, self._track_plan.num_points) for keyframe_id in wanted)
 
     def _take_maps(self, updates: list[_MapUpdate], frame: int) -> bool:
         """Keep the newest map until the state is carried along, and look for loops; whether there was one."""
@@ -483,24 +485,24 @@ class BackEnd:
             if update.gone is not None:
                 self._gone.append(update.gone)
             if update.cleaned != NONE and not self._closed:
-                self._to_places.offer(_Replace(update.map, update.cleaned), frame)
+                self._to_places.submit(_Replace(update.map, update.cleaned), frame)
             if update.keyframe != NONE and not self._closed:
-                self._to_places.offer(_Look(update.map, update.keyframe), frame)
+                self._to_places.submit(_LoopSearch(update.map, update.keyframe), frame)
         return bool(updates)
 
     def _carried(self, state: TrackState) -> TrackState:
         if self._arrived is not None:
-            state, change = self._link.corrected(state, self._arrived)
+            state, change = self._link.apply_map(state, self._arrived)
             self._arrived = None
             self._correction = compose(change, self._correction)
             if self._states is not None:
                 self._states.arrived(self.map, self._states_in_map)
         for gone in self._gone:
-            state = self._link.forgotten(state, gone)
+            state = self._link.drop_points(state, gone)
         self._gone.clear()
         return state
 
-    def _take_movers(self, found: list[Movers], error: str, frame: int) -> None:
+    def _take_movers(self, found: list[DynamicObservations], error: str, frame: int) -> None:
         """Have what may move leave the keyframes it was found in, the map, and the tracker's state."""
         self._detector_error = error or self._detector_error
         for movers in found:
@@ -508,33 +510,33 @@ class BackEnd:
             if self._dense is not None and movers.mask.any() and not self._closed:
                 self._dense.remove(movers, frame)
             if movers.keyframe != NONE and movers.mask.any() and not self._closed:
-                self._to_mapping.offer(movers, frame)
+                self._to_mapping.submit(movers, frame)
 
     def _offer_states(self, states: PointStates) -> None:
         """Hand over what has changed since the last keyframe."""
         changes = states.handed_over()
         if len(changes.ids):
-            self._to_mapping.offer(changes, 0)
+            self._to_mapping.submit(changes, 0)
 
     def _take_places(self, results: list[_PlaceResult], frame: int) -> None:
         for result in results:
             if isinstance(result, LoopClosure):
                 if not self._closed:
-                    self._to_mapping.offer(result, frame)
+                    self._to_mapping.submit(result, frame)
             elif result:
                 self._wait_for(result)
 
-    def _wait_for(self, keyframes: Iterable[Recalled]) -> None:
+    def _wait_for(self, keyframes: Iterable[MapKeyframe]) -> None:
         """Have keyframes put back into the tracker, one a frame."""
         self._waiting = list(keyframes)
         self._wanted = {keyframe.keyframe for keyframe in self._waiting}
 
-    def _offer_recall(self, T_world_cam: np.ndarray, frame: int) -> None:
-        if self._track_plan.num_recalled and self._link.reference != NONE:
+    def _request_reload(self, T_world_cam: np.ndarray, frame: int) -> None:
+        if self._track_plan.num_reloaded and self._link.reference != NONE:
             known = frozenset(self._link.latest())
-            self._to_places.offer(_Recall(self.map, T_world_cam, self._link.submap_now(), known), frame)
+            self._to_places.submit(_Reload(self.map, T_world_cam, self._link.submap_now(), known), frame)
 
-    def _with_recalled(self, state: TrackState) -> TrackState:
+    def _with_reloaded(self, state: TrackState) -> TrackState:
         """The state with one more of the keyframes that wait; one a frame, so that none takes long."""
         while self._waiting:
             keyframe = self._waiting.pop(0)
@@ -542,13 +544,13 @@ class BackEnd:
                 keyframe = _without_removed(keyframe, self.map)
             slot = self._link.slot_for(keyframe.keyframe, self._wanted)
             if slot is not None:
-                return self._link.recalled(state, slot, keyframe)
+                return self._link.load_keyframe(state, slot, keyframe)
         return state
 
 
-def _without_removed(keyframe: Recalled, map: Map) -> Recalled:
+def _without_removed(keyframe: MapKeyframe, slam_map: Map) -> MapKeyframe:
     """A keyframe that was prepared from an earlier map, without the points that have left it since."""
-    there = has(map.points.ids, point_ids(keyframe.id))
+    there = has(slam_map.points.ids, point_ids(keyframe.id))
     return keyframe._replace(weight=np.where(there, keyframe.weight, np.float32(0)))
 
 

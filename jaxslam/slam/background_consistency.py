@@ -23,7 +23,7 @@ _STEP = 8
 _MARGIN_PX = 9
 """Corners keep so far from what has depth: its edge moves with it."""
 _NUM_CORNERS, _FEWEST = 80, 12
-_MOST_AGREE, _FEW_CONTRADICT = 0.5, 0.25
+_MAX_AGREE, _FEW_CONTRADICT = 0.5, 0.25
 """Shares of the corners that confirm a pose."""
 _NEAREST, _FARTHEST = 0.1, 30.0
 """Times the median depth measured: what has no depth is expected between."""
@@ -32,15 +32,15 @@ _CLEAR_PX, _AGREE_PX, _APART_PX = 2.0, 2.0, 3.0
 do not; pixels."""
 _SMALL = 0.03
 """Share of the median depth measured: a pose that is unsure by less is no weak one, with the covariance to say so."""
-_LEAST_MOVED = 0.2
+_MIN_MOVED = 0.2
 """Of the median depth, what the camera must have moved for the background to tell. Over less, a camera that circles
 around the background sees it as one at rest does: with 0, wrong poses were confirmed in 7 of 12 rendered rooms."""
-_MOST_FRAMES = 90
+_MAX_FRAMES = 90
 """That corners are followed for before others are taken."""
 
 
 @dataclass(frozen=True)
-class Doubt:
+class PoseDoubt:
     """How far a translation may be wrong.
 
     Attributes:
@@ -52,7 +52,7 @@ class Doubt:
     is_weak: bool = False
 
 
-class BackgroundCheck:
+class BackgroundConsistency:
     """Follows corners without depth where too little of the picture has any, and compares their motion with the pose's.
 
     In rendered rooms with two people and depth up to 2 m or 1.6 m, poses are up to 1.8 m wrong; of 91 that are said to
@@ -78,12 +78,12 @@ class BackgroundCheck:
         self._stop()
 
     def look(
-        self, grey: np.ndarray, depth_m: np.ndarray, ignore: np.ndarray, T_world_cam: np.ndarray, correction: np.ndarray
-    ) -> Doubt:
+        self, gray: np.ndarray, depth_m: np.ndarray, ignore: np.ndarray, T_world_cam: np.ndarray, correction: np.ndarray
+    ) -> PoseDoubt:
         """Compare a frame that was tracked with those before.
 
         Args:
-            grey: `(h, w)` uint8; it is copied where it is needed.
+            gray: `(h, w)` uint8; it is copied where it is needed.
             depth_m: `(h, w)` meters; 0 or not finite where nothing was measured.
             ignore: `(h, w)` true where nothing is to be trusted.
             T_world_cam: `(7,)` pose of the camera.
@@ -97,52 +97,52 @@ class BackgroundCheck:
         self._depth_m = float(np.median(near))
         without = self._without_depth(depth_m, ignore)
         if self._previous is None:
-            self._begin(grey, without, T_world_cam)
+            self._begin(gray, without, T_world_cam)
             return self._doubt(0.0)
         self._T_world_first = compose(correction, self._T_world_first)
-        self._follow(grey, without)
+        self._follow(gray, without)
         T_first_cam = between(self._T_world_first, T_world_cam)
         moved_m = float(np.linalg.norm(T_first_cam[4:]))
         few = len(self._now) < _FEWEST
-        if not few and moved_m < _LEAST_MOVED * self._depth_m and self._frames < _MOST_FRAMES:
+        if not few and moved_m < _MIN_MOVED * self._depth_m and self._frames < _MAX_FRAMES:
             return self._doubt(moved_m)
         if few or not self._confirms(T_first_cam):
             self._unsure_m += moved_m
-        self._begin(grey, without, T_world_cam)
+        self._begin(gray, without, T_world_cam)
         return self._doubt(0.0)
 
-    def _doubt(self, moved_m: float) -> Doubt:
+    def _doubt(self, moved_m: float) -> PoseDoubt:
         """What is unsure, with what the camera has moved since the background last had its say."""
-        return Doubt(self._unsure_m + moved_m, self._unsure_m > _SMALL * self._depth_m)
+        return PoseDoubt(self._unsure_m + moved_m, self._unsure_m > _SMALL * self._depth_m)
 
     def _stop(self) -> None:
         self._previous: np.ndarray | None = None
         self._first = self._now = np.zeros((0, 2), np.float32)
         self._frames = 0
 
-    def _begin(self, grey: np.ndarray, without: np.ndarray, T_world_cam: np.ndarray) -> None:
+    def _begin(self, gray: np.ndarray, without: np.ndarray, T_world_cam: np.ndarray) -> None:
         """Take corners of a frame to follow."""
-        corners = cv2.goodFeaturesToTrack(grey, _NUM_CORNERS, 0.02, 12, mask=without)
+        corners = cv2.goodFeaturesToTrack(gray, _NUM_CORNERS, 0.02, 12, mask=without)
         if corners is None or len(corners) < _FEWEST:
             self._stop()  # a background without texture tells nothing
             return
         self._first = self._now = corners[:, 0]
-        self._previous, self._T_world_first, self._frames = grey.copy(), T_world_cam, 0
+        self._previous, self._T_world_first, self._frames = gray.copy(), T_world_cam, 0
 
-    def _follow(self, grey: np.ndarray, without: np.ndarray) -> None:
+    def _follow(self, gray: np.ndarray, without: np.ndarray) -> None:
         """Follow the corners into a frame, as long as they have no depth there."""
         self._frames += 1
         if self._previous is not None and len(self._now):
             guess = np.zeros_like(self._now)
             now, found, _ = cv2.calcOpticalFlowPyrLK(
-                self._previous, grey, self._now, guess, winSize=(15, 15), maxLevel=3
+                self._previous, gray, self._now, guess, winSize=(15, 15), maxLevel=3
             )
             column, row = np.rint(now).astype(int).T
-            inside = (column >= 0) & (row >= 0) & (column < grey.shape[1]) & (row < grey.shape[0])
+            inside = (column >= 0) & (row >= 0) & (column < gray.shape[1]) & (row < gray.shape[0])
             there = found[:, 0].astype(bool) & inside
             there[there] = without[row[there], column[there]] > 0
             self._first, self._now = self._first[there], now[there]
-        self._previous = grey.copy()
+        self._previous = gray.copy()
 
     def _confirms(self, T_first_cam: np.ndarray) -> bool:
         """Whether most corners move as the pose says, and visibly so, and few do not."""
@@ -164,7 +164,7 @@ class BackgroundCheck:
         as_said = (across_px < _AGREE_PX) & (along_px > _CLEAR_PX) & (along_px < most_px + _APART_PX)
         as_said &= along_px > least_px - _AGREE_PX
         not_so = (across_px > _APART_PX) | (along_px < least_px - _AGREE_PX) | (along_px > most_px + _APART_PX)
-        return bool(as_said.mean() > _MOST_AGREE and not_so.mean() < _FEW_CONTRADICT)
+        return bool(as_said.mean() > _MAX_AGREE and not_so.mean() < _FEW_CONTRADICT)
 
     def _without_depth(self, depth_m: np.ndarray, ignore: np.ndarray) -> np.ndarray:
         """`(h, w)` uint8, 255 where nothing was measured and nothing is masked, away from what is."""

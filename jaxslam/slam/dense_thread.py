@@ -12,12 +12,12 @@ import numpy as np
 
 from jaxslam.config.schema import DenseConfig
 from jaxslam.dense.coverage import SeenArea
-from jaxslam.dense.dense_map import DenseFigures, DenseMap, Look, Shown
-from jaxslam.dense.key_objects import Neighbours
+from jaxslam.dense.dense_map import DenseFigures, DenseKeyframe, DenseMap, DepthGlance
+from jaxslam.dense.key_objects import Neighbors
 from jaxslam.dense.occupancy import Occupancy
 from jaxslam.dense.point_cloud import DenseCloud
-from jaxslam.geometry.se3 import IDENTITY, moved
-from jaxslam.map.dynamic_removal import Movers
+from jaxslam.geometry.se3 import IDENTITY, retract
+from jaxslam.map.dynamic_removal import DynamicObservations
 from jaxslam.map.types import NONE, Map
 from jaxslam.mapping.local_mapping import NewKeyframe
 from jaxslam.runtime.worker import Worker, make_worker
@@ -25,13 +25,13 @@ from jaxslam.sensors.frame_arrays import FrameArrays
 from jaxslam.slam.tracker_map_sync import pose_of
 from jaxslam.tracking.state import TrackOutput
 
-_MOST_WAITING = 8
+_MAX_WAITING = 8
 """Keyframes that wait: 2.5 MB each at 640x480, and more than two seconds of a tracker that makes three a second."""
 _LOOK_EVERY = 5
 """Frames, of which one has its look at what is not there any more, and at what is new: with keyframes alone, twice as
 many ghosts stay. A keyframe of a camera that measures depth has none of its own besides."""
 
-_Job: TypeAlias = Shown | Look | Movers | None
+_Job: TypeAlias = DenseKeyframe | DepthGlance | DynamicObservations | None
 """`None`: look at the newest map."""
 
 
@@ -44,19 +44,19 @@ class DenseMapping:
         wants_keyframe: Whether much is in the picture that no keyframe shows.
     """
 
-    def __init__(self, map: DenseMap, seen: SeenArea, config: DenseConfig, *, deterministic: bool) -> None:
+    def __init__(self, slam_map: DenseMap, seen: SeenArea, config: DenseConfig, *, deterministic: bool) -> None:
         """Begin.
 
         Args:
-            map: Empty; from now on nobody else's.
+            slam_map: Empty; from now on nobody else's.
             seen: Without keyframes; nobody else's either.
             config: Settings that it was made with.
             deterministic: Work in turn; else in a thread.
         """
-        self._map, self._carves = map, config.carve
+        self._map, self._carves = slam_map, config.carve
         self._seen, self._least_seen, self.wants_keyframe = seen, config.keyframe_below, False
-        self._neighbours = Neighbours(config.key_window, config.key_frames) if map.has_keys else None
-        self._on_the_way: dict[int, Shown] = {}
+        self._neighbors = Neighbors(config.key_window, config.key_frames) if slam_map.has_keys else None
+        self._on_the_way: dict[int, DenseKeyframe] = {}
         self._waiting: deque[_Job] = deque()
         self._lock, self._waiting_lock = threading.Lock(), threading.Lock()
         self._passed_over = 0
@@ -69,7 +69,7 @@ class DenseMapping:
         with self._lock:
             self._map.compile()
 
-    def keyframe_made(self, new: NewKeyframe, image: np.ndarray, pose: np.ndarray, frame: int) -> None:
+    def insert_keyframe(self, new: NewKeyframe, image: np.ndarray, pose: np.ndarray, frame: int) -> None:
         """Take a keyframe; it is put in when it is in the map.
 
         Args:
@@ -81,14 +81,14 @@ class DenseMapping:
         arrays = new.frame
         self._seen.add(pose)
         self.wants_keyframe = False
-        self._on_the_way[new.id] = Shown(
+        self._on_the_way[new.id] = DenseKeyframe(
             keyframe=new.id,
             image=image.copy(),
             depth=np.asarray(arrays.depth),
             pair=None if arrays.right is None else (np.asarray(arrays.image), np.asarray(arrays.right)),
             ignore=np.asarray(arrays.ignore),
-            T_cam_depth=moved(IDENTITY, new.twist * float(arrays.depth_delay_s)),
-            neighbours=() if self._neighbours is None else self._neighbours.before(frame, pose),
+            T_cam_depth=retract(IDENTITY, new.twist * float(arrays.depth_delay_s)),
+            neighbors=() if self._neighbors is None else self._neighbors.before(frame, pose),
         )
 
     def frame_tracked(self, frame: int, image: np.ndarray, arrays: FrameArrays, output: TrackOutput) -> None:
@@ -97,23 +97,23 @@ class DenseMapping:
         It may show key objects of a keyframe to come, and what it sees past is not there.
         """
         depth, ignore, pose = np.asarray(arrays.depth), np.asarray(arrays.ignore), pose_of(output)
-        if self._neighbours is not None:
-            self._neighbours.see(frame, image, depth, ignore, pose)
+        if self._neighbors is not None:
+            self._neighbors.see(frame, image, depth, ignore, pose)
         if frame % _LOOK_EVERY:
             return
         self.wants_keyframe = self._seen.share(depth, ignore, pose) < self._least_seen
         # Rough depth of a pair would see past what is there: keyframes, which are matched again, look instead.
-        if self._carves and arrays.right is None and len(self._waiting) < _MOST_WAITING:
-            pose = moved(pose, np.asarray(output.twist) * float(arrays.depth_delay_s))
+        if self._carves and arrays.right is None and len(self._waiting) < _MAX_WAITING:
+            pose = retract(pose, np.asarray(output.twist) * float(arrays.depth_delay_s))
             self._add_job(self._map.look_of(depth, ignore, pose), frame)
 
-    def map_made(self, map: Map, keyframe: int, frame: int) -> None:
+    def map_made(self, slam_map: Map, keyframe: int, frame: int) -> None:
         """Take in a new map, and the keyframe that is new in it, or `NONE`."""
-        self._map.sparse = map
+        self._map.sparse = slam_map
         shown = self._on_the_way.pop(keyframe, None)
         self._add_job(shown, frame)
 
-    def remove(self, movers: Movers, frame: int) -> None:
+    def remove(self, movers: DynamicObservations, frame: int) -> None:
         """Take in what may move in a keyframe."""
         shown = self._on_the_way.get(movers.keyframe)
         if shown is not None:
@@ -121,13 +121,13 @@ class DenseMapping:
         elif movers.keyframe != NONE:
             self._add_job(movers, frame)
 
-    def take(self, frame: int) -> None:
+    def collect(self, frame: int) -> None:
         """Raise what went wrong, if something did."""
-        self.worker.take(frame)
+        self.worker.collect(frame)
 
     def finish(self) -> None:
         """Wait until all is in, and every keyframe where the map has it."""
-        self.worker.drain()
+        self.worker.flush()
         with self._lock:
             self._map.correct_all()
 
@@ -160,13 +160,13 @@ class DenseMapping:
     def _add_job(self, job: _Job, frame: int) -> None:
         if job is None and self._waiting:
             return  # the newest map is looked at with each job
-        if isinstance(job, Shown):
+        if isinstance(job, DenseKeyframe):
             jobs = tuple(self._waiting)
-            waiting = [number for number, other in enumerate(jobs) if isinstance(other, Shown)]
-            if len(waiting) >= _MOST_WAITING:
+            waiting = [number for number, other in enumerate(jobs) if isinstance(other, DenseKeyframe)]
+            if len(waiting) >= _MAX_WAITING:
                 self._pass_over(jobs[waiting[0]])
         self._waiting.append(job)
-        self.worker.offer(None, frame)
+        self.worker.submit(None, frame)
 
     def _pass_over(self, job: _Job) -> None:
         """Take the place of a job that waits, unless its turn has come; then nothing is done in that turn."""
@@ -183,11 +183,11 @@ class DenseMapping:
                 return
             job = self._waiting.popleft()
         with self._lock:
-            if isinstance(job, Shown):
+            if isinstance(job, DenseKeyframe):
                 self._map.add(job)
-            elif isinstance(job, Movers):
+            elif isinstance(job, DynamicObservations):
                 self._map.remove(job)
-            elif isinstance(job, Look):
+            elif isinstance(job, DepthGlance):
                 self._map.look(job)
             else:
                 self._map.correct()

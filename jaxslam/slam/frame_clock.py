@@ -14,7 +14,7 @@ from jaxslam.slam.input_warnings import InputWarnings
 _WINDOW, _LONG_WINDOW, _FEW = 16, 32, 4
 """Intervals that decide whether stamps have become irregular, and whether they are regular again; and the fewest of
 which the median is a rate."""
-_OFF, _MOST_ODD = 0.25, 2
+_OFF, _MAX_ODD = 0.25, 2
 """An interval further from a whole number of periods is odd, in periods; so many odd ones are chance. TUM fr1_rpy has 1
 of 159 further than 0.2, Bonn crowd and KITTI none."""
 _SHORTEST = 0.5
@@ -25,7 +25,7 @@ _GAP_S = 1.0
 """A longer interval is a pause: it says nothing of the rate."""
 _FASTEST_S = 1e-3
 """Of shorter periods there are no cameras."""
-_MOST_AHEAD = 4.0
+_MAX_AHEAD = 4.0
 """Periods that the clock may be ahead of the stamps: about the longest burst."""
 _SET_BACK_S, _SET_BACK_FRAMES = 0.5, 3
 """A clock was set back if so many frames in a row come in order, each so far before the last one that was tracked."""
@@ -130,7 +130,7 @@ class FrameClock:
         )
         periods = max(1, round((interval_s - self._ahead_s) / period_s))
         ahead_s = self._ahead_s + periods * period_s - interval_s
-        return periods * period_s, min(max(ahead_s, 0.0), _MOST_AHEAD * period_s), True
+        return periods * period_s, min(max(ahead_s, 0.0), _MAX_AHEAD * period_s), True
 
     def _regular_period(self, intervals_s: list[float]) -> float | None:
         """The period that nearly all intervals are multiples of, the nominal one or their median; `None` if neither.
@@ -146,7 +146,7 @@ class FrameClock:
             candidates.append(middle_s)
         odd = {period_s: _num_odd(intervals_s, period_s) for period_s in candidates}
         best = min(candidates, key=lambda period_s: odd[period_s])
-        return best if odd[best] <= (0 if self._irregular else _MOST_ODD) else None
+        return best if odd[best] <= (0 if self._irregular else _MAX_ODD) else None
 
     def _mean_period(self, intervals_s: list[float]) -> float:
         """The nominal period if the mean interval is near, or of no camera; else the mean interval."""

@@ -10,7 +10,7 @@ from jaxslam.tracking.state import KeyframeReason, TrackOutput, TrackReason, Tra
 
 
 @dataclass(frozen=True, eq=False)
-class Tracked:
+class FrameResult:
     """What became of one frame.
 
     Attributes:
@@ -21,11 +21,11 @@ class Tracked:
             drifted since it began, nor where the world of another submap is. At the first frame of a submap, which is
             its origin by definition, 1e-12 on the diagonal; 100 where `status` is `LOST`.
         status: What the pose is worth.
-        reason: Why it is not worth more, and of `RELOCALISED` why flow had lost it; empty if it is `OK`.
+        reason: Why it is not worth more, and of `RELOCALIZED` why flow had lost it; empty if it is `OK`.
         twist: `(6,)` velocity of the camera in its own axes: m/s, then rad/s.
         num_inliers: Followed points that agree with the pose.
         inlier_ratio: Their share of the points that could be followed.
-        num_looked_up: Points found again in keyframes, by their picture.
+        num_keyframe_matches: Points found again in keyframes, by their picture.
         num_matched: Points of the map that were found by their descriptor and agree with the pose, sought where flow
             is weak or lost.
         residual_px: Robust standard deviation of the inliers' reprojection error, pixels.
@@ -57,7 +57,7 @@ class Tracked:
     twist: np.ndarray
     num_inliers: int
     inlier_ratio: float
-    num_looked_up: int
+    num_keyframe_matches: int
     num_matched: int
     residual_px: float
     uv: np.ndarray
@@ -110,7 +110,7 @@ class Rejected:
 class FrameRecord:
     """One line of a run's log: a frame's fate without its arrays.
 
-    Attributes are those of `Tracked`; a rejected frame has only a time, a status and a reason.
+    Attributes are those of `FrameResult`; a rejected frame has only a time, a status and a reason.
     """
 
     timestamp_ns: int
@@ -118,7 +118,7 @@ class FrameRecord:
     reason: str
     num_inliers: int = 0
     inlier_ratio: float = 0.0
-    num_looked_up: int = 0
+    num_keyframe_matches: int = 0
     num_matched: int = 0
     residual_px: float = 0.0
     is_keyframe: bool = False
@@ -131,21 +131,21 @@ class FrameRecord:
     submap: int | None = None
 
     @classmethod
-    def of(cls, result: "Tracked | Rejected") -> "FrameRecord":
+    def of(cls, result: "FrameResult | Rejected") -> "FrameRecord":
         """The record of a result."""
         return cls(**{field.name: getattr(result, field.name) for field in fields(cls) if hasattr(result, field.name)})
 
 
-def tracked_of(
+def frame_result(
     timestamp_ns: int,
     output: TrackOutput,
     correction: np.ndarray,
     num_matched: int,
     mask: FrameMask,
     occluded_share: float | None = None,
-) -> Tracked:
+) -> FrameResult:
     """The result of a frame, from what the compiled step said of it."""
-    return Tracked(
+    return FrameResult(
         timestamp_ns=timestamp_ns,
         T_world_cam=np.asarray(output.T_world_cam.wxyz_xyz, np.float64),
         covariance=np.asarray(output.covariance),
@@ -154,7 +154,7 @@ def tracked_of(
         twist=np.asarray(output.twist, np.float64),
         num_inliers=int(output.num_inliers),
         inlier_ratio=float(output.inlier_ratio),
-        num_looked_up=int(output.num_looked_up),
+        num_keyframe_matches=int(output.num_keyframe_matches),
         num_matched=num_matched,
         residual_px=float(output.residual_px),
         uv=np.asarray(output.uv),

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from jaxslam.semantics.checked_detector import WatchedDetector
+from jaxslam.semantics.checked_detector import CheckedDetector
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.depth_checks import contradiction_of_depth
-from jaxslam.sensors.frame import Frame, to_grey
+from jaxslam.sensors.frame import Frame, to_gray
 from jaxslam.sensors.image_checks import scaled_to_one
 from jaxslam.sensors.stereo_checks import contradiction_of_pairs, matched_shifts
 from jaxslam.slam.input_warnings import InputWarnings
@@ -15,10 +15,10 @@ _PAIR_EVERY = 3
 """Of the first frames, those whose pair is matched: it takes longest."""
 
 
-class InputWatch:
+class InputChecks:
     """Looks at the first ten frames, then at every hundredth, and warns of what contradicts the camera."""
 
-    def __init__(self, camera: Camera, warnings: InputWarnings, detector: WatchedDetector | None) -> None:
+    def __init__(self, camera: Camera, warnings: InputWarnings, detector: CheckedDetector | None) -> None:
         """Begin before the first frame.
 
         Args:
@@ -37,7 +37,7 @@ class InputWatch:
             self._warnings.warn("color order", self._detector.color_suspicion)
         if number >= _FIRST and number % _RARELY:
             return
-        if scaled_to_one(to_grey(frame.image)):
+        if scaled_to_one(to_gray(frame.image)):
             text = "image: expected values from 0 to 255, got 0 and 1 only; it looks like an image scaled to 0 to 1"
             self._warnings.warn("image range", text)
         if self._camera.is_stereo:
@@ -48,7 +48,7 @@ class InputWatch:
     def _look_at_pair(self, frame: Frame, number: int) -> None:
         if frame.right is None or (number < _FIRST and number % _PAIR_EVERY):
             return
-        new = matched_shifts(to_grey(frame.image), to_grey(frame.right), quick=True)
+        new = matched_shifts(to_gray(frame.image), to_gray(frame.right), quick=True)
         self._shifts = new if number >= _FIRST else np.concatenate([self._shifts, new])
         topic, text = contradiction_of_pairs(self._shifts)
         if text:

@@ -12,41 +12,41 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.map.dynamic_removal import Movers, under
-from jaxslam.mapping.local_mapping import Tracks
+from jaxslam.map.dynamic_removal import DynamicObservations, under
+from jaxslam.mapping.local_mapping import TrackedObservations
 from jaxslam.masks.box_to_mask import dilated
 from jaxslam.runtime.stage_timer import StageTimes
 from jaxslam.runtime.worker import Worker, make_worker
 from jaxslam.semantics import Detector
 from jaxslam.sensors.camera import Camera
-from jaxslam.sensors.downscale import Raster, Reduced
+from jaxslam.sensors.downscale import Downscaler, ImageGrid
 from jaxslam.slam.mask_pipeline import WIDTH_PX
-from jaxslam.slam.semantic_thread import Failures, mask_found, rgb_copy
+from jaxslam.slam.semantic_thread import ErrorLog, detect_mask, rgb_copy
 
 _log = logging.getLogger(__name__)
 
-_MOST_WAITING = 32
+_MAX_WAITING = 32
 """Keyframes that wait for the detector. A late mask still cleans the map, so few would do harm; so many are 40 MB at
 640x480, and ten seconds of a tracker that makes three a second. When more come, the one that has waited longest is
 never looked at: the tracker is done with it, and what others see of the same objects is removed with them."""
 
 
-class _Shown(NamedTuple):
+class _KeyframeImage(NamedTuple):
     """A keyframe for the detector, its own copy.
 
     Attributes:
         keyframe: Its id, or `NONE`.
         image: `(h, w, 3)` RGB.
-        depth: `(h', w')` metres, at the size of masks.
+        depth: `(h', w')` meters, at the size of masks.
         id: `(n,)` the tracker's numbers of the points it saw,
-        seen_uv: `(2, n)` and where, pixels.
+        uv_raw: `(2, n)` and where, pixels.
     """
 
     keyframe: int
     image: np.ndarray
     depth: np.ndarray
     id: np.ndarray
-    seen_uv: np.ndarray
+    uv_raw: np.ndarray
 
 
 class KeyframeSemantics:
@@ -78,58 +78,58 @@ class KeyframeSemantics:
             times: Where to keep how long a look takes.
         """
         self._detector, self._dilate_px = detector, dilate_px
-        self._reduced, self._failures = Reduced(Raster.of(camera), WIDTH_PX), Failures()
-        self._waiting: deque[_Shown] = deque(maxlen=_MOST_WAITING)
+        self._reduced, self._failures = Downscaler(ImageGrid.of(camera), WIDTH_PX), ErrorLog()
+        self._waiting: deque[_KeyframeImage] = deque(maxlen=_MAX_WAITING)
         self.num_passed_over = 0
         # A job is only the word that there is one more: of those that wait, the thread takes the first.
-        self.worker: Worker[None, Movers | None] = make_worker(
+        self.worker: Worker[None, DynamicObservations | None] = make_worker(
             (times or StageTimes()).timed("detector", self._look),
             "jaxslam-semantics",
             deterministic=deterministic,
             latency_frames=latency_frames,
         )
 
-    def offer(
-        self, keyframe: int, image: np.ndarray, depth: Float[np.ndarray, "h w"], tracks: Tracks, frame: int
+    def submit(
+        self, keyframe: int, image: np.ndarray, depth: Float[np.ndarray, "h w"], tracks: TrackedObservations, frame: int
     ) -> None:
         """Have it look at a keyframe.
 
         Args:
             keyframe: Its id; `NONE` if it does not go into the map.
             image: `(h, w, 3)` RGB or `(h, w)`; copied.
-            depth: Metres; copied.
+            depth: Meters; copied.
             tracks: Points that the tracker saw in it.
             frame: Number of the frame.
         """
         seen = tracks.weight > 0
-        points = tracks.id[seen].astype(np.int64), tracks.seen_uv[:, seen]
-        self._waiting.append(_Shown(keyframe, rgb_copy(image), self._reduced.every(depth).copy(), *points))
-        self.worker.offer(None, frame)
+        points = tracks.id[seen].astype(np.int64), tracks.uv_raw[:, seen]
+        self._waiting.append(_KeyframeImage(keyframe, rgb_copy(image), self._reduced.every(depth).copy(), *points))
+        self.worker.submit(None, frame)
 
-    def take(self, frame: int) -> tuple[list[Movers], str]:
+    def collect(self, frame: int) -> tuple[list[DynamicObservations], str]:
         """What was found by a frame, in the order of the keyframes, and what went wrong last; told once."""
-        return self._taken(lambda: self.worker.take(frame))
+        return self._collected(lambda: self.worker.collect(frame))
 
-    def drain(self) -> tuple[list[Movers], str]:
+    def flush(self) -> tuple[list[DynamicObservations], str]:
         """The same once all keyframes have been looked at; it waits for that, unless it is closed."""
-        return self._taken(self.worker.drain)
+        return self._collected(self.worker.flush)
 
-    def _look(self, _: None) -> Movers | None:
+    def _look(self, _: None) -> DynamicObservations | None:
         if not self._waiting:
             return None  # more came than can wait
         shown = self._waiting.popleft()
-        found = mask_found(self._detector, self._reduced, shown.image, shown.depth)
+        found = detect_mask(self._detector, self._reduced, shown.image, shown.depth)
         mask = dilated(self._reduced.whole(found), self._dilate_px)
-        return Movers(shown.keyframe, mask, shown.id[under(mask, shown.seen_uv)])
+        return DynamicObservations(shown.keyframe, mask, shown.id[under(mask, shown.uv_raw)])
 
-    def _taken(self, take: Callable[[], list[Movers | None]]) -> tuple[list[Movers], str]:
-        found: list[Movers] = []
+    def _collected(self, take: Callable[[], list[DynamicObservations | None]]) -> tuple[list[DynamicObservations], str]:
+        found: list[DynamicObservations] = []
         error = ""
         while True:
             try:
                 done = take()
             except Exception as wrong:  # whatever a network raises: tracking goes on without it
-                error = self._failures.told(f"{type(wrong).__name__}: {wrong}")
+                error = self._failures.report(f"{type(wrong).__name__}: {wrong}")
                 continue
             if not done:
                 return found, error

@@ -18,15 +18,15 @@ from jaxslam.masks.background_depth import SurfaceMemory
 from jaxslam.masks.box_to_mask import dilated
 from jaxslam.masks.propagation import PYRAMID_LEVELS, follow, make_origin, predicted_mask
 from jaxslam.runtime.aligned_memory import aligned_array
-from jaxslam.runtime.compile_cache import IN_ITS_THREAD
+from jaxslam.runtime.compile_cache import SINGLE_THREAD
 from jaxslam.runtime.stage_timer import StageTimes
-from jaxslam.runtime.trace_cache import traced_once
+from jaxslam.runtime.trace_cache import cached_trace
 from jaxslam.semantics import Detector
 from jaxslam.sensors.camera import Camera
-from jaxslam.sensors.downscale import Raster, Reduced
-from jaxslam.slam.semantic_thread import Found, Seen, SemanticThread
+from jaxslam.sensors.downscale import Downscaler, ImageGrid
+from jaxslam.slam.semantic_thread import DetectedMask, DetectionJob, SemanticThread
 
-_MOST_FRAMES = 30
+_MAX_FRAMES = 30
 """Frames kept for a detector that takes long; what it says of older ones is of no use."""
 _TRUSTED_FRAMES = 5
 """Frames after a detection during which what stands still stays in the mask: a person may."""
@@ -34,7 +34,7 @@ _TRUSTED_FRAMES = 5
 WIDTH_PX = 320
 """Masks are made at about so many columns: one of a third of the image is carried on in 1.5 ms, at 640 in 5.4."""
 
-_pyramid = jax.jit(traced_once(partial(build_pyramid, num_levels=PYRAMID_LEVELS)), compiler_options=IN_ITS_THREAD)
+_pyramid = jax.jit(cached_trace(partial(build_pyramid, num_levels=PYRAMID_LEVELS)), compiler_options=SINGLE_THREAD)
 
 
 class MaskSource(enum.IntEnum):
@@ -70,17 +70,17 @@ class FrameMask(NamedTuple):
     error: str
 
 
-class _Seen:
+class _BufferedFrame:
     """What is kept of a frame, at the size of masks."""
 
-    def __init__(self, grey: np.ndarray) -> None:
-        self.grey = grey
+    def __init__(self, gray: np.ndarray) -> None:
+        self.gray = gray
         self._pyramid: Pyramid | None = None
 
     @property
     def pyramid(self) -> Pyramid:
         """Its pyramid; most frames need none, because nothing is in their mask."""
-        made = self._pyramid or _pyramid(self.grey)
+        made = self._pyramid or _pyramid(self.gray)
         self._pyramid = made
         return made
 
@@ -89,7 +89,7 @@ class _Seen:
         self._pyramid = made
 
 
-class DynamicMasks:
+class MaskPipeline:
     """Makes the mask of every frame."""
 
     def __init__(
@@ -100,7 +100,7 @@ class DynamicMasks:
         deterministic: bool,
         latency_frames: int,
         propagate: bool = True,
-        newcomers: bool = True,
+        new_surfaces: bool = True,
         farthest_m: float = math.inf,
         dilate_px: int = 2,
         seed: int = 0,
@@ -114,14 +114,14 @@ class DynamicMasks:
             deterministic: Run it in turn, its result `latency_frames` later; else in a thread.
             latency_frames: 0 has every frame wait for its own mask.
             propagate: Carry masks on from frame to frame; without it, an old mask is used where it was.
-            newcomers: Add what has come before surfaces seen earlier.
+            new_surfaces: Add what has come before surfaces seen earlier.
             farthest_m: Depth beyond says nothing of those.
             dilate_px: How far a mask reaches beyond what was found.
             seed: Of random choices.
             times: Where to keep how long the detector takes.
         """
-        self._propagate, self._newcomers, self._dilate_px, self._seed = propagate, newcomers, dilate_px, seed
-        self._reduced = Reduced(Raster.of(camera), WIDTH_PX)
+        self._propagate, self._new_surfaces, self._dilate_px, self._seed = propagate, new_surfaces, dilate_px, seed
+        self._reduced = Downscaler(ImageGrid.of(camera), WIDTH_PX)
         self._semantics = (
             None
             if detector is None
@@ -135,8 +135,8 @@ class DynamicMasks:
             )
         )
         self._surfaces = SurfaceMemory(self._reduced.raster, farthest_m)
-        self._seen: dict[int, _Seen] = {}
-        self._next: Found | None = None
+        self._seen: dict[int, _BufferedFrame] = {}
+        self._next: DetectedMask | None = None
         self._carried_from: tuple[int, np.ndarray] | None = None
         self._detected_in: int | None = None
         self._depth = aligned_array(self._reduced.raster.shape, np.float32)
@@ -150,29 +150,31 @@ class DynamicMasks:
         follow(origin, [pyramid] * 2, blank, blank.astype(np.float32))
         self._surfaces.compile()
 
-    def of_frame(self, frame: int, image: np.ndarray, grey: np.ndarray, depth: Float[np.ndarray, "h w"]) -> FrameMask:
+    def mask_frame(self, frame: int, image: np.ndarray, gray: np.ndarray, depth: Float[np.ndarray, "h w"]) -> FrameMask:
         """The mask of the next frame.
 
         Args:
             frame: Its number.
             image: `(h, w, 3)` RGB or `(h, w)`.
-            grey: `(h, w)` uint8; copied.
-            depth: Metres; copied.
+            gray: `(h, w)` uint8; copied.
+            depth: Meters; copied.
         """
-        self._seen[frame] = _Seen(self._reduced.mean(grey))
+        self._seen[frame] = _BufferedFrame(self._reduced.mean(gray))
         np.copyto(self._depth, self._reduced.every(depth))
         found, error = (None, "") if self._semantics is None else self._semantics.newest(self._shown(frame, image))
-        source = self._carry(frame, found)
+        source = self._update_mask(frame, found)
         self._forget(frame)
         if not self._mask.any():  # and so nothing is carried on
             self._detected_in, source = None, MaskSource.NONE
         age = -1 if self._detected_in is None else frame - self._detected_in
         return FrameMask(dilated(self._reduced.whole(self._mask), self._dilate_px), source, age, error)
 
-    def tracked(self, frame: int, time_s: float, T_world_cam: Float[np.ndarray, "7"], turn_rad_per_s: float) -> None:
+    def frame_tracked(
+        self, frame: int, time_s: float, T_world_cam: Float[np.ndarray, "7"], turn_rad_per_s: float
+    ) -> None:
         """Put the mask right before it is carried on to the next frame, now that it is known where the camera was.
 
-        What stood outside the mask before leaves it, and newcomers are added.
+        What stood outside the mask before leaves it, and new_surfaces are added.
 
         Args:
             frame: That was tracked, the last one.
@@ -185,17 +187,17 @@ class DynamicMasks:
             # While nothing is detected, what only stands there may never have been part of an object.
             lately = self._detected_in is not None and frame - self._detected_in <= _TRUSTED_FRAMES
             self._mask = self._surfaces.without(self._mask, seen.outside if lately else seen.outside | seen.still)
-        if self._newcomers:
-            self._mask = self._surfaces.with_newcomers(self._mask, seen)
+        if self._new_surfaces:
+            self._mask = self._surfaces.with_new_surfaces(self._mask, seen)
         self._surfaces.remember(frame, time_s, T_world_cam, turn_rad_per_s, self._mask)
         self._prepare(frame + 1)
 
-    def lost(self, frame: int) -> None:
+    def frame_lost(self, frame: int) -> None:
         """Take in that nobody knows where the camera was in the last frame."""
         self._surfaces.forget()
         self._prepare(frame + 1)
 
-    def look(self, frame: int, image: np.ndarray) -> None:
+    def submit_for_detection(self, frame: int, image: np.ndarray) -> None:
         """Have the detector look at the frame that was made the mask of last, if it is idle.
 
         To be called when the frame has been tracked: until the next one there is time, and a network that runs beside
@@ -206,9 +208,9 @@ class DynamicMasks:
             image: `(h, w, 3)` RGB or `(h, w)`; copied.
         """
         if self._semantics is not None:
-            self._semantics.offer(self._shown(frame, image))
+            self._semantics.submit(self._shown(frame, image))
 
-    def corrected(self, T_new_old: Float[np.ndarray, "7"]) -> None:
+    def apply_map_correction(self, T_new_old: Float[np.ndarray, "7"]) -> None:
         """Take in that the world was moved."""
         self._surfaces.correct(T_new_old)
 
@@ -217,10 +219,10 @@ class DynamicMasks:
         if self._semantics is not None:
             self._semantics.close()
 
-    def _shown(self, frame: int, image: np.ndarray) -> Seen:
-        return Seen(frame, image, self._seen[frame].grey, self._depth)
+    def _shown(self, frame: int, image: np.ndarray) -> DetectionJob:
+        return DetectionJob(frame, image, self._seen[frame].gray, self._depth)
 
-    def _carry(self, frame: int, found: Found | None) -> MaskSource:
+    def _update_mask(self, frame: int, found: DetectedMask | None) -> MaskSource:
         """Bring the mask to this frame, from where the detector has looked or from the frame before."""
         prepared, self._next, self._carried_from = self._next, None, None
         if found is not None and found.frame in self._seen and (found.origin.mask.any() or not self._propagate):
@@ -231,7 +233,7 @@ class DynamicMasks:
             return MaskSource.DETECTOR
         if self._mask.any():
             self._carried_from = frame - 1, self._mask
-            origin = prepared or self._as_origin(frame)
+            origin = prepared or self._detected_now(frame)
             if origin is not None:
                 self._mask = self._carried(origin, frame)
         return MaskSource.DEPTH if self._detected_in is None else MaskSource.PROPAGATED
@@ -242,26 +244,26 @@ class DynamicMasks:
         A detector as fast as the camera will have looked by then; else it is done when that comes.
         """
         if self._detected_in != frame - 2:
-            self._next = self._as_origin(frame)
+            self._next = self._detected_now(frame)
 
-    def _as_origin(self, frame: int) -> Found | None:
+    def _detected_now(self, frame: int) -> DetectedMask | None:
         """The mask as it is carried on to a frame, if it can be."""
         before = self._seen.get(frame - 1)
         if before is None or not self._propagate or not self._mask.any():
             return None
-        return Found(frame - 1, make_origin(self._mask, before.grey, self._seed + frame))
+        return DetectedMask(frame - 1, make_origin(self._mask, before.gray, self._seed + frame))
 
-    def _carried(self, found: Found, frame: int) -> np.ndarray:
+    def _carried(self, found: DetectedMask, frame: int) -> np.ndarray:
         if found.frame == frame or not self._propagate:
             return found.origin.mask
         pyramids = [self._seen[between].pyramid for between in range(found.frame, frame)]
         now = self._seen[frame]
-        now.pyramid, followed = follow(found.origin, pyramids, now.grey, self._depth)
+        now.pyramid, followed = follow(found.origin, pyramids, now.gray, self._depth)
         return predicted_mask(found.origin, followed, self._depth)
 
     def _forget(self, frame: int) -> None:
         """Drop what no mask can come from any more."""
         looking_at = None if self._semantics is None else self._semantics.looking_at
-        oldest = frame if looking_at is None else max(looking_at, frame - _MOST_FRAMES)
+        oldest = frame if looking_at is None else max(looking_at, frame - _MAX_FRAMES)
         for old in [number for number in self._seen if number < oldest]:
             del self._seen[old]

@@ -12,11 +12,11 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from jaxslam.masks.box_to_mask import mask_of_detections, reduced_detections
-from jaxslam.masks.propagation import Origin, make_origin
+from jaxslam.masks.propagation import TrackedMask, make_origin
 from jaxslam.runtime.stage_timer import StageTimes
 from jaxslam.runtime.worker import InlineWorker, Worker, make_worker
 from jaxslam.semantics import Detector
-from jaxslam.sensors.downscale import Reduced
+from jaxslam.sensors.downscale import Downscaler
 
 _log = logging.getLogger(__name__)
 
@@ -24,23 +24,23 @@ _PATIENCE_S = 2.0
 """Longest wait for the mask of a frame that has to wait."""
 
 
-class Seen(NamedTuple):
+class DetectionJob(NamedTuple):
     """A frame for the detector.
 
     Attributes:
         frame: Its number.
         image: `(h, w, 3)` RGB or `(h, w)`.
-        grey: `(h', w')` uint8, of the size of masks.
-        depth: `(h', w')` metres.
+        gray: `(h', w')` uint8, of the size of masks.
+        depth: `(h', w')` meters.
     """
 
     frame: int
     image: np.ndarray
-    grey: np.ndarray
+    gray: np.ndarray
     depth: np.ndarray
 
 
-class Found(NamedTuple):
+class DetectedMask(NamedTuple):
     """What the detector has found.
 
     Attributes:
@@ -49,17 +49,17 @@ class Found(NamedTuple):
     """
 
     frame: int
-    origin: Origin
+    origin: TrackedMask
 
 
-class Failures:
+class ErrorLog:
     """What goes wrong in a detector: told every time, in the log only when it changes."""
 
     def __init__(self) -> None:
         """Begin with nothing wrong."""
         self._said = ""
 
-    def told(self, error: str) -> str:
+    def report(self, error: str) -> str:
         """What went wrong, as it is told."""
         if error != self._said:
             _log.warning("detector failed: %s", error)
@@ -68,12 +68,12 @@ class Failures:
 
 
 def rgb_copy(image: np.ndarray) -> np.ndarray:
-    """`(h, w, 3)` of `(h, w, 3)` or of grey `(h, w)`, as a detector takes it; a copy."""
+    """`(h, w, 3)` of `(h, w, 3)` or of gray `(h, w)`, as a detector takes it; a copy."""
     return image.copy() if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
 
 
-def mask_found(
-    detector: Detector, reduced: Reduced, rgb: UInt8[np.ndarray, "h w 3"], depth: Float[np.ndarray, "_h _w"]
+def detect_mask(
+    detector: Detector, reduced: Downscaler, rgb: UInt8[np.ndarray, "h w 3"], depth: Float[np.ndarray, "_h _w"]
 ) -> Bool[np.ndarray, "_h _w"]:
     """What a detector finds in an image, as a mask of the size of masks, no wider than it was found."""
     return mask_of_detections(reduced_detections(detector(rgb), reduced), depth, dilate_px=0)
@@ -89,7 +89,7 @@ class SemanticThread:
     def __init__(
         self,
         detector: Detector,
-        reduced: Reduced,
+        reduced: Downscaler,
         *,
         deterministic: bool,
         latency_frames: int,
@@ -109,53 +109,53 @@ class SemanticThread:
         self.looking_at: int | None = None
         self._offered: int | None = None
         self._detector, self._reduced, self._seed = detector, reduced, seed
-        self._all_wait, self._begun, self._failures = latency_frames == 0, False, Failures()
-        self._worker: Worker[Seen, Found] = make_worker(
+        self._all_wait, self._begun, self._failures = latency_frames == 0, False, ErrorLog()
+        self._worker: Worker[DetectionJob, DetectedMask] = make_worker(
             (times or StageTimes()).timed("detector", self._look),
             "jaxslam-semantics",
             deterministic=deterministic,
             latency_frames=latency_frames,
         )
 
-    def newest(self, seen: Seen) -> tuple[Found | None, str]:
+    def newest(self, seen: DetectionJob) -> tuple[DetectedMask | None, str]:
         """The newest mask there is by a frame, if it is newer than the last one, and what went wrong; told once.
 
         The first frame of all waits for its mask: whatever the tracker starts with would else be taken for static.
         """
         found, error = self._newest(seen.frame)
         if self._all_wait or not self._begun:
-            self.offer(seen)
+            self.submit(seen)
             later, failed = self._awaited(seen.frame)
             found, error = later or found, failed or error
         self._begun = True
         return found, error
 
-    def offer(self, seen: Seen) -> None:
+    def submit(self, seen: DetectionJob) -> None:
         """Have it look at a frame, if it is idle and has not yet; image and depth are copied."""
         if self.looking_at is None and seen.frame != self._offered:
-            self._worker.offer(seen._replace(image=rgb_copy(seen.image), depth=seen.depth.copy()), seen.frame)
+            self._worker.submit(seen._replace(image=rgb_copy(seen.image), depth=seen.depth.copy()), seen.frame)
             self.looking_at = self._offered = seen.frame
 
     def close(self) -> None:
         """End the thread."""
         self._worker.close()
 
-    def _look(self, job: Seen) -> Found:
-        mask = mask_found(self._detector, self._reduced, job.image, job.depth)
-        return Found(job.frame, make_origin(mask, job.grey, self._seed + job.frame))
+    def _look(self, job: DetectionJob) -> DetectedMask:
+        mask = detect_mask(self._detector, self._reduced, job.image, job.depth)
+        return DetectedMask(job.frame, make_origin(mask, job.gray, self._seed + job.frame))
 
-    def _newest(self, frame: int) -> tuple[Found | None, str]:
+    def _newest(self, frame: int) -> tuple[DetectedMask | None, str]:
         try:
-            done = self._worker.take(frame)
+            done = self._worker.collect(frame)
         except Exception as error:
             self.looking_at = None
-            return None, self._failures.told(f"{type(error).__name__}: {error}")
+            return None, self._failures.report(f"{type(error).__name__}: {error}")
         if not done:
             return None, ""
         self.looking_at = None
         return done[-1], ""
 
-    def _awaited(self, frame: int) -> tuple[Found | None, str]:
+    def _awaited(self, frame: int) -> tuple[DetectedMask | None, str]:
         """The mask of this very frame, if it comes in time."""
         until_s = time.monotonic() + _PATIENCE_S
         inline = isinstance(self._worker, InlineWorker)

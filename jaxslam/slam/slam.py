@@ -23,36 +23,36 @@ from jaxslam.dense.dense_map import DenseMap
 from jaxslam.dense.point_cloud import DenseCloud
 from jaxslam.dynamics.point_mask import mask_around, moving_points
 from jaxslam.errors import DatasetError, FrameError, JaxSlamError
-from jaxslam.geometry.se3 import IDENTITY, compose, moved
+from jaxslam.geometry.se3 import IDENTITY, compose, retract
 from jaxslam.map.npz_file import load_map, save_map
 from jaxslam.map.types import Map
-from jaxslam.masks.depth_instances import ObjectFinder
-from jaxslam.runtime.compile_cache import IN_ITS_THREAD, SOON_COMPILED, enable_compile_cache
+from jaxslam.masks.depth_instances import InstanceFinder
+from jaxslam.runtime.compile_cache import FAST_COMPILE, SINGLE_THREAD, enable_compile_cache
 from jaxslam.runtime.stage_timer import StageTimes
-from jaxslam.runtime.trace_cache import traced_once
+from jaxslam.runtime.trace_cache import cached_trace
 from jaxslam.runtime.worker import Worker, make_worker
 from jaxslam.semantics import Detector
-from jaxslam.semantics.checked_detector import WatchedDetector
+from jaxslam.semantics.checked_detector import CheckedDetector
 from jaxslam.semantics.from_config import detector_of, key_detector_of, why_no_network
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame, check_frame
 from jaxslam.sensors.frame_arrays import FrameArrays, FrameMemory
 from jaxslam.sensors.stereo_depth import RoughDepth
 from jaxslam.slam.argument_checks import check_arguments, check_recording, warn_of_other_camera
-from jaxslam.slam.back_end import BackEnd, Placed
-from jaxslam.slam.background_consistency import BackgroundCheck
+from jaxslam.slam.back_end import BackEnd, LocalizedPose
+from jaxslam.slam.background_consistency import BackgroundConsistency
 from jaxslam.slam.call_guard import one_at_a_time, refuse_after_fork
 from jaxslam.slam.dense_thread import DenseMapping
 from jaxslam.slam.frame_clock import FrameClock
-from jaxslam.slam.frame_result import FrameRecord, Rejected, Tracked, tracked_of
-from jaxslam.slam.input_checks import InputWatch
+from jaxslam.slam.frame_result import FrameRecord, FrameResult, Rejected, frame_result
+from jaxslam.slam.input_checks import InputChecks
 from jaxslam.slam.input_warnings import InputWarnings
-from jaxslam.slam.mask_pipeline import DynamicMasks, FrameMask, MaskSource
-from jaxslam.slam.tracker_map_sync import Hung
+from jaxslam.slam.mask_pipeline import FrameMask, MaskPipeline, MaskSource
+from jaxslam.slam.tracker_map_sync import AnchoredPose
 from jaxslam.tracking.cue_registry import with_cue_params, with_cues
 from jaxslam.tracking.from_config import track_params, track_plan, with_dense_keyframes
 from jaxslam.tracking.state import TrackOutput, TrackParams, TrackPlan, TrackReason, TrackState, TrackStatus
-from jaxslam.tracking.step import Followed, follow_points, init_state, track_followed
+from jaxslam.tracking.step import FlowResult, follow_points, init_state, track_followed
 from jaxslam.trajectory.trajectory import PathLike, Trajectory
 
 _log = logging.getLogger(__name__)
@@ -69,17 +69,17 @@ _MASKED = 0.95
 _PREDICTED_S = 1.0
 """Longest time for which a constant velocity is believed."""
 
-_new_state = jax.jit(traced_once(init_state), static_argnames=("height", "width", "plan"))
+_new_state = jax.jit(cached_trace(init_state), static_argnames=("height", "width", "plan"))
 """One program instead of some fifty."""
 
 
-_follow_points = jax.jit(traced_once(follow_points), static_argnames="plan", compiler_options=IN_ITS_THREAD)
+_follow_points = jax.jit(cached_trace(follow_points), static_argnames="plan", compiler_options=SINGLE_THREAD)
 
 
-@partial(jax.jit, static_argnames="plan", donate_argnums=0, compiler_options=SOON_COMPILED)
-@traced_once
+@partial(jax.jit, static_argnames="plan", donate_argnums=0, compiler_options=FAST_COMPILE)
+@cached_trace
 def _track_followed(
-    state: TrackState, frame: FrameArrays, followed: Followed, params: TrackParams, plan: TrackPlan
+    state: TrackState, frame: FrameArrays, followed: FlowResult, params: TrackParams, plan: TrackPlan
 ) -> tuple[TrackState, TrackOutput]:
     return track_followed(state, frame, followed, params, plan)
 
@@ -110,7 +110,7 @@ class Slam:
         camera: Camera,
         config: Config | None = None,
         *,
-        map: Map | None = None,
+        slam_map: Map | None = None,
         localize_only: bool = False,
         detector: Detector | None = None,
         key_detector: Detector | None = None,
@@ -120,7 +120,7 @@ class Slam:
         Args:
             camera: That takes the frames.
             config: Settings; the default preset if not given.
-            map: To start with: the first frame is `LOST` until its place is recognised.
+            slam_map: To start with: the first frame is `LOST` until its place is recognized.
             localize_only: Leave the map as it is.
             detector: Finds what may move, instead of the network of the settings.
             key_detector: Finds what a dense map has at full density, instead of the network with `dense.key_classes`.
@@ -137,13 +137,16 @@ class Slam:
         """
         refuse_after_fork()
         detectors = {"detector": detector, "key_detector": key_detector}
-        check_arguments(camera, config, map, detectors, localize_only=localize_only)
+        check_arguments(camera, config, slam_map, detectors, localize_only=localize_only)
         self.call_lock = threading.RLock()
         self.camera = camera
         self.config = config or Config()
         self.compile_s = 0.0
         # An empty map knows no place: with it, no frame would ever be tracked.
-        self._start_map, self._localize_only = map if map is not None and len(map.ids) else None, localize_only
+        self._start_map, self._localize_only = (
+            slam_map if slam_map is not None and len(slam_map.ids) else None,
+            localize_only,
+        )
         params = track_params(camera, with_dense_keyframes(self.config))._replace(restart_after=jnp.float32(_NEVER))
         self._params = with_cue_params(params, self.config.dynamics)
         # ORB-SLAM's local mapping does not accept keyframes either while it is busy.
@@ -157,7 +160,7 @@ class Slam:
         self._rough_depth = RoughDepth(camera) if camera.is_stereo else None
         motion = self._plan.motion
         self._memory = FrameMemory(camera.height, camera.width, pairs=camera.is_stereo, movable=motion is not None)
-        self._objects = None if motion is None else ObjectFinder(camera, motion.num_objects)
+        self._objects = None if motion is None else InstanceFinder(camera, motion.num_objects)
         self._ready = False
         enable_compile_cache()
         self._begin()
@@ -177,8 +180,8 @@ class Slam:
         Raises:
             MapFileError: If the file is missing, damaged, of another kind, or of a camera of another size.
         """
-        map = load_map(path)
-        return cls(camera or map.camera, config, map=map, localize_only=localize_only)
+        slam_map = load_map(path)
+        return cls(camera or slam_map.camera, config, slam_map=slam_map, localize_only=localize_only)
 
     @one_at_a_time
     def save(self, path: PathLike) -> None:
@@ -219,7 +222,7 @@ class Slam:
         return self.compile_s
 
     @one_at_a_time
-    def track(self, frame: Frame) -> Tracked:
+    def track(self, frame: Frame) -> FrameResult:
         """Track one frame.
 
         Args:
@@ -246,41 +249,41 @@ class Slam:
         watch.ends("take over")
         # Neither needs the other, and on two cores masks are ready before flow is; so is the rough depth of a pair.
         if frame.depth_m is None:
-            self._beside.offer(("match pair", partial(self._match_pair, frame)), self._frame)
-        self._beside.offer(("masks", partial(self._mask_of, frame, arrays, correction)), self._frame)
+            self._beside.submit(("match pair", partial(self._match_pair, frame)), self._frame)
+        self._beside.submit(("masks", partial(self._mask_of, frame, arrays, correction)), self._frame)
         followed = _follow_points(self._state, arrays, self._params, self._plan)
         watch.ends("flow")
-        mask: FrameMask = self._beside.drain()[-1]
-        mask = mask._replace(error=mask.error or self._back.told_error())
+        mask: FrameMask = self._beside.flush()[-1]
+        mask = mask._replace(error=mask.error or self._back.latest_error())
         arrays = self._masked(arrays, mask.mask, frame.dynamic_mask)
         watch.ends("wait for mask")
         output, placed, num_matched = self._advance(arrays, followed), None, 0
         arrays, mask = self._without_movers(arrays, mask, followed, output)
         watch.ends("pose")
         if int(output.status) == TrackStatus.LOST:
-            output, placed = self._regain(arrays, output, dt_s)
+            output, placed = self._relocalize(arrays, output, dt_s)
             num_matched = 0 if placed is None else placed.num_matched
-        elif self._to_be_matched(output):
-            self._state, output, num_matched = self._back.held_to_map(self._state, arrays, output)
-        share = None if int(output.status) == TrackStatus.LOST else self._back.look_at_points(arrays, output)
+        elif self._needs_map_match(output):
+            self._state, output, num_matched = self._back.match_local_map(self._state, arrays, output)
+        share = None if int(output.status) == TrackStatus.LOST else self._back.update_occlusion(arrays, output)
         watch.ends("match with map")
         if output.keyframe:
-            hung = None if placed is None else placed.hung
-            self._back.keyframe_made(frame.timestamp_ns, frame.image, arrays, output, self._frame, hung)
+            anchored = None if placed is None else placed.anchored
+            self._back.insert_keyframe(frame.timestamp_ns, frame.image, arrays, output, self._frame, anchored)
         if self.dense_mapping is not None and int(output.status) != TrackStatus.LOST:
             self.dense_mapping.frame_tracked(self._frame, frame.image, arrays, output)
-        tracked = self._in_submap(tracked_of(frame.timestamp_ns, output, correction, num_matched, mask, share))
-        tracked = self._doubted(tracked, arrays)
+        tracked = self._in_submap(frame_result(frame.timestamp_ns, output, correction, num_matched, mask, share))
+        tracked = self._with_background_check(tracked, arrays)
         self._clock.advance(frame.timestamp_ns)
         tracked = self._recorded(tracked, dt_s, float(arrays.depth_delay_s))
         if self._masks is not None:
-            self._masks.look(self._frame, frame.image)
+            self._masks.submit_for_detection(self._frame, frame.image)
         self._frame += 1
         watch.ends("hand over")
         return replace(tracked, track_ms=(time.perf_counter() - began) * 1e3, warnings=self._warnings.taken())
 
     def run(
-        self, dataset: Dataset, on_frame: Callable[[Frame | None, Tracked | Rejected], None] | None = None
+        self, dataset: Dataset, on_frame: Callable[[Frame | None, FrameResult | Rejected], None] | None = None
     ) -> list[FrameRecord]:
         """Track a whole recording.
 
@@ -313,7 +316,7 @@ class Slam:
         So has a detector that looks at keyframes alone, then.
         """
         if any(leaf.is_deleted() for leaf in jax.tree.leaves(self._state)):  # a step that Ctrl-C ended took it along
-            self._state = _to_be_placed(self._fresh_state())
+            self._state = _awaiting_relocalization(self._fresh_state())
         self._state = self._back.finish(self._state)
 
     def close(self) -> None:
@@ -341,7 +344,7 @@ class Slam:
 
     @property
     def dense(self) -> DenseCloud | None:
-        """The dense map as it is now: points, colours and counts; `None` without `dense.enabled`."""
+        """The dense map as it is now: points, colors and counts; `None` without `dense.enabled`."""
         return None if self.dense_mapping is None else self.dense_mapping.cloud()
 
     @property
@@ -381,8 +384,8 @@ class Slam:
         """Every pose as it is known now, in the frame of the submap it is in, by the number of the submap."""
         by_submap: dict[int, list[tuple[int, np.ndarray]]] = {}
         for given in self._given:
-            pose = given.timestamp_ns, self._back.pose(given.hung)
-            by_submap.setdefault(self._back.submap_of(given.hung), []).append(pose)
+            pose = given.timestamp_ns, self._back.pose(given.anchored)
+            by_submap.setdefault(self._back.submap_of(given.anchored), []).append(pose)
         return {submap: _in_order(by_submap[submap]) for submap in sorted(by_submap)}
 
     def _begin(self) -> None:
@@ -390,7 +393,7 @@ class Slam:
         self._warnings = InputWarnings()
         if self._detector is not None:
             self._detector.begin()
-        self._watch = InputWatch(self.camera, self._warnings, self._detector)
+        self._watch = InputChecks(self.camera, self._warnings, self._detector)
         if self._start_map is not None:
             warn_of_other_camera(self._start_map.camera, self.camera, self._warnings)
         run, semantics, dynamics = self.config.run, self.config.semantics, self.config.dynamics
@@ -409,14 +412,14 @@ class Slam:
         )
         self._masks = (
             None
-            if every is None and not dynamics.newcomers
-            else DynamicMasks(
+            if every is None and not dynamics.new_surfaces
+            else MaskPipeline(
                 self.camera,
                 every,
                 deterministic=run.in_turn,
                 latency_frames=semantics.latency_frames,
                 propagate=semantics.propagate,
-                newcomers=dynamics.newcomers,
+                new_surfaces=dynamics.new_surfaces,
                 farthest_m=float(self._params.max_depth_m),
                 dilate_px=semantics.dilate_px,
                 seed=run.seed,
@@ -433,13 +436,13 @@ class Slam:
         )
         self._state = self._fresh_state()
         if self._start_map is not None:
-            self._state = _to_be_placed(self._state)
-        self._frame = self._unrecognised = 0
+            self._state = _awaiting_relocalization(self._state)
+        self._frame = self._unrecognized = 0
         self._clock = FrameClock(self.camera.fps, self._warnings)
         limits = float(self._params.min_depth_m), float(self._params.max_depth_m)
-        self._background = None if self.camera.is_stereo else BackgroundCheck(self.camera, *limits)
+        self._background = None if self.camera.is_stereo else BackgroundConsistency(self.camera, *limits)
         self._last_pose, self._last_twist, self._lost_s = np.array(IDENTITY), np.zeros(6), 0.0
-        self._given: list[_GivenPose] = []
+        self._given: list[_RecordedPose] = []
         self._status = TrackStatus.OK
 
     def _new_dense_mapping(self) -> DenseMapping | None:
@@ -459,10 +462,10 @@ class Slam:
 
     def _fresh_state(self) -> TrackState:
         state = _new_state(self.camera.height, self.camera.width, self._plan, seed=self.config.run.seed)
-        # Committed from the beginning, as after any `traced_once`: else all is compiled again when the first one is.
+        # Committed from the beginning, as after any `cached_trace`: else all is compiled again when the first one is.
         return jax.device_put(state, *state.twist.devices())
 
-    def _tracked_or_rejected(self, timestamp_ns: int, frame: Frame | JaxSlamError | None) -> Tracked | Rejected:
+    def _tracked_or_rejected(self, timestamp_ns: int, frame: Frame | JaxSlamError | None) -> FrameResult | Rejected:
         if frame is None:
             late = FrameError("the next frame was there before there was time for this one")
             return Rejected(timestamp_ns, late, TrackStatus.DROPPED)
@@ -497,9 +500,9 @@ class Slam:
             source = MaskSource.NONE if given is None else MaskSource.CALLER
             return FrameMask(np.asarray(arrays.ignore), source, -1, "")
         if not np.array_equal(correction, IDENTITY):
-            self._masks.corrected(correction)
-        grey, depth = np.asarray(arrays.image), np.asarray(arrays.depth)
-        mask = self._masks.of_frame(self._frame, frame.image, grey, depth)
+            self._masks.apply_map_correction(correction)
+        gray, depth = np.asarray(arrays.image), np.asarray(arrays.depth)
+        mask = self._masks.mask_frame(self._frame, frame.image, gray, depth)
         if given is not None:
             mask = mask._replace(mask=mask.mask | given, source=mask.source or MaskSource.CALLER)
         return mask
@@ -515,7 +518,7 @@ class Slam:
         arrays = self._memory.with_movable(arrays, objects.labels)
         return self._memory.ignoring(arrays, objects.rest if given is None else objects.rest | given)
 
-    def _advance(self, arrays: FrameArrays, followed: Followed) -> TrackOutput:
+    def _advance(self, arrays: FrameArrays, followed: FlowResult) -> TrackOutput:
         params = self._params
         if self._back.is_behind:
             params = self._patient_params
@@ -525,13 +528,13 @@ class Slam:
         return jax.tree.map(np.asarray, output)  # as `device_get`, in a tenth of its time
 
     def _without_movers(
-        self, arrays: FrameArrays, mask: FrameMask, followed: Followed, output: TrackOutput
+        self, arrays: FrameArrays, mask: FrameMask, followed: FlowResult, output: TrackOutput
     ) -> tuple[FrameArrays, FrameMask]:
         """The frame and its mask with what is said to move, regions, things and points: the map gets nothing of it."""
         if self._objects is not None:  # what may move and stands still is out of the mask
             mask = mask._replace(mask=np.array(arrays.ignore))
         moving = None if output.moving is None else np.asarray(output.moving)
-        points, reach_px = moving_points(output.verdicts), self.config.dynamics.reach_px
+        points, reach_px = moving_points(output.cue_results), self.config.dynamics.reach_px
         if reach_px and points.any():
             around = mask_around(np.asarray(followed.uv)[:, points], np.asarray(arrays.depth), reach_px)
             moving = around if moving is None else moving | around
@@ -540,22 +543,26 @@ class Slam:
         mask = mask._replace(mask=mask.mask | moving, source=mask.source or MaskSource.CUES)
         return self._memory.ignoring(arrays, mask.mask), mask
 
-    def _to_be_matched(self, output: TrackOutput) -> bool:
+    def _needs_map_match(self, output: TrackOutput) -> bool:
         """Whether a frame that was tracked is matched with the map too."""
-        status, frames = int(output.status), self.config.track.hold_to_map
+        status, frames = int(output.status), self.config.track.match_map
         chosen = frames == "always" or (frames == "keyframes" and bool(output.keyframe))
         return status == TrackStatus.WEAK or (chosen and status != TrackStatus.STARTED)
 
-    def _regain(self, arrays: FrameArrays, lost: TrackOutput, dt_s: float) -> tuple[TrackOutput, Placed | None]:
+    def _relocalize(
+        self, arrays: FrameArrays, lost: TrackOutput, dt_s: float
+    ) -> tuple[TrackOutput, LocalizedPose | None]:
         """The frame once more, from where the map shows it; or from the pose held, if the settings say so."""
         lost_s = self._lost_s + dt_s
-        predicted = moved(self._last_pose, self._last_twist * lost_s) if self._given and lost_s < _PREDICTED_S else None
-        placed, unknown = self._back.regain(arrays, predicted)
-        self._unrecognised += unknown
+        predicted = (
+            retract(self._last_pose, self._last_twist * lost_s) if self._given and lost_s < _PREDICTED_S else None
+        )
+        placed, unknown = self._back.relocalize(arrays, predicted)
+        self._unrecognized += unknown
         if placed is not None:
-            self._state = self._back.relocated(self._state, placed.hung)
-        elif self._may_begin_submap and self._unrecognised > self.config.track.restart_after:
-            self._state = self._back.restarted(self._state, np.asarray(lost.T_world_cam.wxyz_xyz))
+            self._state = self._back.reset_at_pose(self._state, placed.anchored)
+        elif self._may_begin_submap and self._unrecognized > self.config.track.restart_after:
+            self._state = self._back.start_submap(self._state, np.asarray(lost.T_world_cam.wxyz_xyz))
         elif unknown and len(self.map.ids) and (self._status == TrackStatus.LOST or not self._given):
             # Nothing was followed into the frame: that is not why.
             return lost._replace(reason=np.int32(TrackReason.PLACE_NOT_IN_MAP)), None
@@ -563,12 +570,12 @@ class Slam:
             return lost, None
         output = self._advance(arrays, _follow_points(self._state, arrays, self._params, self._plan))
         if int(output.status) != TrackStatus.STARTED:
-            self._state = _to_be_placed(self._state)  # not to start by itself
+            self._state = _awaiting_relocalization(self._state)  # not to start by itself
         if placed is None:
             return output, None
         # If nothing here has a depth from which to go on, what the map shows is a pose all the same.
         covariance = placed.covariance.astype(np.float32)
-        return output._replace(status=TrackStatus.RELOCALISED, reason=lost.reason, covariance=covariance), placed
+        return output._replace(status=TrackStatus.RELOCALIZED, reason=lost.reason, covariance=covariance), placed
 
     @property
     def _may_begin_submap(self) -> bool:
@@ -576,7 +583,7 @@ class Slam:
         known = bool(self._given or len(self.map.ids))  # else the tracker starts by itself
         return known and self.config.run.on_loss == "submap" and not self._localize_only
 
-    def _in_submap(self, tracked: Tracked) -> Tracked:
+    def _in_submap(self, tracked: FrameResult) -> FrameResult:
         """The result with the submap that its pose is in; changes of its status go to the log, once each."""
         submap = self._back.submap_now
         if tracked.status == TrackStatus.LOST and tracked.dynamic_mask.mean() > _MASKED:
@@ -584,20 +591,20 @@ class Slam:
         before, self._status = self._status, tracked.status
         if tracked.status == TrackStatus.LOST and before != TrackStatus.LOST:
             _log.info("frame %d: lost: %s", self._frame, tracked.reason)
-        elif tracked.status == TrackStatus.RELOCALISED:
+        elif tracked.status == TrackStatus.RELOCALIZED:
             _log.info("frame %d: relocalized in submap %d after %.2f s", self._frame, submap, self._lost_s)
         elif tracked.status == TrackStatus.STARTED:
             _log.info("frame %d: submap %d begins", self._frame, submap)
         return replace(tracked, submap=submap, in_map_frame=submap == self.map.world_submap)
 
-    def _doubted(self, tracked: Tracked, arrays: FrameArrays) -> Tracked:
+    def _with_background_check(self, tracked: FrameResult, arrays: FrameArrays) -> FrameResult:
         """The result with what the background says of its pose, where too little has depth to have a vote there."""
         if self._background is None or tracked.status == TrackStatus.LOST:
             return tracked
-        if tracked.status in (TrackStatus.STARTED, TrackStatus.RELOCALISED):
+        if tracked.status in (TrackStatus.STARTED, TrackStatus.RELOCALIZED):
             self._background.forget()
-        grey, depth, ignore = np.asarray(arrays.image), np.asarray(arrays.depth), np.asarray(arrays.ignore)
-        doubt = self._background.look(grey, depth, ignore, tracked.T_world_cam, tracked.correction)
+        gray, depth, ignore = np.asarray(arrays.image), np.asarray(arrays.depth), np.asarray(arrays.ignore)
+        doubt = self._background.look(gray, depth, ignore, tracked.T_world_cam, tracked.correction)
         if not doubt.unsure_m:
             return tracked
         covariance = tracked.covariance + np.diag(np.repeat(np.array([doubt.unsure_m**2, 0], np.float32), 3))
@@ -605,47 +612,47 @@ class Slam:
             return replace(tracked, covariance=covariance)
         return replace(tracked, covariance=covariance, status=TrackStatus.WEAK, reason=TrackReason.UNCONFIRMED.text)
 
-    def _recorded(self, tracked: Tracked, dt_s: float, depth_delay_s: float) -> Tracked:
+    def _recorded(self, tracked: FrameResult, dt_s: float, depth_delay_s: float) -> FrameResult:
         """The result as it is given out, and remembered."""
         if tracked.status == TrackStatus.LOST:
             self._lost_s += dt_s
             self._last_pose = compose(tracked.correction, self._last_pose)
             if self._masks is not None:
-                self._beside.offer(("masks", partial(self._masks.lost, self._frame)), self._frame)
+                self._beside.submit(("masks", partial(self._masks.frame_lost, self._frame)), self._frame)
             if self.config.run.on_loss == "predict":
                 ahead_s = min(self._lost_s, _PREDICTED_S)
-                tracked = replace(tracked, T_world_cam=moved(self._last_pose, self._last_twist * ahead_s))
+                tracked = replace(tracked, T_world_cam=retract(self._last_pose, self._last_twist * ahead_s))
             return tracked
         if self._masks is not None:
-            pose = moved(tracked.T_world_cam, tracked.twist * depth_delay_s)
+            pose = retract(tracked.T_world_cam, tracked.twist * depth_delay_s)
             when = self._frame, self._clock.continuous_ns(tracked.timestamp_ns) * 1e-9
-            moved_on = partial(self._masks.tracked, *when, pose, _turn(tracked.twist))
-            self._beside.offer(("masks", moved_on), self._frame)
-        self._unrecognised, self._lost_s = 0, 0.0
+            moved_on = partial(self._masks.frame_tracked, *when, pose, _turn(tracked.twist))
+            self._beside.submit(("masks", moved_on), self._frame)
+        self._unrecognized, self._lost_s = 0, 0.0
         self._last_pose, self._last_twist = tracked.T_world_cam, tracked.twist
         self._back.localize(tracked.T_world_cam, self._frame)
-        hung = self._back.hang(tracked.T_world_cam)
-        self._given.append(_GivenPose(tracked.timestamp_ns, tracked.T_world_cam, hung, tracked.in_map_frame))
+        anchored = self._back.anchor(tracked.T_world_cam)
+        self._given.append(_RecordedPose(tracked.timestamp_ns, tracked.T_world_cam, anchored, tracked.in_map_frame))
         return tracked
 
 
-def _watched(detector: Detector | None) -> WatchedDetector | None:
-    return None if detector is None else WatchedDetector(detector)
+def _watched(detector: Detector | None) -> CheckedDetector | None:
+    return None if detector is None else CheckedDetector(detector)
 
 
-class _GivenPose(NamedTuple):
+class _RecordedPose(NamedTuple):
     """A pose that was given out.
 
     Attributes:
         timestamp_ns: Time of its frame.
         T_world_cam: `(7,)` as it was given out.
-        hung: The same tied to a keyframe, with which it moves.
-        in_map_frame: As of `Tracked`.
+        anchored: The same tied to a keyframe, with which it moves.
+        in_map_frame: As of `FrameResult`.
     """
 
     timestamp_ns: int
     T_world_cam: np.ndarray
-    hung: Hung
+    anchored: AnchoredPose
     in_map_frame: bool
 
 
@@ -669,7 +676,7 @@ def _no_old_garbage() -> Iterator[None]:
         gc.unfreeze()
 
 
-def _to_be_placed(state: TrackState) -> TrackState:
+def _awaiting_relocalization(state: TrackState) -> TrackState:
     """A state that waits for its place to be recognized instead of starting by itself."""
     # Where the others are: with `jnp.zeros`, which is on no device for certain, the step was compiled anew.
     return state._replace(lost_frames=jax.device_put(np.int32(0), *state.twist.devices()))
@@ -680,7 +687,7 @@ def _turn(twist: np.ndarray) -> float:
     return float(np.linalg.norm(twist[3:]))
 
 
-class _Tolerant:
+class _ErrorsAsValues:
     """A recording whose unreadable frames are errors as values."""
 
     def __init__(self, dataset: Dataset) -> None:
@@ -701,5 +708,5 @@ class _Tolerant:
 
 def _frames_of(dataset: Dataset, config: Config) -> Iterator[Frame | JaxSlamError | None]:
     """Every frame, or why there is none: it cannot be read, or it came late (`None`)."""
-    frames = prefetch(_Tolerant(dataset), ahead=config.run.prefetch_frames)
+    frames = prefetch(_ErrorsAsValues(dataset), ahead=config.run.prefetch_frames)
     return in_real_time(frames, dataset.timestamps_ns) if config.run.realtime else frames

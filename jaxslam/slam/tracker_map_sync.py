@@ -10,26 +10,26 @@ import jax
 import numpy as np
 
 from jaxslam.geometry.se3 import IDENTITY, angle, between, compose, inverse, to_local, transform
-from jaxslam.map.types import NONE, Map, has, standing
-from jaxslam.mapping.local_mapping import NewKeyframe, Tracks
+from jaxslam.map.types import NONE, Map, has, surviving_keyframes
+from jaxslam.mapping.local_mapping import NewKeyframe, TrackedObservations
 from jaxslam.runtime.padding import padded
-from jaxslam.runtime.trace_cache import traced_once
+from jaxslam.runtime.trace_cache import cached_trace
 from jaxslam.sensors.frame_arrays import FrameArrays
-from jaxslam.slam.keyframe_recall import Recalled
+from jaxslam.slam.keyframe_reload import MapKeyframe
 from jaxslam.tracking.state import TrackOutput, TrackPlan, TrackState, TrackStatus
-from jaxslam.tracking.state_updates import carried, forgotten, recalled
+from jaxslam.tracking.state_updates import apply_map_correction, drop_points, load_keyframe
 
-_LEAST_MOVE_M, _LEAST_TURN = 1e-6, 1e-6
+_MIN_MOVE_M, _MIN_TURN = 1e-6, 1e-6
 """A correction below both is none."""
 
-_carried = jax.jit(traced_once(carried), donate_argnums=0)
-_recalled = jax.jit(traced_once(recalled), donate_argnums=0)
-_forgotten = jax.jit(traced_once(forgotten), donate_argnums=0)
+_carried = jax.jit(cached_trace(apply_map_correction), donate_argnums=0)
+_reloaded = jax.jit(cached_trace(load_keyframe), donate_argnums=0)
+_forgotten = jax.jit(cached_trace(drop_points), donate_argnums=0)
 _AT_ONCE = 1024
 """Points forgotten in one call."""
 
 
-class Hung(NamedTuple):
+class AnchoredPose(NamedTuple):
     """A pose that moves with a keyframe.
 
     Attributes:
@@ -41,58 +41,58 @@ class Hung(NamedTuple):
     T_keyframe_cam: np.ndarray
 
 
-class MapLink:
+class TrackerMapSync:
     """Knows which keyframes the tracker looks into, and where both sides believe them to be."""
 
-    def __init__(self, plan: TrackPlan, map: Map) -> None:
+    def __init__(self, plan: TrackPlan, slam_map: Map) -> None:
         """Start with a tracker that has no keyframe."""
-        self.map = map
+        self.map = slam_map
         self.reference = NONE
         """The keyframe that the frames hang on now."""
         self._plan = plan
-        self._slots = [NONE] * (plan.num_keyframes + plan.num_recalled)
+        self._slots = [NONE] * (plan.num_keyframes + plan.num_reloaded)
         self._made = 0
         self._believed: dict[int, np.ndarray] = {}
-        self._on_the_way: dict[int, Hung] = {}
+        self._on_the_way: dict[int, AnchoredPose] = {}
         self._new_submaps: dict[int, int] = {}  # of keyframes on the way that begin one
-        self._next = map.next_keyframe
-        self._submap = int(map.submap.max(initial=-1)) + 1
+        self._next = slam_map.next_keyframe
+        self._submap = int(slam_map.submap.max(initial=-1)) + 1
 
     def compile(self, state: TrackState) -> TrackState:
         """Compile what changes a state, on one that is not needed any more."""
         identity, nothing = IDENTITY.astype(np.float32), np.zeros(self._plan.num_points, np.float32)
         state = _carried(state, identity, np.tile(identity, (len(self._slots), 1)))
-        if self._plan.num_recalled:
+        if self._plan.num_reloaded:
             plane, image = np.tile(nothing, (3, 1)), np.zeros(state.keyframes.images.shape[1:], np.uint8)
             places = (identity, plane[:2], plane)
-            state = _recalled(state, np.int32(0), image, *places, nothing, nothing.astype(np.int32))
+            state = _reloaded(state, np.int32(0), image, *places, nothing, nothing.astype(np.int32))
         return state
 
-    def hang(self, T_world_cam: np.ndarray) -> Hung:
+    def anchor(self, T_world_cam: np.ndarray) -> AnchoredPose:
         """A pose of the tracker, tied to the reference keyframe."""
-        return Hung(self.reference, between(self._believed[self.reference], T_world_cam))
+        return AnchoredPose(self.reference, between(self._believed[self.reference], T_world_cam))
 
-    def pose(self, hung: Hung) -> np.ndarray:
+    def pose(self, anchored: AnchoredPose) -> np.ndarray:
         """`(7,)` where a pose is in the map as it is now."""
-        return compose(self._in_map(hung.keyframe), hung.T_keyframe_cam)
+        return compose(self._in_map(anchored.keyframe), anchored.T_keyframe_cam)
 
-    def in_map(self, T_world_cam: np.ndarray) -> Hung | None:
+    def in_map(self, T_world_cam: np.ndarray) -> AnchoredPose | None:
         """A pose of the tracker tied to a keyframe that is in the map; `None` if there is none yet."""
         if self.reference == NONE:
             return None
-        hung = self.hang(T_world_cam)
-        while (above := self._on_the_way.get(hung.keyframe)) is not None:
-            hung = Hung(above.keyframe, compose(above.T_keyframe_cam, hung.T_keyframe_cam))
-        if hung.keyframe == NONE:
+        anchored = self.anchor(T_world_cam)
+        while (above := self._on_the_way.get(anchored.keyframe)) is not None:
+            anchored = AnchoredPose(above.keyframe, compose(above.T_keyframe_cam, anchored.T_keyframe_cam))
+        if anchored.keyframe == NONE:
             return None
-        standing_id = int(standing(self.map, np.array([hung.keyframe]))[0])
-        return Hung(standing_id, between(self.map.pose(standing_id), self.pose(hung)))
+        standing_id = int(surviving_keyframes(self.map, np.array([anchored.keyframe]))[0])
+        return AnchoredPose(standing_id, between(self.map.pose(standing_id), self.pose(anchored)))
 
-    def believed(self, keyframe_id: int) -> np.ndarray:
+    def tracker_pose(self, keyframe_id: int) -> np.ndarray:
         """`(7,)` where the tracker believes a keyframe to be."""
         return self._believed[keyframe_id]
 
-    def refer_to(self, keyframe_id: int) -> None:
+    def set_reference_keyframe(self, keyframe_id: int) -> None:
         """Hang the frames to come on a keyframe of the map."""
         self.reference = keyframe_id
         self._believed.setdefault(keyframe_id, self.map.pose(keyframe_id))
@@ -111,15 +111,15 @@ class MapLink:
             if above.keyframe == NONE:
                 return self._new_submaps[keyframe_id]
             keyframe_id = above.keyframe
-        return int(self.map.submap[self.map.row(int(standing(self.map, np.array([keyframe_id]))[0]))])
+        return int(self.map.submap[self.map.row(int(surviving_keyframes(self.map, np.array([keyframe_id]))[0]))])
 
     @property
     def num_on_the_way(self) -> int:
         """Keyframes handed over that are not in the map yet."""
         return len(self._on_the_way)
 
-    def keyframe_made(
-        self, timestamp_ns: int, frame: FrameArrays, output: TrackOutput, recognised: Hung | None
+    def register_keyframe(
+        self, timestamp_ns: int, frame: FrameArrays, output: TrackOutput, recognized: AnchoredPose | None
     ) -> NewKeyframe:
         """The job for mapping that a keyframe of the tracker is.
 
@@ -127,18 +127,18 @@ class MapLink:
             timestamp_ns: Time of the frame.
             frame: As the tracker got it.
             output: What it said.
-            recognised: Where it is in the map, if tracking began at a place that was recognised.
+            recognized: Where it is in the map, if tracking began at a place that was recognized.
         """
         pose = pose_of(output)
-        first = int(output.status) == TrackStatus.STARTED and recognised is None
+        first = int(output.status) == TrackStatus.STARTED and recognized is None
         if first and self.reference != NONE:
             self._submap += 1  # nothing ties the frame to those before
         parent = NONE if first else self.reference
-        seen_from = pose if parent == NONE else self.hang(pose).T_keyframe_cam
+        seen_from = pose if parent == NONE else self.anchor(pose).T_keyframe_cam
         id = self._next
         self._next += 1
         self._believed[id] = pose
-        self._on_the_way[id] = Hung(parent, seen_from)
+        self._on_the_way[id] = AnchoredPose(parent, seen_from)
         if parent == NONE:
             self._new_submaps[id] = self._submap
         self._slots[self._made % self._plan.num_keyframes] = id
@@ -147,14 +147,14 @@ class MapLink:
         tracks = tracks_of(output)
         return NewKeyframe(id, timestamp_ns, frame, parent, seen_from, self._submap, np.asarray(output.twist), tracks)
 
-    def corrected(self, state: TrackState, map: Map) -> tuple[TrackState, np.ndarray]:
+    def apply_map(self, state: TrackState, slam_map: Map) -> tuple[TrackState, np.ndarray]:
         """The tracker's state carried along with a new map.
 
         Returns:
             The state, and the correction `(7,)` at the camera, from the old world to the new one.
         """
-        self.map = map
-        self._on_the_way = {id: hung for id, hung in self._on_the_way.items() if id >= map.next_keyframe}
+        self.map = slam_map
+        self._on_the_way = {id: anchored for id, anchored in self._on_the_way.items() if id >= slam_map.next_keyframe}
         self._new_submaps = {id: submap for id, submap in self._new_submaps.items() if id in self._on_the_way}
         wanted = {id for id in (*self._slots, self.reference, *self._on_the_way) if id != NONE}
         new = {id: self._in_map(id) for id in wanted}
@@ -162,13 +162,13 @@ class MapLink:
         now = change.get(self.reference, IDENTITY)
         corrections = np.stack([change.get(id, IDENTITY) for id in self._slots])
         both = np.concatenate([corrections, now[None]])
-        if np.abs(both[:, 4:]).max() < _LEAST_MOVE_M and angle(both).max() < _LEAST_TURN:
+        if np.abs(both[:, 4:]).max() < _MIN_MOVE_M and angle(both).max() < _MIN_TURN:
             self._believed = {id: self._believed[id] for id in wanted}  # small ones add up until they are made
             return state, IDENTITY
         self._believed = new
         return _carried(state, now.astype(np.float32), corrections.astype(np.float32)), now
 
-    def moved(self, state: TrackState, T_new_old: np.ndarray, *, is_keyframe: bool) -> TrackState:
+    def apply_correction(self, state: TrackState, T_new_old: np.ndarray, *, is_keyframe: bool) -> TrackState:
         """The tracker's state with the camera moved, and with it what it saw last; keyframes stay but this frame.
 
         Args:
@@ -182,7 +182,7 @@ class MapLink:
             corrections[self._made % self._plan.num_keyframes] = change
         return _carried(state, change, corrections)
 
-    def forgotten(self, state: TrackState, ids: np.ndarray) -> TrackState:
+    def drop_points(self, state: TrackState, ids: np.ndarray) -> TrackState:
         """The tracker's state without some points, given its numbers of them, however many."""
         for start in range(0, len(ids), _AT_ONCE):
             some = ids[start : start + _AT_ONCE]
@@ -194,26 +194,26 @@ class MapLink:
         return [id for id in self._slots[: self._plan.num_keyframes] if id != NONE]
 
     def slot_for(self, keyframe_id: int, keep: set[int]) -> int | None:
-        """Where to put a recalled keyframe, not in place of those to keep; `None` if it is there or gone."""
+        """Where to put a reloaded keyframe, not in place of those to keep; `None` if it is there or gone."""
         if keyframe_id in self._slots or not knows(self.map, keyframe_id):
             return None
         free = range(self._plan.num_keyframes, len(self._slots))
         return next((slot for slot in free if self._slots[slot] not in keep), None)
 
-    def recalled(self, state: TrackState, slot: int, keyframe: Recalled) -> TrackState:
+    def load_keyframe(self, state: TrackState, slot: int, keyframe: MapKeyframe) -> TrackState:
         """The tracker's state with a keyframe of the map to look into."""
         pose = self._believed.setdefault(keyframe.keyframe, self._in_map(keyframe.keyframe))
         self._slots[slot] = keyframe.keyframe
         X_world = transform(pose, keyframe.X_cam.astype(np.float64)).astype(np.float32)
-        places = (pose.astype(np.float32), keyframe.seen_uv, X_world)
-        return _recalled(state, np.int32(slot), keyframe.image, *places, keyframe.weight, keyframe.id)
+        places = (pose.astype(np.float32), keyframe.uv_raw, X_world)
+        return _reloaded(state, np.int32(slot), keyframe.image, *places, keyframe.weight, keyframe.id)
 
     def _in_map(self, keyframe_id: int) -> np.ndarray:
         """Where a keyframe is in the map; one on its way there hangs on the one before."""
-        hung = self._on_the_way.get(keyframe_id)
-        if hung is None:
+        anchored = self._on_the_way.get(keyframe_id)
+        if anchored is None:
             return self.map.pose(keyframe_id)
-        return hung.T_keyframe_cam if hung.keyframe == NONE else self.pose(hung)
+        return anchored.T_keyframe_cam if anchored.keyframe == NONE else self.pose(anchored)
 
 
 def pose_of(output: TrackOutput) -> np.ndarray:
@@ -221,19 +221,21 @@ def pose_of(output: TrackOutput) -> np.ndarray:
     return compose(np.asarray(output.T_world_cam.wxyz_xyz, np.float64), IDENTITY)
 
 
-def knows(map: Map, keyframe_id: int) -> bool:
+def knows(slam_map: Map, keyframe_id: int) -> bool:
     """Whether a keyframe is in a map."""
-    return bool(has(map.ids, np.array([keyframe_id]))[0])
+    return bool(has(slam_map.ids, np.array([keyframe_id]))[0])
 
 
-def tracks_of(output: TrackOutput) -> Tracks:
+def tracks_of(output: TrackOutput) -> TrackedObservations:
     """Points followed and looked up, in the axes of the camera."""
-    pose, found = pose_of(output), output.looked_up
-    join = lambda followed, looked_up: np.concatenate([np.asarray(followed), np.asarray(looked_up)], axis=-1)
+    pose, found = pose_of(output), output.keyframe_matches
+    join = lambda followed, keyframe_matches: np.concatenate(
+        [np.asarray(followed), np.asarray(keyframe_matches)], axis=-1
+    )
     X_world = join(output.X_world, found.X_world).astype(np.float64)
-    return Tracks(
+    return TrackedObservations(
         id=join(output.id, found.id),
-        seen_uv=join(output.uv, found.uv),
+        uv_raw=join(output.uv, found.uv),
         X_cam=to_local(pose, X_world).astype(np.float32),
         weight=join(output.weights, found.weight),
     )

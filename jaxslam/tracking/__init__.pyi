@@ -12,7 +12,7 @@ from .state import TrackPlan as TrackPlan
 from .state import TrackReason as TrackReason
 from .state import TrackState as TrackState
 from .state import TrackStatus as TrackStatus
-from .step import Followed as Followed
+from .step import FlowResult as FlowResult
 from .step import follow_points as follow_points
 from .step import init_state as init_state
 from .step import track_followed as track_followed

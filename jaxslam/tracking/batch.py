@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxslam.errors import ConfigError, FrameError
-from jaxslam.runtime.compile_cache import IN_ITS_THREAD, SOON_COMPILED
-from jaxslam.runtime.trace_cache import traced_once
-from jaxslam.sensors.frame_arrays import FrameArrays, check_grey_range
+from jaxslam.runtime.compile_cache import FAST_COMPILE, SINGLE_THREAD
+from jaxslam.runtime.trace_cache import cached_trace
+from jaxslam.sensors.frame_arrays import FrameArrays, check_gray_range
 from jaxslam.tracking.state import TrackParams, TrackPlan, TrackState
 from jaxslam.tracking.step import DEFAULT_PLAN, init_state, track_step
 
@@ -63,7 +63,7 @@ def track_clips(
             do not reach further ones.
 
     Raises:
-        FrameError: If there is no clip or no frame, clips differ in shape or type, or grey values are from 0 to 1.
+        FrameError: If there is no clip or no frame, clips differ in shape or type, or gray values are from 0 to 1.
         ConfigError: If `params` or `seeds` are not as many as clips, or `at_once` or `threads` is below 1.
     """
     _check_clips(clips)
@@ -105,7 +105,7 @@ def _track(batch: _Batch, size: int, plan: TrackPlan, first: int) -> TrackedClip
 
 
 @partial(jax.jit, static_argnums=(1, 2, 3, 4, 5))
-@traced_once
+@cached_trace
 def _new_states(
     seeds: Int[Array, " clips"], height: int, width: int, plan: TrackPlan, image_dtype: np.dtype, dtype: np.dtype
 ) -> TrackState:
@@ -114,8 +114,8 @@ def _new_states(
 
 
 # In its thread: for a batch as fast as without, and programs in several threads do not wait for each other's parts.
-@partial(jax.jit, static_argnames="plan", donate_argnums=0, compiler_options=SOON_COMPILED | IN_ITS_THREAD)
-@traced_once
+@partial(jax.jit, static_argnames="plan", donate_argnums=0, compiler_options=FAST_COMPILE | SINGLE_THREAD)
+@cached_trace
 def _step(
     states: TrackState, frames: FrameArrays, params: TrackParams, plan: TrackPlan
 ) -> tuple[TrackState, tuple[Array, Array]]:
@@ -144,7 +144,7 @@ def _check_clips(clips: Sequence[FrameArrays]) -> None:
             if one != other:
                 raise FrameError(f"clips: {name}: expected {one} as in the first clip, got {other} in clip {index}")
     for index, clip in enumerate(clips):
-        check_grey_range(f"clips: image of clip {index}", clip.image, FrameError)
+        check_gray_range(f"clips: image of clip {index}", clip.image, FrameError)
 
 
 def _check_settings(batch: _Batch, at_once: int, threads: int) -> None:

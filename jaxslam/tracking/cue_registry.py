@@ -48,11 +48,11 @@ def with_cues(plan: TrackPlan, config: DynamicsConfig, *, pairs: bool = False) -
     chosen, clusters = [_KNOWN[name] for name in config.cues], config.clusters
     step_px = 2 * clusters.step_px if pairs else clusters.step_px
     regions = RegionPlan(clusters.num_regions, step_px, clusters.num_steps, clusters.recover_frames)
-    needed = config.even_votes or any(known.needs_regions for known in chosen)
+    needed = config.balance_regions or any(known.needs_regions for known in chosen)
     return plan._replace(
         cues=tuple(known.cue(config) for known in chosen),
         regions=regions if needed else None,
-        even_votes=config.even_votes,
+        balance_regions=config.balance_regions,
         motion=_motion_plan(config.motion),
     )
 

@@ -11,8 +11,8 @@ from jaxslam_kernels.se3 import to_world
 from jaxslam_kernels.types import Flag, Mask, Pixels, Weights
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.dynamics.cue import Scene, Verdict, combined
-from jaxslam.dynamics.object_motion import MeasuredPoints, MotionState, judge_motion
+from jaxslam.dynamics.cue import CueInput, CueResult, combine_cues
+from jaxslam.dynamics.object_motion import MeasuredPoints, MotionState, classify_motion
 from jaxslam.dynamics.regions import (
     RegionMemory,
     Regions,
@@ -21,15 +21,15 @@ from jaxslam.dynamics.regions import (
     of_points,
     region_weights,
 )
-from jaxslam.tracking.measurement import View, depth_sigma, observe_points
+from jaxslam.tracking.measurement import PreparedFrame, depth_sigma, measure_points
 from jaxslam.tracking.state import TrackParams, TrackPlan, TrackState
 from jaxslam.tracking.step_checks import check_verdict
 
-_MOST_WITNESSES, _ENOUGH_WITNESSES = 10, 5
+_MAX_WITNESSES, _ENOUGH_WITNESSES = 10, 5
 """Of each region."""
 
 
-class PointsSeen(NamedTuple):
+class FramePoints(NamedTuple):
     """The points of a state in a frame, `(n,)` each.
 
     Attributes:
@@ -51,7 +51,7 @@ class PointsSeen(NamedTuple):
     thing: Int[Array, " n"]
 
 
-class Judged(NamedTuple):
+class DynamicRejection(NamedTuple):
     """What cues say, and the pixels that are left out for it.
 
     Attributes:
@@ -64,7 +64,7 @@ class Judged(NamedTuple):
         motion: What is known of the things that may move.
     """
 
-    verdicts: tuple[Verdict, ...] = ()
+    verdicts: tuple[CueResult, ...] = ()
     regions: Regions | None = None
     memory: RegionMemory | None = None
     remembered: Weights | None = None
@@ -74,7 +74,7 @@ class Judged(NamedTuple):
 
     def weights(self, weight: Weights) -> Weights:
         """Weights of the points, times those of the cues, and 0 in regions that moved a moment ago."""
-        judged = combined(self.verdicts, weight)
+        judged = combine_cues(self.verdicts, weight)
         judged = judged if self.remembered is None else judged * self.remembered
         return jnp.where(self.heard, judged, weight)
 
@@ -82,17 +82,17 @@ class Judged(NamedTuple):
         """`(n,)` which points no cue says anything against."""
         return self.weights(jnp.ones(())) > 0
 
-    def without_movers(self, view: View) -> View:
+    def without_moving_pixels(self, view: PreparedFrame) -> PreparedFrame:
         """The frame with nothing trusted where regions move."""
         return view if self.moving is None else view.without(self.moving)
 
-    def with_motion(self, motion: MotionState, view: View) -> "Judged":
+    def with_motion(self, motion: MotionState, view: PreparedFrame) -> "DynamicRejection":
         """The same, with what is known of the things that may move."""
         assert view.frame.movable is not None
         moving = motion.moving_pixels(view.frame.movable)
         return self._replace(motion=motion, moving=moving if self.moving is None else self.moving | moving)
 
-    def witnesses(self, uv: Pixels, age: Int[Array, " n"], points: Mask) -> Mask:
+    def monitor_points(self, uv: Pixels, age: Int[Array, " n"], points: Mask) -> Mask:
         """`(n,)` which points, now at `uv`, are to be followed on what moves, to see whether it goes on.
 
         A few of each, those of some age first. New points in their place in every frame show the motion of one frame
@@ -103,15 +103,15 @@ class Judged(NamedTuple):
             return jnp.zeros_like(points)
         points = points & ~self.at_rest(uv)
         if self.motion is not None:
-            points = points | self.motion.watched()
+            points = points | self.motion.monitored()
         old = points & (age > 0)
         there_old, there_new = self._in_regions(old), self._in_regions(points & ~old)
         after = jnp.sum(there_old, axis=1, dtype=jnp.int32)[:, None]
         old_rank, new_rank = (jnp.cumsum(there, axis=1, dtype=jnp.int32) for there in (there_old, there_new))
         rank = jnp.where(there_old, old_rank, after + new_rank)
-        return jnp.any((there_old | there_new) & (rank <= _MOST_WITNESSES), axis=0)
+        return jnp.any((there_old | there_new) & (rank <= _MAX_WITNESSES), axis=0)
 
-    def without_watched(self, view: View, witnesses: Mask, plan: TrackPlan) -> View:
+    def without_monitored(self, view: PreparedFrame, witnesses: Mask, plan: TrackPlan) -> PreparedFrame:
         """The frame with nothing new to be followed where what moves has witnesses."""
         if self.moving is None:
             return view
@@ -122,16 +122,16 @@ class Judged(NamedTuple):
             weight = 1.0 - watched[:num].astype(view.depth.dtype)
             view = view.without(moving_pixels(self.regions, weight, height, width, plan.regions))
             watched = watched[num:]
-        return view if self.motion is None else view.without(self._of_things(watched & ~self.motion.at_rest, view))
+        return view if self.motion is None else view.without(self._in_objects(watched & ~self.motion.at_rest, view))
 
-    def unwatched(self, view: View, witnesses: Mask) -> Bool[Array, "h w"] | None:
+    def unmonitored(self, view: PreparedFrame, witnesses: Mask) -> Bool[Array, "h w"] | None:
         """Pixels of things that move, for all that is known, and have too few points to tell; `None` without things."""
         if self.motion is None:
             return None
         few = jnp.sum(self._in_regions(witnesses), axis=1) < _ENOUGH_WITNESSES
-        return self._of_things(few[-len(self.motion.at_rest) :] & ~self.motion.at_rest, view)
+        return self._in_objects(few[-len(self.motion.at_rest) :] & ~self.motion.at_rest, view)
 
-    def _of_things(self, chosen: Bool[Array, " k"], view: View) -> Bool[Array, "h w"]:
+    def _in_objects(self, chosen: Bool[Array, " k"], view: PreparedFrame) -> Bool[Array, "h w"]:
         assert view.frame.movable is not None
         by_label = jnp.concatenate([jnp.zeros(1, bool), chosen])
         return by_label[view.frame.movable.astype(jnp.int32)]
@@ -160,18 +160,18 @@ class Judged(NamedTuple):
         return ~self.moving.at[row, column].get(mode="fill", fill_value=False)
 
 
-def judge_points(
+def reject_dynamic_points(
     state: TrackState,
-    view: View,
-    seen: PointsSeen,
+    view: PreparedFrame,
+    seen: FramePoints,
     regions: Regions | None,
     coarse: SE3,
     twist: Float[Array, "6"],
     params: TrackParams,
     plan: TrackPlan,
-) -> Judged:
+) -> DynamicRejection:
     """What is said of points and things, given the coarse pose, which most of the points at rest have made."""
-    verdicts = _verdicts(state, view, seen, regions, coarse, twist, params, plan)
+    verdicts = _cue_results(state, view, seen, regions, coarse, twist, params, plan)
     judged = _with_regions(verdicts, regions, state.regions.weight, view, seen.agreeing, plan)
     if verdicts:
         left = jnp.sum(seen.agreeing & (judged.weights(seen.trust) > 0), dtype=seen.trust.dtype)
@@ -184,8 +184,8 @@ def judge_points(
 
 def _motion(
     state: TrackState,
-    view: View,
-    seen: PointsSeen,
+    view: PreparedFrame,
+    seen: FramePoints,
     coarse: SE3,
     twist: Float[Array, "6"],
     params: TrackParams,
@@ -195,7 +195,7 @@ def _motion(
     """What is known of the things that may move."""
     assert params.motion is not None
     points = state.points
-    observed = observe_points(points.X_world, seen.uv, coarse, twist, view, params, view.matched)
+    observed = measure_points(points.X_world, seen.uv, coarse, twist, view, params, view.matched)
     there = seen.there & (observed.depth > 0) & (points.depth > 0)
     across = (
         params.pixel_sigma * observed.depth[None, :] / jnp.stack([params.intrinsics.fx, params.intrinsics.fy])[:, None]
@@ -207,48 +207,48 @@ def _motion(
         X_world = to_world(state.T_world_cam, before)
     measured = MeasuredPoints(X_world, observed.in_camera(), sigma, there)
     background = seen.agreeing.astype(sigma.dtype)
-    return judge_motion(
+    return classify_motion(
         measured, seen.thing, background, coarse, state.motion, params.motion, as_published=as_published
     )
 
 
 def _with_regions(
-    verdicts: tuple[Verdict, ...],
+    verdicts: tuple[CueResult, ...],
     regions: Regions | None,
     before: Float[Array, " k"],
-    view: View,
+    view: PreparedFrame,
     agreeing: Mask,
     plan: TrackPlan,
-) -> Judged:
+) -> DynamicRejection:
     """Verdicts, and what becomes of those on regions, given what was remembered before."""
     if regions is None or plan.regions is None:
-        return Judged(verdicts)
+        return DynamicRejection(verdicts)
     of_regions = [verdict.regions for verdict in verdicts if verdict.regions is not None]
     if not of_regions:
-        return Judged(verdicts, regions, RegionMemory(regions.centers, before))
+        return DynamicRejection(verdicts, regions, RegionMemory(regions.centers, before))
     weight = lasting_weights(regions, of_regions, before, agreeing, plan.regions)
     remembered = of_points((weight >= 0.5).astype(weight.dtype), regions, jnp.ones_like(weight[0]))
     height, width = view.depth.shape
     moving = moving_pixels(regions, jnp.minimum(weight, region_weights(of_regions)), height, width, plan.regions)
-    return Judged(verdicts, regions, RegionMemory(regions.centers, weight), remembered, moving)
+    return DynamicRejection(verdicts, regions, RegionMemory(regions.centers, weight), remembered, moving)
 
 
-def _verdicts(
+def _cue_results(
     state: TrackState,
-    view: View,
-    seen: PointsSeen,
+    view: PreparedFrame,
+    seen: FramePoints,
     regions: Regions | None,
     coarse: SE3,
     twist: Float[Array, "6"],
     params: TrackParams,
     plan: TrackPlan,
-) -> tuple[Verdict, ...]:
+) -> tuple[CueResult, ...]:
     if not plan.cues:
         return ()
     points, ideal = state.points, without_distortion(params.intrinsics)
-    observed = observe_points(points.X_world, seen.uv, coarse, twist, view, params, view.matched)
+    observed = measure_points(points.X_world, seen.uv, coarse, twist, view, params, view.matched)
     height, width = view.frame.image.shape
-    scene = Scene(
+    scene = CueInput(
         uv_before=to_pixels(ideal, points.xy),
         uv=to_pixels(ideal, observed.xy),
         followed=seen.followed,

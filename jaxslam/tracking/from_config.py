@@ -16,8 +16,8 @@ class DepthNoise(NamedTuple):
     """Standard deviation of depth: `sigma_m + sigma_per_m2 z^2`.
 
     Attributes:
-        sigma_m: Close to the camera, metres.
-        sigma_per_m2: Its growth with the square of depth, a metre.
+        sigma_m: Close to the camera, meters.
+        sigma_per_m2: Its growth with the square of depth, a meter.
     """
 
     sigma_m: float

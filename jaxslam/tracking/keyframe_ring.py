@@ -3,29 +3,29 @@
 import jax
 import jax.numpy as jnp
 from jaxlie import SE3
-from jaxslam_kernels.camera import Intrinsics, normalise
+from jaxslam_kernels.camera import Intrinsics, normalize
 from jaxslam_kernels.depth.sampling import sample_depth
 from jaxslam_kernels.flow.patch_align import align_patches
 from jaxslam_kernels.se3 import to_camera
 from jaxslam_kernels.types import Mask, Pixels, Scalar, Weights
 from jaxtyping import Array, Bool, Float, Int, Num
 
-from jaxslam.tracking.measurement import View, predict_pixels
-from jaxslam.tracking.state import Keyframes, LookedUp, TrackedPoints, TrackParams, TrackPlan
+from jaxslam.tracking.measurement import PreparedFrame, predict_pixels
+from jaxslam.tracking.state import KeyframeMatches, KeyframeRing, TrackedPoints, TrackParams, TrackPlan
 
 _MARGIN_PX = 8
-_MOST_TURN = 0.7
+_MAX_TURN = 0.7
 """Cosine of the largest angle between the directions from which a point is looked up and was seen."""
-_MOST_SCALE = 2.0
+_MAX_SCALE = 2.0
 """How much nearer or farther it may be."""
 _MAX_SHIFT_PX = 12.0
 """A point found further from where the pose predicts it is another one."""
 
 
-def empty_keyframes(height: int, width: int, plan: TrackPlan, image_dtype: jnp.dtype, dtype: jnp.dtype) -> Keyframes:
+def empty_keyframes(height: int, width: int, plan: TrackPlan, image_dtype: jnp.dtype, dtype: jnp.dtype) -> KeyframeRing:
     """A ring without keyframes."""
-    k, n = plan.num_keyframes + plan.num_recalled, plan.num_points
-    return Keyframes(
+    k, n = plan.num_keyframes + plan.num_reloaded, plan.num_points
+    return KeyframeRing(
         images=jnp.zeros((k, height, width), image_dtype),
         T_world_cam=jnp.tile(SE3.identity().wxyz_xyz.astype(dtype), (k, 1)),
         uv=jnp.zeros((k, 2, n), dtype),
@@ -36,14 +36,14 @@ def empty_keyframes(height: int, width: int, plan: TrackPlan, image_dtype: jnp.d
     )
 
 
-def look_up(
-    keyframes: Keyframes,
+def align_keyframe_points(
+    keyframes: KeyframeRing,
     T_world_cam: SE3,
     twist: Float[Array, "6"],
-    view: View,
+    view: PreparedFrame,
     params: TrackParams,
     plan: TrackPlan,
-) -> LookedUp:
+) -> KeyframeMatches:
     """Look points of the best keyframes up in the current frame, around where the pose predicts them.
 
     Args:
@@ -59,12 +59,12 @@ def look_up(
     valid = keyframes.weight > 0
     X_cam = to_camera(T_world_cam, jnp.moveaxis(keyframes.X_world, 1, 0).reshape(3, k * n))
     predicted = predict_pixels(X_cam, twist, height, params)
-    alike = _seen_alike(keyframes, T_world_cam).reshape(-1)
+    alike = _similar_views(keyframes, T_world_cam).reshape(-1)
     visible = _visible(predicted, X_cam[2], height, width) & alike & valid.reshape(-1)
     shown = jnp.sum(visible.reshape(k, n), axis=1)
     overlap = jnp.max((shown / jnp.maximum(jnp.sum(valid, axis=1), 1)).astype(predicted.dtype))
     if plan.num_sources == 0:
-        return _nothing_found(overlap, keyframes)
+        return _no_matches(overlap, keyframes)
     _, sources = jax.lax.top_k(shown, plan.num_sources)
     chosen = jax.vmap(lambda s: jnp.nonzero(visible.reshape(k, n)[s], size=plan.points_per_source, fill_value=n)[0])(
         sources
@@ -92,13 +92,13 @@ def look_up(
     shift = jnp.sum(jnp.square(match.points - guess), axis=0)
     found = match.converged & (match.correlation > params.min_correlation) & (shift < _MAX_SHIFT_PX**2)
     weight = jnp.where(found, take(keyframes.weight.reshape(-1)), 0)
-    return LookedUp(X_world, match.points, weight, take(keyframes.id.reshape(-1)), overlap)
+    return KeyframeMatches(X_world, match.points, weight, take(keyframes.id.reshape(-1)), overlap)
 
 
-def _nothing_found(overlap: Scalar, keyframes: Keyframes) -> LookedUp:
+def _no_matches(overlap: Scalar, keyframes: KeyframeRing) -> KeyframeMatches:
     none = lambda like, rows: jnp.zeros((*rows, 0), like.dtype)
     found = none(keyframes.X_world, (3,)), none(keyframes.uv, (2,)), none(keyframes.weight, ()), none(keyframes.id, ())
-    return LookedUp(*found, overlap)
+    return KeyframeMatches(*found, overlap)
 
 
 def _visible(uv: Pixels, depth: Weights, height: int, width: int) -> Mask:
@@ -107,21 +107,21 @@ def _visible(uv: Pixels, depth: Weights, height: int, width: int) -> Mask:
     return inside & (depth > 0)
 
 
-def _seen_alike(keyframes: Keyframes, T_world_cam: SE3) -> Bool[Array, "k n"]:
+def _similar_views(keyframes: KeyframeRing, T_world_cam: SE3) -> Bool[Array, "k n"]:
     """Which points are seen from about the same direction and distance as in their keyframe."""
     then = keyframes.X_world - keyframes.T_world_cam[:, 4:, None]
     now = keyframes.X_world - T_world_cam.translation()[None, :, None]
     far_then, far_now = jnp.sum(jnp.square(then), axis=1), jnp.sum(jnp.square(now), axis=1)
     along = jnp.sum(then * now, axis=1)
-    aligned = (along > 0) & (jnp.square(along) > _MOST_TURN**2 * far_then * far_now)
-    return aligned & (far_now < _MOST_SCALE**2 * far_then) & (far_then < _MOST_SCALE**2 * far_now)
+    aligned = (along > 0) & (jnp.square(along) > _MAX_TURN**2 * far_then * far_now)
+    return aligned & (far_now < _MAX_SCALE**2 * far_then) & (far_then < _MAX_SCALE**2 * far_now)
 
 
 def _warp(
     uv: Pixels, depth: Weights, T_world_cam: SE3, sources: Float[Array, "n 7"], intrinsics: Intrinsics
 ) -> Float[Array, "2 2 n"]:
     """Offset in the keyframe for an offset in the frame, `[to, from]`, on a plane that faces the camera."""
-    xy = normalise(intrinsics, uv)
+    xy = normalize(intrinsics, uv)
     focal = jnp.stack([intrinsics.fx, intrinsics.fy])
 
     def ray_in_keyframe(source: Float[Array, "7"], x: Scalar, y: Scalar, z: Scalar) -> Float[Array, "2"]:
@@ -132,25 +132,25 @@ def _warp(
 
     step = 1.0
     at = jax.vmap(ray_in_keyframe)
-    centre = at(sources, xy[0], xy[1], depth)
+    center = at(sources, xy[0], xy[1], depth)
     right = at(sources, xy[0] + step / intrinsics.fx, xy[1], depth)
     below = at(sources, xy[0], xy[1] + step / intrinsics.fy, depth)
-    return jnp.stack([(right - centre).T, (below - centre).T], axis=1) / step
+    return jnp.stack([(right - center).T, (below - center).T], axis=1) / step
 
 
 def with_keyframe(
-    keyframes: Keyframes,
+    keyframes: KeyframeRing,
     make: Bool[Array, ""],
     image: Num[Array, "h w"],
     T_world_cam: SE3,
     points: TrackedPoints,
     weight: Weights,
     plan: TrackPlan,
-) -> Keyframes:
+) -> KeyframeRing:
     """The ring with a keyframe in place of the oldest one where `make` is true, else unchanged."""
     slot: Int[Array, ""] = keyframes.made % plan.num_keyframes
     put = lambda ring, new: ring.at[slot].set(jnp.where(make, new, ring[slot]))
-    return Keyframes(
+    return KeyframeRing(
         images=put(keyframes.images, image.astype(keyframes.images.dtype)),
         T_world_cam=put(keyframes.T_world_cam, T_world_cam.wxyz_xyz),
         uv=put(keyframes.uv, points.uv),

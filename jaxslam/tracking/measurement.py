@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxlie import SE3
-from jaxslam_kernels.camera import distort, normalise, to_pixels
-from jaxslam_kernels.depth.sampling import believable, sample_depth
+from jaxslam_kernels.camera import distort, normalize, to_pixels
+from jaxslam_kernels.depth.sampling import sample_depth, valid_depth
 from jaxslam_kernels.flow.disparity import ROW_PLAN, row_disparities
 from jaxslam_kernels.flow.lk_flow import FlowPlan
 from jaxslam_kernels.image.pyramid import Pyramid, build_pyramid
@@ -23,7 +23,7 @@ _EXPECTED_PX = 1.0
 """A match so close to where the map has a point is that point."""
 
 
-class View(NamedTuple):
+class PreparedFrame(NamedTuple):
     """The current frame, prepared.
 
     Attributes:
@@ -32,7 +32,7 @@ class View(NamedTuple):
         depth: Its depth image, 0 where missing or not to be believed.
         elapsed_s: Seconds since the last good frame.
         right: Finest levels of the right image of a pair; `None` where depth is measured.
-        matched: `(n,)` depth of the points followed, by matching left and right, metres, 0 where that failed; `None`
+        matched: `(n,)` depth of the points followed, by matching left and right, meters, 0 where that failed; `None`
             where depth is measured.
     """
 
@@ -43,35 +43,35 @@ class View(NamedTuple):
     right: Pyramid | None = None
     matched: Weights | None = None
 
-    def with_right(self) -> "View":
+    def with_right(self) -> "PreparedFrame":
         """The same frame with the right image of its pair, if it is one."""
         if self.frame.right is None:
             return self
         dtype, border = self.pyramid.levels[0].dtype, self.pyramid.border
         return self._replace(right=build_pyramid(self.frame.right, num_levels=RIGHT_LEVELS, border=border, dtype=dtype))
 
-    def without(self, pixels: Bool[Array, "h w"]) -> "View":
+    def without(self, pixels: Bool[Array, "h w"]) -> "PreparedFrame":
         """The same frame with these pixels to be ignored too."""
         return self._replace(frame=self.frame._replace(ignore=self.frame.ignore | pixels))
 
 
-class Observed(NamedTuple):
+class Measurements(NamedTuple):
     """Points as an ideal camera would have seen them at the time of the frame.
 
     Attributes:
-        xy: `(2, n)` normalised coordinates.
-        depth: `(n,)` measured depth in metres, 0 where there is none to believe.
+        xy: `(2, n)` normalized coordinates.
+        depth: `(n,)` measured depth in meters, 0 where there is none to believe.
     """
 
     xy: Pixels
     depth: Weights
 
     def in_camera(self) -> Points:
-        """`(3, n)` where the points are in the axes of the camera; at its centre without depth."""
+        """`(3, n)` where the points are in the axes of the camera; at its center without depth."""
         return jnp.concatenate([self.xy, jnp.ones_like(self.xy[:1])]) * self.depth[None, :]
 
 
-def observe(
+def measure(
     uv: Pixels,
     expected_depth: Weights,
     twist: Float[Array, "6"],
@@ -81,12 +81,12 @@ def observe(
     *,
     reach: int = 1,
     matched: Weights | None = None,
-) -> Observed:
+) -> Measurements:
     """Remove distortion, rolling shutter and the delay of the depth image from what was seen.
 
     Args:
         uv: `(2, n)` pixels as seen.
-        expected_depth: `(n,)` metres, about; it scales the part of the image motion that translation causes.
+        expected_depth: `(n,)` meters, about; it scales the part of the image motion that translation causes.
         twist: Velocity of the camera in its own axes.
         depth: Depth image, 0 where missing.
         depth_delay_s: Seconds from the time of the image to that of the depth.
@@ -94,32 +94,32 @@ def observe(
         reach: As for `sample_depth`, static.
         matched: `(n,)` depth at the pixels by `match_depth`, which then is what was measured.
     """
-    xy = normalise(params.intrinsics, uv)
+    xy = normalize(params.intrinsics, uv)
     focal = jnp.stack([params.intrinsics.fx, params.intrinsics.fy])[:, None]
     velocity = image_velocity(xy, expected_depth, twist)
     at_once = as_if_at_once(xy, velocity, uv[1], depth.shape[0], params.readout_s)
     if matched is not None:
-        return Observed(at_once, matched)
+        return Measurements(at_once, matched)
     later = uv + focal * velocity * depth_delay_s
-    return Observed(at_once, sample_depth(depth, later, reach=reach))
+    return Measurements(at_once, sample_depth(depth, later, reach=reach))
 
 
-def observe_points(
+def measure_points(
     X_world: Points,
     uv: Pixels,
     pose: SE3,
     twist: Float[Array, "6"],
-    view: View,
+    view: PreparedFrame,
     params: TrackParams,
     matched: Weights | None = None,
-) -> Observed:
-    """What a frame says of map points, `(3, n)` metres, seen at pixels `uv` from about `pose`; `matched` as above."""
+) -> Measurements:
+    """What a frame says of map points, `(3, n)` meters, seen at pixels `uv` from about `pose`; `matched` as above."""
     expected = jnp.maximum(to_camera(pose, X_world)[2], params.min_depth_m)
-    return observe(uv, expected, twist, view.depth, view.frame.depth_delay_s, params, matched=matched)
+    return measure(uv, expected, twist, view.depth, view.frame.depth_delay_s, params, matched=matched)
 
 
 def match_depth(
-    view: View,
+    view: PreparedFrame,
     uv: Pixels,
     expected_depth: Weights,
     mask: Mask,
@@ -133,7 +133,7 @@ def match_depth(
     Args:
         view: The frame.
         uv: `(2, n)` pixels as seen.
-        expected_depth: `(n,)` metres, where matching begins; where it is not positive, the frame's own rough depth.
+        expected_depth: `(n,)` meters, where matching begins; where it is not positive, the frame's own rough depth.
         mask: `(n,)` which to match.
         params: Camera, and the depths to be believed.
         known_point: Whether `expected_depth` is that of points of the map, static: where it is confirmed, a match needs
@@ -141,7 +141,7 @@ def match_depth(
         plan: How rows are searched, static.
 
     Returns:
-        `(n,)` metres, 0 where there is no match.
+        `(n,)` meters, 0 where there is no match.
     """
     if view.right is None:
         return None
@@ -155,7 +155,7 @@ def match_depth(
     expected_px = _EXPECTED_PX if known_point else 0.0
     match = row_disparities(left, view.right, uv, guess, known, expected_px=expected_px, plan=plan)
     depth = focal_baseline / jnp.where(match.found, match.disparity, 1)
-    return believable(jnp.where(match.found, depth, 0), params.min_depth_m, params.max_depth_m)
+    return valid_depth(jnp.where(match.found, depth, 0), params.min_depth_m, params.max_depth_m)
 
 
 def predict_pixels(X_cam: Points, twist: Float[Array, "6"], height: int, params: TrackParams) -> Pixels:
@@ -168,5 +168,5 @@ def predict_pixels(X_cam: Points, twist: Float[Array, "6"], height: int, params:
 
 
 def depth_sigma(depth: Weights, params: TrackParams) -> Weights:
-    """Standard deviation of measured depth, metres."""
+    """Standard deviation of measured depth, meters."""
     return params.depth_sigma_m + params.depth_sigma_per_m2 * jnp.square(depth)

@@ -8,7 +8,7 @@ from jaxslam_kernels.se3 import to_world
 from jaxslam_kernels.types import Code
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.tracking.measurement import Observed, View, depth_sigma, match_depth, observe
+from jaxslam.tracking.measurement import Measurements, PreparedFrame, depth_sigma, match_depth, measure
 from jaxslam.tracking.state import TrackedPoints, TrackParams, TrackPlan
 
 _MIN_SCORE = 2.0
@@ -18,10 +18,10 @@ _DEPTH_STEP = 0.3
 """Largest difference of depth in the window of a point that counts as one surface, as a share of its depth."""
 
 
-def refill(
+def detect_new_points(
     points: TrackedPoints,
     next_id: Int[Array, ""],
-    view: View,
+    view: PreparedFrame,
     T_world_cam: SE3,
     twist: Float[Array, "6"],
     params: TrackParams,
@@ -66,7 +66,7 @@ def refill(
     uv = corners.points * 2
 
     rough = sample_depth(depth, uv, reach=2)
-    seen = observe(uv, rough, twist, depth, view.frame.depth_delay_s, params, reach=2)
+    seen = measure(uv, rough, twist, depth, view.frame.depth_delay_s, params, reach=2)
 
     good = (corners.score > _MIN_SCORE) & ~taken & (rough > 0) & (seen.depth > 0)
     one_surface = sample_depth(depth, uv, reach=plan.flow.finest.window // 2, max_step=_DEPTH_STEP) > 0
@@ -81,7 +81,7 @@ def refill(
     candidate = order[jnp.clip(rank, 0, order.shape[0] - 1)]
     new = ~points.valid & (rank < room)
     uv, rough, *chosen = (jnp.take(array, candidate, axis=-1) for array in (uv, rough, *seen))
-    seen = Observed(*chosen)
+    seen = Measurements(*chosen)
     matched = match_depth(view, uv, rough, new, params, known_point=False, plan=plan.pair_flow)
     if matched is not None:
         seen, new = seen._replace(depth=matched), new & (matched > 0)

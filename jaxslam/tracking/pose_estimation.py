@@ -10,26 +10,32 @@ from jaxslam_kernels.se3 import to_camera
 from jaxslam_kernels.types import Code, Mask, Pixels, Points, Weights
 from jaxtyping import Array, Float
 
-from jaxslam.tracking.measurement import View, depth_sigma, match_depth, observe_points
-from jaxslam.tracking.state import LookedUp, TrackParams, TrackPlan, TrackState
+from jaxslam.tracking.measurement import PreparedFrame, depth_sigma, match_depth, measure_points
+from jaxslam.tracking.state import KeyframeMatches, TrackParams, TrackPlan, TrackState
 
 _DEPTH_GATE_M, _DEPTH_SIGMAS = 0.1, 3.0
-"""Of depth that supports a pose hypothesis: metres, and deviations with even votes or of a pair.
+"""Of depth that supports a pose hypothesis: meters, and deviations with even votes or of a pair.
 
-With even votes points vote by deviations, and of those that agree the ones within both count for what follows. Metres
+With even votes points vote by deviations, and of those that agree the ones within both count for what follows. Meters
 in the vote too: Bonn `crowd` loses a frame in two of five runs, and a frame of noise moves what follows by 7 mm instead
-of 6. Deviations alone: a rendered room with people who sit has 4.1 mm instead of 2.4; metres in the vote alone, or as a
+of 6. Deviations alone: a rendered room with people who sit has 4.1 mm instead of 2.4; meters in the vote alone, or as a
 weight of zero for points that are kept: 4.1 too. The larger of 0.1 m and one deviation for all: `static` has 36 mm
 instead of 16 in the room xyz.
 """
 
 
 def coarse_pose(
-    state: TrackState, view: View, uv: Pixels, votes: Weights, predicted: SE3, params: TrackParams, plan: TrackPlan
+    state: TrackState,
+    view: PreparedFrame,
+    uv: Pixels,
+    votes: Weights,
+    predicted: SE3,
+    params: TrackParams,
+    plan: TrackPlan,
 ) -> tuple[SE3, Mask, Code]:
     """The pose that gets most votes of points, which agree with it, and its `PoseStatus`."""
-    seen = observe_points(state.points.X_world, uv, predicted, state.twist, view, params, view.matched)
-    by_noise = plan.even_votes or view.right is not None
+    seen = measure_points(state.points.X_world, uv, predicted, state.twist, view, params, view.matched)
+    by_noise = plan.balance_regions or view.right is not None
     result = ransac_pnp(
         jax.random.fold_in(state.random_key(), state.frame),
         state.points.X_world,
@@ -39,12 +45,12 @@ def coarse_pose(
         depth=seen.depth,
         threshold_px=params.ransac_px,
         threshold_depth=_DEPTH_SIGMAS * depth_sigma(seen.depth, params) if by_noise else _DEPTH_GATE_M,
-        averaged=plan.even_votes,
+        averaged=plan.balance_regions,
         num_hypotheses=plan.num_hypotheses,
         max_steps=plan.pose_steps,
         initial=predicted,
     )
-    if not plan.even_votes or view.right is not None:
+    if not plan.balance_regions or view.right is not None:
         return result.T_world_cam, result.inliers, result.status
     apart_m = to_camera(result.T_world_cam, state.points.X_world)[2] - seen.depth
     near = (seen.depth <= 0) | (jnp.abs(apart_m) < _DEPTH_GATE_M)
@@ -53,22 +59,24 @@ def coarse_pose(
 
 def refined_pose(
     state: TrackState,
-    view: View,
+    view: PreparedFrame,
     uv: Pixels,
     trust: Weights,
-    looked_up: LookedUp,
+    keyframe_matches: KeyframeMatches,
     coarse: SE3,
     twist: Float[Array, "6"],
     params: TrackParams,
     plan: TrackPlan,
 ) -> tuple[PoseRefinement, Mask]:
     """The pose that fits followed points and points of keyframes together, and which followed points it fits."""
-    X_world = jnp.concatenate([state.points.X_world, looked_up.X_world], axis=1)
-    expected = to_camera(coarse, looked_up.X_world)[2]
-    matched = match_depth(view, looked_up.uv, expected, looked_up.weight > 0, params, plan=plan.pair_flow)
+    X_world = jnp.concatenate([state.points.X_world, keyframe_matches.X_world], axis=1)
+    expected = to_camera(coarse, keyframe_matches.X_world)[2]
+    matched = match_depth(view, keyframe_matches.uv, expected, keyframe_matches.weight > 0, params, plan=plan.pair_flow)
     matched = None if view.matched is None or matched is None else jnp.concatenate([view.matched, matched])
-    seen = observe_points(X_world, jnp.concatenate([uv, looked_up.uv], axis=1), coarse, twist, view, params, matched)
-    weights = jnp.concatenate([trust, looked_up.weight])
+    seen = measure_points(
+        X_world, jnp.concatenate([uv, keyframe_matches.uv], axis=1), coarse, twist, view, params, matched
+    )
+    weights = jnp.concatenate([trust, keyframe_matches.weight])
     refined = refine_pose(
         coarse,
         X_world,
@@ -101,10 +109,12 @@ def _close(T_world_cam: SE3, X_world: Points, xy: Pixels, params: TrackParams) -
     return front & (jnp.sum(jnp.square(error), axis=0) < jnp.square(params.outlier_px))
 
 
-def fits(state: TrackState, view: View, uv: Pixels, pose: SE3, twist: Float[Array, "6"], params: TrackParams) -> Mask:
+def fits(
+    state: TrackState, view: PreparedFrame, uv: Pixels, pose: SE3, twist: Float[Array, "6"], params: TrackParams
+) -> Mask:
     """Which points are where a pose puts them, in the picture and in depth where that is measured."""
     X_world = state.points.X_world
-    seen = observe_points(X_world, uv, pose, twist, view, params, view.matched)
+    seen = measure_points(X_world, uv, pose, twist, view, params, view.matched)
     apart_m = jnp.abs(to_camera(pose, X_world)[2] - seen.depth)
     near = (seen.depth <= 0) | (apart_m < _DEPTH_SIGMAS * depth_sigma(seen.depth, params))
     return _close(pose, X_world, seen.xy, params) & near

@@ -12,7 +12,7 @@ from jaxslam_kernels.image.pyramid import Pyramid
 from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Points, Scalar, Weights
 from jaxtyping import Array, Bool, Float, Int, Key, Num, UInt32
 
-from jaxslam.dynamics.cue import Cue, Verdict
+from jaxslam.dynamics.cue import Cue, CueResult
 from jaxslam.dynamics.object_motion import MotionMemory, MotionParams, MotionPlan, MotionState
 from jaxslam.dynamics.regions import RegionMemory, RegionPlan, Regions
 
@@ -29,7 +29,7 @@ class TrackStatus(enum.IntEnum):
     """Tracking begins here, or begins anew in a new submap, at the pose held while lost."""
     REJECTED = 4
     """The frame could not be read or does not fit; it never reached the tracker."""
-    RELOCALISED = 5
+    RELOCALIZED = 5
     """After a loss, tracking goes on where the map shows this place, in the submap that `Tracked.submap` names."""
     DROPPED = 6
     """In a run in real time: the next frame was there before the tracker had time for this one."""
@@ -84,7 +84,7 @@ _REASON_TEXT = {
     TrackReason.NO_DEPTH: "too few of the corners in the image have depth to start from",
     TrackReason.BAD_TIME: "the time since the last frame is not positive",
     TrackReason.NO_CORNERS: "too few corners were found in the image to start from"
-    " (dark, blurred, covered, all to be ignored, or grey values not from 0 to 255)",
+    " (dark, blurred, covered, all to be ignored, or gray values not from 0 to 255)",
     TrackReason.PLACE_NOT_IN_MAP: "the place was not recognized: it is not in the map",
     TrackReason.MASKED: "nearly all of the image is masked",
     TrackReason.UNCONFIRMED: "the background, which has no depth, does not move as the pose says",
@@ -98,7 +98,7 @@ class TrackPlan(NamedTuple):
         num_points: Points followed from frame to frame.
         num_levels: Levels of the image pyramid.
         num_keyframes: Latest keyframes kept to look points up in again.
-        num_recalled: Further keyframes to look into, put there from a map by `recalled`.
+        num_reloaded: Further keyframes to look into, put there from a map by `reloaded`.
         num_sources: How many of them are looked into in a frame; 0 for following alone.
         points_per_source: Points looked up from each.
         num_hypotheses: Pose hypotheses a frame.
@@ -107,9 +107,9 @@ class TrackPlan(NamedTuple):
         flow: How points are followed from frame to frame.
         cues: What tells points that move, see `dynamics.cue.Cue`; functions, in the order of `TrackParams.cues`.
         regions: How the depth image is divided for cues that judge whole surfaces; `None` if none does.
-        even_votes: Whether no region has more of a say in the pose than an even share.
+        balance_regions: Whether no region has more of a say in the pose than an even share.
         motion: How things that may move are judged, see `FrameArrays.movable`; `None` if they are not.
-        keyframe_choice: Whether a keyframe is made as soon as there is a reason, or at the right moment after.
+        keyframe_policy: Whether a keyframe is made as soon as there is a reason, or at the right moment after.
         look_up: How points of keyframes are searched. A window of 21 takes 1 ms a frame more and is no more accurate;
             17, 15 and 13 are alike too: TUM `fr1_rpy` 10.2, 10.2, 10.2 mm, Bonn `crowd` (start) 9.7, 9.6, 9.5.
         pose_steps: Bound on the evaluations of the cost in each refinement of the pose; `TrackOutput.pose_status`
@@ -120,7 +120,7 @@ class TrackPlan(NamedTuple):
     num_points: int = 512
     num_levels: int = 4
     num_keyframes: int = 12
-    num_recalled: int = 4
+    num_reloaded: int = 4
     num_sources: int = 2
     points_per_source: int = 160
     num_hypotheses: int = 64
@@ -130,9 +130,9 @@ class TrackPlan(NamedTuple):
     look_up: LevelPlan = LevelPlan(15, 8, 0.05)
     cues: tuple[Cue, ...] = ()
     regions: RegionPlan | None = None
-    even_votes: bool = False
+    balance_regions: bool = False
     motion: MotionPlan | None = None
-    keyframe_choice: Literal["as_needed", "sparing"] = "as_needed"
+    keyframe_policy: Literal["as_needed", "sparing"] = "as_needed"
     pose_steps: int = 25
     pair_flow: FlowPlan = ROW_PLAN
 
@@ -165,8 +165,8 @@ class TrackParams(NamedTuple):
         intrinsics: Pinhole camera with distortion.
         readout_s: Seconds from the first row to the last of a rolling shutter; 0 for a global one.
         depth_sigma_m: Standard deviation of measured depth close to the camera.
-        depth_sigma_per_m2: Its growth with the square of depth, a metre (Khoshelham and Elberink 2012). Both include
-            the errors that neighbouring pixels share, and so are larger than the noise of a single one.
+        depth_sigma_per_m2: Its growth with the square of depth, a meter (Khoshelham and Elberink 2012). Both include
+            the errors that neighboring pixels share, and so are larger than the noise of a single one.
         min_depth_m: Nearest depth believed.
         max_depth_m: Farthest depth believed.
         pixel_sigma: Standard deviation of a tracked point, pixels.
@@ -179,7 +179,7 @@ class TrackParams(NamedTuple):
         min_inliers: Fewest points that make a pose.
         weak_inliers: Below this the status is `WEAK`.
         min_share: Smallest share of the followed points that must agree on the pose.
-        refill_below: New points are sought when fewer than this share of the capacity is alive.
+        detect_below: New points are sought when fewer than this share of the capacity is alive.
         keyframe_below: A keyframe is made when no kept one shows more than this share of its points (`NEW_AREA`),
         keyframe_followed_below: when less than this share of the followed points was there at the last keyframe
             (`FEW_FOLLOWED`),
@@ -187,7 +187,7 @@ class TrackParams(NamedTuple):
             if the last one was made just now,
         keyframe_after_s: or when the last one was made this many seconds ago (`TIME`),
         keyframe_weak_after_s: or this many while tracking is weak (`WEAK`) or has few points.
-        keyframe_least_s: With a sparing choice, not before this many seconds have gone since the last one,
+        keyframe_min_s: With a sparing choice, not before this many seconds have gone since the last one,
         keyframe_motion: nor before points have moved by this part of their depth in the axes of the camera,
         keyframe_movable_below: nor while more than this share of the picture may move,
         keyframe_patience_s: for so many seconds more.
@@ -197,7 +197,7 @@ class TrackParams(NamedTuple):
         restart_after: Frames of loss after which tracking starts anew at the held pose.
         max_speed_m_per_s: Highest believed speed of the camera.
         max_turn_rad_per_s: Highest believed angular speed of the camera.
-        baseline_m: From the left to the right camera of a rectified pair, metres; 0 for a camera that measures depth.
+        baseline_m: From the left to the right camera of a rectified pair, meters; 0 for a camera that measures depth.
         cues: Parameters of each of `TrackPlan.cues`.
         motion: Parameters of `TrackPlan.motion`; `None` without.
     """
@@ -217,13 +217,13 @@ class TrackParams(NamedTuple):
     min_inliers: Scalar
     weak_inliers: Scalar
     min_share: Scalar
-    refill_below: Scalar
+    detect_below: Scalar
     keyframe_below: Scalar
     keyframe_followed_below: Scalar
     keyframe_points_below: Scalar
     keyframe_after_s: Scalar
     keyframe_weak_after_s: Scalar
-    keyframe_least_s: Scalar
+    keyframe_min_s: Scalar
     keyframe_motion: Scalar
     keyframe_movable_below: Scalar
     keyframe_patience_s: Scalar
@@ -242,9 +242,9 @@ class TrackedPoints(NamedTuple):
 
     Attributes:
         uv: `(2, n)` where they are in the last good frame, pixels.
-        xy: `(2, n)` the same as an ideal camera sees it, normalised coordinates.
-        depth: `(n,)` measured there, metres, 0 where nothing was.
-        X_world: `(3, n)` where they are in the world, metres, as measured over the last few frames.
+        xy: `(2, n)` the same as an ideal camera sees it, normalized coordinates.
+        depth: `(n,)` measured there, meters, 0 where nothing was.
+        X_world: `(3, n)` where they are in the world, meters, as measured over the last few frames.
         X_anchor: `(3, n)` the same as measured `anchor_age` frames ago: what moves slowly leaves it.
         information: `(n,)` inverse variance of their depth, 1 / m^2.
         weight: `(n,)` how much each counts, 0 to 1; the caller may change it between steps.
@@ -267,14 +267,14 @@ class TrackedPoints(NamedTuple):
     valid: Mask
 
 
-class Keyframes(NamedTuple):
-    """Past frames with the points seen in them, to look up again: a ring of the latest, then those recalled.
+class KeyframeRing(NamedTuple):
+    """Past frames with the points seen in them, to look up again: a ring of the latest, then those reloaded.
 
     Attributes:
         images: `(k, h, w)` pictures, of the type of the frames.
         T_world_cam: `(k, 7)` poses as `wxyz_xyz`.
         uv: `(k, 2, n)` the points in them, pixels.
-        X_world: `(k, 3, n)` the points in the world, metres.
+        X_world: `(k, 3, n)` the points in the world, meters.
         weight: `(k, n)` how much each counted when the keyframe was made; 0 for a slot without a point.
         id: `(k, n)` number of each point.
         made: Keyframes made so far; the next one goes to slot `made` modulo the size of the ring.
@@ -289,11 +289,11 @@ class Keyframes(NamedTuple):
     made: Code
 
 
-class LookedUp(NamedTuple):
+class KeyframeMatches(NamedTuple):
     """Points of keyframes found in a frame.
 
     Attributes:
-        X_world: `(3, n)` metres.
+        X_world: `(3, n)` meters.
         uv: `(2, n)` pixels in the frame.
         weight: `(n,)` how much each counts; 0 for what was not found.
         id: `(n,)` number of each point.
@@ -311,7 +311,7 @@ class TrackState(NamedTuple):
     """What the tracker knows after a frame: a pytree whose leaves are all plain arrays.
 
     A state can be saved with `numpy.savez(path, *jax.tree.leaves(state))`, with `pickle`, or with
-    `equinox.tree_serialise_leaves`. To restore one from its leaves, take the structure of a state that `init_state`
+    `equinox.tree_serialize_leaves`. To restore one from its leaves, take the structure of a state that `init_state`
     makes for the same plan and size of image, `jax.tree.unflatten(jax.tree.structure(blank), leaves)`. Tracking goes on
     from it with the same bytes.
 
@@ -320,7 +320,7 @@ class TrackState(NamedTuple):
         points: Followed points, as in the last good frame.
         keyframes: Past frames to look points up in.
         T_world_cam: Pose of the camera.
-        twist: Velocity of the camera in its own axes, metres a second then radians a second.
+        twist: Velocity of the camera in its own axes, meters a second then radians a second.
         elapsed_s: Seconds since the last good frame.
         since_keyframe_s: Seconds since the last keyframe.
         since_keyframe: Good frames since the last keyframe.
@@ -334,7 +334,7 @@ class TrackState(NamedTuple):
 
     pyramid: Pyramid
     points: TrackedPoints
-    keyframes: Keyframes
+    keyframes: KeyframeRing
     T_world_cam: SE3
     twist: Float[Array, "6"]
     elapsed_s: Scalar
@@ -362,15 +362,15 @@ class TrackOutput(NamedTuple):
         reason: A `TrackReason`.
         num_inliers: Followed points that agree with the pose.
         inlier_ratio: Their share of the points that could be followed.
-        num_looked_up: Points found again in keyframes.
+        num_keyframe_matches: Points found again in keyframes.
         residual_px: Robust standard deviation of the reprojection error of the inliers, pixels.
         uv: `(2, n)` pixels of the points in this frame, new ones included.
         weights: `(n,)` final weight of each, 0 to 1; 0 for what is no inlier, 1 times the given weight for a new point.
         tracked: `(n,)` which of the points came from the frame before.
-        X_world: `(3, n)` where the points are in the world, metres.
+        X_world: `(3, n)` where the points are in the world, meters.
         id: `(n,)` number of each point.
-        looked_up: Points of keyframes found in the frame.
-        twist: Velocity of the camera in its own axes, metres a second then radians a second.
+        keyframe_matches: Points of keyframes found in the frame.
+        twist: Velocity of the camera in its own axes, meters a second then radians a second.
         keyframe: A `KeyframeReason`.
         pose_status: A `PoseStatus` of the refinement of the pose in this frame, also of one that was not taken because
             the frame is lost. `NOT_CONVERGED` means that it ran out of `TrackPlan.pose_steps`: the pose is then near
@@ -388,18 +388,18 @@ class TrackOutput(NamedTuple):
     reason: Code
     num_inliers: Code
     inlier_ratio: Scalar
-    num_looked_up: Code
+    num_keyframe_matches: Code
     residual_px: Scalar
     uv: Pixels
     weights: Weights
     tracked: Mask
     X_world: Points
     id: Int[Array, " n"]
-    looked_up: LookedUp
+    keyframe_matches: KeyframeMatches
     twist: Float[Array, "6"]
     keyframe: Code
     pose_status: Code
-    verdicts: tuple[Verdict, ...] = ()
+    cue_results: tuple[CueResult, ...] = ()
     regions: Regions | None = None
     moving: Bool[Array, "h w"] | None = None
     motion: MotionState | None = None

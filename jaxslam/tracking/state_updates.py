@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxlie import SE3
-from jaxslam_kernels.se3 import composed, to_world
+from jaxslam_kernels.se3 import compose, to_world
 from jaxslam_kernels.types import Code, Pixels, Points, Weights
 from jaxtyping import Array, Bool, Float, Int, Num
 
@@ -13,7 +13,9 @@ from jaxslam.tracking.state import TrackState
 from jaxslam.tracking.step_checks import check_array
 
 
-def carried(state: TrackState, T_new_old: Float[Array, "7"], T_new_old_keyframes: Float[Array, "k 7"]) -> TrackState:
+def apply_map_correction(
+    state: TrackState, T_new_old: Float[Array, "7"], T_new_old_keyframes: Float[Array, "k 7"]
+) -> TrackState:
     """The state after the world was corrected: everything moves rigidly with the keyframe it hangs on.
 
     Args:
@@ -29,12 +31,12 @@ def carried(state: TrackState, T_new_old: Float[Array, "7"], T_new_old_keyframes
     check_array("T_new_old", T_new_old, (7,), state.twist.dtype, " as the state")
     each = keyframes.T_world_cam.shape
     check_array("T_new_old_keyframes", T_new_old_keyframes, each, state.twist.dtype, " as the keyframes of the state")
-    poses = jax.vmap(lambda correction, pose: composed(SE3(correction), SE3(pose)).wxyz_xyz)(
+    poses = jax.vmap(lambda correction, pose: compose(SE3(correction), SE3(pose)).wxyz_xyz)(
         T_new_old_keyframes, keyframes.T_world_cam
     )
     X_world = jax.vmap(lambda correction, X: to_world(SE3(correction), X))(T_new_old_keyframes, keyframes.X_world)
     return state._replace(
-        T_world_cam=composed(now, state.T_world_cam),
+        T_world_cam=compose(now, state.T_world_cam),
         points=state.points._replace(
             X_world=to_world(now, state.points.X_world), X_anchor=to_world(now, state.points.X_anchor)
         ),
@@ -42,7 +44,7 @@ def carried(state: TrackState, T_new_old: Float[Array, "7"], T_new_old_keyframes
     )
 
 
-def recalled(
+def load_keyframe(
     state: TrackState,
     slot: Code,
     image: Num[Array, "h w"],
@@ -60,7 +62,7 @@ def recalled(
         image: The keyframe's picture.
         T_world_cam: Its pose, `wxyz_xyz`.
         uv: Points in it, pixels as seen; as many as the tracker follows.
-        X_world: Where they are in the world, metres.
+        X_world: Where they are in the world, meters.
         weight: How much each counts, 0 for none.
         id: Numbers of the points.
 
@@ -87,7 +89,7 @@ def recalled(
     )
 
 
-def forgotten(state: TrackState, ids: Int[Array, " m"]) -> TrackState:
+def drop_points(state: TrackState, ids: Int[Array, " m"]) -> TrackState:
     """The state without some points: they are followed no longer, and not looked up in keyframes.
 
     Args:
@@ -111,10 +113,10 @@ def forgotten(state: TrackState, ids: Int[Array, " m"]) -> TrackState:
     )
 
 
-def relocated(state: TrackState, T_world_cam: Float[Array, "7"]) -> TrackState:
+def reset_at_pose(state: TrackState, T_world_cam: Float[Array, "7"]) -> TrackState:
     """The state of a tracker that is lost and begins anew at a pose: the next step starts there at once.
 
-    Its keyframes are forgotten: nothing says how they lie to where it begins. Those that do can be `recalled`.
+    Its keyframes are forgotten: nothing says how they lie to where it begins. Those that do can be `reloaded`.
 
     Args:
         state: The state.

@@ -16,27 +16,27 @@ from jax import lax
 from jax.typing import DTypeLike
 from jaxlie import SE3
 from jaxslam_kernels.camera import without_distortion
-from jaxslam_kernels.depth.sampling import believable
+from jaxslam_kernels.depth.sampling import valid_depth
 from jaxslam_kernels.flow.lk_flow import lk_flow
 from jaxslam_kernels.image.pyramid import Pyramid, build_pyramid
 from jaxslam_kernels.pose.pose_refine import PoseRefinement
 from jaxslam_kernels.robust import weighted_median
-from jaxslam_kernels.se3 import displacement, moved, to_camera, to_world
+from jaxslam_kernels.se3 import displacement, retract, to_camera, to_world
 from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Scalar, Weights
 from jaxtyping import Array, Float, Int
 
 from jaxslam.dynamics.object_motion import labels_at, no_motion
-from jaxslam.dynamics.regions import Regions, even_votes, find_regions, no_regions
+from jaxslam.dynamics.regions import Regions, balance_regions, find_regions, no_regions
 from jaxslam.sensors.frame_arrays import FrameArrays
-from jaxslam.tracking.dynamic_rejection import Judged, PointsSeen, judge_points
+from jaxslam.tracking.dynamic_rejection import DynamicRejection, FramePoints, reject_dynamic_points
 from jaxslam.tracking.floating_dtype import floating_dtype
-from jaxslam.tracking.keyframe_decision import Candidate, keyframe_reason
-from jaxslam.tracking.keyframe_ring import empty_keyframes, look_up, with_keyframe
-from jaxslam.tracking.measurement import View, depth_sigma, match_depth, observe_points, predict_pixels
-from jaxslam.tracking.point_detection import refill
+from jaxslam.tracking.keyframe_decision import KeyframeCandidate, keyframe_reason
+from jaxslam.tracking.keyframe_ring import align_keyframe_points, empty_keyframes, with_keyframe
+from jaxslam.tracking.measurement import PreparedFrame, depth_sigma, match_depth, measure_points, predict_pixels
+from jaxslam.tracking.point_detection import detect_new_points
 from jaxslam.tracking.pose_estimation import coarse_pose, fits, refined_pose, worse_status
 from jaxslam.tracking.state import (
-    LookedUp,
+    KeyframeMatches,
     TrackedPoints,
     TrackOutput,
     TrackParams,
@@ -61,7 +61,7 @@ _LOOK_EVERY = 3
 """Frames from one search for points on things that have too few to the next."""
 
 
-class Followed(NamedTuple):
+class FlowResult(NamedTuple):
     """The points of a state in a frame.
 
     Attributes:
@@ -86,7 +86,7 @@ class _Outcome(NamedTuple):
     inlier_ratio: Scalar
 
 
-class _Kept(NamedTuple):
+class _KeptPoints(NamedTuple):
     """The points of the last frame as they are in this one: those at rest, and those on what moves.
 
     Attributes:
@@ -195,7 +195,7 @@ def track_step(
 
     Raises:
         ValueError: While tracing, if a shape does not fit the image or the plan. Of an image that is no tracer, if its
-            grey values are from 0 to 1 and not to 255.
+            gray values are from 0 to 1 and not to 255.
         TypeError: While tracing, if state, parameters and frame are not of one floating-point type, the images of
             the state are of another type than that of the frame, or float32 is given for `TrackPlan.exact()`.
     """
@@ -206,7 +206,7 @@ def track_step(
 
 def follow_points(
     state: TrackState, frame: FrameArrays, params: TrackParams, plan: TrackPlan = DEFAULT_PLAN
-) -> Followed:
+) -> FlowResult:
     """The first part of `track_step`: the points of the state followed into a frame by optical flow.
 
     It takes nothing of the frame but image and time: what is to be ignored may be found out meanwhile.
@@ -226,7 +226,7 @@ def follow_points(
     elapsed_s = state.elapsed_s + frame.dt_s
     pyramid = build_pyramid(frame.image, num_levels=plan.num_levels, dtype=state.twist.dtype)
     # Constant velocity.
-    predicted = moved(state.T_world_cam, state.twist * jnp.clip(elapsed_s, 0, _MAX_PREDICTION_S))
+    predicted = retract(state.T_world_cam, state.twist * jnp.clip(elapsed_s, 0, _MAX_PREDICTION_S))
     points = state.points
     before = predict_pixels(to_camera(state.T_world_cam, points.X_world), state.twist, height, params)
     after = predict_pixels(to_camera(predicted, points.X_world), state.twist, height, params)
@@ -234,13 +234,13 @@ def follow_points(
     inside = jnp.all((guess > 0) & (guess < jnp.array([[width - 1], [height - 1]], guess.dtype)), axis=0)
     guess = jnp.where(inside[None, :], guess, points.uv)
     flow = lk_flow(state.pyramid, pyramid, points.uv, guess, points.valid, plan=plan.flow)
-    return Followed(pyramid, predicted, flow.points, flow.ok & (points.weight > 0))
+    return FlowResult(pyramid, predicted, flow.points, flow.ok & (points.weight > 0))
 
 
 def track_followed(
     state: TrackState,
     frame: FrameArrays,
-    followed_points: Followed,
+    followed_points: FlowResult,
     params: TrackParams,
     plan: TrackPlan = DEFAULT_PLAN,
 ) -> tuple[TrackState, TrackOutput]:
@@ -263,38 +263,40 @@ def track_followed(
     expected = _check(state, frame, params, plan)
     check_cues(state, frame, params, plan)
     points = expected.points
-    check_followed(followed_points, Followed(expected.pyramid, expected.T_world_cam, points.uv, points.valid))
+    check_followed(followed_points, FlowResult(expected.pyramid, expected.T_world_cam, points.uv, points.valid))
     pyramid, predicted, uv, found = followed_points
-    depth = believable(frame.depth, params.min_depth_m, params.max_depth_m)
-    view = View(frame, pyramid, depth, state.elapsed_s + frame.dt_s)
+    depth = valid_depth(frame.depth, params.min_depth_m, params.max_depth_m)
+    view = PreparedFrame(frame, pyramid, depth, state.elapsed_s + frame.dt_s)
     view = _matched(view, state, uv, found, predicted, params, plan)
     column, row = jnp.round(lax.stop_gradient(uv)).astype(jnp.int32)
     masked = frame.ignore.at[row, column].get(mode="fill", fill_value=True)
-    thing = _things_at(frame, uv, plan)
+    thing = _object_ids_at(frame, uv, plan)
     followed = _background(state, found & ~masked, thing, params)
     params = _widened(params, state.points.uv, uv, followed)
     regions = _regions(state, view, uv, predicted, params, plan)
     trust = _trust(state.points, params)
     votes = jnp.where(followed, trust, 0)
-    if regions is not None and plan.even_votes:
-        votes = even_votes(votes, regions)
+    if regions is not None and plan.balance_regions:
+        votes = balance_regions(votes, regions)
     coarse, agreeing, coarse_status = coarse_pose(state, view, uv, votes, predicted, params, plan)
     twist = _twist(state.T_world_cam, coarse, view.elapsed_s)
-    points = PointsSeen(uv, followed, found & masked, agreeing, trust, found & ~masked, thing)
-    judged = judge_points(state, view, points, regions, coarse, twist, params, plan)
+    points = FramePoints(uv, followed, found & masked, agreeing, trust, found & ~masked, thing)
+    judged = reject_dynamic_points(state, view, points, regions, coarse, twist, params, plan)
     if judged.motion is not None:
         joining = judged.motion.joining()
         followed, agreeing = followed | joining, agreeing | (joining & fits(state, view, uv, coarse, twist, params))
     # Not `votes`: what carries the pose is out by now, and with even votes here too the kitchen has 0.029 m, not 0.025.
     trust = judged.weights(trust)
     agreeing &= trust > 0
-    looked_up = look_up(state.keyframes, coarse, twist, judged.without_movers(view), params, plan)
+    keyframe_matches = align_keyframe_points(
+        state.keyframes, coarse, twist, judged.without_moving_pixels(view), params, plan
+    )
     counting = jnp.where(agreeing, trust, 0)
-    refined, inliers = refined_pose(state, view, uv, counting, looked_up, coarse, twist, params, plan)
+    refined, inliers = refined_pose(state, view, uv, counting, keyframe_matches, coarse, twist, params, plan)
     verdict = _judge(state, view, refined, followed & judged.counts(), inliers, params)
-    witnesses = judged.witnesses(uv, state.points.anchor_age, followed & ~inliers)
+    witnesses = judged.monitor_points(uv, state.points.anchor_age, followed & ~inliers)
     kept = _update_points(state, view, uv, inliers, witnesses, refined.T_world_cam, params)
-    new_state, output = _conclude(state, view, kept, refined, looked_up, verdict, judged, params, plan)
+    new_state, output = _conclude(state, view, kept, refined, keyframe_matches, verdict, judged, params, plan)
     said = {"verdicts": judged.verdicts, "regions": judged.regions, "moving": judged.moving, "motion": judged.motion}
     if plan.pose_steps > DEFAULT_PLAN.pose_steps:
         # Not always: one more use of the coarse pose's status has XLA round the pose itself in another way.
@@ -302,7 +304,7 @@ def track_followed(
     return new_state, output._replace(**said)
 
 
-def _things_at(frame: FrameArrays, uv: Pixels, plan: TrackPlan) -> Int[Array, " n"]:
+def _object_ids_at(frame: FrameArrays, uv: Pixels, plan: TrackPlan) -> Int[Array, " n"]:
     """Number of the thing that may move at each pixel; 0 for none, and where nobody asks."""
     if plan.motion is None:
         return jnp.zeros(uv.shape[1], jnp.int32)
@@ -325,8 +327,14 @@ def _background(state: TrackState, there: Mask, thing: Int[Array, " n"], params:
 
 
 def _matched(
-    view: View, state: TrackState, uv: Pixels, found: Mask, predicted: SE3, params: TrackParams, plan: TrackPlan
-) -> View:
+    view: PreparedFrame,
+    state: TrackState,
+    uv: Pixels,
+    found: Mask,
+    predicted: SE3,
+    params: TrackParams,
+    plan: TrackPlan,
+) -> PreparedFrame:
     """The frame with the right image of a pair, and the depth of the points followed by it; without one as it was."""
     view = view.with_right()
     expected = to_camera(predicted, state.points.X_world)[2]
@@ -351,12 +359,12 @@ def _trust(points: TrackedPoints, params: TrackParams) -> Weights:
 
 
 def _regions(
-    state: TrackState, view: View, uv: Pixels, predicted: SE3, params: TrackParams, plan: TrackPlan
+    state: TrackState, view: PreparedFrame, uv: Pixels, predicted: SE3, params: TrackParams, plan: TrackPlan
 ) -> Regions | None:
     """The surfaces of the frame, if something asks for them."""
     if plan.regions is None:
         return None
-    seen = observe_points(state.points.X_world, uv, predicted, state.twist, view, params, view.matched)
+    seen = measure_points(state.points.X_world, uv, predicted, state.twist, view, params, view.matched)
     key, ideal = jax.random.fold_in(state.random_key(), -1 - state.frame), without_distortion(params.intrinsics)
     return find_regions(key, view.depth, state.regions.centers, seen.in_camera(), ideal, plan.regions)
 
@@ -368,7 +376,7 @@ def _twist(before: SE3, after: SE3, elapsed_s: Scalar) -> Float[Array, "6"]:
 
 
 def _judge(
-    state: TrackState, view: View, refined: PoseRefinement, followed: Mask, inliers: Mask, params: TrackParams
+    state: TrackState, view: PreparedFrame, refined: PoseRefinement, followed: Mask, inliers: Mask, params: TrackParams
 ) -> _Outcome:
     """Lost, weak or fine, and why."""
     num_followed, num_inliers = (jnp.sum(mask, dtype=state.twist.dtype) for mask in (followed, inliers))
@@ -396,20 +404,20 @@ def _code(value: enum.IntEnum) -> Code:
 
 def _update_points(
     state: TrackState,
-    view: View,
+    view: PreparedFrame,
     uv: Pixels,
     inliers: Mask,
     witnesses: Mask,
     T_world_cam: SE3,
     params: TrackParams,
-) -> _Kept:
+) -> _KeptPoints:
     """Keep the inliers, and fuse the depth measured now into where they are.
 
     Witnesses, on what moves, are kept too, measured anew in every frame.
     """
     points = state.points
     twist = _twist(state.T_world_cam, T_world_cam, view.elapsed_s)
-    seen = observe_points(points.X_world, uv, T_world_cam, twist, view, params, view.matched)
+    seen = measure_points(points.X_world, uv, T_world_cam, twist, view, params, view.matched)
     X_cam = to_camera(T_world_cam, points.X_world)
     sigma = depth_sigma(seen.depth, params)
     agrees = inliers & (seen.depth > 0) & (jnp.abs(seen.depth - X_cam[2]) < 3 * sigma)
@@ -437,17 +445,17 @@ def _update_points(
         id=points.id,
         valid=points.valid & there,
     )
-    return _Kept(updated, points.valid & inliers, witnesses)
+    return _KeptPoints(updated, points.valid & inliers, witnesses)
 
 
 def _conclude(
     state: TrackState,
-    view: View,
-    kept: _Kept,
+    view: PreparedFrame,
+    kept: _KeptPoints,
     refined: PoseRefinement,
-    looked_up: LookedUp,
+    keyframe_matches: KeyframeMatches,
     verdict: _Outcome,
-    judged: Judged,
+    judged: DynamicRejection,
     params: TrackParams,
     plan: TrackPlan,
 ) -> tuple[TrackState, TrackOutput]:
@@ -465,11 +473,11 @@ def _conclude(
     movable = (
         jnp.zeros_like(twist[0]) if view.frame.movable is None else jnp.mean(view.frame.movable > 0, dtype=twist.dtype)
     )
-    candidate = Candidate(
+    candidate = KeyframeCandidate(
         refined.T_world_cam,
         kept.points,
         kept.tracked,
-        looked_up.overlap,
+        keyframe_matches.overlap,
         verdict.lost,
         verdict.weak,
         start,
@@ -477,12 +485,12 @@ def _conclude(
         movable,
     )
     reason_to_keep = lambda started: keyframe_reason(state, candidate._replace(started=started), params, plan)
-    few = jnp.sum(points.valid, dtype=twist.dtype) < params.refill_below * plan.num_points
+    few = jnp.sum(points.valid, dtype=twist.dtype) < params.detect_below * plan.num_points
     may = few if plan.new_points == "always" else few & (reason_to_keep(start) > 0)
-    unwatched = judged.unwatched(view, kept.witnesses)
+    unwatched = judged.unmonitored(view, kept.witnesses)
     may = may if unwatched is None else may | (jnp.any(unwatched) & (state.frame % _LOOK_EVERY == 0))
-    free = judged.without_watched(view, kept.witnesses, plan)
-    seek = partial(refill, first=unwatched, next_id=state.next_id, view=free)
+    free = judged.without_monitored(view, kept.witnesses, plan)
+    seek = partial(detect_new_points, first=unwatched, next_id=state.next_id, view=free)
     seek = partial(seek, T_world_cam=pose, twist=twist, params=params, plan=plan)
     sought = (start | (may & ~verdict.lost)).astype(jnp.int32)
     branches = [lambda p: (p, jnp.zeros((), jnp.int32)), seek]
@@ -521,7 +529,7 @@ def _conclude(
     plain = num_corners.astype(twist.dtype) < params.min_inliers
     why_not = jnp.where(plain, _code(TrackReason.NO_CORNERS), _code(TrackReason.NO_DEPTH))
     reason = jnp.select([failed, started], [why_not, _code(TrackReason.NONE)], verdict.reason)
-    found = looked_up._replace(weight=jnp.where(verdict.lost, 0, looked_up.weight))
+    found = keyframe_matches._replace(weight=jnp.where(verdict.lost, 0, keyframe_matches.weight))
     output = TrackOutput(
         T_world_cam=pose,
         covariance=jnp.where(
@@ -533,14 +541,14 @@ def _conclude(
         reason=reason,
         num_inliers=jnp.where(verdict.lost, 0, jnp.sum(kept.tracked)),
         inlier_ratio=jnp.where(verdict.lost, 0, verdict.inlier_ratio),
-        num_looked_up=jnp.sum(found.weight > 0),
+        num_keyframe_matches=jnp.sum(found.weight > 0),
         residual_px=refined.residual_scale * params.pixel_sigma,
         uv=points.uv,
         weights=jnp.where(points.valid & at_rest & ~held, points.weight, 0),
         tracked=kept.tracked & ~verdict.lost,
         X_world=points.X_world,
         id=points.id,
-        looked_up=found,
+        keyframe_matches=found,
         twist=twist,
         keyframe=keyframe,
         pose_status=refined.status,

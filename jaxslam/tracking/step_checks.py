@@ -13,9 +13,9 @@ from jax.core import Tracer
 from jax.typing import DTypeLike
 from jaxlie import SE3
 
-from jaxslam.dynamics.cue import Verdict
+from jaxslam.dynamics.cue import CueResult
 from jaxslam.dynamics.object_motion import MotionParams
-from jaxslam.sensors.frame_arrays import FrameArrays, check_grey_range
+from jaxslam.sensors.frame_arrays import FrameArrays, check_gray_range
 from jaxslam.tracking.state import TrackParams, TrackPlan, TrackState
 
 _STATE_DTYPE = " as the state"
@@ -29,7 +29,7 @@ def check_step(state: TrackState, frame: FrameArrays, params: TrackParams, plan:
 
     Raises:
         ValueError: If a shape does not fit the image, the parts of the plan do not go together, or an image that is no
-            tracer has grey values from 0 to 1.
+            tracer has gray values from 0 to 1.
         TypeError: If an argument is of another class, or its arrays are of another type than the state's.
     """
     for name, value, cls in (("state", state, TrackState), ("frame", frame, FrameArrays), ("plan", plan, TrackPlan)):
@@ -123,12 +123,12 @@ def check_state(state: TrackState, expected: TrackState) -> None:
     """
     kept = expected.keyframes.images
     height, width = kept.shape[1:]
-    made_by = f"init_state({height}, {width}, plan, image_dtype={kept.dtype}, dtype={expected.twist.dtype})"
+    reference_keyframe = f"init_state({height}, {width}, plan, image_dtype={kept.dtype}, dtype={expected.twist.dtype})"
     try:
         _check_images(state, expected)
         _check_like("state", state, expected)
     except (TypeError, ValueError) as error:
-        raise type(error)(f"{error}; make the state with {made_by}") from None
+        raise type(error)(f"{error}; make the state with {reference_keyframe}") from None
 
 
 def _check_images(state: TrackState, expected: TrackState) -> None:
@@ -175,13 +175,13 @@ def _checked_image(frame: FrameArrays) -> Any:
         raise TypeError(f"frame.image: expected an array (h, w), got {type(frame.image).__name__}") from None
     if image.ndim != 2:
         raise ValueError(
-            f"frame.image: expected one grey image (h, w), got {image.shape};"
-            " make colour grey, and scan over the frames of a clip"
+            f"frame.image: expected one gray image (h, w), got {image.shape};"
+            " make color gray, and scan over the frames of a clip"
         )
     if image.dtype != np.uint8 and not jnp.issubdtype(image.dtype, jnp.floating):
         raise TypeError(f"frame.image: expected uint8 or a floating-point type, got {image.dtype}")
     if not isinstance(frame.image, Tracer):
-        check_grey_range("frame.image", frame.image)
+        check_gray_range("frame.image", frame.image)
     return image
 
 
@@ -200,20 +200,20 @@ def check_followed(followed: NamedTuple, expected: NamedTuple) -> None:
     _check_like("followed_points", followed, expected)
 
 
-def check_verdict(name: str, verdict: Verdict, num_points: int, dtype: jnp.dtype) -> None:
+def check_verdict(name: str, verdict: CueResult, num_points: int, dtype: jnp.dtype) -> None:
     """Refuse what a cue says if it is not of every point.
 
     Raises:
         ValueError: If a shape is another one.
-        TypeError: If it is no `Verdict`, or a type is another one.
+        TypeError: If it is no `CueResult`, or a type is another one.
     """
-    _check_class(name, verdict, Verdict)
+    _check_class(name, verdict, CueResult)
     for field, of in (("weight", dtype), ("evidence", dtype), ("known", np.bool_)):
         check_array(f"{name}.{field}", getattr(verdict, field), (num_points,), of, " for every point")
 
 
-_LEAST = {
-    "num_points": 1, "num_levels": 2, "num_keyframes": 1, "num_recalled": 0, "num_sources": 0, "points_per_source": 1,
+_MIN = {
+    "num_points": 1, "num_levels": 2, "num_keyframes": 1, "num_reloaded": 0, "num_sources": 0, "points_per_source": 1,
     "num_hypotheses": 1, "pose_steps": 1,
 }  # fmt: skip
 
@@ -225,19 +225,19 @@ def check_plan(plan: TrackPlan) -> None:
         ValueError: If a number is too small, a side of cells is odd or one of a window even, a word is unknown, more
             keyframes are looked into than there are, or even votes lack regions.
     """
-    for name, least in _LEAST.items():
+    for name, least in _MIN.items():
         if getattr(plan, name) < least:
             raise ValueError(f"plan.{name}: expected at least {least}, got {getattr(plan, name)}")
     for name, hint in get_type_hints(TrackPlan).items():
         if get_origin(hint) is Literal and getattr(plan, name) not in get_args(hint):
             raise ValueError(f"plan.{name}: expected one of {get_args(hint)}, got {getattr(plan, name)!r}")
-    slots = plan.num_keyframes + plan.num_recalled
+    slots = plan.num_keyframes + plan.num_reloaded
     if plan.num_sources > slots:
         raise ValueError(
-            f"plan.num_sources: expected at most num_keyframes + num_recalled, {slots}, got {plan.num_sources}"
+            f"plan.num_sources: expected at most num_keyframes + num_reloaded, {slots}, got {plan.num_sources}"
         )
-    if plan.even_votes and plan.regions is None:
-        raise ValueError("plan.regions: expected a RegionPlan for even_votes, got None")
+    if plan.balance_regions and plan.regions is None:
+        raise ValueError("plan.regions: expected a RegionPlan for balance_regions, got None")
     _check_sides(plan)
 
 

@@ -21,7 +21,7 @@ class Evaluation:
     """Figures of one estimate against one reference. `str()` prints them, `summary()` is for JSON.
 
     All are over the matched poses. The RMSE of the distances is what papers call the ATE. A relative figure is the
-    RMSE over pairs of matched poses; pairs bridge losses too, so that a wrong relocalisation counts.
+    RMSE over pairs of matched poses; pairs bridge losses too, so that a wrong relocalization counts.
 
     Attributes:
         align: What was aligned: `none`, `se3` or `sim3`.

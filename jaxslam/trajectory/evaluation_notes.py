@@ -26,7 +26,7 @@ _BRIDGED_INTERVALS = 3.0
 _CLEARLY_BETTER = 0.8
 """Share of the errors that may remain with a time offset that is worth naming."""
 _SMALLEST_OFFSET_S = 0.01
-_LEAST_ATE = 1e-4
+_MIN_ATE = 1e-4
 """Share of the size of the path below which an ATE is too small to look for a cause of it."""
 
 _Wxyz = Float[np.ndarray, "n 4"]
@@ -228,7 +228,7 @@ def _explains(offset: TimeOffset, reference: Trajectory) -> bool:
     (ate, turn), (ate_without, turn_without) = offset.with_it, offset.without_it
     size = np.sqrt(np.var(reference.positions, axis=0).sum())
     better = ate < _CLEARLY_BETTER * ate_without and turn < _CLEARLY_BETTER * turn_without
-    return bool(better and ate_without > _LEAST_ATE * size)
+    return bool(better and ate_without > _MIN_ATE * size)
 
 
 def _reordered(wxyz: _Wxyz) -> _Wxyz:

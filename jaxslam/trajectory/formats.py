@@ -33,7 +33,7 @@ class PoseRows:
         kind: Its format.
         lines: `(n,)` the number of the line each pose stands in, from 1.
         timestamps_ns: `(n,)` int64 nanoseconds; `None` for KITTI, whose rows have no stamps.
-        T_world_cam: `(n, 7)` `qw qx qy qz x y z`, metres; quaternions as the file has them, not checked.
+        T_world_cam: `(n, 7)` `qw qx qy qz x y z`, meters; quaternions as the file has them, not checked.
     """
 
     path: Path
@@ -68,7 +68,7 @@ def read_rows(path: PathLike) -> PoseRows:
 
 
 def read_tum_rows(path: PathLike) -> PoseRows:
-    """Read rows of `timestamp tx ty tz qx qy qz qw`: seconds, metres.
+    """Read rows of `timestamp tx ty tz qx qy qz qw`: seconds, meters.
 
     Raises:
         TrajectoryError: If the file is missing, unreadable or empty, or a row is malformed.

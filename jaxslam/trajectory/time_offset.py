@@ -18,7 +18,7 @@ _FIRST_STEP_S, _LAST_STEP_S = 0.02, 2e-5
 """Steps of the first and of the last search; each search is ten times as fine as the one before."""
 _TURN_S = 0.2
 """The shortest time over which angles are compared: long enough that they exceed the noise of motion capture."""
-_MOST_SAMPLES, _FEWEST_SAMPLES = 1000, 10
+_MAX_SAMPLES, _FEWEST_SAMPLES = 1000, 10
 _LARGEST_SHARE_OF_TIME = 0.25
 _BRIDGED_INTERVALS = 3.0
 """Nothing is interpolated between poses that are more than this many median intervals apart."""
@@ -28,7 +28,7 @@ class Disagreement(NamedTuple):
     """How far two trajectories differ with one time offset.
 
     Attributes:
-        ate_m: The RMSE of the aligned positions, metres. Positions are interpolated.
+        ate_m: The RMSE of the aligned positions, meters. Positions are interpolated.
         turn_rad: The RMS difference of the angles by which the two turn within 0.2 s, or within one interval of the
             sparser one if that is longer, radians.
     """
@@ -105,7 +105,7 @@ class _Course:
 
     Attributes:
         seconds: `(n,)` times, strictly increasing.
-        values: `(n, 4)` positions, metres, and the angle turned from each time to a fixed time later, radians; NaN
+        values: `(n, 4)` positions, meters, and the angle turned from each time to a fixed time later, radians; NaN
             where there is no pose then.
         bridged: `(n - 1,)` which steps are gaps.
     """
@@ -166,7 +166,7 @@ class _Comparison:
         samples, other = (_Course.of(trajectory, int(reference.timestamps_ns[0]), turn_ns) for trajectory in pair)
         if samples_are_true := intervals_ns[1] > intervals_ns[0]:
             samples, other = other, samples
-        chosen = np.unique(np.linspace(0, len(samples.seconds) - 1, _MOST_SAMPLES).round().astype(int))
+        chosen = np.unique(np.linspace(0, len(samples.seconds) - 1, _MAX_SAMPLES).round().astype(int))
         return cls(samples.seconds[chosen], samples.values[chosen], other, samples_are_true, align)
 
     def at(self, offsets_s: Float[np.ndarray, " k"]) -> _Disagreements:

@@ -31,8 +31,8 @@ class Trajectory:
 
     Attributes:
         timestamps_ns: `(n,)` int64 nanoseconds, never decreasing.
-        T_world_cam: `(n, 7)` float64 `qw qx qy qz x y z` (jaxlie's order), metres; quaternions of unit length.
-            Given quaternions may be up to 5 % off and are normalised.
+        T_world_cam: `(n, 7)` float64 `qw qx qy qz x y z` (jaxlie's order), meters; quaternions of unit length.
+            Given quaternions may be up to 5 % off and are normalized.
 
     Raises:
         TrajectoryError: If a shape, a type, a number, a quaternion or the order of time is wrong.
@@ -62,7 +62,7 @@ class Trajectory:
 
     @property
     def positions(self) -> np.ndarray:
-        """`(n, 3)` positions of the camera in the world, metres."""
+        """`(n, 3)` positions of the camera in the world, meters."""
         return self.T_world_cam[:, 4:]
 
     def select(self, index: np.ndarray) -> "Trajectory":
@@ -141,7 +141,7 @@ def read(path: PathLike) -> Trajectory:
 
 
 def read_tum(path: PathLike) -> Trajectory:
-    """Read `timestamp tx ty tz qx qy qz qw` rows: seconds, metres, `T_world_cam`; `#` begins a comment.
+    """Read `timestamp tx ty tz qx qy qz qw` rows: seconds, meters, `T_world_cam`; `#` begins a comment.
 
     Stamps are read as exact decimals, not as floats, which would round epoch seconds to 0.2 microseconds.
 
@@ -277,7 +277,7 @@ def _first_problem(stamps: np.ndarray, poses: np.ndarray) -> tuple[int, str] | N
 
 
 def _mutually_nearest(stamps: np.ndarray, second: np.ndarray, limit: int) -> np.ndarray:
-    """Which neighbours in a sorted list are each other's nearest of the other kind; `(n - 1,)`.
+    """Which neighbors in a sorted list are each other's nearest of the other kind; `(n - 1,)`.
 
     These pairs the greedy matching takes whatever becomes of the rest. The two gaps at one stamp never tie, because
     the key also holds which list's stamp is the earlier.

@@ -18,7 +18,7 @@ _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 def draw_detections(image: np.ndarray, detections: Detections) -> np.ndarray:
-    """A copy of an image with what was found in it; the surest on top, each in a colour of its own.
+    """A copy of an image with what was found in it; the surest on top, each in a color of its own.
 
     Args:
         image: `(h, w, 3)` uint8 RGB.
@@ -55,7 +55,7 @@ def _outermost_pixels(boxes: np.ndarray, picture: np.ndarray) -> np.ndarray:
 def _write(
     picture: np.ndarray, text: str, corner: tuple[int, int], color: tuple[int, ...], taken: Sequence[_Area]
 ) -> _Area:
-    """Write on a ground of a colour at a corner, wholly inside the picture, and below what is taken if there is room.
+    """Write on a ground of a color at a corner, wholly inside the picture, and below what is taken if there is room.
 
     Returns:
         The area it takes.

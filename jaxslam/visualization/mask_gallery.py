@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from jaxslam.io.atomic_files import write_atomically
 from jaxslam.sensors.frame import Frame
-from jaxslam.slam.frame_result import Rejected, Tracked
+from jaxslam.slam.frame_result import FrameResult, Rejected
 from jaxslam.slam.mask_pipeline import MaskSource
 from jaxslam.visualization.overlay import GREEN, ORANGE, PURPLE, SKY_BLUE, VERMILION, Rgb, tint
 from jaxslam.visualization.plots import PNG_LEVEL
@@ -23,11 +23,11 @@ MASK_RGB: dict[MaskSource, Rgb] = {
     MaskSource.DEPTH: GREEN,
     MaskSource.CUES: VERMILION,
 }
-"""The colour of a mask, by where it comes from."""
+"""The color of a mask, by where it comes from."""
 
-_MOST_PICTURES = 60
+_MAX_PICTURES = 60
 _WIDTH_PX, _BAR_PX, _FONT_PX = 320, 20, 14
-_FRAME_MS, _GIF_COLORS, _MOST_GIF_BYTES = 150, 128, 3_000_000
+_FRAME_MS, _GIF_COLORS, _MAX_GIF_BYTES = 150, 128, 3_000_000
 _SHEET_PICTURES, _SHEET_COLUMNS = 12, 4
 
 
@@ -38,19 +38,19 @@ class MaskPictures:
     many. Which one of n is left to chance: a detector comes back every few frames, and every nth might be its own.
 
     Attributes:
-        kept: `(h, 320, 3)` uint8 RGB each, in the order of the run: the frame, its mask in the colour of its source,
+        kept: `(h, 320, 3)` uint8 RGB each, in the order of the run: the frame, its mask in the color of its source,
             and a line that says what it is.
     """
 
-    def __init__(self, most: int = _MOST_PICTURES) -> None:
+    def __init__(self, most: int = _MAX_PICTURES) -> None:
         """Keep `most` pictures at most, half as many at least, or those there are."""
         self.kept: list[np.ndarray] = []
         self._most, self._one_of, self._wanted, self._masked, self._seen = most, 1, 0, 0, 0
         self._random = np.random.default_rng(0)
 
-    def __call__(self, frame: Frame | None, result: Tracked | Rejected) -> None:
+    def __call__(self, frame: Frame | None, result: FrameResult | Rejected) -> None:
         """Look at one frame."""
-        if frame is not None and isinstance(result, Tracked) and result.dynamic_mask.any():
+        if frame is not None and isinstance(result, FrameResult) and result.dynamic_mask.any():
             if self._masked % self._one_of == 0:
                 self._wanted = self._masked + int(self._random.integers(self._one_of))
             if self._masked == self._wanted:
@@ -65,11 +65,11 @@ class MaskPictures:
         self.kept.append(picture)
 
 
-def draw_mask(image: np.ndarray, tracked: Tracked, title: str) -> np.ndarray:
+def draw_mask(image: np.ndarray, tracked: FrameResult, title: str) -> np.ndarray:
     """A small picture of a frame with its mask, and where that comes from, its age and share of the image in words.
 
     Args:
-        image: `(h, w, 3)` RGB or `(h, w)` grey, uint8.
+        image: `(h, w, 3)` RGB or `(h, w)` gray, uint8.
         tracked: What became of the frame; its mask is of the image's size.
         title: What to write first.
 
@@ -111,7 +111,7 @@ def _spread(pictures: Sequence[np.ndarray], most: int, random: np.random.Generat
 
 
 def _bar(text: str, color: tuple[int, int, int]) -> np.ndarray:
-    """Black words on a ground of a colour."""
+    """Black words on a ground of a color."""
     bar = Image.new("RGB", (_WIDTH_PX, _BAR_PX), color)
     font = ImageFont.load_default(_FONT_PX)
     ImageDraw.Draw(bar).text((4, _BAR_PX // 2), text, fill=(0, 0, 0), font=font, anchor="lm")
@@ -133,14 +133,14 @@ def _sheet(pictures: Sequence[np.ndarray]) -> bytes:
 def _small_animation(pictures: Sequence[np.ndarray]) -> bytes:
     """GIF of as many pictures as fit: all of them, or every 2nd, 4th, ... if it would be too large."""
     data = _animation(pictures)
-    while len(data) > _MOST_GIF_BYTES and len(pictures) > 1:
+    while len(data) > _MAX_GIF_BYTES and len(pictures) > 1:
         pictures = pictures[::2]
         data = _animation(pictures)
     return data
 
 
 def _animation(pictures: Sequence[np.ndarray]) -> bytes:
-    """GIF in one palette for all, so that a mask has the same colour throughout."""
+    """GIF in one palette for all, so that a mask has the same color throughout."""
     palette = Image.fromarray(np.concatenate(_spread(pictures, 8))).quantize(_GIF_COLORS)
     frames = [Image.fromarray(each).quantize(palette=palette, dither=Image.Dither.NONE) for each in pictures]
     file = io.BytesIO()

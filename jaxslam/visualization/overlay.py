@@ -1,4 +1,4 @@
-"""Masks drawn over images, in colours that colour-blind eyes tell apart too."""
+"""Masks drawn over images, in colors that color-blind eyes tell apart too."""
 
 from typing import TypeAlias
 
@@ -15,7 +15,7 @@ _OPACITY = 0.5
 
 
 def tint(picture: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"], color: Rgb) -> None:
-    """Mix a colour into the pixels of a mask, in place, and draw its outlines."""
+    """Mix a color into the pixels of a mask, in place, and draw its outlines."""
     picture[mask] = np.round((1 - _OPACITY) * picture[mask] + _OPACITY * np.array(color)).astype(np.uint8)
     outlines, _ = cv2.findContours(mask.view(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(picture, outlines, -1, color, 1)

@@ -66,7 +66,7 @@ def plot_trajectory(
     """Write one picture: the path and, if it was evaluated, the error over time and the figures; below, some frames.
 
     The path is seen along its flattest axis, at one scale. With an evaluation the estimate is drawn aligned and
-    coloured by error, and times without estimated poses are shaded; otherwise both paths are drawn as they are.
+    colored by error, and times without estimated poses are shaded; otherwise both paths are drawn as they are.
 
     Args:
         estimate: What was estimated.
@@ -100,37 +100,39 @@ def plot_trajectory(
     _write_picture(figure, path)
 
 
-def plot_map(map: Map, trajectory: Trajectory, path: str | os.PathLike[str]) -> None:
+def plot_map(slam_map: Map, trajectory: Trajectory, path: str | os.PathLike[str]) -> None:
     """Write one picture: points of the map by how many keyframes saw them, keyframes with their tree, loops, path.
 
     Two views, along the flattest axis of the points and along the next one. Gravity is not known: up is where the
     first keyframe has it.
 
     Args:
-        map: With a keyframe at least.
+        slam_map: With a keyframe at least.
         trajectory: Of the camera in the frame of the map.
         path: Where the picture goes; its ending, of `PICTURE_FORMATS`, says as what.
 
     Raises:
         TrajectoryError: If there is no keyframe, or the file cannot be written.
     """
-    if not len(map.ids):
+    if not len(slam_map.ids):
         raise TrajectoryError("nothing to plot: the map holds no keyframes")
-    seen = np.bincount(np.searchsorted(map.points.ids, map.sightings.point), minlength=len(map.points.ids))
+    seen = np.bincount(
+        np.searchsorted(slam_map.points.ids, slam_map.observations.point), minlength=len(slam_map.points.ids)
+    )
     order = np.argsort(seen, kind="stable")
-    centres, X = map.T_world_cam[:, 4:], map.points.X_world[:, order].T
-    low, high = np.percentile(np.concatenate([X, centres]), [1, 99], axis=0)
+    centers, X = slam_map.T_world_cam[:, 4:], slam_map.points.X_world[:, order].T
+    low, high = np.percentile(np.concatenate([X, centers]), [1, 99], axis=0)
     by_extent = np.argsort(high - low, kind="stable").tolist()
     room = 0.05 * (high - low) + 0.1
     figure = Figure(figsize=(12, 6), layout="constrained")
     points = None
     for axes, hidden in zip(figure.subplots(1, 2), by_extent[:2], strict=True):
-        view = _view(map.T_world_cam[0], hidden)
+        view = _view(slam_map.T_world_cam[0], hidden)
         plane = [view.across, view.up]
         points = axes.scatter(*X[:, plane].T, s=1.5, c=seen[order], cmap="viridis", vmin=1, vmax=8, label="points")
-        _draw_links(axes, map, plane)
+        _draw_links(axes, slam_map, plane)
         _draw_path(axes, trajectory, plane, color=_PATH_COLOR, label="path")
-        axes.plot(*centres[:, plane].T, "^", color="black", markersize=4, label="keyframes")
+        axes.plot(*centers[:, plane].T, "^", color="black", markersize=4, label="keyframes")
         (left, bottom), (right, top) = (low - room)[plane].tolist(), (high + room)[plane].tolist()
         axes.set(xlim=(right, left) if view.across_falls else (left, right), xlabel=f"{'xyz'[view.across]} [m]")
         axes.set(ylim=(top, bottom) if view.up_falls else (bottom, top), ylabel=f"{'xyz'[view.up]} [m]")
@@ -140,8 +142,9 @@ def plot_map(map: Map, trajectory: Trajectory, path: str | os.PathLike[str]) -> 
     assert points is not None
     figure.colorbar(points, ax=figure.axes, label="keyframes that saw the point", shrink=0.8)
     figure.suptitle(
-        f"{len(map.ids)} keyframes, {len(map.points.ids)} points, {len(map.sightings.point)} sightings,"
-        f" {len(map.loops.source)} loops, {len(np.unique(map.submap))} submaps",
+        f"{len(slam_map.ids)} keyframes, {len(slam_map.points.ids)} points,"
+        f" {len(slam_map.observations.point)} observations,"
+        f" {len(slam_map.loops.source)} loops, {len(np.unique(slam_map.submap))} submaps",
         fontsize=10,
     )
     _write_picture(figure, path)
@@ -254,13 +257,13 @@ def _write_picture(figure: Figure, path: str | os.PathLike[str]) -> None:
     write_atomically(path, _picture(figure, picture_format(path)), TrajectoryError)
 
 
-def _draw_links(axes: Axes, map: Map, plane: list[int]) -> None:
+def _draw_links(axes: Axes, slam_map: Map, plane: list[int]) -> None:
     """The spanning tree, and loops."""
-    children = np.flatnonzero(map.parent != NONE)
-    parents = rows(map.ids, map.parent[children])
-    loops = rows(map.ids, map.loops.source), rows(map.ids, map.loops.target)
+    children = np.flatnonzero(slam_map.parent != NONE)
+    parents = rows(slam_map.ids, slam_map.parent[children])
+    loops = rows(slam_map.ids, slam_map.loops.source), rows(slam_map.ids, slam_map.loops.target)
     for (first, second), color, label in (((parents, children), "0.5", None), (loops, _LOST_COLOR, "loops")):
-        ends = np.stack([map.T_world_cam[first, 4:], map.T_world_cam[second, 4:]], axis=1)[:, :, plane]
+        ends = np.stack([slam_map.T_world_cam[first, 4:], slam_map.T_world_cam[second, 4:]], axis=1)[:, :, plane]
         if len(ends):
             axes.add_collection(LineCollection(list(ends), colors=color, linewidths=1.0, label=label))
 

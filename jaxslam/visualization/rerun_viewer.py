@@ -20,7 +20,7 @@ from jaxslam.geometry.se3 import inverse, transform
 from jaxslam.map.types import Map
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame
-from jaxslam.slam.frame_result import Rejected, Tracked
+from jaxslam.slam.frame_result import FrameResult, Rejected
 from jaxslam.slam.mask_pipeline import MaskSource
 from jaxslam.slam.slam import Slam
 from jaxslam.tracking.state import TrackStatus
@@ -36,8 +36,8 @@ except ImportError as missing:
 
 PathLike: TypeAlias = str | os.PathLike[str]
 
-_CENTRE = 0.5
-"""What rerun calls the centre of the top-left pixel; ours is 0."""
+_CENTER = 0.5
+"""What rerun calls the center of the top-left pixel; ours is 0."""
 _JPEG_QUALITY = 75
 _DEPTH_STEP = 2
 """One depth of so many rows and columns is shown, as a square of that size: half the bytes."""
@@ -87,16 +87,16 @@ class Viewer:
         self._frame, self._closed = 0, False
         self._map: Map | None = None
         self._map_since = -_MAP_EVERY_FRAMES
-        self._last_centre: np.ndarray | None = None
+        self._last_center: np.ndarray | None = None
         self._mask_shown = False
         self._said: tuple[TrackStatus, str] | None = None
         self._log_what_stays(slam.camera)
 
-    def __call__(self, frame: Frame | None, result: Tracked | Rejected) -> None:
+    def __call__(self, frame: Frame | None, result: FrameResult | Rejected) -> None:
         """Show one frame."""
         self._stream.set_time("frame", sequence=self._frame)
         self._stream.set_time("time", timestamp=np.datetime64(result.timestamp_ns, "ns"))
-        if isinstance(result, Tracked):
+        if isinstance(result, FrameResult):
             if frame is not None:
                 self._log_images(frame)
             self._log_mask(result)
@@ -126,7 +126,7 @@ class Viewer:
     def _log_what_stays(self, camera: Camera) -> None:
         pinhole = rr.Pinhole(
             focal_length=(camera.fx, camera.fy),
-            principal_point=(camera.cx + _CENTRE, camera.cy + _CENTRE),
+            principal_point=(camera.cx + _CENTER, camera.cy + _CENTER),
             resolution=(camera.width, camera.height),
             image_plane_distance=0.3,
         )
@@ -145,55 +145,57 @@ class Viewer:
             depth = rr.EncodedDepthImage(_depth_png(frame.depth_m), media_type="image/png", meter=_DEPTH_PER_M)
             self._stream.log("world/camera/image/depth", depth)
 
-    def _log_mask(self, tracked: Tracked) -> None:
+    def _log_mask(self, tracked: FrameResult) -> None:
         shown = bool(tracked.dynamic_mask.any())
         if shown or self._mask_shown:  # one that is empty, to end the one before
             classes = np.uint8(tracked.mask_source) * tracked.dynamic_mask.view(np.uint8)
             self._stream.log("world/camera/image/mask", rr.SegmentationImage(classes, opacity=0.5))
         self._mask_shown = shown
 
-    def _log_points(self, tracked: Tracked) -> None:
+    def _log_points(self, tracked: FrameResult) -> None:
         alive = tracked.weights > 0
         weights, followed = tracked.weights[alive, None], tracked.followed[alive, None]
         believed = weights * np.array(_FOLLOWED_RGB) + (1 - weights) * np.array(_DOUBTED_RGB)
         colors = np.where(followed, believed, np.array(_NEW_RGB)).round().astype(np.uint8)
-        points = rr.Points2D(tracked.uv.T[alive] + np.float32(_CENTRE), colors=colors, radii=rr.Radius.ui_points(2.0))
+        points = rr.Points2D(tracked.uv.T[alive] + np.float32(_CENTER), colors=colors, radii=rr.Radius.ui_points(2.0))
         self._stream.log("world/camera/image/points", points)
 
-    def _log_pose(self, tracked: Tracked) -> None:
-        centre = tracked.T_world_cam[4:]
+    def _log_pose(self, tracked: FrameResult) -> None:
+        center = tracked.T_world_cam[4:]
         self._stream.log("world/camera", _transform(tracked.T_world_cam))
         known = tracked.status != TrackStatus.LOST
-        if known and self._last_centre is not None:
-            self._stream.log("world/trajectory", _line(np.stack([self._last_centre, centre]), _PATH_RGB))
-        self._last_centre = centre if known else None
+        if known and self._last_center is not None:
+            self._stream.log("world/trajectory", _line(np.stack([self._last_center, center]), _PATH_RGB))
+        self._last_center = center if known else None
 
-    def _log_figures(self, tracked: Tracked) -> None:
+    def _log_figures(self, tracked: FrameResult) -> None:
         figures = (tracked.track_ms, tracked.num_inliers, tracked.dynamic_ratio, tracked.mask_age)
         for entity, figure in zip(_SERIES, figures, strict=True):
             self._stream.log(entity, rr.Scalars(float(figure)))
 
-    def _log_status(self, result: Tracked | Rejected) -> None:
+    def _log_status(self, result: FrameResult | Rejected) -> None:
         """What became of the frame, where it is not what became of the one before."""
         said = result.status, result.reason
         if said != self._said:
             text = ": ".join(filter(None, (result.status.name, result.reason)))
             self._stream.log("tracking/status", rr.TextLog(text, level=_LEVELS.get(result.status, "INFO")))
         self._said = said
-        if isinstance(result, Tracked) and result.detector_error:
+        if isinstance(result, FrameResult) and result.detector_error:
             self._stream.log("mask/detector_error", rr.TextLog(result.detector_error, level="WARN"))
 
     def _log_map(self) -> None:
         """Points by how many keyframes saw them, and the places of the keyframes."""
-        map = self._slam.map
-        if map is self._map:
+        slam_map = self._slam.map
+        if slam_map is self._map:
             return
-        self._map, self._map_since = map, self._frame
-        seen = np.bincount(np.searchsorted(map.points.ids, map.sightings.point), minlength=len(map.points.ids))
+        self._map, self._map_since = slam_map, self._frame
+        seen = np.bincount(
+            np.searchsorted(slam_map.points.ids, slam_map.observations.point), minlength=len(slam_map.points.ids)
+        )
         colors = colormaps["viridis"](np.clip(0.3 + 0.1 * seen, 0, 1), bytes=True)  # its dark end is lost on black
-        points = rr.Points3D(map.points.X_world.T, colors=colors, radii=rr.Radius.ui_points(1.5))
+        points = rr.Points3D(slam_map.points.X_world.T, colors=colors, radii=rr.Radius.ui_points(1.5))
         self._stream.log("world/map/points", points)
-        keyframes = rr.Points3D(map.T_world_cam[:, 4:], colors=_KEYFRAME_RGB, radii=rr.Radius.ui_points(4.0))
+        keyframes = rr.Points3D(slam_map.T_world_cam[:, 4:], colors=_KEYFRAME_RGB, radii=rr.Radius.ui_points(4.0))
         self._stream.log("world/map/keyframes", keyframes)
 
     def _log_final_path(self) -> None:
@@ -238,7 +240,7 @@ def _opened_viewer(stream: rr.RecordingStream) -> rr.GrpcSink:
 
 
 def _depth_png(depth_m: np.ndarray) -> bytes:
-    """A coarse depth image of the same size, in millimetres; 0 where there is none or it is beyond 65 m."""
+    """A coarse depth image of the same size, in millimeters; 0 where there is none or it is beyond 65 m."""
     coarse = depth_m[::_DEPTH_STEP, ::_DEPTH_STEP] * np.float32(_DEPTH_PER_M)
     coarse = np.where((coarse > 0) & (coarse < np.iinfo(np.uint16).max), coarse, 0).round().astype(np.uint16)
     height, width = depth_m.shape

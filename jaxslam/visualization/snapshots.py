@@ -5,13 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxslam.sensors.frame import Frame
-from jaxslam.slam.frame_result import Rejected, Tracked
+from jaxslam.slam.frame_result import FrameResult, Rejected
 from jaxslam.tracking.state import TrackStatus
 from jaxslam.visualization.mask_gallery import MaskPictures
 from jaxslam.visualization.plots import Snapshot
 
 _NUM_SNAPSHOTS = 4
-_MOST_LOSSES = 5
+_MAX_LOSSES = 5
 
 
 class Snapshots:
@@ -23,9 +23,9 @@ class Snapshots:
         self._seen = 0
         self.kept: list[Snapshot] = []
 
-    def __call__(self, frame: Frame | None, result: Tracked | Rejected) -> None:
+    def __call__(self, frame: Frame | None, result: FrameResult | Rejected) -> None:
         """Look at one frame."""
-        if self._seen in self._wanted and frame is not None and isinstance(result, Tracked):
+        if self._seen in self._wanted and frame is not None and isinstance(result, FrameResult):
             title = f"frame {self._seen}: {result.status.name}, {result.num_inliers} inliers"
             self.kept.append(_snapshot(title, frame, result))
         self._seen += 1
@@ -34,16 +34,16 @@ class Snapshots:
 class Losses:
     """Keeps the frames in which tracking was lost, the first of each loss: an `on_frame` of `Slam.run`."""
 
-    def __init__(self, most: int = _MOST_LOSSES) -> None:
+    def __init__(self, most: int = _MAX_LOSSES) -> None:
         """Keep those of the first `most` losses."""
         self._most, self._seen, self._lost = most, 0, False
         self.kept: list[Snapshot] = []
 
-    def __call__(self, frame: Frame | None, result: Tracked | Rejected) -> None:
+    def __call__(self, frame: Frame | None, result: FrameResult | Rejected) -> None:
         """Look at one frame."""
         lost = result.status == TrackStatus.LOST
         begins = lost and not self._lost and len(self.kept) < self._most
-        if begins and frame is not None and isinstance(result, Tracked):
+        if begins and frame is not None and isinstance(result, FrameResult):
             self.kept.append(_snapshot(f"frame {self._seen}: LOST, {result.reason}", frame, result))
         self._lost = lost
         self._seen += 1
@@ -56,7 +56,7 @@ class RunPictures:
         """Keep nothing of `num_frames` frames yet."""
         self._snapshots, self._losses, self._masks = Snapshots(num_frames), Losses(), MaskPictures()
 
-    def __call__(self, frame: Frame | None, result: Tracked | Rejected) -> None:
+    def __call__(self, frame: Frame | None, result: FrameResult | Rejected) -> None:
         """Look at one frame."""
         for watcher in (self._snapshots, self._losses, self._masks):
             watcher(frame, result)
@@ -77,5 +77,5 @@ class RunPictures:
         return self._masks.kept
 
 
-def _snapshot(title: str, frame: Frame, result: Tracked) -> Snapshot:
+def _snapshot(title: str, frame: Frame, result: FrameResult) -> Snapshot:
     return Snapshot(title, frame.image, result.uv, result.weights, result.followed)

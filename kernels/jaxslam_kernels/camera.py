@@ -21,10 +21,10 @@ from jaxslam_kernels.checks import checked
 from jaxslam_kernels.types import Mask, Pixels, Points, Scalar, Weights
 
 MIN_DEPTH = 0.01
-"""Metres. Nothing nearer than this is imaged: such a point counts as behind the camera."""
+"""Meters. Nothing nearer than this is imaged: such a point counts as behind the camera."""
 
 _NEWTON_STEPS = 5  # 4 reach float64 accuracy for the cameras of TUM and Bonn, 5 for KITTI's raw wide one
-_MAX_SLOPE = 10.0  # normalised coordinates, 84 degrees off the axis: keeps a diverging iteration finite
+_MAX_SLOPE = 10.0  # normalized coordinates, 84 degrees off the axis: keeps a diverging iteration finite
 
 _Planes: TypeAlias = tuple[Array, Array]
 _Coefficients: TypeAlias = tuple[Array, ...]
@@ -77,7 +77,7 @@ def in_front(X_cam: Points) -> Mask:
 
 @checked
 def project(intrinsics: Intrinsics, X_cam: Points) -> Pixels:
-    """Pixels of points in camera coordinates (metres), distortion included.
+    """Pixels of points in camera coordinates (meters), distortion included.
 
     A point that is not `in_front` lands on the principal point.
     """
@@ -89,30 +89,30 @@ def project(intrinsics: Intrinsics, X_cam: Points) -> Pixels:
 
 @checked
 def back_project(intrinsics: Intrinsics, uv: Pixels, depth: Weights) -> Points:
-    """Points in camera coordinates (metres) seen at distorted pixels `uv` with `depth` along the optical axis.
+    """Points in camera coordinates (meters) seen at distorted pixels `uv` with `depth` along the optical axis.
 
     The origin where the pixel or the depth is not finite, or the depth not positive.
     """
     known = jnp.isfinite(depth) & (depth > 0) & jnp.isfinite(uv).all(axis=0)
     z = jnp.where(known, depth, 0.0)
-    return jnp.concatenate([normalise(intrinsics, uv) * z[None, :], z[None, :]])
+    return jnp.concatenate([normalize(intrinsics, uv) * z[None, :], z[None, :]])
 
 
 @checked
 def to_pixels(intrinsics: Intrinsics, xy: Pixels) -> Pixels:
-    """Normalised coordinates to pixels by the camera matrix alone, without distortion."""
+    """Normalized coordinates to pixels by the camera matrix alone, without distortion."""
     return jnp.stack([intrinsics.fx * xy[0] + intrinsics.cx, intrinsics.fy * xy[1] + intrinsics.cy])
 
 
 @checked
 def distort(intrinsics: Intrinsics, xy: Pixels) -> Pixels:
-    """Distorted normalised coordinates of undistorted ones."""
+    """Distorted normalized coordinates of undistorted ones."""
     return jnp.stack(_distort(tuple(intrinsics.distortion), xy[0], xy[1]))
 
 
 @checked
-def normalise(intrinsics: Intrinsics, uv: Pixels) -> Pixels:
-    """Undistorted normalised coordinates `(x / z, y / z)` of distorted pixels; 0 where `uv` is not finite.
+def normalize(intrinsics: Intrinsics, uv: Pixels) -> Pixels:
+    """Undistorted normalized coordinates `(x / z, y / z)` of distorted pixels; 0 where `uv` is not finite.
 
     Newton's method on `distort`, a fixed number of steps. Its derivatives are those of the implicit function theorem,
     forward and reverse, of any order. Meant for pixels where the distortion can be
@@ -131,18 +131,18 @@ def normalise(intrinsics: Intrinsics, uv: Pixels) -> Pixels:
 @checked
 def undistort_pixels(intrinsics: Intrinsics, uv: Pixels) -> Pixels:
     """Pixels where an ideal camera with the same matrix and no distortion would have seen the same rays."""
-    return to_pixels(intrinsics, normalise(intrinsics, uv))
+    return to_pixels(intrinsics, normalize(intrinsics, uv))
 
 
 @checked
 def depth_from_disparity(disparity: Weights, fx: Scalar, baseline: Scalar | float) -> Weights:
-    """Depth in metres of rectified disparities in pixels, `fx * baseline / d`; 0 where there is none."""
+    """Depth in meters of rectified disparities in pixels, `fx * baseline / d`; 0 where there is none."""
     return _reciprocal(disparity, fx, baseline)
 
 
 @checked
 def disparity_from_depth(depth: Weights, fx: Scalar, baseline: Scalar | float) -> Weights:
-    """Rectified disparities in pixels of depths in metres, `fx * baseline / z`; 0 where there is none."""
+    """Rectified disparities in pixels of depths in meters, `fx * baseline / z`; 0 where there is none."""
     return _reciprocal(depth, fx, baseline)
 
 

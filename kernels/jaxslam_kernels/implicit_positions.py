@@ -14,7 +14,7 @@ from jaxslam_kernels.types import Mask, Pixels
 Measures = PyTree[Float[Array, " n"]]
 
 
-class Found(NamedTuple):
+class ConvergedPositions(NamedTuple):
     """Where a search for positions ended.
 
     Attributes:
@@ -30,10 +30,10 @@ class Found(NamedTuple):
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def implicit_positions(
-    solve: Callable[[Any], Found],
+    solve: Callable[[Any], ConvergedPositions],
     explain: Callable[[Pixels, Any], tuple[Pixels, Measures]],
     inputs: PyTree[Array],
-) -> Found:
+) -> ConvergedPositions:
     """Positions at which a slope vanishes, differentiable whatever iteration found them.
 
     The derivative of a position is `-(d slope / d position)^-1 (d slope / d inputs)`, forward and reverse; a measure
@@ -52,7 +52,9 @@ def implicit_positions(
 
 
 @implicit_positions.defjvp
-def _implicit_positions_jvp(solve: Callable, explain: Callable, primals: tuple, tangents: tuple) -> tuple[Found, Found]:
+def _implicit_positions_jvp(
+    solve: Callable, explain: Callable, primals: tuple, tangents: tuple
+) -> tuple[ConvergedPositions, ConvergedPositions]:
     (inputs,), (change,) = primals, tangents
     found = implicit_positions(solve, explain, inputs)
     position, finite_inputs = found.positions, jax.tree.map(_finite, inputs)
@@ -72,7 +74,7 @@ def _implicit_positions_jvp(solve: Callable, explain: Callable, primals: tuple, 
     total = lambda given, along_u, along_v: jnp.where(regular, given + along_u * du + along_v * dv, 0)
     measures = jax.tree.map(total, by_inputs, by_u, by_v)
     not_differentiable = np.zeros(found.converged.shape, jax.dtypes.float0)
-    return found, Found(jnp.stack([du, dv]), not_differentiable, measures)  # pyright: ignore[reportArgumentType]
+    return found, ConvergedPositions(jnp.stack([du, dv]), not_differentiable, measures)  # pyright: ignore[reportArgumentType]
 
 
 def _finite(leaf: Array) -> Array:

@@ -1,6 +1,6 @@
 """Levenberg-Marquardt on a manifold from normal equations: a solver for `optimistix.minimise`.
 
-`optimistix.LevenbergMarquardt` sees residuals and a Jacobian as a linear operator, and by default factorises the tall
+`optimistix.LevenbergMarquardt` sees residuals and a Jacobian as a linear operator, and by default factorizes the tall
 Jacobian anew in every step: 11.6 ms for 500 points and six unknowns. Here the function hands over its cost, gradient
 and approximate Hessian, six numbers a side however many points went in. The loop, the damped Newton step and the
 trust region are optimistix's, the linear solver is lineax's. The unknown can live on any manifold: a step is taken
@@ -48,9 +48,9 @@ class _State(eqx.Module):
 
 
 class ManifoldLevenbergMarquardt(optx.AbstractMinimiser):
-    """Minimises `fn(y, args) -> (cost, NormalEquations)`, to be passed with `has_aux=True`.
+    """Minimizes `fn(y, args) -> (cost, NormalEquations)`, to be passed with `has_aux=True`.
 
-    Steps are measured in units that give the Hessian a constant diagonal, so that metres and radians weigh the same
+    Steps are measured in units that give the Hessian a constant diagonal, so that meters and radians weigh the same
     in the damping (Marquardt's scaling).
 
     Attributes:

@@ -1,6 +1,6 @@
 """Robust losses on squared residuals, and robust estimates of scale.
 
-A loss maps the squared, whitened residual `s >= 0` (a squared Mahalanobis norm) to `rho(s)`. All are normalised as
+A loss maps the squared, whitened residual `s >= 0` (a squared Mahalanobis norm) to `rho(s)`. All are normalized as
 in Ceres and SciPy: `rho(s) = c² rho_1(s / c²)`, so `rho(s) = s + O(s²)` near zero and an inlier counts as in plain
 least squares. The cost of a problem is `½ Σ rho(s_i)`, the weight in iteratively reweighted least squares is
 `rho'(s)`, and the scale `c` is in the unit of the whitened residual: standard deviations.

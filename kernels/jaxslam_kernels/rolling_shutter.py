@@ -14,15 +14,15 @@ from jaxslam_kernels.types import Pixels, Scalar, Weights
 
 @checked
 def image_velocity(xy: Pixels, depth: Weights, twist: Float[Array, "6"]) -> Pixels:
-    """Velocity in normalised coordinates of static points seen from a moving camera.
+    """Velocity in normalized coordinates of static points seen from a moving camera.
 
     Source: Longuet-Higgins and Prazdny, The Interpretation of a Moving Retinal Image, 1980.
 
     Args:
-        xy: `(2, n)` normalised coordinates.
-        depth: `(n,)` depth in metres; only rotation acts on a point whose depth is unknown (0, not a number, or less
+        xy: `(2, n)` normalized coordinates.
+        depth: `(n,)` depth in meters; only rotation acts on a point whose depth is unknown (0, not a number, or less
             than `camera.MIN_DEPTH`).
-        twist: Velocity of the camera in its own axes, metres a second then radians a second: after a time `s` its
+        twist: Velocity of the camera in its own axes, meters a second then radians a second: after a time `s` its
             pose is `T_world_cam @ exp(s * twist)`.
 
     Returns:
@@ -61,14 +61,14 @@ def as_if_at_once(xy: Pixels, velocity: Pixels, v: Float[Array, " n"], height: i
     grows with the square of speed and readout time.
 
     Args:
-        xy: `(2, n)` normalised coordinates of the points as seen.
+        xy: `(2, n)` normalized coordinates of the points as seen.
         velocity: `(2, n)` from `image_velocity` there.
         v: As for `row_time`.
         height: As for `row_time`.
         readout_s: As for `row_time`.
 
     Returns:
-        `(2, n)` normalised coordinates; 0 where `xy` is not finite.
+        `(2, n)` normalized coordinates; 0 where `xy` is not finite.
     """
     seen = jnp.isfinite(xy).all(axis=0)[None, :]
     return jnp.where(seen, xy, 0) - velocity * row_time(v, height, readout_s)[None, :]

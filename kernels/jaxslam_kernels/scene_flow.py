@@ -35,8 +35,8 @@ def scene_flow(X_world: Points, X_cam: Points, T_world_cam: SE3) -> Points:
     """How far points have come from where they would be at rest, in the axes of the camera (equations 4 and 5).
 
     Args:
-        X_world: `(3, n)` where they were in the world, metres.
-        X_cam: `(3, n)` where they are in the axes of the camera, metres.
+        X_world: `(3, n)` where they were in the world, meters.
+        X_cam: `(3, n)` where they are in the axes of the camera, meters.
         T_world_cam: Pose of the camera now.
     """
     return X_cam - to_camera(T_world_cam, X_world)

@@ -25,14 +25,14 @@ def lenient_promotion() -> Iterator[None]:
 
 
 @checked
-def moved(T_a_b: SE3, tangent_b: Float[Array, "6"]) -> SE3:
+def retract(T_a_b: SE3, tangent_b: Float[Array, "6"]) -> SE3:
     """`T_a_b @ exp(tangent_b)`: a pose moved in its own axes, translation first."""
     with lenient_promotion():
         return _typed(T_a_b @ SE3.exp(tangent_b), T_a_b)
 
 
 @checked
-def composed(T_a_b: Annotated[SE3, "..."], T_b_c: Annotated[SE3, "..."]) -> SE3:
+def compose(T_a_b: Annotated[SE3, "..."], T_b_c: Annotated[SE3, "..."]) -> SE3:
     """`T_a_c`, its quaternion of unit length."""
     with lenient_promotion():
         return _typed((T_a_b @ T_b_c).normalize(), T_a_b)

@@ -1,14 +1,14 @@
 """Conventions every kernel keeps: axes, frames, units, layout. Stated once, here.
 
 Layout: struct of arrays with the long axis last. `n` points in the image are `(2, n)`, in space `(3, n)`;
-XLA vectorises the last axis on a CPU. Fixed shapes with boolean masks; nothing is ever dropped from an array.
+XLA vectorizes the last axis on a CPU. Fixed shapes with boolean masks; nothing is ever dropped from an array.
 
 Frames: `T_world_cam` carries camera coordinates into the world, `X_world = T_world_cam @ X_cam`. Every transform
 names both frames that way. Camera axes as in OpenCV: x right, y down, z forward. Transforms are `jaxlie.SE3`
 (parameters `wxyz_xyz`, tangent = translation first, then rotation). A pose is updated on the right in its own
 frame, `T_world_cam @ exp(tangent)`, unless a docstring says otherwise; covariances live in that tangent space.
 
-Units: metres, radians, seconds, pixels. A pixel `(u, v)` counts from the centre of the top-left pixel, which
+Units: meters, radians, seconds, pixels. A pixel `(u, v)` counts from the center of the top-left pixel, which
 is (0, 0): `u` along a row, `v` down a column. An image is `image[v, u]`.
 
 Failure: nothing raises inside compiled code. Results are finite, and a status code says what they are worth; that goes
@@ -32,12 +32,12 @@ Code: TypeAlias = Int[Array, ""]
 Pixels: TypeAlias = Float[Array, "2 n"]
 """Pixel coordinates `(u, v)`, one column a point."""
 Points: TypeAlias = Float[Array, "3 n"]
-"""Points in space in metres, one column a point."""
+"""Points in space in meters, one column a point."""
 Weights: TypeAlias = Float[Array, " n"]
 """One non-negative number a point; zero means that the point does not count."""
 Mask: TypeAlias = Bool[Array, " n"]
 
 Image: TypeAlias = Float[Array, "h w"]
-"""A grey image, intensities 0 to 255."""
+"""A gray image, intensities 0 to 255."""
 DepthImage: TypeAlias = Float[Array, "h w"]
-"""Depth along the optical axis in metres; 0 where missing."""
+"""Depth along the optical axis in meters; 0 where missing."""

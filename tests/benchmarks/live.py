@@ -12,7 +12,7 @@ from jaxslam import Slam, evaluate, load_config, open_dataset
 from jaxslam.benchmark.reference_flow import corners_of, flow_ms
 from jaxslam.datasets import Dataset
 from jaxslam.semantics import Detector
-from jaxslam.sensors.frame import Frame, to_grey
+from jaxslam.sensors.frame import Frame, to_gray
 
 WARM_UP = 10
 
@@ -60,13 +60,13 @@ def live_run(recording: Recording, model: Path | None = None, detector: Detector
     OpenCV's flow takes the same frames in the same thread, before and after the tracker in turn.
     """
     dataset, frames, corners, rate_hz = recording
-    grey = [to_grey(frame.image) for frame in frames]
+    gray = [to_gray(frame.image) for frame in frames]
     config = load_config(overrides=["run.deterministic=false", f"semantics.model={model or 'null'}"])
     ours, theirs, keyframes = [], [], []
     with Slam(dataset.camera, config, detector=detector) as slam:
         slam.warm_up()
         began = time.perf_counter()
-        for index, (before, after) in enumerate(itertools.pairwise([grey[0], *grey])):
+        for index, (before, after) in enumerate(itertools.pairwise([gray[0], *gray])):
             time.sleep(max(0.0, began + index / rate_hz - time.perf_counter()))
             old = corners[max(index - 1, 0)]
             tracked = slam.track(frames[index]) if index % 2 else None

@@ -8,7 +8,7 @@ import cv2
 import jax
 import numpy as np
 import pytest
-from jaxslam_kernels.camera import normalise, project
+from jaxslam_kernels.camera import normalize, project
 
 from jaxslam.benchmark.kernels.scenes.single_view import DISTORTION, MATRIX, camera, make_scene
 from jaxslam.benchmark.timing import compare
@@ -18,9 +18,9 @@ pytestmark = pytest.mark.benchmark
 INTRINSICS = camera()
 
 
-def test_normalise():
+def test_normalize():
     scene = make_scene(0, 500)
-    uv, f = scene.arrays()[1], jax.jit(normalise)
+    uv, f = scene.arrays()[1], jax.jit(normalize)
     points = np.ascontiguousarray(scene.uv.T[:, None], np.float32)
     comparison = compare(lambda: f(INTRINSICS, uv), lambda: cv2.undistortPoints(points, MATRIX, DISTORTION))
     print(f"\nundistort 500 points\n{comparison}")

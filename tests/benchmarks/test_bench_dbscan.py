@@ -14,7 +14,7 @@ pytestmark = pytest.mark.benchmark
 
 
 def _scattered(n: int) -> np.ndarray:
-    """`(3, n)` metres: as many small groups as chance makes."""
+    """`(3, n)` meters: as many small groups as chance makes."""
     return np.random.default_rng(1).uniform(-2, 2, (3, n))
 
 

@@ -19,7 +19,7 @@ from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.datasets.synthetic.camera_path_kind import CameraPathKind
 from jaxslam.geometry.se3 import inverse, transform
 from jaxslam.semantics import load_detector
-from jaxslam.sensors.frame import Frame, to_grey
+from jaxslam.sensors.frame import Frame, to_gray
 from jaxslam.trajectory.trajectory import Trajectory
 
 pytestmark = [pytest.mark.benchmark, pytest.mark.usefixtures("opencv_in_one_thread")]
@@ -99,8 +99,8 @@ class _FlowBeside:
 
     def __call__(self, frame: Frame | None, _: object) -> None:
         if frame is not None and self._last is not None and self._frames % FLOW_EVERY == 0:
-            before = to_grey(self._last)
-            self.ms.append(flow_ms(before, to_grey(frame.image), corners_of(before)))
+            before = to_gray(self._last)
+            self.ms.append(flow_ms(before, to_gray(frame.image), corners_of(before)))
         self._frames, self._last = self._frames + 1, None if frame is None else frame.image
 
 

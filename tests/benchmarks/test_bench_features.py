@@ -16,7 +16,7 @@ from jaxslam.features.orb import Features, extract, features_of
 from jaxslam.loop_closing.place_index import PlaceIndex
 from jaxslam.loop_closing.place_recognition import verify
 from jaxslam.map.types import Keyframe
-from jaxslam.sensors.frame import to_grey
+from jaxslam.sensors.frame import to_gray
 from jaxslam.sensors.frame_arrays import frame_arrays
 
 pytestmark = pytest.mark.benchmark
@@ -25,19 +25,19 @@ KEYFRAMES = 2000
 
 
 @pytest.fixture(scope="module")
-def grey() -> np.ndarray:
-    return to_grey(picture(0).image)
+def gray() -> np.ndarray:
+    return to_gray(picture(0).image)
 
 
-def test_extraction(grey):
+def test_extraction(gray):
     orb = cv2.ORB.create(1000)
-    plain = lambda: orb.detectAndCompute(grey, None)
-    ignore = np.zeros(grey.shape, bool)
+    plain = lambda: orb.detectAndCompute(gray, None)
+    ignore = np.zeros(gray.shape, bool)
     ignore[100:300, 200:400] = True
     frame = frame_arrays(picture(0), 1 / 30)
-    extracted = compare(lambda: extract(grey), plain)
+    extracted = compare(lambda: extract(gray), plain)
     print(f"\nextract, against cv2.ORB without spreading: {extracted}")
-    print(f"masked: {compare(lambda: extract(grey, ignore), plain)}")
+    print(f"masked: {compare(lambda: extract(gray, ignore), plain)}")
     print(f"features_of: {compare(lambda: features_of(frame, STILL, params()), plain)}")
     assert extracted.processor_ratio < 3
 

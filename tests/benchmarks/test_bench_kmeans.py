@@ -18,7 +18,7 @@ CLUSTERS, STEPS, KEYS = 24, 10, 20
 
 
 def _room(height: int, width: int) -> np.ndarray:
-    """Metres along the optical axis: a wall at 4 m with a floor, and six upright ellipses before it, as people are."""
+    """Meters along the optical axis: a wall at 4 m with a floor, and six upright ellipses before it, as people are."""
     random = np.random.default_rng(0)
     v, u = np.mgrid[:height, :width] / np.array([height, width]).reshape(2, 1, 1)
     depth = np.minimum(4.0, 1.5 / np.maximum(v - 0.4, 1e-3))
@@ -29,7 +29,7 @@ def _room(height: int, width: int) -> np.ndarray:
 
 
 def _points(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """`(3, 19200)` metres, every fourth pixel of every fourth row of 640x480, and which of them were measured."""
+    """`(3, 19200)` meters, every fourth pixel of every fourth row of 640x480, and which of them were measured."""
     v, u = np.mgrid[: depth.shape[0] : 4, : depth.shape[1] : 4]
     z = depth[::4, ::4]
     points = np.stack([(u - 319.5) / 540 * z, (v - 239.5) / 540 * z, z]).reshape(3, -1).astype(np.float32)

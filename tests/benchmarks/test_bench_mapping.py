@@ -26,7 +26,7 @@ pytestmark = pytest.mark.benchmark
 
 KEYFRAMES = 1000
 STAGES = ("features_of", "_part", "find_points", "with_triangulated", "fuse_duplicates", "without_unconfirmed")
-STAGES += ("adjust_around", "without_redundant", "put_back")
+STAGES += ("adjust_around", "without_redundant", "merge_back")
 STEPS = ("_with_keyframe", "_with_tracks", "_with_found_points", "_with_new_points", "_fused")
 FAR_M = 50.0
 """How far each repetition is from the one before: nothing of one is in view of another."""
@@ -60,7 +60,7 @@ def repeated(jobs: list[NewKeyframe], number: int) -> NewKeyframe:
     if job.parent == NONE:
         parent = offset - 1 if turn else NONE
         pose = np.array([1.0, 0, 0, 0, FAR_M, 0, 0]) if turn else pose
-    own = job.tracks.id >= 0  # the others are points recalled from that map
+    own = job.tracks.id >= 0  # the others are points reloaded from that map
     tracks = job.tracks._replace(
         id=np.where(own, job.tracks.id + 10**6 * turn, job.tracks.id), weight=np.where(own, job.tracks.weight, 0)
     )
@@ -123,14 +123,16 @@ def test_growth(recorded):
         if (number + 1) % 100 == 0 or number == 49:
             recent = np.median(took[max(0, number - 49) : number + 1])
             print(f"\n{number + 1}: {recent:.1f} ms of processor time, {memory[number + 1]:.0f} MB resident", end="")
-    map = mapping.map
+    slam_map = mapping.map
     early, late = np.median(took[20:70]), np.median(took[-50:])
     a_keyframe = (memory[KEYFRAMES] - memory[100]) / (KEYFRAMES - 100)
     size = lambda record: sum(array.nbytes for array in record if isinstance(array, np.ndarray)) / KEYFRAMES / 1e3
     print(f"\nat 50 {early:.1f} ms, at {KEYFRAMES} {late:.1f} ms: {late / early:.2f} times", end="; ")
     print(f"{a_keyframe:.2f} MB a keyframe")
-    print(f"kB a keyframe: points {size(map.points):.0f}, sightings {size(map.sightings):.0f}, ", end="")
-    print(f"features {np.mean([1e3 * size(frame.features) for frame in map.keyframes]):.0f}, ", end="")
-    print(f"image {np.mean([len(frame.image_png) / 1e3 for frame in map.keyframes]):.0f}")
+    print(
+        f"kB a keyframe: points {size(slam_map.points):.0f}, observations {size(slam_map.observations):.0f}, ", end=""
+    )
+    print(f"features {np.mean([1e3 * size(frame.features) for frame in slam_map.keyframes]):.0f}, ", end="")
+    print(f"image {np.mean([len(frame.image_png) / 1e3 for frame in slam_map.keyframes]):.0f}")
     assert late < 2 * early
     assert a_keyframe < 1.0

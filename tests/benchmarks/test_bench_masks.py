@@ -19,9 +19,9 @@ from jaxslam.benchmark.reference_flow import corners_of, opencv_flow
 from jaxslam.benchmark.timing import Comparison, compare, compile_seconds
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.geometry.se3 import between
-from jaxslam.masks.propagation import PYRAMID_LEVELS, Origin, follow, make_origin, predicted_mask
-from jaxslam.sensors.downscale import Raster, Reduced
-from jaxslam.sensors.frame import to_grey
+from jaxslam.masks.propagation import PYRAMID_LEVELS, TrackedMask, follow, make_origin, predicted_mask
+from jaxslam.sensors.downscale import Downscaler, ImageGrid
+from jaxslam.sensors.frame import to_gray
 from jaxslam.slam.mask_pipeline import WIDTH_PX
 
 pytestmark = pytest.mark.benchmark
@@ -37,7 +37,7 @@ _pyramid = jax.jit(partial(build_pyramid, num_levels=PYRAMID_LEVELS))
 
 
 class View(NamedTuple):
-    grey: np.ndarray
+    gray: np.ndarray
     depth: np.ndarray
     person: np.ndarray
 
@@ -50,42 +50,42 @@ def dataset() -> SyntheticDataset:
 @pytest.fixture(scope="module")
 def views(dataset) -> tuple[View, View]:
     before, now = (dataset.render(index) for index in (FRAME, FRAME + 1))
-    view = lambda frame: View(to_grey(frame.rgb), frame.depth_m, frame.instance_mask > 0)
+    view = lambda frame: View(to_gray(frame.rgb), frame.depth_m, frame.instance_mask > 0)
     return view(before), view(now)
 
 
 @pytest.fixture(scope="module")
 def opencv(views):
     """What everything is compared with: flow of 1000 points, both pyramids included."""
-    before, now = (view.grey for view in views)
+    before, now = (view.gray for view in views)
     corners = corners_of(before)
     assert len(corners) == 1000
     return lambda: opencv_flow(before, now, corners)
 
 
-def _carry(reduced: Reduced, before: Pyramid, origin: Origin, now: View) -> np.ndarray:
+def _carry(reduced: Downscaler, before: Pyramid, origin: TrackedMask, now: View) -> np.ndarray:
     """The new mask, from the old one and its points, and both frames, of which the earlier one's pyramid is there."""
     depth = np.ascontiguousarray(reduced.every(now.depth))
-    _, followed = follow(origin, [before], reduced.mean(now.grey), depth)
+    _, followed = follow(origin, [before], reduced.mean(now.gray), depth)
     return reduced.whole(predicted_mask(origin, followed, depth))
 
 
 def test_carrying_a_mask(dataset, views, opencv, capsys):
     """Half the time of OpenCV's flow at most, all that the tracker may wait for included."""
     before, now = views
-    reduced = Reduced(Raster.of(dataset.camera), WIDTH_PX)
-    small, mask_before = reduced.mean(before.grey), np.ascontiguousarray(reduced.every(before.person))
+    reduced = Downscaler(ImageGrid.of(dataset.camera), WIDTH_PX)
+    small, mask_before = reduced.mean(before.gray), np.ascontiguousarray(reduced.every(before.person))
     pyramid, origin = _pyramid(small), make_origin(mask_before, small, 0)
-    grey, depth = reduced.mean(now.grey), np.ascontiguousarray(reduced.every(now.depth))
-    _, followed = follow(origin, [pyramid], grey, depth)
+    gray, depth = reduced.mean(now.gray), np.ascontiguousarray(reduced.every(now.depth))
+    _, followed = follow(origin, [pyramid], gray, depth)
     mask = _carry(reduced, pyramid, origin, now)
     overlap = np.count_nonzero(mask & now.person) / np.count_nonzero(mask | now.person)
     assert 0.15 < before.person.mean() < 0.25
     assert overlap > 0.8
     pieces = {
         "points of the mask": lambda: make_origin(mask_before, small, 0),
-        "smaller image": lambda: reduced.mean(now.grey),
-        "flow, objects": lambda: follow(origin, [pyramid], grey, depth),
+        "smaller image": lambda: reduced.mean(now.gray),
+        "flow, objects": lambda: follow(origin, [pyramid], gray, depth),
         "new mask": lambda: predicted_mask(origin, followed, depth),
         "larger mask": lambda: reduced.whole(mask_before),
     }

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from jaxslam.benchmark.kernels.scenes.single_view import (
     DISTORTION,
     MATRIX,
-    Scene,
+    PosedPoints,
     camera,
     make_scene,
     pose_error,
@@ -37,7 +37,7 @@ def _with_depth(key, X_world, uv, depth, threshold_depth):
     return ransac_pnp(key, X_world, uv, INTRINSICS, depth=depth, threshold_depth=threshold_depth)
 
 
-def _opencv(scene: Scene, threshold: float):
+def _opencv(scene: PosedPoints, threshold: float):
     """EPnP in RANSAC with OpenCV's default of iterations: rotation and translation vectors and inliers, or `None`."""
     X, uv = scene.X_world.T.copy(), scene.uv.T.copy()
     found, rvec, tvec, inliers = cv2.solvePnPRansac(
@@ -46,7 +46,7 @@ def _opencv(scene: Scene, threshold: float):
     return (rvec, tvec, inliers) if found and inliers is not None else None
 
 
-def _opencv_error(scene: Scene, threshold: float) -> tuple[float, float]:
+def _opencv_error(scene: PosedPoints, threshold: float) -> tuple[float, float]:
     """Of OpenCV's pose after Levenberg-Marquardt on its inliers."""
     result = _opencv(scene, threshold)
     if result is None:

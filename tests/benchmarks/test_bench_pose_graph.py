@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxlie import SE3
-from jaxslam_kernels.pose_graph.block_tridiagonal_cg import GraphMatrix, factorise, solve_factor
+from jaxslam_kernels.pose_graph.block_tridiagonal_cg import GraphMatrix, factorize, solve_factor
 from jaxslam_kernels.pose_graph.cost import PoseGraphEdges, graph_equations, graph_nodes, graph_problem
-from jaxslam_kernels.pose_graph.pose_graph import PoseGraphStatus, band_rank, optimise_pose_graph
+from jaxslam_kernels.pose_graph.pose_graph import PoseGraphStatus, band_rank, optimize_pose_graph
 from pose_graph_cases import read_g2o
 from scipy.sparse import bsr_array, coo_array
 from scipy.sparse.linalg import splu
@@ -45,7 +45,7 @@ def _load(data_dir: Path, name: str) -> tuple[Graph, SE3, PoseGraphEdges, np.nda
 
 @pytest.mark.parametrize("name", ["sphere2500.g2o", "parking-garage.g2o", "input_M3500_g2o.g2o"])
 def test_one_linear_solve_against_scipy(data_dir, name):
-    """Factorising and solving the first damped system, in float64; the solutions agree."""
+    """Factorizing and solving the first damped system, in float64; the solutions agree."""
     with jax.enable_x64(True):
         graph, poses, edges, rank, group = _load(data_dir, name)
         k = len(graph.nodes)
@@ -54,7 +54,7 @@ def test_one_linear_solve_against_scipy(data_dir, name):
         equations = graph_equations(nodes, problem, "squared")
         diagonal = equations.diagonal + 1e-3 * jnp.max(equations.diagonal) * jnp.eye(6)[None]
         matrix = GraphMatrix(diagonal, equations.coupling, problem.source, problem.target)
-        ours = jax.jit(lambda matrix, b: solve_factor(factorise(matrix, jnp.asarray(rank), group), b))
+        ours = jax.jit(lambda matrix, b: solve_factor(factorize(matrix, jnp.asarray(rank), group), b))
         b = equations.gradient
         blocks = bsr_array((np.asarray(diagonal), np.arange(k), np.arange(k + 1)), shape=(6 * k, 6 * k)).tocoo()
         rows = (6 * np.asarray(problem.source)[:, None, None] + np.arange(6)[None, :, None]) + np.zeros((1, 1, 6), int)
@@ -88,12 +88,12 @@ def test_whole_solve_against_gtsam(data_dir, name):
 
     def solve(poses, edges):
         fixed = jnp.arange(poses.wxyz_xyz.shape[0]) == 0
-        return optimise_pose_graph(poses, edges, fixed, elimination="host")
+        return optimize_pose_graph(poses, edges, fixed, elimination="host")
 
-    optimise = jax.jit(partial(solve))
+    optimize = jax.jit(partial(solve))
     with jax.enable_x64(True):
-        reference = jax.block_until_ready(optimise(*double[1:3]))
-    result = jax.block_until_ready(optimise(*single[1:3]))
+        reference = jax.block_until_ready(optimize(*double[1:3]))
+    result = jax.block_until_ready(optimize(*single[1:3]))
     graph, initial = gtsam.readG2o(str(data_dir / "posegraph" / name), "M3500" not in name)
     anchored = gtsam.NonlinearFactorGraph(graph)
     if "M3500" in name:
@@ -103,7 +103,7 @@ def test_whole_solve_against_gtsam(data_dir, name):
     params = gtsam.LevenbergMarquardtParams()
     params.setRelativeErrorTol(1e-9)
     theirs = lambda: graph.error(gtsam.LevenbergMarquardtOptimizer(anchored, initial, params).optimize())
-    comparison = compare(lambda: optimise(*single[1:3]), theirs, rounds=3, warm_up=1)
+    comparison = compare(lambda: optimize(*single[1:3]), theirs, rounds=3, warm_up=1)
     print(f"\n{name} whole, single precision, against gtsam\n{comparison}")
     for what, r in (("single", result), ("double", reference)):
         print(f"  {what}: χ² {2 * float(r.cost):.6f}, status {int(r.status)}, {int(r.num_steps)} steps")

@@ -9,7 +9,7 @@ from jaxslam import Slam, frame_arrays, open_dataset, track_params, track_plan, 
 from jaxslam.benchmark.reference_flow import corners_of, opencv_flow
 from jaxslam.benchmark.timing import compare
 from jaxslam.config.schema import Config, TrackConfig
-from jaxslam.sensors.frame import to_grey
+from jaxslam.sensors.frame import to_gray
 
 pytestmark = pytest.mark.benchmark
 
@@ -28,8 +28,8 @@ def test_step_is_not_slower_than_opencv_flow(data_dir, capsys):
     state, statuses = slam._state, []
     frames = [dataset[index] for index in range(FIRST - 1, FIRST + ROUNDS + WARM_UP)]
     arrays = iter([frame_arrays(frame, 1 / 30) for frame in frames[1:]])
-    grey = [to_grey(frame.image) for frame in frames]
-    pairs = iter([(a, b, corners_of(a)) for a, b in itertools.pairwise(grey)])
+    gray = [to_gray(frame.image) for frame in frames]
+    pairs = iter([(a, b, corners_of(a)) for a, b in itertools.pairwise(gray)])
 
     def ours():
         nonlocal state

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxlie import SE3
 from jaxslam_kernels.camera import make_intrinsics, project
-from jaxslam_kernels.se3 import moved, to_camera, to_world
+from jaxslam_kernels.se3 import retract, to_camera, to_world
 
-from jaxslam.dynamics.cue import Scene
+from jaxslam.dynamics.cue import CueInput
 
 N = 60
 MOTIONS: dict[str, Any] = {
@@ -24,18 +24,18 @@ MOTIONS: dict[str, Any] = {
 INTRINSICS = (500.0, 505.0, 320.0, 240.0, (0.05, -0.1, 0.001, -0.001, 0.0))
 
 
-def scene(motion: Any, moved_m: Any = (0, 0, 0), seed: int = 0, noise_px: float = 0.0) -> Scene:
+def scene(motion: Any, moved_m: Any = (0, 0, 0), seed: int = 0, noise_px: float = 0.0) -> CueInput:
     """Points before a camera that moves by a tangent in its own axes; every third point moves too, in the world."""
     rng = np.random.default_rng(seed)
     X_cam = np.stack([rng.uniform(-1, 1, N), rng.uniform(-0.8, 0.8, N), rng.uniform(1, 4, N)])
-    before = moved(SE3.identity(), jnp.array([0.3, -0.2, 0.1, 0.2, 0.1, -0.3]))
-    now = moved(before, jnp.asarray(motion, float))
+    before = retract(SE3.identity(), jnp.array([0.3, -0.2, 0.1, 0.2, 0.1, -0.3]))
+    now = retract(before, jnp.asarray(motion, float))
     X_world = np.asarray(to_world(before, jnp.asarray(X_cam)))
     X_now = X_world + np.where(moves()[None, :], np.asarray(moved_m, float)[:, None], 0)
     intrinsics = make_intrinsics(*INTRINSICS, dtype=jnp.float64)
     seen = to_camera(now, jnp.asarray(X_now))
     noise = noise_px * rng.standard_normal((2, 2, N))
-    return Scene(
+    return CueInput(
         uv_before=project(intrinsics, jnp.asarray(X_cam)) + noise[0],
         uv=project(intrinsics, seen) + noise[1],
         followed=jnp.ones(N, bool),

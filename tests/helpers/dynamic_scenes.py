@@ -30,7 +30,7 @@ class Scene(NamedTuple):
 
 
 class Errors(NamedTuple):
-    """ATE in metres: without masks (preset `static`), and with true masks (preset `ngd`)."""
+    """ATE in meters: without masks (preset `static`), and with true masks (preset `ngd`)."""
 
     static: float
     at_once: float

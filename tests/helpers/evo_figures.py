@@ -31,20 +31,20 @@ class Evo:
         return metric.get_all_statistics()
 
     def rpe(self, relation: str, delta: int = 1, *, all_pairs: bool = False) -> float:
-        """RMSE over pairs so many frames apart, in metres (`translation_part`) or degrees (`rotation_angle_deg`)."""
+        """RMSE over pairs so many frames apart, in meters (`translation_part`) or degrees (`rotation_angle_deg`)."""
         metric = metrics.RPE(getattr(metrics.PoseRelation, relation), delta, metrics.Unit.frames, all_pairs=all_pairs)
         metric.process_data((self.reference, self.estimate))
         return metric.get_statistic(metrics.StatisticsType.rmse)
 
     def rpe_of(self, first: np.ndarray, second: np.ndarray, seconds: np.ndarray) -> tuple[float, float]:
-        """RMSE in metres and in degrees a second over given pairs, so many seconds apart.
+        """RMSE in meters and in degrees a second over given pairs, so many seconds apart.
 
-        evo chooses pairs by frames, metres or angles, never by seconds, and divides by nothing.
+        evo chooses pairs by frames, meters or angles, never by seconds, and divides by nothing.
         """
         Q, P = self.reference.poses_se3, self.estimate.poses_se3
         E = [metrics.RPE.rpe_base(Q[i], Q[j], P[i], P[j]) for i, j in zip(first, second, strict=True)]
         metric = metrics.RPE()
         metric.error = np.array([np.linalg.norm(E_ij[:3, 3]) for E_ij in E]) / seconds
-        metres = metric.get_statistic(metrics.StatisticsType.rmse)
+        meters = metric.get_statistic(metrics.StatisticsType.rmse)
         metric.error = np.array([lie_algebra.so3_log_angle(E_ij[:3, :3], degrees=True) for E_ij in E]) / seconds
-        return metres, metric.get_statistic(metrics.StatisticsType.rmse)
+        return meters, metric.get_statistic(metrics.StatisticsType.rmse)

@@ -111,7 +111,7 @@ def cases(n: int = 11) -> dict[str, Case]:
         camera.back_project: {"intrinsics": CAMERA, "uv": f(2, n), "depth": f(n)},
         camera.to_pixels: {"intrinsics": CAMERA, "xy": f(2, n)},
         camera.distort: {"intrinsics": CAMERA, "xy": f(2, n)},
-        camera.normalise: {"intrinsics": CAMERA, "uv": f(2, n)},
+        camera.normalize: {"intrinsics": CAMERA, "uv": f(2, n)},
         camera.undistort_pixels: {"intrinsics": CAMERA, "uv": f(2, n)},
         camera.depth_from_disparity: {"disparity": f(n), "fx": f(), "baseline": f()},
         camera.disparity_from_depth: {"depth": f(n), "fx": f(), "baseline": f()},
@@ -126,7 +126,7 @@ def cases(n: int = 11) -> dict[str, Case]:
             "intrinsics": CAMERA,
             "same_m": f(),
         },
-        depth_image.believable: {"depth": f(n), "nearest": f(), "farthest": f()},
+        depth_image.valid_depth: {"depth": f(n), "nearest": f(), "farthest": f()},
         depth_image.sample_depth: {"depth": f(40, 48), "uv": f(2, n)},
         disparity.row_disparities: {
             "left": pyramid,
@@ -146,7 +146,7 @@ def cases(n: int = 11) -> dict[str, Case]:
         },
         epipolar.seven_point: {"uv_before": f(2, 7, n), "uv_after": f(2, 7, n)},
         epipolar.adjugate: {"F": f(3, 3, n)},
-        free_space.seen_from: {
+        free_space.classify_visibility: {
             "X_world": f(3, n),
             "T_world_cam": transforms(),
             "depth": f(40, 48),
@@ -186,13 +186,13 @@ def cases(n: int = 11) -> dict[str, Case]:
         partial(patch_align.warped_patches, side=5, stride=8): {
             "pictures": f(2, 40, 48),
             "picture": i(n),
-            "centre": f(2, n),
+            "center": f(2, n),
             "warp": f(2, 2, n),
         },
         patch_align.align_patches: {
             "pictures": f(2, 40, 48),
             "picture": i(n),
-            "centre": f(2, n),
+            "center": f(2, n),
             "warp": f(2, 2, n),
             "current": pyramid,
             "guess": f(2, n),
@@ -211,7 +211,7 @@ def cases(n: int = 11) -> dict[str, Case]:
         },
         partial(pnp.draw_samples, num_samples=3): {"key": KEY, "weights": f(n)},
         pnp.score_poses: {"T_cam_world": f(3, 4, 2), "problem": problem},
-        partial(pose_graph.optimise_pose_graph, group_size=16): {
+        partial(pose_graph.optimize_pose_graph, group_size=16): {
             "T_world_cam": transforms(n),
             "edges": edges,
             "fixed": b(n),
@@ -242,8 +242,8 @@ def cases(n: int = 11) -> dict[str, Case]:
             "readout_s": f(),
         },
         segments.segment_errors: {"estimate": transforms(n), "reference": transforms(n), "mask": b(n), "lengths": f(2)},
-        transform.moved: {"T_a_b": transforms(), "tangent_b": f(6)},
-        transform.composed: {"T_a_b": transforms(n), "T_b_c": transforms(n)},
+        transform.retract: {"T_a_b": transforms(), "tangent_b": f(6)},
+        transform.compose: {"T_a_b": transforms(n), "T_b_c": transforms(n)},
         transform.between: {"T_world_a": transforms(n), "T_world_b": transforms(n)},
         transform.displacement: {"T_world_a": transforms(), "T_world_b": transforms()},
         transform.to_camera: {"T_world_cam": transforms(), "X_world": f(3, n)},
@@ -251,14 +251,14 @@ def cases(n: int = 11) -> dict[str, Case]:
         transform.cross_matrix: {"v": f(3)},
         partial(voxel_grid.reduced_cloud, capacity=8): {
             "X": f(3, n),
-            "colour": f(3, n),
+            "color": f(3, n),
             "mask": b(n),
             "voxel_m": f(),
         },
         voxel_grid.with_cloud: {
             "grid": grid,
             "X": f(3, n),
-            "colour": f(3, n),
+            "color": f(3, n),
             "count": f(n),
             "evidence": f(n),
             "voxel_m": f(),
@@ -267,7 +267,7 @@ def cases(n: int = 11) -> dict[str, Case]:
             "grid": grid,
             "rows": i(n),
             "X": f(3, n),
-            "colour": f(3, n),
+            "color": f(3, n),
             "count": f(n),
             "evidence": f(n),
             "voxel_m": f(),

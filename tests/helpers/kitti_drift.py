@@ -14,12 +14,12 @@ from scipy.spatial.transform import Rotation
 def kitti_drift(
     P: np.ndarray, Q: np.ndarray, lengths: Sequence[float] | np.ndarray, step: int
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """Errors of each segment, a metre, by length and beginning, 0 where there is none; and how many there are.
+    """Errors of each segment, a meter, by length and beginning, 0 where there is none; and how many there are.
 
     Args:
         P: `(n, 7)` estimated poses, `wxyz_xyz`.
         Q: `(n, 7)` true poses.
-        lengths: Of segments, metres.
+        lengths: Of segments, meters.
         step: From one beginning to the next.
     """
     P, Q = _matrices(P), _matrices(Q)

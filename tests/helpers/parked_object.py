@@ -18,7 +18,7 @@ class Verdicts(NamedTuple):
     Attributes:
         moves: `(n,)` whether the box moves from the frame before to this one.
         masked: `(n,)` share of the pixels that show it which are left out.
-        error_m: `(n,)` distance between tracked and true position of the camera, metres.
+        error_m: `(n,)` distance between tracked and true position of the camera, meters.
     """
 
     moves: np.ndarray

@@ -100,7 +100,7 @@ distortion_coefficients: {list(lens.distortion)}
 
 
 def write_euroc(folder: Path, raw: RawRoom) -> Path:
-    """A recording in the layout of EuRoC, grey, with ground truth of the body; gives the folder that holds `mav0`."""
+    """A recording in the layout of EuRoC, gray, with ground truth of the body; gives the folder that holds `mav0`."""
     mav = folder / "mav0"
     stamps = [int(stamp) for stamp in raw.room.timestamps_ns]
     T_left_right = np.array(raw.rig.T_left_right)

@@ -10,7 +10,7 @@ from jaxslam.config.schema import Config, RunConfig
 from jaxslam.datasets import Dataset
 from jaxslam.geometry.se3 import between
 from jaxslam.sensors.frame import Frame
-from jaxslam.slam.frame_result import Tracked
+from jaxslam.slam.frame_result import FrameResult
 from jaxslam.slam.slam import Slam
 from jaxslam.tracking.state import TrackStatus
 from jaxslam.trajectory.trajectory import Trajectory
@@ -32,7 +32,7 @@ class Played:
 
     def __init__(self, slam: Slam, dataset: Dataset, order: Order, fps: float, gap_s: float = 0.0) -> None:
         """Track them; after a frame that is not followed by the next one or a black one come `gap_s` seconds."""
-        self.slam, self.order, self.results = slam, order, list[Tracked]()
+        self.slam, self.order, self.results = slam, order, list[FrameResult]()
         time_ns, before = slam._clock.last_ns or 0, None
         for index in order:
             cut = before is not None and index is not None and index != before + 1
@@ -68,10 +68,10 @@ class Played:
         true = dict(zip(self.shown, self.truth.T_world_cam[:, 4:], strict=True))
         given = np.array([self.results[place].T_world_cam[4:] for place in fitted])
         wanted = np.array([true[place] for place in fitted])
-        centre, true_centre = given.mean(axis=0), wanted.mean(axis=0)
-        U, _, Vt = np.linalg.svd((given - centre).T @ (wanted - true_centre))  # Kabsch 1976
+        center, true_center = given.mean(axis=0), wanted.mean(axis=0)
+        U, _, Vt = np.linalg.svd((given - center).T @ (wanted - true_center))  # Kabsch 1976
         R = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
-        expected = [R @ (true[place] - true_centre) + centre for place in places]
+        expected = [R @ (true[place] - true_center) + center for place in places]
         return np.array(
             [np.linalg.norm(self.results[p].T_world_cam[4:] - x) for p, x in zip(places, expected, strict=True)]
         )

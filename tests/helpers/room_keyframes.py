@@ -6,9 +6,9 @@ import numpy as np
 from room_views import features, params, picture, room
 
 from jaxslam.config.schema import Config
-from jaxslam.geometry.se3 import between, moved, to_local, transform
+from jaxslam.geometry.se3 import between, retract, to_local, transform
 from jaxslam.map.types import NONE, Map
-from jaxslam.mapping.local_mapping import LocalMapping, MappingPlan, NewKeyframe, Tracks, mapping_plan
+from jaxslam.mapping.local_mapping import LocalMapping, MappingPlan, NewKeyframe, TrackedObservations, mapping_plan
 from jaxslam.sensors.frame_arrays import FrameArrays, frame_arrays
 
 PLAN: MappingPlan = mapping_plan(room().camera, Config())
@@ -39,7 +39,7 @@ def _in_camera(uv: np.ndarray, depth: np.ndarray, seed: int) -> np.ndarray:
     return np.concatenate([rays, np.ones((1, uv.shape[1]))]) * depth
 
 
-def tracks(index: int, seed: int = 0) -> Tracks:
+def tracks(index: int, seed: int = 0) -> TrackedObservations:
     """Those of `followed` that a picture shows, with a little noise; the others have weight 0."""
     camera, X_world = room(seed).camera, followed(seed)
     X_cam = to_local(room(seed).T_world_cam[index], X_world)
@@ -50,9 +50,9 @@ def tracks(index: int, seed: int = 0) -> Tracks:
     measured = np.asarray(arrays(index, seed).depth)[v, u]
     shown = inside & (np.abs(measured - X_cam[2]) < 0.05)
     noise = np.random.default_rng(index).normal(0, _NOISE_PX, uv.shape)
-    return Tracks(
+    return TrackedObservations(
         id=np.arange(X_world.shape[1]),
-        seen_uv=np.where(shown, uv + noise, 0).astype(np.float32),
+        uv_raw=np.where(shown, uv + noise, 0).astype(np.float32),
         X_cam=X_cam.astype(np.float32),
         weight=shown.astype(np.float32),
     )
@@ -69,7 +69,7 @@ def new_keyframe(
         timestamp_ns=int(room(seed).timestamps_ns[index]),
         frame=arrays(index, seed),
         parent=NONE if before is None else number - 1,
-        T_parent_keyframe=moved(pose, np.zeros(6) if error is None else error),
+        T_parent_keyframe=retract(pose, np.zeros(6) if error is None else error),
         submap=0,
         twist=np.zeros(6, np.float32),
         tracks=tracks(index, seed),
@@ -90,8 +90,8 @@ def mapped(count: int, *, noisy: bool = True) -> tuple[LocalMapping, list[Map]]:
     return mapping, maps
 
 
-def pose_errors(map: Map, seed: int = 0, step: int = STEP) -> np.ndarray:
-    """`(k,)` metres between where keyframes are and the truth, seen from the first."""
-    truth = room(seed).T_world_cam[map.ids * step]
-    ours = between(map.T_world_cam[:1], map.T_world_cam)
+def pose_errors(slam_map: Map, seed: int = 0, step: int = STEP) -> np.ndarray:
+    """`(k,)` meters between where keyframes are and the truth, seen from the first."""
+    truth = room(seed).T_world_cam[slam_map.ids * step]
+    ours = between(slam_map.T_world_cam[:1], slam_map.T_world_cam)
     return np.linalg.norm((between(truth[:1], truth) - ours)[:, 4:], axis=1)

@@ -1,4 +1,4 @@
-"""A third of a round of the room, at a size at which places are recognised, and a tracker for it."""
+"""A third of a round of the room, at a size at which places are recognized, and a tracker for it."""
 
 import functools
 

@@ -42,9 +42,9 @@ def params(seed: int = 0) -> TrackParams:
 
 def map_of(indices: Sequence[int], seed: int = 0) -> Map:
     """Keyframe `k` is picture `indices[k]`, at its true pose."""
-    map = empty_map(room(seed).camera)
+    slam_map = empty_map(room(seed).camera)
     for index in indices:
-        keyframe = Keyframe(map.next_keyframe, int(room(seed).timestamps_ns[index]), features(index, seed), b"")
-        parent = map.next_keyframe - 1 if map.keyframes else NONE
-        map = with_keyframe(map, keyframe, room(seed).T_world_cam[index], parent, 0)
-    return map
+        keyframe = Keyframe(slam_map.next_keyframe, int(room(seed).timestamps_ns[index]), features(index, seed), b"")
+        parent = slam_map.next_keyframe - 1 if slam_map.keyframes else NONE
+        slam_map = with_keyframe(slam_map, keyframe, room(seed).T_world_cam[index], parent, 0)
+    return slam_map

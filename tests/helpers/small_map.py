@@ -5,8 +5,8 @@ import numpy as np
 
 from jaxslam.features.orb import Features
 from jaxslam.geometry.se3 import to_local
-from jaxslam.map.edit import with_keyframe, with_loop, with_points, with_sightings
-from jaxslam.map.types import NONE, Keyframe, Map, MapPoints, Sightings, empty_map
+from jaxslam.map.edit import with_keyframe, with_loop, with_observations, with_points
+from jaxslam.map.types import NONE, Keyframe, Map, MapPoints, Observations, empty_map
 from jaxslam.sensors.camera import Camera
 
 CAMERA = Camera("small", 64, 48, 50.0, 51.0, 31.0, 24.5)
@@ -15,14 +15,14 @@ NUM_FEATURES = 12
 
 def png(seed: int, camera: Camera = CAMERA) -> bytes:
     noise = np.random.default_rng(seed).integers(0, 256, (camera.height // 8, camera.width // 8), np.uint8)
-    grey = cv2.resize(noise, (camera.width, camera.height), interpolation=cv2.INTER_NEAREST)
-    return cv2.imencode(".png", grey)[1].tobytes()
+    gray = cv2.resize(noise, (camera.width, camera.height), interpolation=cv2.INTER_NEAREST)
+    return cv2.imencode(".png", gray)[1].tobytes()
 
 
 def features(rng: np.random.Generator, count: int = NUM_FEATURES) -> Features:
     uv = rng.uniform(0, 48, (2, count)).astype(np.float32)
     return Features(
-        seen_uv=uv,
+        uv_raw=uv,
         uv=uv + np.float32(0.25),
         depth=rng.uniform(0, 4, count).astype(np.float32),
         octave=rng.integers(0, 8, count).astype(np.uint8),
@@ -31,9 +31,9 @@ def features(rng: np.random.Generator, count: int = NUM_FEATURES) -> Features:
     )
 
 
-def keyframe(map: Map, rng: np.random.Generator, count: int = NUM_FEATURES) -> Keyframe:
+def keyframe(slam_map: Map, rng: np.random.Generator, count: int = NUM_FEATURES) -> Keyframe:
     """The next one of a map."""
-    number = map.next_keyframe
+    number = slam_map.next_keyframe
     return Keyframe(number, 10**18 + 33_333_333 * number, features(rng, count), png(number))
 
 
@@ -42,38 +42,38 @@ def pose(rng: np.random.Generator, turn: float = 0.1, move: float = 0.3) -> np.n
     return np.concatenate([wxyz / np.linalg.norm(wxyz), move * rng.normal(size=3)])
 
 
-def points(map: Map, made_by: np.ndarray, rng: np.random.Generator) -> MapPoints:
+def points(slam_map: Map, reference_keyframe: np.ndarray, rng: np.random.Generator) -> MapPoints:
     """New ones in front of the origin, half of them with a descriptor."""
-    count = len(made_by)
-    recognisable = rng.random(count) < 0.5
+    count = len(reference_keyframe)
+    recognizable = rng.random(count) < 0.5
     return MapPoints(
-        ids=map.next_point + np.arange(count),
+        ids=slam_map.next_point + np.arange(count),
         X_world=rng.uniform([[-0.6], [-0.5], [2.0]], [[0.6], [0.5], [3.0]], (3, count)),
         weight=rng.random(count).astype(np.float32),
-        descriptor=rng.integers(0, 256, (count, 32)).astype(np.uint8) * recognisable[:, None],
-        recognisable=recognisable,
-        made_by=np.asarray(made_by, np.int64),
+        descriptor=rng.integers(0, 256, (count, 32)).astype(np.uint8) * recognizable[:, None],
+        has_descriptor=recognizable,
+        reference_keyframe=np.asarray(reference_keyframe, np.int64),
         state=(np.arange(count) % 3).astype(np.int8),
     )
 
 
-def sightings(
-    map: Map, keyframes: np.ndarray, point_ids: np.ndarray, feature: np.ndarray, rng: np.random.Generator
-) -> Sightings:
+def observations(
+    slam_map: Map, keyframes: np.ndarray, point_ids: np.ndarray, feature: np.ndarray, rng: np.random.Generator
+) -> Observations:
     """Where the camera without distortion would see the points, with half a pixel of noise."""
     keyframes, point_ids = np.asarray(keyframes, np.int64), np.asarray(point_ids, np.int64)
-    X = map.points.X_world[:, np.searchsorted(map.points.ids, point_ids)]
+    X = slam_map.points.X_world[:, np.searchsorted(slam_map.points.ids, point_ids)]
     local = np.zeros((3, len(keyframes)))
     for column, number in enumerate(keyframes.tolist()):
-        local[:, column] = to_local(map.pose(number), X[:, column : column + 1])[:, 0]
-    camera = map.camera
+        local[:, column] = to_local(slam_map.pose(number), X[:, column : column + 1])[:, 0]
+    camera = slam_map.camera
     uv = np.stack([camera.fx * local[0] / local[2] + camera.cx, camera.fy * local[1] / local[2] + camera.cy])
     uv = (uv + 0.5 * rng.normal(size=uv.shape)).astype(np.float32)
-    return Sightings(
+    return Observations(
         keyframe=keyframes,
         point=point_ids,
         feature=np.asarray(feature, np.int32),
-        seen_uv=uv,
+        uv_raw=uv,
         uv=uv,
         depth=np.maximum(local[2], 0).astype(np.float32),
         sigma_px=np.ones(len(keyframes), np.float32),
@@ -90,14 +90,20 @@ def small_map(num_keyframes: int = 4, num_points: int = 10, seed: int = 0, camer
     made = with_points(made, points(made, rng.integers(0, num_keyframes, num_points), rng))
     which, point = np.divmod(np.arange(num_keyframes * num_points), num_points)
     by_feature = np.where((point % 2 == 0) & (point < NUM_FEATURES), point, NONE)
-    made = with_sightings(made, sightings(made, which, point, by_feature, rng))
+    made = with_observations(made, observations(made, which, point, by_feature, rng))
     return with_loop(made, 0, num_keyframes - 1, pose(rng), 7.0 * np.eye(6)) if num_keyframes > 1 else made
 
 
-def arrays(map: Map) -> dict[str, np.ndarray]:
+def arrays(slam_map: Map) -> dict[str, np.ndarray]:
     """All arrays of a map by a name of their own."""
-    records = {"map": map, "points": map.points, "sightings": map.sightings, "loops": map.loops, "culled": map.culled}
-    records |= {f"keyframe {number.id}": number.features for number in map.keyframes}
+    records = {
+        "map": slam_map,
+        "points": slam_map.points,
+        "observations": slam_map.observations,
+        "loops": slam_map.loops,
+        "culled": slam_map.culled,
+    }
+    records |= {f"keyframe {number.id}": number.features for number in slam_map.keyframes}
     return {
         f"{prefix}.{name}": value
         for prefix, record in records.items()

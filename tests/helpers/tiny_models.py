@@ -29,7 +29,7 @@ class Thing(NamedTuple):
     stride: int = 8
 
     @property
-    def centre(self) -> np.ndarray:
+    def center(self) -> np.ndarray:
         return np.array([self.box[0] + self.box[2], self.box[1] + self.box[3]]) / 2
 
     @property
@@ -99,7 +99,7 @@ def yolox_output(things: Iterable[Thing], size: tuple[int, int] = (WIDTH, HEIGHT
     output = np.zeros((1, num_cells(STRIDES, size), 5 + NUM_COCO), np.float32)
     for thing in things:
         row, cell = _row(thing, STRIDES, size)
-        output[0, row, :2] = thing.centre / thing.stride - cell
+        output[0, row, :2] = thing.center / thing.stride - cell
         output[0, row, 2:4] = np.log(thing.size / thing.stride)
         output[0, row, 4] = output[0, row, 5 + thing.label] = math.sqrt(thing.score)
     return output
@@ -126,7 +126,7 @@ def fastestdet(path: Path, things: Iterable[Thing], **kwargs) -> Path:
     for thing in things:
         _, (column, row) = _row(thing._replace(stride=16), (16,))
         share = thing.size / (WIDTH, HEIGHT)
-        output[0, 1:3, row, column] = np.arctanh(thing.centre / 16 - (column, row))
+        output[0, 1:3, row, column] = np.arctanh(thing.center / 16 - (column, row))
         output[0, 3:5, row, column] = np.log(share / (1 - share))
         output[0, 0, row, column] = output[0, 5 + thing.label, row, column] = thing.score
     return save(path, {"758": output}, **kwargs)
@@ -185,8 +185,8 @@ def num_cells(strides: tuple[int, ...], size: tuple[int, int] = (WIDTH, HEIGHT))
 def _row(
     thing: Thing, strides: tuple[int, ...], size: tuple[int, int] = (WIDTH, HEIGHT)
 ) -> tuple[int, tuple[int, int]]:
-    """Row of the cell that holds a thing's centre, and the cell's column and row in its map."""
-    column, row = (int(value // thing.stride) for value in thing.centre)
+    """Row of the cell that holds a thing's center, and the cell's column and row in its map."""
+    column, row = (int(value // thing.stride) for value in thing.center)
     before = num_cells(strides[: strides.index(thing.stride)], size)
     return before + row * math.ceil(size[0] / thing.stride) + column, (column, row)
 
@@ -195,7 +195,7 @@ def _yolov8_rows(things: Iterable[Thing]) -> np.ndarray:
     output = np.zeros((1, 4 + NUM_COCO, num_cells(STRIDES)), np.float32)
     for thing in things:
         row, _ = _row(thing, STRIDES)
-        output[0, :4, row] = [*thing.centre, *thing.size]
+        output[0, :4, row] = [*thing.center, *thing.size]
         output[0, 4 + thing.label, row] = thing.score
     return output
 

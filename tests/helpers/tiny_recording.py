@@ -22,7 +22,7 @@ def color(index: int) -> np.ndarray:
 
 
 def depth_counts(index: int) -> np.ndarray:
-    """A slanted wall 1.5 to 4 metres away, with one pixel in ten missing."""
+    """A slanted wall 1.5 to 4 meters away, with one pixel in ten missing."""
     counts = np.linspace(1.5 * SCALE, 4 * SCALE, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH).astype(np.uint16)
     counts[np.random.default_rng(index).random(counts.shape) < 0.1] = 0
     return counts

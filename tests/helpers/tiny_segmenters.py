@@ -1,6 +1,6 @@
 """Tiny promptable segmenters with the inputs and outputs of real ones; what they draw follows from prompts and image.
 
-An encoder gives the mean colour of blocks, normalised as the real ones are. A decoder draws the box it is asked for, or
+An encoder gives the mean color of blocks, normalized as the real ones are. A decoder draws the box it is asked for, or
 a disc around the point, in its own coordinates, but only where the image is light. Of the masks that it offers, the one
 with the highest score is right, the others are wrong all over; on the right side of its input it is unsure.
 """
@@ -40,7 +40,7 @@ def build(path: Path, text: str, constants: Mapping[str, Any]) -> Path:
 
 
 def sam(folder: Path, *, hwc: bool = False, many: bool = False, output: str = "low_res_masks", blind: bool = False):
-    """SAM's and MobileSAM's: `hwc` is an encoder that normalises and pads; `many` takes prompts at once.
+    """SAM's and MobileSAM's: `hwc` is an encoder that normalizes and pads; `many` takes prompts at once.
 
     `output` is what holds the masks; if that is `low_res_masks`, `masks` are there too, and wrong. A `blind` one draws
     in the dark too.
@@ -48,8 +48,8 @@ def sam(folder: Path, *, hwc: bool = False, many: bool = False, output: str = "l
     encoder = folder / "sam_encoder.onnx"
     if hwc:
         text = """sam (float[h, w, 3] input_image) => (float[1, 3, 16, 16] image_embeddings) {
-            centred = Sub(input_image, mean)
-            scaled = Div(centred, std)
+            centered = Sub(input_image, mean)
+            scaled = Div(centered, std)
             first = Transpose <perm = [2, 0, 1]> (scaled)
             size = Shape(first)
             missing = Sub(whole, size)
@@ -151,8 +151,8 @@ def efficient_sam(folder: Path, *, one: bool = False):
     """EfficientSAM's: images of any size, masks of theirs; `one` takes a prompt of two points at a time."""
     text = """esam (float[b, 3, h, w] batched_images) => (float[b, 3, 8, 8] image_embeddings) {
         resized = Resize <mode = "linear"> (batched_images, none, none, square)
-        centred = Sub(resized, mean)
-        normal = Div(centred, std)
+        centered = Sub(resized, mean)
+        normal = Div(centered, std)
         image_embeddings = AveragePool <kernel_shape = [16, 16], strides = [16, 16]> (normal)
     }"""
     mean, std = (values[:, None, None] / 255 for values in (MEAN, STD))
@@ -218,7 +218,7 @@ def transformers_sam(folder: Path):
 
 
 def in_context(path: Path, *, many: bool = True, side: int | None = EXAMPLE_SIDE) -> Path:
-    """SegGPT's: paints what has the mean colour of the masked part of the example; open sizes are `side=None`."""
+    """SegGPT's: paints what has the mean color of the masked part of the example; open sizes are `side=None`."""
     num, rows, tall = ("b" if many else "1"), side or "h", 2 * side if side else "tall"
     image = f"float[{num}, 3, {rows}, {rows}]"
     text = f"""seggpt ({image} pixel_values, {image} prompt_pixel_values, {image} prompt_masks)
@@ -228,16 +228,16 @@ def in_context(path: Path, *, many: bool = True, side: int | None = EXAMPLE_SIDE
         inside = Greater(white, half)
         mask = Cast <to = 1> (inside)
         area = ReduceSum <keepdims = 1> (mask, plane)
-        coloured = Mul(prompt_pixel_values, mask)
-        total = ReduceSum <keepdims = 1> (coloured, plane)
-        colour = Div(total, area)
-        apart = Sub(pixel_values, colour)
+        colored = Mul(prompt_pixel_values, mask)
+        total = ReduceSum <keepdims = 1> (colored, plane)
+        color = Div(total, area)
+        apart = Sub(pixel_values, color)
         size = Abs(apart)
         distance = ReduceSum <keepdims = 1> (size, channel)
         like = Less(distance, half)
         number = Cast <to = 1> (like)
-        centred = Sub(number, mean)
-        painted = Div(centred, std)
+        centered = Sub(number, mean)
+        painted = Div(centered, std)
         pred_masks = Concat <axis = 2> (prompt_masks, painted)
     }}"""
     mean, std = (values[:, None, None] / 255 for values in (MEAN, STD))
@@ -245,7 +245,7 @@ def in_context(path: Path, *, many: bool = True, side: int | None = EXAMPLE_SIDE
 
 
 def _drawn(blind: bool = False) -> str:
-    """From `coordinates` (k, n, 2), `kinds` (k, n, 1) and `seen` to `drawn` (k, 1, h, w) and its centre `middle`."""
+    """From `coordinates` (k, n, 2), `kinds` (k, n, 1) and `seen` to `drawn` (k, 1, h, w) and its center `middle`."""
     sums = "".join(
         f"""
         is_{name} = Equal(kinds, kind_{name})
@@ -282,8 +282,8 @@ def _drawn(blind: bool = False) -> str:
         much = Mul(light, far)
         drawn = {"Identity(pierced)" if blind else "Min(pierced, much)"}
         corners = Add(sum_first, sum_second)
-        centre = Mul(corners, half)
-        middle = Where(any_first, centre, sum_on)
+        center = Mul(corners, half)
+        middle = Where(any_first, center, sum_on)
     """
 
 
@@ -316,8 +316,8 @@ def _offered(num: int) -> str:
 
 
 def _constants(cells: int, num: int) -> dict[str, Any]:
-    centres = (np.arange(cells) + 0.5) * SIDE / cells
-    grid = np.stack(np.meshgrid(centres, centres))[None]
+    centers = (np.arange(cells) + 0.5) * SIDE / cells
+    grid = np.stack(np.meshgrid(centers, centers))[None]
     kinds = {f"kind_{name}": float(kind) for kind, name in enumerate(_KINDS, start=-1)}
     return kinds | {
         "grid": grid,

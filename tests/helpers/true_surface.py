@@ -8,7 +8,7 @@ from scipy.spatial import KDTree
 
 from jaxslam.datasets.synthetic import SyntheticDataset
 from jaxslam.datasets.synthetic.dataset import SyntheticFrame
-from jaxslam.dense.depth_view import View
+from jaxslam.dense.depth_view import DepthView
 from jaxslam.geometry.se3 import transform
 
 SEEN_M, COVERED_M = 6.0, 0.03
@@ -16,15 +16,15 @@ EVERY = 6
 
 
 class Accuracy(NamedTuple):
-    """Mean distance of points from the true surface, metres, and how much of it has a point nearby."""
+    """Mean distance of points from the true surface, meters, and how much of it has a point nearby."""
 
     mean_m: float
     coverage: float
 
 
 def true_surface(source: SyntheticDataset, frames: Sequence[SyntheticFrame], *, people: bool) -> np.ndarray:
-    """`(n, 3)` the true surface that frames see up to six metres, of what stands still or of who moves."""
-    view, points = View(source.camera, 1, 100.0, 0.1), []
+    """`(n, 3)` the true surface that frames see up to six meters, of what stands still or of who moves."""
+    view, points = DepthView(source.camera, 1, 100.0, 0.1), []
     for frame in frames:
         z = frame.exact_depth_m.reshape(1, -1)
         chosen = ((frame.instance_mask > 0) == people).ravel() & (z[0] < SEEN_M) & (frame.depth_m > 0).ravel()

@@ -1,10 +1,10 @@
 """A wall of points in keyframes that show it from here and there, for tests of which of them are wanted."""
 
 import numpy as np
-from small_map import CAMERA, features, png, sightings
+from small_map import CAMERA, features, observations, png
 
 from jaxslam.geometry.so3 import axis_rotation
-from jaxslam.map.edit import with_keyframe, with_points, with_sightings
+from jaxslam.map.edit import with_keyframe, with_observations, with_points
 from jaxslam.map.types import NONE, Keyframe, Map, MapPoints, empty_map
 
 POINTS = 100
@@ -16,7 +16,7 @@ def at(x: float = 0.0, z: float = 0.0, turn: float = 0.0) -> np.ndarray:
 
 
 def seen_from(poses: list[np.ndarray], shown: list[int], submaps: list[int] | None = None) -> Map:
-    """A wall of points two metres ahead of the origin, in keyframes that each show so many of them."""
+    """A wall of points two meters ahead of the origin, in keyframes that each show so many of them."""
     rng = np.random.default_rng(0)
     made = empty_map(CAMERA)
     submaps = [0] * len(poses) if submaps is None else submaps
@@ -30,12 +30,12 @@ def seen_from(poses: list[np.ndarray], shown: list[int], submaps: list[int] | No
         X = np.concatenate([rng.uniform(-0.5, 0.5, (2, POINTS)), np.full((1, POINTS), 2.0)])
         whole = np.ones(POINTS, np.float32)
         none, no_descriptor = np.zeros(POINTS, bool), np.zeros((POINTS, 32), np.uint8)
-        made_by, static = np.full(POINTS, maker, np.int64), np.zeros(POINTS, np.int8)
-        made = with_points(made, MapPoints(ids, X, whole, no_descriptor, none, made_by, static))
+        reference_keyframe, static = np.full(POINTS, maker, np.int64), np.zeros(POINTS, np.int8)
+        made = with_points(made, MapPoints(ids, X, whole, no_descriptor, none, reference_keyframe, static))
         for number in np.flatnonzero(np.array(submaps) == submap):
             some = ids[: shown[number]]
             by_feature = np.where(np.arange(len(some)) % 2, NONE, np.arange(len(some)))
-            made = with_sightings(made, sightings(made, np.full(len(some), number), some, by_feature, rng))
+            made = with_observations(made, observations(made, np.full(len(some), number), some, by_feature, rng))
     return made
 
 

@@ -16,7 +16,7 @@ from jaxslam_kernels.camera import (
     distort,
     in_front,
     make_intrinsics,
-    normalise,
+    normalize,
     project,
     to_pixels,
     undistort_pixels,
@@ -30,7 +30,7 @@ CAMERAS = {
     "rectified": (535.4, 539.2, 320.1, 247.6, (0.0, 0.0, 0.0, 0.0, 0.0)),
 }
 
-_project, _back_project, _normalise = jax.jit(project), jax.jit(back_project), jax.jit(normalise)
+_project, _back_project, _normalize = jax.jit(project), jax.jit(back_project), jax.jit(normalize)
 
 
 def _camera(name: str, dtype=jnp.float64) -> Intrinsics:
@@ -63,7 +63,7 @@ def test_shapes():
     X_cam = jax.eval_shape(back_project, camera, uv, depth)
     assert X_cam.shape == (3, 7)
     assert jax.eval_shape(in_front, X_cam).shape == (7,)
-    for f in (normalise, undistort_pixels, distort, to_pixels):
+    for f in (normalize, undistort_pixels, distort, to_pixels):
         assert jax.eval_shape(f, camera, uv).shape == (2, 7)
     assert jax.eval_shape(project, camera, X_cam).dtype == jnp.float32
     assert jax.eval_shape(depth_from_disparity, depth, camera.fx, 0.1).shape == (7,)
@@ -84,7 +84,7 @@ class TestAgainstOpenCV:
         src = np.ascontiguousarray(uv.T[:, None])
         expected = undistort(src, matrix, distortion, R=None, P=None, criteria=criteria)[:, 0].T
         with jax.enable_x64(True):
-            np.testing.assert_allclose(_normalise(_camera(name), jnp.asarray(uv)), expected, atol=1e-9)
+            np.testing.assert_allclose(_normalize(_camera(name), jnp.asarray(uv)), expected, atol=1e-9)
 
     def test_round_trip_over_the_whole_image(self, name):
         uv, depth = _pixels(2), np.random.default_rng(2).uniform(0.3, 8.0, N)
@@ -137,8 +137,8 @@ class TestGradient:
 def test_vmap_equals_loop():
     cameras = jax.tree.map(lambda *x: jnp.stack(x), *(_camera(name, jnp.float32) for name in CAMERAS))
     uv = jnp.asarray(_pixels(7), jnp.float32)
-    batched = jax.jit(jax.vmap(normalise, in_axes=(0, None)))(cameras, uv)
-    looped = np.stack([_normalise(_camera(name, jnp.float32), uv) for name in CAMERAS])
+    batched = jax.jit(jax.vmap(normalize, in_axes=(0, None)))(cameras, uv)
+    looped = np.stack([_normalize(_camera(name, jnp.float32), uv) for name in CAMERAS])
     np.testing.assert_allclose(batched, looped, atol=1e-6)
 
 
@@ -171,8 +171,8 @@ class TestDegenerate:
         """Where the distortion cannot be inverted the result is finite."""
         uv = jnp.asarray(np.random.default_rng(8).uniform(-1e5, 1e5, (2, N)), jnp.float32)
         camera = _camera("tum_fr1", jnp.float32)
-        assert np.isfinite(_normalise(camera, uv)).all()
-        gradient = jax.jit(jax.grad(lambda c: normalise(c, uv).sum()))(camera)
+        assert np.isfinite(_normalize(camera, uv)).all()
+        gradient = jax.jit(jax.grad(lambda c: normalize(c, uv).sum()))(camera)
         assert all(np.isfinite(g).all() for g in jax.tree.leaves(gradient))
 
     def test_disparity(self):

@@ -26,7 +26,7 @@ from quick_compile import quick_compile
 N = 11
 CASES = cases(N)
 EMPTY = cases(0)
-ANY_SHAPE = {"absolute_orientation", "adjugate", "believable", "loss_value", "loss_weight", "composed", "between"}
+ANY_SHAPE = {"absolute_orientation", "adjugate", "valid_depth", "loss_value", "loss_weight", "composed", "between"}
 INSIDE = {  # parts of kernels: called by kernels only, with what those have checked
     *("_patches", "block_band", "bundle_idle", "bundle_lens", "bundle_schur", "checks", "first_order"),
     *("fundamental_refine", "homography", "implicit", "levenberg_marquardt", "lk_search", "pose_cost"),

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from jax import lax
 from jax.test_util import check_grads
-from jaxslam_kernels.implicit_positions import Found, implicit_positions
+from jaxslam_kernels.implicit_positions import ConvergedPositions, implicit_positions
 
 N = 6
 
@@ -39,7 +39,7 @@ def _solve(inputs):
     finite = jnp.isfinite(position).all(axis=0)
     slack = jnp.sum(jnp.square(slope), axis=0)
     measures = jax.tree.map(lambda a: jnp.where(finite, a, 0), {**measures, "slack": slack})
-    return Found(jnp.where(finite[None, :], position, 0), inputs.accepted & finite, measures)
+    return ConvergedPositions(jnp.where(finite[None, :], position, 0), inputs.accepted & finite, measures)
 
 
 def _found(inputs):
@@ -126,7 +126,7 @@ class TestImplicitPositions:
         turn = np.array([[0.6, -0.8], [0.8, 0.6]])
         matrix = jnp.asarray(turn @ np.diag([1, weak]) @ turn.T)
         system = lambda position, b: matrix @ position - b
-        solve = lambda b: Found(jnp.linalg.solve(matrix, b), jnp.ones(N, bool), ())
+        solve = lambda b: ConvergedPositions(jnp.linalg.solve(matrix, b), jnp.ones(N, bool), ())
         find = jax.jit(lambda b: implicit_positions(solve, lambda p, b: (system(p, b), ()), b).positions)
         derivative = jax.jit(jax.jacrev(find))(jnp.ones((2, N)))[:, 0, :, 0]
         np.testing.assert_allclose(derivative, np.linalg.inv(matrix), rtol=1e-6)
@@ -135,7 +135,7 @@ class TestImplicitPositions:
     def test_a_singular_system_has_derivative_zero(self, x64, weak):
         matrix = jnp.array([[1.0, 1.0], [1.0, 1.0 + weak]])
         explain = lambda position, b: (matrix @ position - b, jnp.sum(position * b, axis=0))
-        solve = lambda b: Found(b / 2, jnp.ones(N, bool), jnp.zeros(N))
+        solve = lambda b: ConvergedPositions(b / 2, jnp.ones(N, bool), jnp.zeros(N))
         gradient = jax.jit(jax.grad(lambda b: sum(map(jnp.sum, implicit_positions(solve, explain, b)[::2]))))
         np.testing.assert_array_equal(gradient(jnp.ones((2, N))), 0)
 

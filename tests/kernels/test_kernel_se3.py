@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxlie import SE3
-from jaxslam_kernels.se3 import between, cross_matrix, displacement, moved, to_camera, to_world
+from jaxslam_kernels.se3 import between, cross_matrix, displacement, retract, to_camera, to_world
 from scipy.linalg import expm
 
 
@@ -42,7 +42,7 @@ class TestTransform:
         np.testing.assert_allclose(
             between(A, B).as_matrix(), np.linalg.inv(A.as_matrix()) @ np.asarray(B.as_matrix()), atol=1e-12
         )
-        there = moved(A, jnp.asarray(tangent))
+        there = retract(A, jnp.asarray(tangent))
         np.testing.assert_allclose(there.as_matrix(), np.asarray(A.as_matrix()) @ expm(hat(tangent)), atol=1e-12)
         np.testing.assert_allclose(displacement(A, there), tangent, atol=1e-12)
 
@@ -55,7 +55,7 @@ class TestTransform:
     @pytest.mark.parametrize("size", [0.0, 1e-7, 0.7])
     def test_gradient(self, size):
         A, direction = random_pose(6), np.random.default_rng(7).normal(size=6)
-        loss = lambda tangent: jnp.sum(displacement(A, moved(A, tangent)) * direction)
+        loss = lambda tangent: jnp.sum(displacement(A, retract(A, tangent)) * direction)
         at = jnp.asarray(size * np.random.default_rng(8).normal(size=6))
         # The displacement undoes the move: the gradient is the direction itself, also where nothing moves.
         # (jaxlie cancels digits just above its switch to a series, 3e-8 at 1e-7.)
@@ -65,8 +65,8 @@ class TestTransform:
     def test_vmap_equals_loop(self):
         tangents = jnp.asarray(np.random.default_rng(9).normal(size=(4, 6)))
         A = random_pose(10)
-        batched = jax.vmap(lambda t: moved(A, t).wxyz_xyz)(tangents)
-        np.testing.assert_allclose(batched, [moved(A, t).wxyz_xyz for t in tangents], atol=1e-14)
+        batched = jax.vmap(lambda t: retract(A, t).wxyz_xyz)(tangents)
+        np.testing.assert_allclose(batched, [retract(A, t).wxyz_xyz for t in tangents], atol=1e-14)
 
     def test_single_trace(self):
         step = eqx.filter_jit(eqx.debug.assert_max_traces(displacement, max_traces=1))
@@ -76,7 +76,7 @@ class TestTransform:
     def test_degenerate(self):
         nothing = displacement(random_pose(11), random_pose(11))
         np.testing.assert_allclose(nothing, 0, atol=1e-15)
-        half_turn = moved(SE3.identity(), jnp.asarray([0, 0, 0, np.pi, 0, 0]))
+        half_turn = retract(SE3.identity(), jnp.asarray([0, 0, 0, np.pi, 0, 0]))
         assert np.isfinite(displacement(SE3.identity(), half_turn)).all()
 
     def test_cross_matrix(self):

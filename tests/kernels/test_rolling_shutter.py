@@ -33,7 +33,7 @@ def _corrected_and_gradients(*inputs):
 
 @jax.jit
 def _seen_at(seconds, X_cam, twist):
-    """Normalised coordinates and depth of points, each when the camera has moved for its own time; exact."""
+    """Normalized coordinates and depth of points, each when the camera has moved for its own time; exact."""
     move = lambda t, X: SE3.exp(-t * twist).as_matrix()[:3] @ jnp.append(X, 1.0)
     X = jax.vmap(move, in_axes=(0, 1), out_axes=1)(seconds, X_cam)
     return X[:2] / X[2:], X[2]

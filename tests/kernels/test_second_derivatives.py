@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxslam_kernels.camera import make_intrinsics, normalise
+from jaxslam_kernels.camera import make_intrinsics, normalize
 from jaxslam_kernels.first_order import first_order
 from jaxslam_kernels.flow.lk_flow import FlowPlan, lk_flow
 from jaxslam_kernels.flow.lk_search import LevelPlan
@@ -17,7 +17,7 @@ from small_problems import (
     graph_inputs,
     match,
     match_inputs,
-    optimise,
+    optimize,
     pose_inputs,
     ransac,
     refine,
@@ -28,7 +28,7 @@ SOLVERS = {
     "refine_pose cost": (lambda w: refine(pose_inputs(), w).cost, 12),
     "ransac_pnp": (lambda w: ransac(pose_inputs(), w).T_world_cam.wxyz_xyz.sum(), 12),
     "bundle_adjust": (lambda w: adjust(bundle_inputs(), w).X_world.sum(), 8),
-    "optimise_pose_graph": (lambda w: optimise(graph_inputs(), w).T_world_cam.wxyz_xyz.sum(), 6),
+    "optimize_pose_graph": (lambda w: optimize(graph_inputs(), w).T_world_cam.wxyz_xyz.sum(), 6),
     "ransac_fundamental": (lambda w: match(match_inputs(), w).F.sum(), 20),
 }
 ORDERS = {
@@ -144,7 +144,7 @@ def _patches(t):
 def _directions(t):
     camera = make_intrinsics(200.0, 210.0, 80.0, 60.0, (0.2, -0.1, 0.002, -0.003, 0.03), dtype=jnp.float64)
     moved = camera._replace(fx=camera.fx + 10 * t, distortion=camera.distortion * (1 + t))
-    return normalise(moved, jnp.array([[20.0, 150, 80], [30.0, 100, 61]]) + 10 * t).ravel()
+    return normalize(moved, jnp.array([[20.0, 150, 80], [30.0, 100, 61]]) + 10 * t).ravel()
 
 
 @pytest.mark.parametrize("kernel", [_flow, _patches, _directions])

@@ -17,7 +17,7 @@ from small_problems import (
     graph_inputs,
     match,
     match_inputs,
-    optimise,
+    optimize,
     pose_inputs,
     ransac,
     refine,
@@ -149,7 +149,7 @@ def test_pose_graph():
     edges = edges._replace(target=edges.target.at[5].set(3))
 
     def solve(weights):
-        result = optimise((start, edges), weights)
+        result = optimize((start, edges), weights)
         return (result.T_world_cam.wxyz_xyz[:3], result.cost, result.cost_before), result.status
 
     jacobian = _compare(solve, jnp.ones(6).at[5].set(0.0), [1], PoseGraphStatus.DISCONNECTED)

@@ -19,13 +19,13 @@ from jaxslam.benchmark.kernels.scenes.room_views import (
 )
 from jaxslam.benchmark.reference_flow import NUM_CORNERS, opencv_flow
 from jaxslam.config.schema import DynamicsConfig, OcclusionConfig, TrackConfig
-from jaxslam.dynamics.cue import Scene, combined
+from jaxslam.dynamics.cue import CueInput, combine_cues
 from jaxslam.dynamics.occlusion import PointState
 from jaxslam.dynamics.regions import RegionMemory, RegionPlan, find_regions, moving_pixels, no_regions
 from jaxslam.features.orb import DESCRIPTOR_BYTES, Features
 from jaxslam.geometry.se3 import between, to_local, transform
-from jaxslam.map.edit import with_keyframe, with_points, with_sightings
-from jaxslam.map.types import NONE, Keyframe, Map, MapPoints, Sightings, empty_map
+from jaxslam.map.edit import with_keyframe, with_observations, with_points
+from jaxslam.map.types import NONE, Keyframe, Map, MapPoints, Observations, empty_map
 from jaxslam.mapping.occlusion_states import PointStates
 from jaxslam.sensors.frame_arrays import FrameMemory
 from jaxslam.tracking.cue_registry import with_cue_params, with_cues
@@ -60,7 +60,7 @@ def _clusters(num_points: int) -> Problem:
     regions_plan = plan.regions or RegionPlan()
     depth, height, width = jnp.asarray(views.now.depth_m), views.camera.height, views.camera.width
 
-    def ours(scene: Scene, depth: Any, before: RegionMemory, params: tuple[Any, ...]) -> Any:
+    def ours(scene: CueInput, depth: Any, before: RegionMemory, params: tuple[Any, ...]) -> Any:
         X_cam = back_project(scene.intrinsics, scene.uv, scene.depth)
         regions = find_regions(scene.key, depth, before.centers, X_cam, scene.intrinsics, regions_plan)
         verdict = plan.cues[0](scene._replace(regions=regions), params[0])
@@ -75,7 +75,7 @@ def _clusters(num_points: int) -> Problem:
     )
 
 
-def _settled(views: RoomViews, scene: Scene, plan: RegionPlan) -> RegionMemory:
+def _settled(views: RoomViews, scene: CueInput, plan: RegionPlan) -> RegionMemory:
     """The regions of the frame before, as of a tracker that has seen many."""
     many = plan._replace(num_steps=_SETTLING_STEPS)
     depth, nowhere = jnp.asarray(views.before.depth_m), jnp.zeros((3, 0), jnp.float32)
@@ -89,8 +89,8 @@ def _epipolar_trajectory(num_points: int) -> Problem:
     scene, moves = followed_points(views, num_points)
     plan, params = _chosen(views, DynamicsConfig(cues=("epipolar", "trajectory")))
 
-    def ours(scene: Scene, params: tuple[Any, ...]) -> Any:
-        return combined([cue(scene, its) for cue, its in zip(plan.cues, params, strict=True)], scene.weight)
+    def ours(scene: CueInput, params: tuple[Any, ...]) -> Any:
+        return combine_cues([cue(scene, its) for cue, its in zip(plan.cues, params, strict=True)], scene.weight)
 
     return Problem(ours, (scene, params), _flow(), lambda ours, _: _wrong(ours, moves))
 
@@ -100,15 +100,15 @@ def _occlusion(num_points: int) -> Problem:
     views = room_views()
     X_world = _of_empty_room(views, num_points)
     under = _under(views, X_world)
-    map = _keyframe_map(views, X_world, np.where(under, PointState.BLOCKED, PointState.STATIC).astype(np.int8))
-    states = PointStates(OcclusionConfig(enabled=True), track_params(views.camera, TrackConfig()), map, num_points)
+    slam_map = _keyframe_map(views, X_world, np.where(under, PointState.BLOCKED, PointState.STATIC).astype(np.int8))
+    states = PointStates(OcclusionConfig(enabled=True), track_params(views.camera, TrackConfig()), slam_map, num_points)
     arrays = FrameMemory(views.camera.height, views.camera.width).hold(views.empty.measured, 1 / 30)
-    T_keyframe_cam = between(map.pose(0), views.empty.T_world_cam)
+    T_keyframe_cam = between(slam_map.pose(0), views.empty.T_world_cam)
     still = np.zeros(6, np.float32)
     share = float(np.mean(under))
 
     return Problem(
-        lambda: np.float64(states.see(map, 0, T_keyframe_cam, still, arrays)),
+        lambda: np.float64(states.see(slam_map, 0, T_keyframe_cam, still, arrays)),
         (),
         _flow(),
         lambda ours, _: abs(float(ours) - share),
@@ -140,9 +140,9 @@ def _keyframe_map(views: RoomViews, X_world: np.ndarray, states: np.ndarray) -> 
     no_descriptor = np.zeros((num, DESCRIPTOR_BYTES), np.uint8)
     points = MapPoints(ids, X_world, whole, no_descriptor, np.zeros(num, bool), np.zeros(num, np.int64), states)
     by_flow = np.full(num, NONE, np.int32)
-    seen = Sightings(np.zeros(num, np.int64), ids, by_flow, uv, uv, depth, whole, whole)
-    map = with_points(with_keyframe(empty_map(views.camera), keyframe, pose, NONE, 0), points)
-    return with_sightings(map, seen)
+    seen = Observations(np.zeros(num, np.int64), ids, by_flow, uv, uv, depth, whole, whole)
+    slam_map = with_points(with_keyframe(empty_map(views.camera), keyframe, pose, NONE, 0), points)
+    return with_observations(slam_map, seen)
 
 
 def _no_features() -> Features:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxlie import SE3
 from jaxslam_kernels.bundle.bundle_adjust import bundle_adjust
 from jaxslam_kernels.pose_graph.cost import PoseGraphEdges
-from jaxslam_kernels.pose_graph.pose_graph import Elimination, band_rank, optimise_pose_graph
+from jaxslam_kernels.pose_graph.pose_graph import Elimination, band_rank, optimize_pose_graph
 
 from jaxslam.benchmark.kernels.case import Case, Problem
 from jaxslam.benchmark.kernels.scenes.bundle_window import make_window, without_depth
@@ -39,7 +39,7 @@ def _adjust(num_keyframes: int) -> Problem:
     )
 
 
-def _optimise(num_keyframes: int, elimination: Elimination) -> Problem:
+def _optimize(num_keyframes: int, elimination: Elimination) -> Problem:
     graph = loop_graph(0, num_keyframes)
     m, single = len(graph.source), lambda x: jnp.asarray(x, jnp.float32)
     edges = PoseGraphEdges(
@@ -53,7 +53,7 @@ def _optimise(num_keyframes: int, elimination: Elimination) -> Problem:
     rank = jnp.asarray(band_rank(graph.source, graph.target, num_keyframes))
 
     def ours(T: Any, edges: Any, fixed: Any, rank: Any) -> Any:
-        return optimise_pose_graph(T, edges, fixed, rank=rank, elimination=elimination)
+        return optimize_pose_graph(T, edges, fixed, rank=rank, elimination=elimination)
 
     @cache
     def prepare() -> tuple[Any, ...]:
@@ -97,7 +97,7 @@ GRAPH_CASES = (
         compared=f"{_ROUND_TRIP}; ours with SciPy's sparse factors, `elimination='host'`",
         difference="relative difference of the final cost",
         limit=0.01,
-        problem=partial(_optimise, elimination="host"),
+        problem=partial(_optimize, elimination="host"),
         packages=("gtsam",),
     ),
     Case(
@@ -108,7 +108,7 @@ GRAPH_CASES = (
         compared=f"{_ROUND_TRIP}; ours compiled whole, `elimination='band'`",
         difference="relative difference of the final cost",
         limit=0.01,
-        problem=partial(_optimise, elimination="band"),
+        problem=partial(_optimize, elimination="band"),
         packages=("gtsam",),
     ),
 )

@@ -11,7 +11,7 @@ import numpy as np
 from jaxslam.benchmark.kernels.case import Case, Problem
 from jaxslam.benchmark.timing import call_times, compare, compiled
 
-_WARM_UP, _MOST_S = 2, 5.0
+_WARM_UP, _MAX_S = 2, 5.0
 
 
 def devices() -> list[Any]:
@@ -41,7 +41,7 @@ def _row(case: Case, size: int, device: Any, rounds: int) -> dict[str, Any]:
     problem, absent = case.problem(size), case.missing()
     arguments = jax.device_put(problem.arguments, device)
     program, compile_s = _program(problem, arguments)
-    limits = {"rounds": rounds, "warm_up": _WARM_UP, "most_s": _MOST_S}
+    limits = {"rounds": rounds, "warm_up": _WARM_UP, "most_s": _MAX_S}
     row: dict[str, Any] = {
         "kernel": case.name,
         "size": size,

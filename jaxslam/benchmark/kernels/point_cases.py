@@ -37,8 +37,8 @@ def paths(n: int) -> tuple[np.ndarray, np.ndarray]:
 def movers(n: int) -> np.ndarray:
     """`(2, n)` pixels: six groups on people, and a quarter of outliers."""
     random = np.random.default_rng(0)
-    centres = random.uniform([[50], [50]], [[590], [430]], (2, 6))
-    points = centres[:, random.integers(0, 6, n)] + 20 * random.normal(size=(2, n))
+    centers = random.uniform([[50], [50]], [[590], [430]], (2, 6))
+    points = centers[:, random.integers(0, 6, n)] + 20 * random.normal(size=(2, n))
     return np.where(random.uniform(size=n) < 0.25, random.uniform([[0], [0]], [[640], [480]], (2, n)), points)
 
 

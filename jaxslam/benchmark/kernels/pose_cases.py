@@ -12,7 +12,7 @@ from jaxslam_kernels.pose.pose_refine import refine_pose
 from scipy.spatial.transform import Rotation
 
 from jaxslam.benchmark.kernels.case import Case, Problem
-from jaxslam.benchmark.kernels.scenes.single_view import DISTORTION, MATRIX, Scene, camera, make_scene
+from jaxslam.benchmark.kernels.scenes.single_view import DISTORTION, MATRIX, PosedPoints, camera, make_scene
 
 _THRESHOLD_PX = 3.0
 _POINTS = 500
@@ -33,7 +33,7 @@ def _ransac_hypotheses(num_hypotheses: int) -> Problem:
     return _ransac_problem(scene, num_hypotheses, **options)
 
 
-def _ransac_problem(scene: Scene, num_hypotheses: int, **options: Any) -> Problem:
+def _ransac_problem(scene: PosedPoints, num_hypotheses: int, **options: Any) -> Problem:
     X_world, uv, _, _ = scene.arrays(jnp.float32)
     X, pixels = scene.X_world.T.copy(), scene.uv.T.copy()
 
@@ -56,7 +56,7 @@ def _refine_of(T: Any, X_world: Any, uv: Any, intrinsics: Any) -> Any:
     return refine_pose(T, X_world, uv, intrinsics, loss="squared").T_world_cam.wxyz_xyz
 
 
-def _opencv_refine(scene: Scene) -> Any:
+def _opencv_refine(scene: PosedPoints) -> Any:
     """A function that refines the pose of a scene, and gives rotation and translation vectors."""
     X, uv = scene.X_world.T.copy(), scene.uv.T.copy()
     rotation = Rotation.from_quat(np.roll(scene.initial[:4], -1)).inv()

@@ -26,7 +26,7 @@ from jaxslam.benchmark.suites.suite import Suite
 from jaxslam.visualization.plots import png
 
 _PICTURE_PX = 1000
-_COLOURED = ("better", "worse")
+_COLORED = ("better", "worse")
 _PICTURES = {
     "failures.png": "where it was lost, and the largest error",
     "masks.png": "what was left out as moving",
@@ -117,7 +117,7 @@ def _table(lines: Sequence[Sequence[str]]) -> str:
 
 
 def _cell(text: str) -> str:
-    look = f' class="{text}"' if text in _COLOURED else ""
+    look = f' class="{text}"' if text in _COLORED else ""
     return f"<td{look}>{_text(text)}</td>"
 
 

@@ -16,7 +16,7 @@ from jaxslam.visualization.plots import with_breaks
 _WIDTH_IN, _DPI = 4.8, 160
 """So that the letters can be read on a telephone, across its whole width."""
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
-"""Told apart by the colour-blind too (Okabe and Ito)."""
+"""Told apart by the color-blind too (Okabe and Ito)."""
 _STAGES = ("take over", "flow", "wait for mask", "pose", "match with map", "hand over")
 _ROOM = 0.15
 _LONGEST = 29
@@ -78,7 +78,7 @@ def plot_paths(done: Sequence[Mapping[str, Any]], out: Path) -> Figure | None:
         axes.set(xlim=(low[0] - room, high[0] + room), ylim=(low[1] - room, high[1] + room), aspect="equal")
         axes.grid(alpha=0.3)
         axes.tick_params(labelsize=8)
-    figure.supxlabel(f"{'xyz'[plane[0]]} [m], truth in grey", fontsize=9)
+    figure.supxlabel(f"{'xyz'[plane[0]]} [m], truth in gray", fontsize=9)
     figure.supylabel(f"{'xyz'[plane[1]]} [m]", fontsize=9)
     return figure
 

@@ -22,7 +22,7 @@ from jaxslam.benchmark.suites.run_names import run_folder
 from jaxslam.errors import BenchmarkError
 from jaxslam.io.atomic_files import write_atomically
 
-MOST_MEAN, MOST_RECORDING = 1.04, 1.15
+MAX_MEAN, MAX_RECORDING = 1.04, 1.15
 """Ratios of median errors that are not worse: of the geometric mean over recordings, and of a single recording."""
 _DRAWS, _PERCENT = 4000, (2.5, 97.5)
 _NO_NETWORK = "none"
@@ -250,13 +250,13 @@ def _check_same(name: str, now: Measured, before: Measured | None) -> None:
 
 def _worse(rows: Sequence[Compared], mean: float | None) -> list[str]:
     found = []
-    if mean is not None and mean > MOST_MEAN:
-        found.append(f"geometric mean of the ratios {mean:.3f}, expected at most {MOST_MEAN:g}")
+    if mean is not None and mean > MAX_MEAN:
+        found.append(f"geometric mean of the ratios {mean:.3f}, expected at most {MAX_MEAN:g}")
     for row in rows:
         if row.before is None or row.ratio is None:
             continue
-        if row.ratio > MOST_RECORDING:
-            found.append(f"{row.name}: ratio {row.ratio:.3f}, expected at most {MOST_RECORDING:g}")
+        if row.ratio > MAX_RECORDING:
+            found.append(f"{row.name}: ratio {row.ratio:.3f}, expected at most {MAX_RECORDING:g}")
         if row.now.tracked < row.before.tracked:
             found.append(f"{row.name}: {row.now.tracked} frames tracked over all seeds, expected {row.before.tracked}")
     return found

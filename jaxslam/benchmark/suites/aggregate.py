@@ -43,7 +43,7 @@ ACCURACY = (
 RUNNING = (
     Column("dropped, %", "dropped_percent", 1),
     Column("first loss, s", "first_loss_s", 2, "least"),
-    Column("found again", "relocalised", 0),
+    Column("found again", "relocalized", 0),
     Column("mask age, frames", "mask_age_median", 0),
     Column("ms", "track_ms_median", 1),
     Column("p95, ms", "track_ms_p95", 1),

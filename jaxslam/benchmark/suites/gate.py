@@ -28,9 +28,9 @@ _WORSE_ATE, _WORSE_TIME = 0.02, 0.2
 _NOISE, _ROUNDING = 4.0, 0.05
 """Where rounding differs: so many standard deviations of the errors over seeds, or this share of them. With XLA held to
 AVX2, AVX and SSE4.2 on one processor, errors of `smoke` differ by 0.02, 0.8 and 2.2 % at most."""
-_LEAST_ATE_M = 1e-5
+_MIN_ATE_M = 1e-5
 """Smaller differences are of no interest to anybody."""
-_LEAST_PERCENT = 1e-6
+_MIN_PERCENT = 1e-6
 _TRACKED, _TIME = "tracked_percent", "time_of_flows"
 """The last: the median frame of a run, in times of optical flow."""
 
@@ -170,14 +170,14 @@ def _limits(baseline: Baseline, results: Sequence[Mapping[str, Any]]) -> Callabl
 
     def limit(row: str, figure: str, before: float) -> float:
         if figure == _TRACKED:
-            return before - _LEAST_PERCENT
+            return before - _MIN_PERCENT
         if figure == _TIME:
             return before * (1 + _WORSE_TIME) if same_machine else np.inf
         noise = _NOISE * max(
             (share for label, share in baseline.noise.items() if row.endswith(f", {label}")), default=0.0
         )
         share = _WORSE_ATE if same_rounding else max(_ROUNDING, noise)
-        return before * (1 + share) + _LEAST_ATE_M
+        return before * (1 + share) + _MIN_ATE_M
 
     return limit
 

@@ -18,7 +18,7 @@ from jaxslam.runtime.machine import machine
 from jaxslam.runtime.trace_cache import source_files
 from jaxslam.semantics.from_config import network_files
 
-_MOST_HASHED_BYTES = 5_000_000
+_MAX_HASHED_BYTES = 5_000_000
 _HASHED = (".txt", ".yaml", ".csv")
 _COMPUTED_BY = ("commit", "versions")
 
@@ -118,7 +118,7 @@ def data_sha256(folder: Path) -> str:
     for path in sorted(path for path in folder.rglob("*") if path.is_file()):
         size = path.stat().st_size
         digest.update(f"{path.relative_to(folder)} {size}\n".encode())
-        if path.suffix in _HASHED and size <= _MOST_HASHED_BYTES:
+        if path.suffix in _HASHED and size <= _MAX_HASHED_BYTES:
             digest.update(path.read_bytes())
     return digest.hexdigest()
 

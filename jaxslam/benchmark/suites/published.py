@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias, get_args
 
 from jaxslam.config.schema import configs_dir
-from jaxslam.config.validation import Checked, Range, checked_value, field_hints
+from jaxslam.config.validation import Range, ValidatedConfig, checked_value, field_hints
 from jaxslam.errors import ConfigError, nearest
 from jaxslam.io.yaml_files import check_keys, read_mapping
 
@@ -41,7 +41,7 @@ _TABLE_KEYS = ("source", "system", "variant", "sensor", "alignment", "note", "me
 
 
 @dataclass(frozen=True)
-class Figure(Checked):
+class Figure(ValidatedConfig):
     """One published number.
 
     Attributes:
@@ -72,7 +72,7 @@ class Figure(Checked):
 
 
 @dataclass(frozen=True)
-class PublishedSystem(Checked):
+class PublishedSystem(ValidatedConfig):
     """One file: a paper and the figures in it.
 
     Attributes:

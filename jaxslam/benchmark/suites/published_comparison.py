@@ -13,13 +13,13 @@ from jaxslam.datasets.catalog import known_recordings
 NO_VERDICT = "no verdict"
 VERDICTS: tuple[Verdict, ...] = ("better", "in range", "worse")
 
-_LEAST_TRACKED_PERCENT = 95.0
+_MIN_TRACKED_PERCENT = 95.0
 """Of all frames, dropped ones too: an error of the easy part of a recording says nothing about the rest."""
-_ALL_IMAGES, _LEAST_WITH_DEPTH = 0.99, 0.9
+_ALL_IMAGES, _MIN_WITH_DEPTH = 0.99, 0.9
 """Shares of the published length. Of the color images of TUM up to 7 % have no depth image at the same time."""
-_LEAST_MATCHED_PERCENT = 90.0
+_MIN_MATCHED_PERCENT = 90.0
 """Of the frames, with ground truth at their time."""
-_LEAST_COVERED_PERCENT = 80.0
+_MIN_COVERED_PERCENT = 80.0
 """Of the time of the ground truth, where the published length is not known. That of TUM fr1 begins before the images
 and ends after them: those of fr1 xyz cover 88 %."""
 
@@ -87,7 +87,7 @@ def reservations(suite: Suite, row: Mapping[str, Any]) -> list[str]:
     found = [f"{row['done']} of {row['runs']} planned runs are done"] if row["done"] < row["runs"] else []
     found += ["run without the network that the preset needs"] if row["lacks_network"] else []
     tracked = _of(row, "tracked_of_all_percent", "least")
-    if tracked is not None and tracked < _LEAST_TRACKED_PERCENT:
+    if tracked is not None and tracked < _MIN_TRACKED_PERCENT:
         late = _of(row, "dropped_percent", "most")
         found.append(f"{tracked:.1f} % of the frames tracked" + (f", {late:.1f} % dropped" if late else ""))
     without = sum(row["unevaluated"].values())
@@ -175,16 +175,16 @@ def _of_a_part(recording: str, frames: float, images: float) -> list[str]:
         return []
     if images < _ALL_IMAGES * length:
         return [f"a part of the recording: {images:.0f} of {length} images"]
-    return [f"{frames:.0f} frames of {length} images"] if frames < _LEAST_WITH_DEPTH * length else []
+    return [f"{frames:.0f} frames of {length} images"] if frames < _MIN_WITH_DEPTH * length else []
 
 
 def _without_truth(recording: str, row: Mapping[str, Any]) -> list[str]:
     matched, covered = _of(row, "matched_percent", "least"), _of(row, "span_percent", "least")
     if row["ate_rmse_m"] is None or matched is None:
         return []
-    if matched < _LEAST_MATCHED_PERCENT:
+    if matched < _MIN_MATCHED_PERCENT:
         return [f"{matched:.1f} % of the frames matched with ground truth"]
-    if not length_is_known(recording) and covered is not None and covered < _LEAST_COVERED_PERCENT:
+    if not length_is_known(recording) and covered is not None and covered < _MIN_COVERED_PERCENT:
         return [f"the published length is not known, and frames cover {covered:.1f} % of the time of the ground truth"]
     return []
 

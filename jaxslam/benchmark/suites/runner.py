@@ -13,7 +13,7 @@ from jaxslam.benchmark.suites.job import Job, run_in_process, stored
 from jaxslam.benchmark.suites.provenance import changes, identities
 from jaxslam.datasets.catalog import found_recordings
 
-_MOST_REASONS = 4
+_MAX_REASONS = 4
 _ROOMS = ".rooms"
 """Frames of rendered rooms, as long as there are runs that need them."""
 
@@ -61,7 +61,7 @@ def run_jobs(
         there[job][1].extend(changes(there[job][0], now))
     for job, (result, different) in there.items():
         if different:
-            on_stale(job, "; ".join(different[:_MOST_REASONS]) + (" ..." if len(different) > _MOST_REASONS else ""))
+            on_stale(job, "; ".join(different[:_MAX_REASONS]) + (" ..." if len(different) > _MAX_REASONS else ""))
         else:
             on_result(result)
     for _, result in executor.run([job for job in jobs if job not in there or there[job][1]], out):

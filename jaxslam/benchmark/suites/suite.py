@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 from jaxslam.config.schema import Config, configs_dir, load_config, presets, updated
-from jaxslam.config.validation import Checked, Range
+from jaxslam.config.validation import Range, ValidatedConfig
 from jaxslam.datasets.catalog import name_of
 from jaxslam.datasets.synthetic import SyntheticConfig
 from jaxslam.errors import BenchmarkError, JaxSlamError, nearest
@@ -37,7 +37,7 @@ _Positive = Range(at_least=1)
 
 
 @dataclass(frozen=True)
-class Sequence(Checked):
+class Sequence(ValidatedConfig):
     """A recording or a part of one, or a rendered room.
 
     Attributes:

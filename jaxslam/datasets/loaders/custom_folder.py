@@ -11,13 +11,13 @@ from jaxslam.datasets.paired_images import ImagePairs, check_stereo, moved
 from jaxslam.datasets.protocol import Fit, Loader
 from jaxslam.errors import CameraError, DatasetError
 from jaxslam.sensors.camera import Camera
-from jaxslam.sensors.image_files import read_color, read_depth, read_depth_metres
+from jaxslam.sensors.image_files import read_color, read_depth, read_depth_meters
 from jaxslam.sensors.rectification import RectifiedPair
 from jaxslam.trajectory.trajectory import Trajectory, read_tum
 
 _COLOR, _DEPTH, _LEFT, _RIGHT = ("rgb", "color", "image"), "depth", "left", "right"
 _TIMES, _GROUND_TRUTH = "times.txt", "groundtruth.txt"
-_METRES = ".npy"
+_METERS = ".npy"
 
 
 class _Layout(NamedTuple):
@@ -31,8 +31,8 @@ class _Layout(NamedTuple):
 class FolderDataset(ImagePairs):
     """Two folders of images, the n-th of one with the n-th of the other, sorted by name.
 
-    `left` and `right` hold a stereo pair; `rgb` (or `color`, `image`) and `depth` colour and depth, as counts in .png
-    (`depth_scale_per_m` of the camera) or as metres in .npy. Times are those of `times.txt` (seconds, one a line);
+    `left` and `right` hold a stereo pair; `rgb` (or `color`, `image`) and `depth` color and depth, as counts in .png
+    (`depth_scale_per_m` of the camera) or as meters in .npy. Times are those of `times.txt` (seconds, one a line);
     without it those that are the names, as nanoseconds (16 to 19 digits) or seconds (with decimals); without either,
     frames follow each other at `fps` of the camera. `groundtruth.txt` may hold poses in the format of TUM.
 
@@ -75,8 +75,8 @@ class FolderDataset(ImagePairs):
         return read_color, read_color if self.camera.is_stereo else self._depth
 
     def _depth(self, path: Path) -> np.ndarray:
-        if path.suffix == _METRES:
-            return read_depth_metres(path)
+        if path.suffix == _METERS:
+            return read_depth_meters(path)
         return read_depth(path, self.camera.depth_scale_per_m or 1.0)  # checked at the start
 
 
@@ -96,10 +96,10 @@ def _layout(folder: Path) -> _Layout:
 
 
 def _depth_files(folder: Path) -> list[Path]:
-    kinds = {path.suffix for path in folder.iterdir() if path.suffix in (".png", _METRES)}
+    kinds = {path.suffix for path in folder.iterdir() if path.suffix in (".png", _METERS)}
     if len(kinds) > 1:
         raise DatasetError(f"{folder}: expected depth as .png or as .npy, got both")
-    return files_in(folder, (".png", _METRES))
+    return files_in(folder, (".png", _METERS))
 
 
 def _check_camera(camera: Camera, folder: Path, layout: _Layout, suffix: str) -> None:
@@ -108,7 +108,7 @@ def _check_camera(camera: Camera, folder: Path, layout: _Layout, suffix: str) ->
         return
     if camera.is_stereo:
         raise CameraError(f"camera '{camera.name}': expected one with depth for {folder}, got a stereo pair")
-    if suffix != _METRES and camera.depth_scale_per_m is None:
+    if suffix != _METERS and camera.depth_scale_per_m is None:
         raise CameraError(f"camera '{camera.name}': depth_scale_per_m: expected a number for depth as .png, got none")
 
 

@@ -16,7 +16,7 @@ from jaxslam.errors import CameraError, DatasetError
 from jaxslam.geometry.se3 import between, compose
 from jaxslam.io.yaml_files import read_mapping
 from jaxslam.sensors.camera import Camera
-from jaxslam.sensors.image_files import read_grey
+from jaxslam.sensors.image_files import read_gray
 from jaxslam.sensors.rectification import RectifiedPair
 from jaxslam.sensors.stereo_rig import Rig
 from jaxslam.sensors.stereo_rig_formats import lens_of_kalibr, transform_of
@@ -71,7 +71,7 @@ class EurocDataset(ImagePairs):
 
     @property
     def _readers(self) -> tuple[Callable[[Path], np.ndarray], Callable[[Path], np.ndarray]]:
-        return read_grey, read_grey
+        return read_gray, read_gray
 
 
 def _mav(folder: Path) -> Path:

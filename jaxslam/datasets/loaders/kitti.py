@@ -1,4 +1,4 @@
-"""Recordings of the KITTI odometry benchmark: rectified stereo pairs, grey or in colour, from a car.
+"""Recordings of the KITTI odometry benchmark: rectified stereo pairs, gray or in color, from a car.
 
 Source: Geiger, Lenz and Urtasun, "Are we ready for Autonomous Driving? The KITTI Vision Benchmark Suite", CVPR 2012.
 """
@@ -13,7 +13,7 @@ from jaxslam.datasets.paired_images import ImagePairs, check_stereo, moved
 from jaxslam.datasets.protocol import Fit, Loader
 from jaxslam.errors import CameraError, DatasetError, TrajectoryError
 from jaxslam.sensors.camera import Camera
-from jaxslam.sensors.image_files import read_color, read_grey
+from jaxslam.sensors.image_files import read_color, read_gray
 from jaxslam.trajectory.formats import read_times
 from jaxslam.trajectory.trajectory import Trajectory, read_kitti
 
@@ -26,17 +26,17 @@ class _Pair(NamedTuple):
     left: str
     right: str
     projections: tuple[str, str]
-    grey: bool
+    gray: bool
 
 
 _PAIRS = (_Pair("image_0", "image_1", ("P0", "P1"), True), _Pair("image_2", "image_3", ("P2", "P3"), False))
-"""Grey comes first: it is sharper, and colour is not needed."""
+"""Gray comes first: it is sharper, and color is not needed."""
 
 
 class KittiDataset(ImagePairs):
     """A folder such as `sequences/06`, with poses in `poses/06.txt` two folders up if they are public.
 
-    Poses are those of the left camera that is used; KITTI's are of the left grey one, 6 cm beside the one for colour.
+    Poses are those of the left camera that is used; KITTI's are of the left gray one, 6 cm beside the one for color.
 
     Attributes:
         name: `kitti_` and the folder's name.
@@ -81,7 +81,7 @@ class KittiDataset(ImagePairs):
 
     @property
     def _readers(self) -> tuple[Callable[[Path], np.ndarray], Callable[[Path], np.ndarray]]:
-        return (read_grey, read_grey) if self._sides.grey else (read_color, read_color)
+        return (read_gray, read_gray) if self._sides.gray else (read_color, read_color)
 
 
 def _name(folder: Path) -> str:
@@ -109,7 +109,7 @@ def _camera(folder: Path) -> Camera:
     files = sorted((folder / pair.left).glob("*.png"))
     if not files:
         raise DatasetError(f"{folder / pair.left}: expected images, got none")
-    height, width = read_grey(files[0]).shape
+    height, width = read_gray(files[0]).shape
     baseline_m = float(left[0, 3] - right[0, 3]) / float(left[0, 0])
     if not baseline_m > 0:
         raise CameraError(f"{folder / _CALIBRATION}: expected the right camera to the right, got {baseline_m:g} m")

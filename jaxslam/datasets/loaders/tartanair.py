@@ -16,7 +16,7 @@ from jaxslam.datasets.protocol import Fit, Loader
 from jaxslam.errors import CameraError, DatasetError, TrajectoryError
 from jaxslam.geometry.so3 import matrices, quaternions
 from jaxslam.sensors.camera import Camera
-from jaxslam.sensors.image_files import read_color, read_depth_metres
+from jaxslam.sensors.image_files import read_color, read_depth_meters
 from jaxslam.trajectory.trajectory import Trajectory
 
 _LEFT, _RIGHT, _DEPTH, _POSES = "image_left", "image_right", "depth_left", "pose_left.txt"
@@ -66,7 +66,7 @@ class TartanAirDataset(ImagePairs):
 
 
 def _read_depth(path: Path) -> np.ndarray:
-    depth_m = read_depth_metres(path)
+    depth_m = read_depth_meters(path)
     return np.where(depth_m <= _FARTHEST_M, depth_m, np.float32(0))
 
 
@@ -96,7 +96,7 @@ def _camera(folder: Path) -> Camera:
 
 
 def tartanair_camera(*, stereo: bool) -> Camera:
-    """The camera of all recordings, with depth in metres or as a pair."""
+    """The camera of all recordings, with depth in meters or as a pair."""
     lens = ("tartanair", 640, 480, 320.0, 320.0, 320.0, 240.0)
     if stereo:
         return Camera(*lens, fps=_RATE_HZ, baseline_m=_BASELINE_M)

@@ -20,17 +20,17 @@ from jaxslam.sensors.image_files import read_color, read_depth
 from jaxslam.trajectory.trajectory import Trajectory, associate, read_tum
 
 MAX_GAP_S = 0.02
-"""Colour and depth further apart in time than this are no pair (the benchmark's own `associate.py`)."""
+"""Color and depth further apart in time than this are no pair (the benchmark's own `associate.py`)."""
 
 _COLOR_LIST, _DEPTH_LIST, _GROUND_TRUTH = "rgb.txt", "depth.txt", "groundtruth.txt"
 _NAME = re.compile(r"rgbd_dataset_freiburg([123])_")
 
 
 class TumDataset(ImagePairs):
-    """A recording whose colour and depth images are listed apart and matched by time, one to one.
+    """A recording whose color and depth images are listed apart and matched by time, one to one.
 
-    A frame has the time of its colour image, and says that of its depth.
-    Depth counts become metres; nothing else is done to the images.
+    A frame has the time of its color image, and says that of its depth.
+    Depth counts become meters; nothing else is done to the images.
 
     Attributes:
         name: The folder's name.
@@ -44,7 +44,7 @@ class TumDataset(ImagePairs):
 
         Raises:
             DatasetError: If a list is missing or malformed, a listed image is missing, or nothing matches.
-            CameraError: If the camera does not say how many counts make a metre.
+            CameraError: If the camera does not say how many counts make a meter.
         """
         if camera.depth_scale_per_m is None:
             raise CameraError(f"camera '{camera.name}': depth_scale_per_m: expected a number, got none")
@@ -80,7 +80,7 @@ def has_layout(folder: Path) -> bool:
 
 
 def _match(color: FileList, depth: FileList) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of the colour and depth images that belong together, in the order of time."""
+    """Indices of the color and depth images that belong together, in the order of time."""
     pairs = associate(color.timestamps_ns, depth.timestamps_ns, MAX_GAP_S)
     if not len(pairs[0]):
         raise DatasetError(

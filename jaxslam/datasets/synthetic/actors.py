@@ -1,6 +1,6 @@
 """Who moves in the room: walking people of capsules, boxes that are carried or pushed, and people who sit.
 
-Each actor has a frame of its own: origin on the floor under it (a person) or in its centre (a box), x forward, z up.
+Each actor has a frame of its own: origin on the floor under it (a person) or in its center (a box), x forward, z up.
 Motions are closed forms of time in float64, so that ground truth is exact and any frame can be asked for.
 """
 
@@ -38,12 +38,12 @@ class Lane:
     """An ellipse on the floor and how it is walked.
 
     Attributes:
-        centre: `(x, y)` metres.
-        semi_axes: Along x and y, metres.
+        center: `(x, y)` meters.
+        semi_axes: Along x and y, meters.
         rate: Radians a second, negative for clockwise.
     """
 
-    centre: tuple[float, float]
+    center: tuple[float, float]
     semi_axes: tuple[float, float]
     rate: float
 
@@ -89,7 +89,7 @@ def _walk(lane: Lane, start: float, time_s: np.ndarray) -> tuple[np.ndarray, np.
     angle = start + lane.rate * time_s + 0.15 * np.sin(0.9 * time_s + start)
     rate = lane.rate + 0.135 * np.cos(0.9 * time_s + start)
     a, b = lane.semi_axes
-    position = np.array(lane.centre) + np.stack([a * np.cos(angle), b * np.sin(angle)], axis=-1)
+    position = np.array(lane.center) + np.stack([a * np.cos(angle), b * np.sin(angle)], axis=-1)
     speed = np.abs(rate) * np.hypot(a * np.sin(angle), b * np.cos(angle))
     # A lane is narrow; whoever turns at its end turns as on a rounder one, not on the spot.
     rounder = max(a, 0.4 * b)
@@ -168,7 +168,7 @@ class CarriedBox(Crate):
         super().__init__(half_m, ((0.50, 0.40, 0.26), (0.72, 0.58, 0.40)), rng)
 
     def root(self, time_s: np.ndarray) -> np.ndarray:
-        """Poses of the centre of the box: `(t, 7)`, wxyz_xyz."""
+        """Poses of the center of the box: `(t, 7)`, wxyz_xyz."""
         position, _, _ = _walk(self._lane, self._start, time_s)
         height = 1.1 + 0.18 * np.sin(0.7 * time_s + 2.0 * self._start)
         turn = 0.5 * np.sin(0.45 * time_s + self._start)

@@ -15,7 +15,7 @@ _HAIR = Material((0.10, 0.07, 0.05), (0.26, 0.18, 0.12), noise_per_m=20.0, stret
 _SHOE = Material((0.10, 0.10, 0.11), (0.25, 0.24, 0.23), noise_per_m=12.0, noise=0.5)
 
 TRUNK = ((0.0, 0.0, 1.19), (0.0, 0.0, 0.96), (0.01, 0.0, 1.50), (0.02, 0.0, 1.63), (-0.01, 0.0, 1.655))
-"""Where torso, hips, neck, head and hair are on a person of average size, in metres."""
+"""Where torso, hips, neck, head and hair are on a person of average size, in meters."""
 
 
 def body(scale: float, rng: np.random.Generator) -> list[Solid]:

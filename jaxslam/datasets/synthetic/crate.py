@@ -9,7 +9,7 @@ Color = tuple[float, float, float]
 
 
 class Crate:
-    """One textured box, whose frame is in its centre, along its edges.
+    """One textured box, whose frame is in its center, along its edges.
 
     Attributes:
         half_m: Half its length along x, y and z.
@@ -18,7 +18,7 @@ class Crate:
     label = "box"
 
     def __init__(self, half_m: np.ndarray, colors: tuple[Color, Color], rng: np.random.Generator) -> None:
-        """A box of that size, with dark patches on a noise between two colours."""
+        """A box of that size, with dark patches on a noise between two colors."""
         self.half_m = half_m
         look = Material(
             *colors,

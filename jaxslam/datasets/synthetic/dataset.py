@@ -8,14 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.config.validation import Checked, Range
+from jaxslam.config.validation import Range, ValidatedConfig
 from jaxslam.datasets.synthetic import homogeneous as rigid
 from jaxslam.datasets.synthetic.actors import cast
 from jaxslam.datasets.synthetic.camera_path import CameraPathKind, camera_path
-from jaxslam.datasets.synthetic.parked_boxes import MOST_PARKED
-from jaxslam.datasets.synthetic.render import Rendering, View, pack_scene, render
+from jaxslam.datasets.synthetic.parked_boxes import MAX_PARKED
+from jaxslam.datasets.synthetic.render import CameraView, Rendering, pack_scene, render
 from jaxslam.datasets.synthetic.room import furnish
-from jaxslam.datasets.synthetic.seated_people import MOST_SEATED, chairs
+from jaxslam.datasets.synthetic.seated_people import MAX_SEATED, chairs
 from jaxslam.datasets.synthetic.sensor_noise import SensorConfig, measure, sensor_params
 from jaxslam.errors import ConfigError
 from jaxslam.sensors.camera import Camera
@@ -28,7 +28,7 @@ _START_NS = 1_600_000_000_000_000_000
 
 
 @dataclass(frozen=True)
-class SyntheticConfig(Checked):
+class SyntheticConfig(ValidatedConfig):
     """What to record. Frame `i` does not depend on how many frames there are.
 
     Attributes:
@@ -59,8 +59,8 @@ class SyntheticConfig(Checked):
     path: CameraPathKind = "xyz"
     people: Annotated[int, Range(at_least=0, at_most=24)] = 2
     boxes: Annotated[int, Range(at_least=0, at_most=24)] = 0
-    seated: Annotated[int, Range(at_least=0, at_most=MOST_SEATED)] = 0
-    parked: Annotated[int, Range(at_least=0, at_most=MOST_PARKED)] = 0
+    seated: Annotated[int, Range(at_least=0, at_most=MAX_SEATED)] = 0
+    parked: Annotated[int, Range(at_least=0, at_most=MAX_PARKED)] = 0
     width: Annotated[int, Range(at_least=8, at_most=8192)] = 640
     height: Annotated[int, Range(at_least=8, at_most=8192)] = 480
     fps: Annotated[float, Range(above=0, at_most=1000)] = 30.0
@@ -88,7 +88,7 @@ class SyntheticFrame:
         timestamp_ns: Time of the middle of the exposure.
         rgb: `(height, width, 3)` uint8, as measured.
         depth_m: `(height, width)` float32 depth as measured by a camera that does; 0 where missing.
-        exact_depth_m: `(height, width)` float32 depth at the pixels' centres; never missing.
+        exact_depth_m: `(height, width)` float32 depth at the pixels' centers; never missing.
         instance_mask: `(height, width)` int32; 0 on static things, otherwise the number of the actor.
         T_world_cam: `(7,)` float64 camera pose, wxyz_xyz.
         T_world_actor: `(actors, 7)` float64 poses of the actors, wxyz_xyz; that of actor `k` is in row `k - 1`.
@@ -191,11 +191,11 @@ class SyntheticDataset:
     def _taken(
         self, time_s: float, key: jax.Array, to_the_right_m: float = 0.0
     ) -> tuple[Rendering, np.ndarray, np.ndarray]:
-        """The moment of the frame itself, and colour and depth as measured, by the camera or one to its right."""
+        """The moment of the frame itself, and color and depth as measured, by the camera or one to its right."""
         moments = self._expose(time_s, to_the_right_m)
         own = moments[len(moments) // 2]
-        colours, sensor = tuple(moment.colour for moment in moments), sensor_params(self.config.sensor)
-        channels, depth_m = measure(colours, own.depth_m, own.incidence, self.fx, self._gain(time_s), sensor, key)
+        colors, sensor = tuple(moment.color for moment in moments), sensor_params(self.config.sensor)
+        channels, depth_m = measure(colors, own.depth_m, own.incidence, self.fx, self._gain(time_s), sensor, key)
         # XLA needs as long to interleave the channels as to render a moment.
         return own, cv2.merge(list(np.asarray(channels))), np.asarray(depth_m)
 
@@ -208,12 +208,12 @@ class SyntheticDataset:
         """The moments of one exposure, evenly in time, each on its own row and column within the pixel."""
         n = self.config.sensor.exposure_samples
         rank = np.arange(n)
-        centred = (rank + 0.5) / n - 0.5
-        offsets = np.stack([centred, centred[(2 * rank + (n + 1) // 2) % n]], axis=1)
-        views = self._views(time_s + self.config.sensor.exposure_s * centred, offsets, to_the_right_m)
+        centered = (rank + 0.5) / n - 0.5
+        offsets = np.stack([centered, centered[(2 * rank + (n + 1) // 2) % n]], axis=1)
+        views = self._views(time_s + self.config.sensor.exposure_s * centered, offsets, to_the_right_m)
         return [render(self._scene, view, height=self.height, width=self.width) for view in views]
 
-    def _views(self, time_s: np.ndarray, offsets: np.ndarray, to_the_right_m: float) -> list[View]:
+    def _views(self, time_s: np.ndarray, offsets: np.ndarray, to_the_right_m: float) -> list[CameraView]:
         world_from_cam = rigid.matrix_from_pose(camera_path(self.config.path, time_s, self.config.seed))
         world_from_cam[:, :3, 3] += to_the_right_m * world_from_cam[:, :3, 0]
         from_world = [np.broadcast_to(self._static_from_world, (len(time_s), *self._static_from_world.shape))]
@@ -225,7 +225,9 @@ class SyntheticDataset:
         solid_from_cam[:, self._slots] = (np.concatenate(from_world, axis=1) @ world_from_cam[:, None])[:, :, :3]
         intrinsics = np.array([self.fx, self.fy, self.cx, self.cy], np.float32)
         return [
-            View(*map(jnp.asarray, (solids, camera[:3].astype(np.float32), intrinsics, offset.astype(np.float32))))
+            CameraView(
+                *map(jnp.asarray, (solids, camera[:3].astype(np.float32), intrinsics, offset.astype(np.float32)))
+            )
             for solids, camera, offset in zip(solid_from_cam, world_from_cam, offsets, strict=True)
         ]
 

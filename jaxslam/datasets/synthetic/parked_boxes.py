@@ -5,12 +5,12 @@ import numpy as np
 from jaxslam.datasets.synthetic.crate import Crate
 from jaxslam.geometry.so3 import axis_rotation
 
-MOST_PARKED = 2
+MAX_PARKED = 2
 PERIOD_S = 5.0
 """It stands so long, moves as long, and so on."""
 _SPEED_M_PER_S, _RAMP_S = 0.5, 0.1
 """While it moves, and the time in which it gets as fast and slows down again: a push."""
-_CENTRES, _SEMI_AXES = ((-0.5, 0.0), (1.5, 0.9)), (0.14, 0.5)
+_CENTERS, _SEMI_AXES = ((-0.5, 0.0), (1.5, 0.9)), (0.14, 0.5)
 """Ellipses on the floor along which they are pushed, one in front of the desk and one behind it."""
 _TABLE = 720
 
@@ -19,9 +19,9 @@ class ParkedBox(Crate):
     """A large box on the floor, such as a crate on rollers."""
 
     def __init__(self, place: int, seed: int) -> None:
-        """The box in one of `MOST_PARKED` places; the seed chooses where it begins, which way it goes and its size."""
+        """The box in one of `MAX_PARKED` places; the seed chooses where it begins, which way it goes and its size."""
         rng = np.random.default_rng([seed, 500, place])
-        self._centre = np.array(_CENTRES[place])
+        self._center = np.array(_CENTERS[place])
         start, self._turn = rng.uniform(0.0, 2.0 * np.pi, 2)
         self._sense = rng.choice((-1.0, 1.0))
         half_m = rng.uniform((0.14, 0.16, 0.40), (0.20, 0.22, 0.55))
@@ -30,10 +30,10 @@ class ParkedBox(Crate):
         self._start_m = float(np.interp(start, self._angles, self._ways))
 
     def root(self, time_s: np.ndarray) -> np.ndarray:
-        """Poses of the centre of the box: `(t, 7)`, wxyz_xyz."""
+        """Poses of the center of the box: `(t, 7)`, wxyz_xyz."""
         way = way_m(time_s)
         angle = np.interp((self._start_m + self._sense * way) % self._ways[-1], self._ways, self._angles)
-        position = self._centre + np.stack([_SEMI_AXES[0] * np.cos(angle), _SEMI_AXES[1] * np.sin(angle)], axis=-1)
+        position = self._center + np.stack([_SEMI_AXES[0] * np.cos(angle), _SEMI_AXES[1] * np.sin(angle)], axis=-1)
         height = np.full((len(way), 1), self.half_m[2])
         return np.concatenate([axis_rotation(2, self._turn + 0.4 * self._sense * way), position, height], axis=1)
 

@@ -10,10 +10,10 @@ from jaxslam.geometry.so3 import axis_rotation, matrices
 
 
 class Solid(NamedTuple):
-    """A solid in its own axes, centred on the origin.
+    """A solid in its own axes, centered on the origin.
 
     Attributes:
-        size: `(3,)` metres: half extents of a box; radii of a capsule, the third one of its caps along its axis.
+        size: `(3,)` meters: half extents of a box; radii of a capsule, the third one of its caps along its axis.
         stem: Half the length of a capsule's axis in units of the third radius, 0 for an ellipsoid; `None` for a box.
         surface: `(6, N_WORDS)` texture of the sides -x, +x, -y, +y, -z, +z.
     """
@@ -23,7 +23,7 @@ class Solid(NamedTuple):
     surface: np.ndarray
 
 
-class Placed(NamedTuple):
+class PlacedSolid(NamedTuple):
     """A solid and where it is: `T_world_solid` is `(4, 4)`."""
 
     T_world_solid: np.ndarray
@@ -36,7 +36,7 @@ def box(half_m: tuple[float, float, float], look: Material | list[Material], rng
 
 
 def capsule(radius_m: float, length_m: float, look: Material, rng: np.random.Generator) -> Solid:
-    """A capsule along z, `length_m` between the centres of its round ends."""
+    """A capsule along z, `length_m` between the centers of its round ends."""
     return Solid(np.full(3, radius_m), 0.5 * length_m / radius_m, _surface(look, rng))
 
 

@@ -63,7 +63,7 @@ def solids_in_tiles(
 
 
 def _between(x: Float[Array, "8 n"], z: Float[Array, "8 n"], edges: Float[Array, " k"]) -> Bool[Array, "j n"]:
-    """Between neighbouring edges, with a pixel to spare: false where all corners lie beyond the same edge."""
+    """Between neighboring edges, with a pixel to spare: false where all corners lie beyond the same edge."""
     below = jnp.all(x[None] < (edges[:, None, None] - 1.0) * z[None], axis=1)
     above = jnp.all(x[None] > (edges[:, None, None] + 1.0) * z[None], axis=1)
     return ~below[:-1] & ~above[1:]

@@ -1,4 +1,4 @@
-"""Pictures of a scene in JAX: tile by tile, first what each pixel shows, then its colour, once.
+"""Pictures of a scene in JAX: tile by tile, first what each pixel shows, then its color, once.
 
 Rays have unit depth, so that a distance along a ray is a depth along the optical axis.
 """
@@ -25,18 +25,18 @@ from jaxslam.datasets.synthetic.raycast import (
 )
 from jaxslam.datasets.synthetic.shading import SUN, Hits, shade
 from jaxslam.datasets.synthetic.texture import N_WORDS
-from jaxslam.runtime.compile_cache import MUCH_COMPUTED
-from jaxslam.runtime.trace_cache import traced_once
+from jaxslam.runtime.compile_cache import FUSION_EMITTERS
+from jaxslam.runtime.trace_cache import cached_trace
 
 _CAPACITY_STEP = 64
 
 
-class Scene(NamedTuple):
+class RenderScene(NamedTuple):
     """Every solid, `b` boxes and then `c` capsules, each kind padded to a capacity; the first box is the room.
 
     Attributes:
-        box_size: Half extents in metres.
-        capsule_size: Radii in metres.
+        box_size: Half extents in meters.
+        capsule_size: Radii in meters.
         capsule_stem: Half lengths of the axes in units of the third radius.
         surface: Texture parameters, six surfaces a solid.
         owner: 0 for static solids, otherwise the number of the actor.
@@ -51,14 +51,14 @@ class Scene(NamedTuple):
     used: Bool[Array, " n"]
 
 
-class View(NamedTuple):
+class CameraView(NamedTuple):
     """One camera pose and where the solids are at that moment.
 
     Attributes:
         solid_from_cam: Rigid transforms from camera coordinates to those of each solid.
         world_from_cam: Rigid transform from camera to world coordinates.
         intrinsics: `fx, fy, cx, cy` in pixels.
-        offset: Where in its pixel each ray passes, `(u, v)`, 0 for the centre.
+        offset: Where in its pixel each ray passes, `(u, v)`, 0 for the center.
     """
 
     solid_from_cam: Float[Array, "n 3 4"]
@@ -71,19 +71,19 @@ class Rendering(NamedTuple):
     """What the camera sees, before any sensor.
 
     Attributes:
-        colour: Packed colour; see `shading.unpack_colour`.
+        color: Packed color; see `shading.unpack_color`.
         depth_m: Depth along the optical axis; every ray hits something.
         incidence: Cosine of the angle between the ray and the surface normal.
         owner: 0 on static things, otherwise the number of the actor.
     """
 
-    colour: UInt[Array, "h w"]
+    color: UInt[Array, "h w"]
     depth_m: Float[Array, "h w"]
     incidence: Float[Array, "h w"]
     owner: Int[Array, "h w"]
 
 
-def pack_scene(solids: list[Solid], owner: list[int]) -> tuple[Scene, np.ndarray]:
+def pack_scene(solids: list[Solid], owner: list[int]) -> tuple[RenderScene, np.ndarray]:
     """Arrange solids for rendering.
 
     Args:
@@ -105,7 +105,7 @@ def pack_scene(solids: list[Solid], owner: list[int]) -> tuple[Scene, np.ndarray
     for slot, solid, number in zip(slots, solids, owner, strict=True):
         size[slot], stem[slot], surface[slot] = solid.size, solid.stem or 0.0, solid.surface
         owners[slot], used[slot] = number, True
-    scene = Scene(
+    scene = RenderScene(
         jnp.asarray(size[:n_boxes]),
         jnp.asarray(size[n_boxes:]),
         jnp.asarray(stem[n_boxes:]),
@@ -120,9 +120,9 @@ def _capacity(count: int) -> int:
     return _CAPACITY_STEP * -(-max(count, 1) // _CAPACITY_STEP)
 
 
-@partial(jax.jit, static_argnames=("height", "width"), compiler_options=MUCH_COMPUTED)
-@traced_once
-def render(scene: Scene, view: View, *, height: int, width: int) -> Rendering:
+@partial(jax.jit, static_argnames=("height", "width"), compiler_options=FUSION_EMITTERS)
+@cached_trace
+def render(scene: RenderScene, view: CameraView, *, height: int, width: int) -> Rendering:
     """Cast one ray a pixel.
 
     Args:
@@ -152,7 +152,7 @@ def render(scene: Scene, view: View, *, height: int, width: int) -> Rendering:
     return Rendering(*(_untile(plane, rows, columns)[:height, :width] for plane in planes))
 
 
-def _corners(view: View, size: Float[Array, "n 3"], stem: Float[Array, " n"]) -> Float[Array, "3 8 n"]:
+def _corners(view: CameraView, size: Float[Array, "n 3"], stem: Float[Array, " n"]) -> Float[Array, "3 8 n"]:
     """The corners of the bounding boxes of all solids in camera coordinates."""
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)
     bounds = size.at[:, 2].multiply(1.0 + stem)
@@ -160,7 +160,7 @@ def _corners(view: View, size: Float[Array, "n 3"], stem: Float[Array, " n"]) ->
     return jnp.einsum("nij,kni->jkn", view.solid_from_cam[:, :, :3], local)
 
 
-def _rays(view: View, row: Int[Array, ""], column: Int[Array, ""]) -> tuple[Plane, Plane]:
+def _rays(view: CameraView, row: Int[Array, ""], column: Int[Array, ""]) -> tuple[Plane, Plane]:
     """Rays `(x, y, 1)` through the pixels of one tile."""
     fx, fy, cx, cy = view.intrinsics
     v, u = np.divmod(np.arange(TILE_HEIGHT * TILE_WIDTH, dtype=np.int32), np.int32(TILE_WIDTH))

@@ -5,7 +5,7 @@ World axes: z up, origin on the floor in the middle of the room; see `camera_pat
 
 import numpy as np
 
-from jaxslam.datasets.synthetic.primitives import Placed, box, capsule, pill, upright
+from jaxslam.datasets.synthetic.primitives import PlacedSolid, box, capsule, pill, upright
 from jaxslam.datasets.synthetic.texture import Material
 
 ROOM_HALF_M = (2.7, 2.5, 1.4)
@@ -88,50 +88,50 @@ KEYS = Material(
 CLOTH = Material((0.22, 0.30, 0.45), (0.40, 0.50, 0.66), noise_per_m=7.0, noise=0.7)
 
 
-def furnish(seed: int) -> list[Placed]:
+def furnish(seed: int) -> list[PlacedSolid]:
     """The static scene.
 
     Args:
-        seed: Chooses textures, colours and where the small things lie; the furniture stays where it is.
+        seed: Chooses textures, colors and where the small things lie; the furniture stays where it is.
 
     Returns:
         Everything that stands still; first the room itself, a box to be seen from inside.
     """
     rng = np.random.default_rng([seed, 100])
     walls = [PLASTER, PLASTER, PLASTER, BRICKS, PLANKS, WHITE]
-    room = Placed(upright(0.0, 0.0, ROOM_HALF_M[2]), box(ROOM_HALF_M, walls, rng))
+    room = PlacedSolid(upright(0.0, 0.0, ROOM_HALF_M[2]), box(ROOM_HALF_M, walls, rng))
     tables = [thing for side in (-1.0, 1.0) for thing in _table(0.42 * side, rng)]
     return [room, *tables, *_things_on_tables(rng), *_storage(rng), *_posters(rng)]
 
 
 def _printed(look: Material, rng: np.random.Generator) -> Material:
-    """The same material printed in colours of its own."""
+    """The same material printed in colors of its own."""
     dark, bright = rng.uniform(0.02, 0.55, 3), rng.uniform(0.35, 1.0, 3)
     return look._replace(dark=tuple(dark), bright=tuple(bright))
 
 
-def _table(y: float, rng: np.random.Generator) -> list[Placed]:
+def _table(y: float, rng: np.random.Generator) -> list[PlacedSolid]:
     """A table with its chair, screen, keyboard and mug."""
     legs = [(x, y + side) for x in (0.05, 0.75) for side in (-0.36, 0.36)]
     turn = rng.uniform(-15.0, 15.0)
     return [
-        Placed(upright(0.4, y, 0.73), box((0.40, 0.41, 0.015), WOOD, rng)),
-        *(Placed(upright(*leg, 0.357), box((0.025, 0.025, 0.357), METAL, rng)) for leg in legs),
-        Placed(upright(0.72, y, 0.45), box((0.21, 0.22, 0.02), CLOTH, rng)),
-        Placed(upright(0.92, y, 0.75), box((0.02, 0.21, 0.24), CLOTH, rng)),
-        Placed(upright(0.72, y, 0.215), box((0.03, 0.03, 0.215), METAL, rng)),
-        Placed(upright(0.50, y, 1.02, turn), box((0.02, 0.26, 0.17), SCREEN, rng)),
-        Placed(upright(0.52, y, 0.80, turn), box((0.05, 0.07, 0.055), METAL, rng)),
-        Placed(upright(0.22, y + 0.05, 0.757, turn), box((0.07, 0.20, 0.012), KEYS, rng)),
-        Placed(upright(0.14, y - 0.28, 0.795), pill((0.04, 0.04, 0.01), 0.08, _printed(POSTER, rng), rng)),
+        PlacedSolid(upright(0.4, y, 0.73), box((0.40, 0.41, 0.015), WOOD, rng)),
+        *(PlacedSolid(upright(*leg, 0.357), box((0.025, 0.025, 0.357), METAL, rng)) for leg in legs),
+        PlacedSolid(upright(0.72, y, 0.45), box((0.21, 0.22, 0.02), CLOTH, rng)),
+        PlacedSolid(upright(0.92, y, 0.75), box((0.02, 0.21, 0.24), CLOTH, rng)),
+        PlacedSolid(upright(0.72, y, 0.215), box((0.03, 0.03, 0.215), METAL, rng)),
+        PlacedSolid(upright(0.50, y, 1.02, turn), box((0.02, 0.26, 0.17), SCREEN, rng)),
+        PlacedSolid(upright(0.52, y, 0.80, turn), box((0.05, 0.07, 0.055), METAL, rng)),
+        PlacedSolid(upright(0.22, y + 0.05, 0.757, turn), box((0.07, 0.20, 0.012), KEYS, rng)),
+        PlacedSolid(upright(0.14, y - 0.28, 0.795), pill((0.04, 0.04, 0.01), 0.08, _printed(POSTER, rng), rng)),
     ]
 
 
-def _things_on_tables(rng: np.random.Generator) -> list[Placed]:
-    things = [Placed(upright(0.65, 0.02, 0.875), capsule(0.13, 0.0, _printed(POSTER, rng), rng))]
+def _things_on_tables(rng: np.random.Generator) -> list[PlacedSolid]:
+    things = [PlacedSolid(upright(0.65, 0.02, 0.875), capsule(0.13, 0.0, _printed(POSTER, rng), rng))]
     for y, half_height in ((-0.05, 0.06), (0.10, 0.10), (-0.78, 0.09), (0.78, 0.13)):
         place = upright(0.2 + rng.uniform(-0.05, 0.15), y, 0.745 + half_height, rng.uniform(-40.0, 40.0))
-        things.append(Placed(place, box((0.10, 0.055, half_height), _printed(CARTON, rng), rng)))
+        things.append(PlacedSolid(place, box((0.10, 0.055, half_height), _printed(CARTON, rng), rng)))
     return things
 
 
@@ -152,17 +152,17 @@ _LOW_CABINETS = tuple(cabinet for cabinet in _CABINETS if cabinet[4] < 1.2)
 _CARTONS_ON_FLOOR = ((2.2, -2.2), (-2.2, 1.5), (2.2, 0.12))
 
 
-def _storage(rng: np.random.Generator) -> list[Placed]:
+def _storage(rng: np.random.Generator) -> list[PlacedSolid]:
     """Cabinets and shelves along the walls, cartons on the low ones and on the floor."""
     things = []
     for x, y, half_x, half_y, height, look in _CABINETS:
-        colours = _printed(look, rng) if look is BOOKS else look
-        things.append(Placed(upright(x, y, height / 2), box((half_x, half_y, height / 2), colours, rng)))
+        colors = _printed(look, rng) if look is BOOKS else look
+        things.append(PlacedSolid(upright(x, y, height / 2), box((half_x, half_y, height / 2), colors, rng)))
     places = [(x, y, height) for x, y, _, _, height, _ in _LOW_CABINETS]
     for x, y, z in (*places, *((x, y, 0.0) for x, y in _CARTONS_ON_FLOOR)):
         a, b, c = rng.uniform(0.11, 0.19, 3)
         things.append(
-            Placed(upright(x, y, z + c, rng.uniform(-25.0, 25.0)), box((a, b, c), _printed(CARTON, rng), rng))
+            PlacedSolid(upright(x, y, z + c, rng.uniform(-25.0, 25.0)), box((a, b, c), _printed(CARTON, rng), rng))
         )
     return things
 
@@ -181,5 +181,5 @@ _POSTERS = (  # x, y, z, half x, half y, half z
 )
 
 
-def _posters(rng: np.random.Generator) -> list[Placed]:
-    return [Placed(upright(x, y, z), box((a, b, c), _printed(POSTER, rng), rng)) for x, y, z, a, b, c in _POSTERS]
+def _posters(rng: np.random.Generator) -> list[PlacedSolid]:
+    return [PlacedSolid(upright(x, y, z), box((a, b, c), _printed(POSTER, rng), rng)) for x, y, z, a, b, c in _POSTERS]

@@ -1,7 +1,7 @@
 """People who sit at the desk and hardly move: the trunk sways, the head turns, and an arm is raised now and then.
 
 In the manner of the `sitting` recordings of TUM RGB-D. Motions are closed forms of time in float64, as those of the
-actors who walk; at the head they reach some five centimetres, and a hand is raised by some forty.
+actors who walk; at the head they reach some five centimeters, and a hand is raised by some forty.
 """
 
 from typing import NamedTuple
@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxslam.datasets.synthetic.body import TRUNK, below, body, bone
 from jaxslam.datasets.synthetic.homogeneous import transform
-from jaxslam.datasets.synthetic.primitives import Placed, Solid, box, upright
+from jaxslam.datasets.synthetic.primitives import PlacedSolid, Solid, box, upright
 from jaxslam.datasets.synthetic.room import CLOTH, METAL
 from jaxslam.geometry.so3 import axis_rotation, matrices, multiply
 
@@ -27,7 +27,7 @@ _ARM_AT_REST, _ARM_RAISED = np.array([-0.35, -1.60]), np.array([-0.75, -2.65])
 
 
 class _Place(NamedTuple):
-    """Where somebody sits: the point on the floor under the hips, in metres, and where to."""
+    """Where somebody sits: the point on the floor under the hips, in meters, and where to."""
 
     x: float
     y: float
@@ -36,7 +36,7 @@ class _Place(NamedTuple):
 
 _PLACES = (_Place(0.45, 1.22, -90.0), _Place(0.45, -1.22, 90.0))
 """At the ends of the desk, seen from the side by a camera before it."""
-MOST_SEATED = len(_PLACES)
+MAX_SEATED = len(_PLACES)
 
 
 class SeatedPerson:
@@ -48,7 +48,7 @@ class SeatedPerson:
         """Choose size, clothes and the phases of the motions.
 
         Args:
-            place: Which chair, from 0 to below `MOST_SEATED`.
+            place: Which chair, from 0 to below `MAX_SEATED`.
             seed: Of the scene.
         """
         rng = np.random.default_rng([seed, 500, place])
@@ -88,7 +88,7 @@ class SeatedPerson:
         )
 
 
-def chairs(seated: int, seed: int) -> list[Placed]:
+def chairs(seated: int, seed: int) -> list[PlacedSolid]:
     """The chairs of those who sit, which are not there without them: static.
 
     Args:
@@ -99,12 +99,12 @@ def chairs(seated: int, seed: int) -> list[Placed]:
     return [thing for place in _PLACES[:seated] for thing in _chair(place, rng)]
 
 
-def _chair(place: _Place, rng: np.random.Generator) -> list[Placed]:
+def _chair(place: _Place, rng: np.random.Generator) -> list[PlacedSolid]:
     floor = upright(place.x, place.y, 0.0, place.facing_deg)
     return [
-        Placed(floor @ upright(0.0, 0.0, _SEAT_M - 0.02), box((0.21, 0.22, 0.02), CLOTH, rng)),
-        Placed(floor @ upright(-0.20, 0.0, 0.75), box((0.02, 0.21, 0.24), CLOTH, rng)),
-        Placed(floor @ upright(0.0, 0.0, 0.215), box((0.03, 0.03, 0.215), METAL, rng)),
+        PlacedSolid(floor @ upright(0.0, 0.0, _SEAT_M - 0.02), box((0.21, 0.22, 0.02), CLOTH, rng)),
+        PlacedSolid(floor @ upright(-0.20, 0.0, 0.75), box((0.02, 0.21, 0.24), CLOTH, rng)),
+        PlacedSolid(floor @ upright(0.0, 0.0, 0.215), box((0.03, 0.03, 0.215), METAL, rng)),
     ]
 
 

@@ -1,4 +1,4 @@
-"""What a Kinect-like camera makes of a perfect picture: noise, holes and quantisation, each part on its own switch."""
+"""What a Kinect-like camera makes of a perfect picture: noise, holes and quantization, each part on its own switch."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, UInt, UInt8
 
-from jaxslam.config.validation import Checked, Range
-from jaxslam.datasets.synthetic.shading import unpack_colour
-from jaxslam.runtime.compile_cache import MUCH_COMPUTED
-from jaxslam.runtime.trace_cache import traced_once
+from jaxslam.config.validation import Range, ValidatedConfig
+from jaxslam.datasets.synthetic.shading import unpack_color
+from jaxslam.runtime.compile_cache import FUSION_EMITTERS
+from jaxslam.runtime.trace_cache import cached_trace
 
 
 @dataclass(frozen=True)
-class SensorConfig(Checked):
+class SensorConfig(ValidatedConfig):
     """The faults of the camera; the value that turns each one off stands beside it.
 
     Attributes:
@@ -31,11 +31,11 @@ class SensorConfig(Checked):
         max_incidence_deg: Angle from the surface normal beyond which there is no depth. 90: none is lost.
         min_depth_m: Depth below which there is none. 0: no limit.
         max_depth_m: Depth above which there is none. 1000: no limit, in a room.
-        exposure_s: Time over which the moving picture is integrated, colour only. 0: no motion blur.
+        exposure_s: Time over which the moving picture is integrated, color only. 0: no motion blur.
         exposure_samples: Odd number of moments that are averaged, each at another place in the pixel, which smooths
             edges as well. 1: neither blur nor smooth edges.
         gain_swing: Relative change of brightness as the automatic exposure wanders. 0: constant.
-        image_noise: Standard deviation of the noise of each channel in grey levels. 0: none.
+        image_noise: Standard deviation of the noise of each channel in gray levels. 0: none.
     """
 
     depth_noise_per_m: Annotated[float, Range(at_least=0, at_most=1)] = 1.425e-3
@@ -97,8 +97,8 @@ def sensor_params(config: SensorConfig) -> SensorParams:
     )
 
 
-@partial(jax.jit, compiler_options=MUCH_COMPUTED)
-@traced_once
+@partial(jax.jit, compiler_options=FUSION_EMITTERS)
+@cached_trace
 def measure(
     exposures: tuple[UInt[Array, "h w"], ...],
     depth_m: Float[Array, "h w"],
@@ -111,7 +111,7 @@ def measure(
     """One measured frame.
 
     Args:
-        exposures: Packed colours at the moments that are averaged.
+        exposures: Packed colors at the moments that are averaged.
         depth_m: Exact depth.
         incidence: Cosine of the angle between ray and surface normal.
         fx: Focal length in pixels.
@@ -120,13 +120,13 @@ def measure(
         key: Random key of this frame.
 
     Returns:
-        Red, green and blue of eight bits, and depth in metres, 0 where missing.
+        Red, green and blue of eight bits, and depth in meters, 0 where missing.
     """
     # All in the depth's type: a recording is the same bytes where float64 is enabled.
     fx, gain, params = jax.tree.map(lambda number: jnp.asarray(number, depth_m.dtype), (fx, gain, params))
-    colour_key, depth_key = jax.random.split(key)
-    mean = sum(map(unpack_colour, exposures[1:]), start=unpack_colour(exposures[0])) / len(exposures)
-    noise = params.image_noise * jax.random.normal(colour_key, mean.shape, mean.dtype)
+    color_key, depth_key = jax.random.split(key)
+    mean = sum(map(unpack_color, exposures[1:]), start=unpack_color(exposures[0])) / len(exposures)
+    noise = params.image_noise * jax.random.normal(color_key, mean.shape, mean.dtype)
     rgb = jnp.clip(jnp.round(255.0 * gain * mean + noise), 0.0, 255.0).astype(jnp.uint8)
     kept = _inside_limits(depth_m, incidence, params) & _lit(depth_m, fx, params.shadow_baseline_m)
     kept = kept & ~_on_edge(depth_m, params.edge_jump)
@@ -168,7 +168,7 @@ def _lit(depth_m: Float[Array, "h w"], fx: float, baseline_m: float) -> Bool[Arr
 
 
 def _on_edge(depth_m: Float[Array, "h w"], jump: float) -> Bool[Array, "h w"]:
-    """Whether the depth varies too much among the pixel and its eight neighbours."""
+    """Whether the depth varies too much among the pixel and its eight neighbors."""
     padded = jnp.pad(depth_m, 1, mode="edge")
     spread = _over_nine(padded, jnp.maximum) - _over_nine(padded, jnp.minimum)
     return (spread > jump * depth_m) & (jump > 0.0)

@@ -1,7 +1,7 @@
-"""The colour of what each ray of a tile has met.
+"""The color of what each ray of a tile has met.
 
 XLA compiles all that leads to one plane of results into one pass over the tile, and what leads to several planes into
-as many passes that repeat each other. So planes are kept apart, not stacked, and a colour is one plane: ten bits a
+as many passes that repeat each other. So planes are kept apart, not stacked, and a color is one plane: ten bits a
 channel in one word, a quarter of what eight bits can show.
 """
 
@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped, UInt
 
 from jaxslam.datasets.synthetic.raycast import Plane, Vectors
-from jaxslam.datasets.synthetic.texture import as_surface, texture_colour
+from jaxslam.datasets.synthetic.texture import as_surface, texture_color
 
 SUN = np.array([-0.45, 0.30, 0.84], np.float32)
 """Unit vector towards the directional light, in the world."""
@@ -50,18 +50,18 @@ def shade(
     world_from_cam: Float[Array, "3 4"],
     focal: Float[Array, ""],
 ) -> tuple[UInt[Array, " p"], Plane, Plane]:
-    """Colour and exact place of hits.
+    """Color and exact place of hits.
 
     Args:
         table: Of each solid: the 12 numbers of its map from camera to unit coordinates (`raycast.Shapes`), its size
-            in metres, its stem, the direction to the sun in its coordinates.
+            in meters, its stem, the direction to the sun in its coordinates.
         surfaces: `texture.surface_row`s, six a solid.
         hits: What is to be shaded.
         world_from_cam: Rigid transform from camera to world coordinates.
         focal: Focal length in pixels.
 
     Returns:
-        Packed colour, depth, and the cosine between ray and surface normal.
+        Packed color, depth, and the cosine between ray and surface normal.
     """
     planes = _gather(table, hits.which)
     size, stem, sun = (planes[12], planes[13], planes[14]), planes[15], (planes[16], planes[17], planes[18])
@@ -78,17 +78,17 @@ def shade(
     side = 6 * hits.which + 2 * axis + (_component(point, axis) > 0.0).astype(jnp.int32)
     pixels_per_m = focal * jnp.maximum(incidence, 0.05) / depth
     light = _light(world_from_cam, hits, depth, _dot(normal, sun))
-    red, green, blue = texture_colour(u, v, pixels_per_m, as_surface(_gather(surfaces, side)))
-    return _pack_colour(light * red, light * green, light * blue), depth, incidence
+    red, green, blue = texture_color(u, v, pixels_per_m, as_surface(_gather(surfaces, side)))
+    return _pack_color(light * red, light * green, light * blue), depth, incidence
 
 
-def _pack_colour(red: Plane, green: Plane, blue: Plane) -> UInt[Array, " p"]:
+def _pack_color(red: Plane, green: Plane, blue: Plane) -> UInt[Array, " p"]:
     scaled = (jnp.clip(_LEVELS * channel + 0.5, 0.0, 1023.0).astype(jnp.int32) for channel in (red, green, blue))
     low, middle, high = (channel.astype(jnp.uint32) for channel in scaled)
     return low | (middle << 10) | (high << 20)
 
 
-def unpack_colour(packed: UInt[Array, "h w"]) -> Float[Array, "3 h w"]:
+def unpack_color(packed: UInt[Array, "h w"]) -> Float[Array, "3 h w"]:
     """Red, green and blue, 0 to 1 and a little beyond."""
     channels = [((packed >> shift) & jnp.uint32(1023)).astype(jnp.float32) for shift in (0, 10, 20)]
     return jnp.stack(channels) / _LEVELS

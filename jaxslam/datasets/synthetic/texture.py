@@ -1,9 +1,9 @@
 """Procedural textures: noise, bricks or planks, and scattered patches, all prefiltered by the pixel's footprint.
 
-A texture is a function of metres on the surface, so that it is the same from everywhere. Each of its scales fades
+A texture is a function of meters on the surface, so that it is the same from everywhere. Each of its scales fades
 out where it becomes finer than a pixel sees, because what shimmers in the distance cannot be tracked honestly.
 
-Three numbers make a colour, from a palette of four a surface: `blend` goes from the first colour to the second,
+Three numbers make a color, from a palette of four a surface: `blend` goes from the first color to the second,
 `mark` from there to the third (below zero) or the fourth (above), `joint` darkens.
 """
 
@@ -27,14 +27,14 @@ _ACROSS, _ALONG = np.uint32(0x9E3779B1), np.uint32(0x85EBCA77)
 
 
 class Material(NamedTuple):
-    """How a surface looks; colours are RGB from 0 to 1.
+    """How a surface looks; colors are RGB from 0 to 1.
 
     Attributes:
-        colour: Where the noise is low.
+        color: Where the noise is low.
         second: Where the noise is high.
         dark: Of one half of the bricks and patches.
         bright: Of the other half.
-        noise_per_m: Cells a metre of the coarsest octave; each of the `N_OCTAVES` next ones has twice as many.
+        noise_per_m: Cells a meter of the coarsest octave; each of the `N_OCTAVES` next ones has twice as many.
         stretch: How many times longer the noise is along the second axis of the surface.
         noise: Strength of the noise, 0 to 1.
         cell_m: Width and height of bricks, tiles or planks.
@@ -42,10 +42,10 @@ class Material(NamedTuple):
         cell_contrast: How much bricks differ, 0 to 1.
         patch_m: Cell of the coarsest layer of patches; each of the `N_PATCH_LAYERS` next ones is about a quarter.
         patch_density: Probability that a cell holds a patch.
-        patch_contrast: How far the colour of a patch is from what it covers, 0 to 1.
+        patch_contrast: How far the color of a patch is from what it covers, 0 to 1.
     """
 
-    colour: Rgb
+    color: Rgb
     second: Rgb
     dark: Rgb = (0.15, 0.13, 0.12)
     bright: Rgb = (0.92, 0.90, 0.85)
@@ -63,7 +63,7 @@ class Material(NamedTuple):
 class Surface(NamedTuple):
     """The texture of what each pixel shows, one plane a number: a `Material` made ready to do without divisions."""
 
-    colour: tuple[Plane, Plane, Plane]
+    color: tuple[Plane, Plane, Plane]
     second: tuple[Plane, Plane, Plane]
     dark: tuple[Plane, Plane, Plane]
     bright: tuple[Plane, Plane, Plane]
@@ -85,11 +85,11 @@ N_WORDS = 12
 
 
 def surface_row(material: Material, seed: int) -> np.ndarray:
-    """A surface packed into `(N_WORDS,)` uint32: four colours of three bytes, fourteen bfloat16 in pairs, a seed.
+    """A surface packed into `(N_WORDS,)` uint32: four colors of three bytes, fourteen bfloat16 in pairs, a seed.
 
     What is fetched for every pixel is worth packing; a texture does not need more digits.
     """
-    colours = np.round(255.0 * np.clip(np.array(material[:4]), 0.0, 1.0)).astype(np.uint32)
+    colors = np.round(255.0 * np.clip(np.array(material[:4]), 0.0, 1.0)).astype(np.uint32)
     numbers = [
         material.noise,
         material.noise_per_m,
@@ -105,8 +105,8 @@ def surface_row(material: Material, seed: int) -> np.ndarray:
         0.0,
     ]
     halves = (np.array(numbers, np.float32).view(np.uint32) + 0x8000) >> 16
-    packed_colours = colours @ np.array([1, 1 << 8, 1 << 16], np.uint32)
-    return np.concatenate([packed_colours, halves[::2] << 16 | halves[1::2], [seed]]).astype(np.uint32)
+    packed_colors = colors @ np.array([1, 1 << 8, 1 << 16], np.uint32)
+    return np.concatenate([packed_colors, halves[::2] << 16 | halves[1::2], [seed]]).astype(np.uint32)
 
 
 def as_surface(words: UInt[Array, "12 p"]) -> Surface:
@@ -137,13 +137,13 @@ def as_surface(words: UInt[Array, "12 p"]) -> Surface:
     )
 
 
-def texture_colour(u: Plane, v: Plane, pixels_per_m: Plane, surface: Surface) -> tuple[Plane, Plane, Plane]:
-    """Colour of points on textured surfaces.
+def texture_color(u: Plane, v: Plane, pixels_per_m: Plane, surface: Surface) -> tuple[Plane, Plane, Plane]:
+    """Color of points on textured surfaces.
 
     Args:
-        u: Place along the first axis of the surface in metres.
+        u: Place along the first axis of the surface in meters.
         v: Place along the second.
-        pixels_per_m: Pixels that a metre of the surface takes in the image, where it is foreshortened most.
+        pixels_per_m: Pixels that a meter of the surface takes in the image, where it is foreshortened most.
         surface: The texture of each point.
 
     Returns:
@@ -157,11 +157,11 @@ def texture_colour(u: Plane, v: Plane, pixels_per_m: Plane, surface: Surface) ->
     mark = jnp.clip(_patches(u, v, pixels_per_m, footprint, surface, seed) + cell, -1.0, 1.0)
     to_dark, to_bright, light = jnp.maximum(-mark, 0.0), jnp.maximum(mark, 0.0), 1.0 - 0.6 * joint
 
-    def mix(colour: Plane, second: Plane, dark: Plane, bright: Plane) -> Plane:
-        base = colour + (second - colour) * blend
+    def mix(color: Plane, second: Plane, dark: Plane, bright: Plane) -> Plane:
+        base = color + (second - color) * blend
         return (base + (dark - base) * to_dark + (bright - base) * to_bright) * light
 
-    red, green, blue = map(mix, surface.colour, surface.second, surface.dark, surface.bright)
+    red, green, blue = map(mix, surface.color, surface.second, surface.dark, surface.bright)
     return red, green, blue
 
 

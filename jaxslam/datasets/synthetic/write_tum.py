@@ -20,7 +20,7 @@ def write_tum(
 ) -> None:
     """Write a recording that `open_dataset` reads: the files of TUM RGB-D, and two things more.
 
-    Beside `rgb/`, `depth/` (16 bits, 5000 a metre), their lists and `groundtruth.txt` there are `mask/` with the
+    Beside `rgb/`, `depth/` (16 bits, 5000 a meter), their lists and `groundtruth.txt` there are `mask/` with the
     numbers of the actors and its list, and `camera.yaml`.
 
     Frames are written to `<folder>.partial`, which becomes `folder` when everything is there: a folder of the wanted

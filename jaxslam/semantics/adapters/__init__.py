@@ -1,4 +1,4 @@
-"""Families of networks, one file each: how to recognise one, what it takes, what it gives."""
+"""Families of networks, one file each: how to recognize one, what it takes, what it gives."""
 
 from jaxslam.semantics.adapters.base import Adapter as Adapter
 from jaxslam.semantics.adapters.class_map import ClassMap

@@ -39,6 +39,6 @@ def grid(image: ImageInput, strides: tuple[int, ...]) -> Grid:
     return Grid(np.concatenate(cells).astype(np.float32), np.concatenate(stride))
 
 
-def corners(centres: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """`(n, 4)` left, top, right, bottom of boxes given by `(n, 2)` centre and `(n, 2)` width and height."""
-    return np.concatenate([centres - sizes / 2, centres + sizes / 2], axis=1)
+def corners(centers: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """`(n, 4)` left, top, right, bottom of boxes given by `(n, 2)` center and `(n, 2)` width and height."""
+    return np.concatenate([centers - sizes / 2, centers + sizes / 2], axis=1)

@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxslam.semantics.detections import Detections
 from jaxslam.semantics.letterbox import Fit, Placement, boxes_to_image, place
-from jaxslam.semantics.onnx_signature import Colours, Graph, ImageInput
+from jaxslam.semantics.onnx_signature import Colors, Graph, ImageInput
 from jaxslam.semantics.postprocess import Candidates, Wanted, choose
 
 
@@ -20,7 +20,7 @@ class Adapter(ABC):
         varying: Whether the sizes of outputs depend on the image.
         fit: How the image enters the input.
         pad: Value of the pixels beside it.
-        colours: How its values do.
+        colors: How its values do.
         image: The graph's input.
         graph: The graph.
         names: Every class by number; empty where a number has none.
@@ -31,7 +31,7 @@ class Adapter(ABC):
     varying: ClassVar[bool] = False
     fit: ClassVar[Fit] = "stretch"
     pad: ClassVar[int] = 114
-    colours: Colours = Colours()
+    colors: Colors = Colors()
 
     def __init__(self, graph: Graph, image: ImageInput) -> None:
         """Prepare for a graph that fits."""
@@ -53,7 +53,7 @@ class Adapter(ABC):
     def prepare(self, pixels: np.ndarray) -> tuple[np.ndarray, Placement]:
         """An RGB image as the network takes it, and where it lies in it."""
         canvas, placement = place(pixels, self.image.size, self.fit, self.pad)
-        return self.image.tensor(canvas, self.colours), placement
+        return self.image.tensor(canvas, self.colors), placement
 
     @abstractmethod
     def decode(self, outputs: list[np.ndarray], placement: Placement, wanted: Wanted) -> Detections:

@@ -9,18 +9,18 @@ from jaxslam.semantics.adapters.base import Adapter
 from jaxslam.semantics.class_names import VOC, pixel_names
 from jaxslam.semantics.detections import Detections, no_detections
 from jaxslam.semantics.letterbox import Fit, Placement, plane_to_image
-from jaxslam.semantics.onnx_signature import Colours, Graph, ImageInput, Port
+from jaxslam.semantics.onnx_signature import Colors, Graph, ImageInput, Port
 from jaxslam.semantics.postprocess import Wanted
 
 _IGNORED = 255  # VOC's and Cityscapes' number for what is no class
-_MOST_COARSE = 32  # pixels of the input for one of the map
+_MAX_COARSE = 32  # pixels of the input for one of the map
 
 
 class ClassMap(Adapter):
     """Whole numbers, or a score for each class, at any resolution.
 
     In: RGB; 0 to 255 for integers, -1 to 1 for real numbers with channels last (TensorFlow), and with channels first
-    normalised by ImageNet's mean and deviation (torchvision). The image keeps its aspect, in the top left corner.
+    normalized by ImageNet's mean and deviation (torchvision). The image keeps its aspect, in the top left corner.
 
     Whole numbers do not say how many classes there are: without names in the metadata they are taken to be VOC's, and a
     number that VOC does not have is an error. Least scores do not apply: each pixel is of its best class.
@@ -35,8 +35,8 @@ class ClassMap(Adapter):
         """Choose how values enter."""
         super().__init__(graph, image)
         half = (127.5, 127.5, 127.5)
-        imagenet = Colours(mean=(123.675, 116.28, 103.53), std=(58.395, 57.12, 57.375))
-        self.colours = imagenet if image.channels_first else Colours(mean=half, std=half)
+        imagenet = Colors(mean=(123.675, 116.28, 103.53), std=(58.395, 57.12, 57.375))
+        self.colors = imagenet if image.channels_first else Colors(mean=half, std=half)
 
     @classmethod
     def names_of(cls, graph: Graph, image: ImageInput) -> tuple[str, ...] | None:
@@ -96,4 +96,4 @@ def _covers(size: tuple[int, ...], image: ImageInput) -> bool:
     if len(size) != 2:
         return False
     steps = (image.height / size[0], image.width / size[1])
-    return all(0.9 <= step <= _MOST_COARSE for step in steps) and 0.9 < steps[0] / steps[1] < 1.1
+    return all(0.9 <= step <= _MAX_COARSE for step in steps) and 0.9 < steps[0] / steps[1] < 1.1

@@ -12,7 +12,7 @@ import numpy as np
 from jaxslam.semantics.adapters.anchor_grid import corners, grid
 from jaxslam.semantics.adapters.base import BoxAdapter
 from jaxslam.semantics.class_names import box_names
-from jaxslam.semantics.onnx_signature import Colours, Graph, ImageInput
+from jaxslam.semantics.onnx_signature import Colors, Graph, ImageInput
 from jaxslam.semantics.postprocess import Candidates, Wanted, best_rows, probabilities
 
 STRIDE = 16
@@ -24,7 +24,7 @@ class FastestDet(BoxAdapter):
 
     name: ClassVar[str] = "fastestdet"
     interface: ClassVar[str] = "1x(5+C)xHxW, a cell every 16 pixels"
-    colours = Colours(bgr=True, std=(255.0, 255.0, 255.0))
+    colors = Colors(bgr=True, std=(255.0, 255.0, 255.0))
 
     def __init__(self, graph: Graph, image: ImageInput) -> None:
         """Lay out the cells."""
@@ -42,10 +42,10 @@ class FastestDet(BoxAdapter):
         return None
 
     def candidates(self, outputs: list[np.ndarray], wanted: Wanted) -> Candidates:
-        """Centre = cell + tanh(offset), size = sigmoid(size) of the image, score = objectness^0.6 x class^0.4."""
+        """Center = cell + tanh(offset), size = sigmoid(size) of the image, score = objectness^0.6 x class^0.4."""
         output = outputs[0][0].reshape(outputs[0].shape[1], -1).T
         objectness, classes = probabilities(output[:, :1], "objectness"), probabilities(output[:, 5:], "classes")
         rows, scores, labels = best_rows(objectness**_OBJECT_POWER * classes**_CLASS_POWER, wanted)
-        centres = (self._cells[rows] + np.tanh(output[rows, 1:3])) * STRIDE
+        centers = (self._cells[rows] + np.tanh(output[rows, 1:3])) * STRIDE
         sizes = (0.5 + 0.5 * np.tanh(output[rows, 3:5] / 2)) * np.asarray(self.image.size, np.float32)
-        return Candidates(corners(centres, sizes), scores, labels, rows)
+        return Candidates(corners(centers, sizes), scores, labels, rows)

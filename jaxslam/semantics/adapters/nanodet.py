@@ -13,16 +13,16 @@ from jaxslam.semantics.adapters.anchor_grid import grid, map_sizes, num_cells
 from jaxslam.semantics.adapters.base import BoxAdapter
 from jaxslam.semantics.class_names import box_names
 from jaxslam.semantics.letterbox import Fit
-from jaxslam.semantics.onnx_signature import Colours, Graph, ImageInput, Port
+from jaxslam.semantics.onnx_signature import Colors, Graph, ImageInput, Port
 from jaxslam.semantics.postprocess import Candidates, Wanted, best_rows, probabilities
 
 STRIDES = (8, 16, 32)
 PLUS_STRIDES = (8, 16, 32, 64)
-_COLOURS = Colours(bgr=True, mean=(103.53, 116.28, 123.675), std=(57.375, 57.12, 58.395))
+_COLORS = Colors(bgr=True, mean=(103.53, 116.28, 123.675), std=(57.375, 57.12, 58.395))
 
 
 class NanoDet(BoxAdapter):
-    """In: BGR, normalised, the image in the top left corner.
+    """In: BGR, normalized, the image in the top left corner.
 
     Out: classes and distances of each of three feature maps, in any order.
     """
@@ -30,7 +30,7 @@ class NanoDet(BoxAdapter):
     name: ClassVar[str] = "nanodet"
     interface: ClassVar[str] = "1xAxC and 1xAx4(R+1) for each of the strides 8, 16, 32"
     fit: ClassVar[Fit] = "corner"
-    colours = _COLOURS
+    colors = _COLORS
 
     def __init__(self, graph: Graph, image: ImageInput) -> None:
         """Lay out the cells, and find which output is which."""
@@ -60,7 +60,7 @@ class NanoDetPlus(BoxAdapter):
     name: ClassVar[str] = "nanodet_plus"
     interface: ClassVar[str] = "1xAx(C+4(R+1)), A cells at strides 8, 16, 32, 64"
     fit: ClassVar[Fit] = "corner"
-    colours = _COLOURS
+    colors = _COLORS
 
     def __init__(self, graph: Graph, image: ImageInput) -> None:
         """Lay out the cells."""
@@ -89,7 +89,7 @@ class NanoDetPlus(BoxAdapter):
 
 
 def _boxes(points: np.ndarray, distances: np.ndarray, stride: np.ndarray) -> np.ndarray:
-    """`(n, 4)` boxes of `(n, 4 (R + 1))` unnormalised log probabilities of left, top, right, bottom."""
+    """`(n, 4)` boxes of `(n, 4 (R + 1))` unnormalized log probabilities of left, top, right, bottom."""
     logits = distances.reshape(len(distances), 4, distances.shape[1] // 4)
     weights = np.exp(logits - logits.max(axis=2, keepdims=True))
     steps = np.arange(weights.shape[2], dtype=np.float32)

@@ -19,7 +19,7 @@ import numpy as np
 from jaxslam.errors import ModelError
 from jaxslam.semantics.adapters.base import BoxAdapter
 from jaxslam.semantics.class_names import COCO_IDS
-from jaxslam.semantics.onnx_signature import Colours, Graph, ImageInput, Port
+from jaxslam.semantics.onnx_signature import Colors, Graph, ImageInput, Port
 from jaxslam.semantics.postprocess import Candidates, Wanted, probabilities
 
 
@@ -72,7 +72,7 @@ class Ssd(BoxAdapter):
         assert layout is not None  # it fits
         self._layout = layout
         half = (127.5, 127.5, 127.5)
-        self.colours = Colours(std=(255.0, 255.0, 255.0)) if image.channels_first else Colours(mean=half, std=half)
+        self.colors = Colors(std=(255.0, 255.0, 255.0)) if image.channels_first else Colors(mean=half, std=half)
 
     @classmethod
     def names_of(cls, graph: Graph, image: ImageInput) -> tuple[str, ...] | None:

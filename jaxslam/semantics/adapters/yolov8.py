@@ -12,20 +12,20 @@ from jaxslam.semantics.adapters.base import Adapter, BoxAdapter, found
 from jaxslam.semantics.class_names import box_names
 from jaxslam.semantics.detections import Detections
 from jaxslam.semantics.letterbox import Fit, Placement, boxes_to_image, plane_to_image
-from jaxslam.semantics.onnx_signature import Colours, Graph, ImageInput, Port
+from jaxslam.semantics.onnx_signature import Colors, Graph, ImageInput, Port
 from jaxslam.semantics.postprocess import Candidates, Wanted, best_rows, choose, probabilities
 
 STRIDES = (8, 16, 32)
-_COLOURS = Colours(std=(255.0, 255.0, 255.0))
+_COLORS = Colors(std=(255.0, 255.0, 255.0))
 
 
 class YoloV8(BoxAdapter):
-    """In: RGB 0 to 1, the image in the middle. Out: centre, size and classes of each cell, in pixels of the input."""
+    """In: RGB 0 to 1, the image in the middle. Out: center, size and classes of each cell, in pixels of the input."""
 
     name: ClassVar[str] = "yolov8"
     interface: ClassVar[str] = "1x(4+C)xA, A cells at strides 8, 16, 32"
-    fit: ClassVar[Fit] = "centre"
-    colours = _COLOURS
+    fit: ClassVar[Fit] = "center"
+    colors = _COLORS
 
     @classmethod
     def names_of(cls, graph: Graph, image: ImageInput) -> tuple[str, ...] | None:
@@ -45,8 +45,8 @@ class YoloV8Seg(Adapter):
 
     name: ClassVar[str] = "yolov8_seg"
     interface: ClassVar[str] = "1x(4+C+K)xA and 1xKxHxW, K prototypes of masks"
-    fit: ClassVar[Fit] = "centre"
-    colours = _COLOURS
+    fit: ClassVar[Fit] = "center"
+    colors = _COLORS
 
     def __init__(self, graph: Graph, image: ImageInput) -> None:
         """Find which output is which."""
@@ -88,7 +88,7 @@ def _is_boxes(port: Port, image: ImageInput) -> bool:
 
 
 def _candidates(output: np.ndarray, num_classes: int, wanted: Wanted) -> Candidates:
-    """Of `(a, 4 + c + k)` centre x, y, width, height, classes and anything behind them."""
+    """Of `(a, 4 + c + k)` center x, y, width, height, classes and anything behind them."""
     rows, scores, classes = best_rows(probabilities(output[:, 4 : 4 + num_classes], "classes"), wanted)
     boxes = output[rows, :4].astype(np.float32, copy=False)
     return Candidates(corners(boxes[:, :2], boxes[:, 2:]), scores, classes, rows)

@@ -12,7 +12,7 @@ from jaxslam.semantics.adapters.anchor_grid import corners, grid, num_cells
 from jaxslam.semantics.adapters.base import BoxAdapter
 from jaxslam.semantics.class_names import box_names
 from jaxslam.semantics.letterbox import Fit
-from jaxslam.semantics.onnx_signature import Colours, Graph, ImageInput
+from jaxslam.semantics.onnx_signature import Colors, Graph, ImageInput
 from jaxslam.semantics.postprocess import Candidates, Wanted, best_rows, probabilities
 
 STRIDES = (8, 16, 32)
@@ -21,12 +21,12 @@ _MAX_LOG_SIZE = 10.0
 
 
 class YoloX(BoxAdapter):
-    """In: BGR 0 to 255, the image in the top left corner. Out: centre, size, objectness and classes of each cell."""
+    """In: BGR 0 to 255, the image in the top left corner. Out: center, size, objectness and classes of each cell."""
 
     name: ClassVar[str] = "yolox"
     interface: ClassVar[str] = "1xAx(5+C), A cells at strides 8, 16, 32"
     fit: ClassVar[Fit] = "corner"
-    colours = Colours(bgr=True)
+    colors = Colors(bgr=True)
 
     def __init__(self, graph: Graph, image: ImageInput) -> None:
         """Lay out the cells."""
@@ -44,17 +44,17 @@ class YoloX(BoxAdapter):
         return None
 
     def candidates(self, outputs: list[np.ndarray], wanted: Wanted) -> Candidates:
-        """Centre = (cell + offset) stride, size = exp(size) stride, score = objectness x class."""
+        """Center = (cell + offset) stride, size = exp(size) stride, score = objectness x class."""
         output = outputs[0][0]
         likely = np.flatnonzero(probabilities(output[:, 4], "objectness") >= wanted.min_score)
         proposed = output[likely]
         scores = probabilities(proposed[:, 5:], "classes") * probabilities(proposed[:, 4:5], "objectness")
         rows, scores, classes = best_rows(scores, wanted)
-        centre, size = proposed[rows, :2], proposed[rows, 2:4]
+        center, size = proposed[rows, :2], proposed[rows, 2:4]
         rows = likely[rows]
         cells, stride = self._grid.cells[rows], self._grid.stride[rows]
         most = float(size.max(initial=0))
         if most > _MAX_LOG_SIZE:
             got = f"{most:g} (exported with boxes in pixels?)"
             raise ModelError(f"sizes: expected logarithms of strides up to {_MAX_LOG_SIZE:g}, got {got}")
-        return Candidates(corners((cells + centre) * stride, np.exp(size) * stride), scores, classes, rows)
+        return Candidates(corners((cells + center) * stride, np.exp(size) * stride), scores, classes, rows)

@@ -9,10 +9,10 @@ from jaxtyping import Float32, Int
 
 from jaxslam.errors import ModelError
 from jaxslam.semantics.letterbox import Fit, Placement, place
-from jaxslam.semantics.onnx_signature import Colours, Graph, ImageInput, Port
+from jaxslam.semantics.onnx_signature import Colors, Graph, ImageInput, Port
 from jaxslam.semantics.prompted.prompt import NO_POINT
 
-IMAGENET = Colours(mean=(123.675, 116.28, 103.53), std=(58.395, 57.12, 57.375))
+IMAGENET = Colors(mean=(123.675, 116.28, 103.53), std=(58.395, 57.12, 57.375))
 
 Arrays: TypeAlias = Mapping[str, np.ndarray]
 Points: TypeAlias = Float32[np.ndarray, "k n 2"]
@@ -89,13 +89,13 @@ class PromptAdapter(ABC):
     def prepare(self, pixels: np.ndarray) -> tuple[np.ndarray, Placement]:
         """An RGB image as the encoder takes it, and where it lies in it.
 
-        Where channels come last the graph normalises; what is beside the image is 0 after that.
+        Where channels come last the graph normalizes; what is beside the image is 0 after that.
         """
         canvas, placement = place(pixels, self.image.size, self.fit, 0)
         values = canvas.astype(np.float32)
         width, height = (round(side * scale) for side, scale in zip(placement.size, placement.scale, strict=True))
         values[height:] = values[:, width:] = np.asarray(IMAGENET.mean, np.float32)
-        return self.image.tensor(values, IMAGENET if self.image.channels_first else Colours()), placement
+        return self.image.tensor(values, IMAGENET if self.image.channels_first else Colors()), placement
 
     def embedding(self, outputs: list[np.ndarray]) -> dict[str, np.ndarray]:
         """The encoder's outputs by the names of the decoder's inputs; a single one may have any name.
@@ -157,6 +157,6 @@ class PromptAdapter(ABC):
 
 
 def in_input(points: Points, placement: Placement) -> Points:
-    """Points of the image as SAM takes them in its input: it counts from the centre of the first pixel."""
+    """Points of the image as SAM takes them in its input: it counts from the center of the first pixel."""
     scale, offset = (np.asarray(pair, np.float32) for pair in (placement.scale, placement.offset))
     return points * scale + offset - np.float32(0.5)

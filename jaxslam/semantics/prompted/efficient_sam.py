@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from jaxslam.semantics.letterbox import Placement
-from jaxslam.semantics.onnx_signature import Colours, Graph
+from jaxslam.semantics.onnx_signature import Colors, Graph
 from jaxslam.semantics.prompted.base import Arrays, Kinds, Points, PromptAdapter
 
 _PATCH = 16  # pixels of what the network sees for one of its embedding
@@ -46,7 +46,7 @@ class EfficientSam(PromptAdapter):
             image = image._replace(width=width, height=height)
         resized = cv2.resize(pixels, image.size, interpolation=cv2.INTER_LINEAR)
         scale = (image.width / width, image.height / height)
-        return image.tensor(resized, Colours(std=(255.0, 255.0, 255.0))), Placement((width, height), scale, (0, 0))
+        return image.tensor(resized, Colors(std=(255.0, 255.0, 255.0))), Placement((width, height), scale, (0, 0))
 
     def feed(self, embedding: Arrays, points: Points, kinds: Kinds, placement: Placement) -> dict[str, np.ndarray]:
         """The graph adds half a pixel to points once it has stretched them."""

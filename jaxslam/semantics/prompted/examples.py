@@ -9,7 +9,7 @@ examples:
     image: hall.png
     boxes: [[10, 20, 200, 400]]  # left, top, right, bottom in pixels
   - label: arm               # without an image: of every frame, for a camera that stands still or moves with the thing
-    points: [[320, 450]]     # pixels (u, v) of the thing, (0, 0) the centre of the top left one
+    points: [[320, 450]]     # pixels (u, v) of the thing, (0, 0) the center of the top left one
     not_points: [[320, 20]]  # pixels that are not of it
 ```
 
@@ -28,7 +28,7 @@ from jaxslam.errors import ConfigError
 from jaxslam.io.yaml_files import check_keys, read_mapping
 from jaxslam.semantics.prompted.prompt import Prompt, prompt
 from jaxslam.semantics.prompted.segmenter import PromptSegmenter
-from jaxslam.sensors.image_files import read_color, read_grey
+from jaxslam.sensors.image_files import read_color, read_gray
 
 _KEYS = ("label", "image", "mask", "boxes", "points", "not_points")
 _MASK = "_mask"
@@ -138,13 +138,13 @@ def _of_row(row: object, folder: Path, origin: str) -> Example:
 
 
 def _with_mask(mask: Path, image: Path, label: str, origin: str) -> Example:
-    pixels, grey = read_color(image), read_grey(mask)
-    if grey.shape != pixels.shape[:2]:
-        (height, width), (rows, columns) = pixels.shape[:2], grey.shape
+    pixels, gray = read_color(image), read_gray(mask)
+    if gray.shape != pixels.shape[:2]:
+        (height, width), (rows, columns) = pixels.shape[:2], gray.shape
         raise ConfigError(f"{origin}: mask: expected the image's {width}x{height} pixels, got {columns}x{rows}")
-    if not grey.any():
+    if not gray.any():
         raise ConfigError(f"{origin}: mask: expected white on the thing, got a black picture")
-    return Example(origin, label, pixels, grey > grey.max() // 2, ())
+    return Example(origin, label, pixels, gray > gray.max() // 2, ())
 
 
 def _prompts(row: dict[str, Any], label: str, origin: str) -> tuple[Prompt, ...]:

@@ -33,7 +33,7 @@ from jaxslam.semantics.prompted.examples import Example
 IMAGE, EXAMPLE, MASK, OUTPUT = "pixel_values", "prompt_pixel_values", "prompt_masks", "pred_masks"
 _SIDE = 448  # where it is open: what SegGPT learnt from
 _PAINTED = 0.5  # masks are white on black
-_LEAST_SHARE = 0.0005  # of the image: smaller pieces are specks
+_MIN_SHARE = 0.0005  # of the image: smaller pieces are specks
 
 
 class InContextDetector:
@@ -115,7 +115,7 @@ class InContextDetector:
         """Connected pieces in the image, and how white they are."""
         plane = plane_to_image(white, self._image.size, placement)
         num, piece, measures, _ = cv2.connectedComponentsWithStats((plane > _PAINTED).astype(np.uint8))
-        masks = [piece == k for k in range(1, num) if measures[k, cv2.CC_STAT_AREA] >= _LEAST_SHARE * plane.size]
+        masks = [piece == k for k in range(1, num) if measures[k, cv2.CC_STAT_AREA] >= _MIN_SHARE * plane.size]
         things = [(float(plane[mask].mean()), mask) for mask in masks]
         return [thing for thing in things if thing[0] >= self._min_score]
 

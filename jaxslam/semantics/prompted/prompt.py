@@ -46,7 +46,7 @@ def prompt(
     Args:
         label: What the thing is called.
         box: Left, top, right, bottom in pixels: `image[top:bottom, left:right]` is what it covers.
-        on: Pixels `(u, v)` of the thing, (0, 0) the centre of the top left one.
+        on: Pixels `(u, v)` of the thing, (0, 0) the center of the top left one.
         beside: Pixels that are not of it.
     """
     rows = [(ON, u + 0.5, v + 0.5) for u, v in on] + [(BESIDE, u + 0.5, v + 0.5) for u, v in beside]

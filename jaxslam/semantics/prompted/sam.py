@@ -17,7 +17,7 @@ _MASK_STEP = 4  # a mask given as a prompt is so much finer than the embedding
 
 
 class Sam(PromptAdapter):
-    """In: 1x3xHxW, normalised by ImageNet, or HxWx3, 0 to 255, which the graph normalises; the image in the corner.
+    """In: 1x3xHxW, normalized by ImageNet, or HxWx3, 0 to 255, which the graph normalizes; the image in the corner.
 
     Masks are read from `low_res_masks`, which cover the whole input: exports of `masks` may have the shape of the image
     they were made with written into them.
@@ -53,7 +53,7 @@ class Sam(PromptAdapter):
 
 
 class Sam2(Sam):
-    """In: 1x3xHxW, normalised by ImageNet, stretched; the graph itself adds the row that is no point."""
+    """In: 1x3xHxW, normalized by ImageNet, stretched; the graph itself adds the row that is no point."""
 
     name: ClassVar[str] = "sam2"
     interface: ClassVar[str] = (

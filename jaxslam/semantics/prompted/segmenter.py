@@ -24,7 +24,7 @@ PROMPT_ADAPTERS: dict[str, type[PromptAdapter]] = {
 """All of them by name; no pair of graphs fits two."""
 
 _SIDE = 1024  # of the encoder's input where it is open: what the networks of this family learnt from
-_MOST_AT_ONCE = 16  # prompts: masks of whole images take room
+_MAX_AT_ONCE = 16  # prompts: masks of whole images take room
 _SAME = 1e-3  # of the largest logit: a batch may be computed in another order
 
 
@@ -58,7 +58,7 @@ class PromptSegmenter:
     def __init__(self, encoder: Network, decoder: Network, adapter: PromptAdapter) -> None:
         """Put together by `load_segmenter`."""
         self._encoder, self._decoder, self._adapter = encoder, decoder, adapter
-        self.at_once = _MOST_AT_ONCE if adapter.takes_many and self._batches() else 1
+        self.at_once = _MAX_AT_ONCE if adapter.takes_many and self._batches() else 1
 
     @property
     def adapter(self) -> str:
@@ -166,12 +166,12 @@ def load_segmenter(
     adapter: str | None = None,
     num_threads: int = 1,
 ) -> PromptSegmenter:
-    """Open two ONNX files as a promptable segmenter; their family is recognised from the graphs.
+    """Open two ONNX files as a promptable segmenter; their family is recognized from the graphs.
 
     Args:
         encoder: The file that takes the image.
         decoder: The file that takes what the first gives, and prompts.
-        adapter: The family, where it shall not be recognised; see `PROMPT_ADAPTERS`.
+        adapter: The family, where it shall not be recognized; see `PROMPT_ADAPTERS`.
         num_threads: Threads the networks may use.
 
     Raises:

@@ -13,7 +13,7 @@ from jaxslam.semantics.prompted.prompt import BOTTOM_RIGHT, ON, TOP_LEFT
 
 
 class TransformersSam(PromptAdapter):
-    """In: 1x3xHxW, normalised by ImageNet, the image in the corner. A box is asked for by the point in its middle."""
+    """In: 1x3xHxW, normalized by ImageNet, the image in the corner. A box is asked for by the point in its middle."""
 
     name: ClassVar[str] = "transformers_sam"
     interface: ClassVar[str] = (

@@ -1,7 +1,7 @@
 """Weighted windowed bundle adjustment: many poses and points at once, differentiably.
 
 Levenberg-Marquardt with Marquardt's scaling. No two points share a residual, so the points are eliminated and what is
-left to factorise is the Schur complement, dense, six numbers a camera: right for a window of up to some 64 cameras.
+left to factorize is the Schur complement, dense, six numbers a camera: right for a window of up to some 64 cameras.
 A camera may have a lens to be found with its pose, three numbers more (`bundle_lens`).
 `levenberg_marquardt` holds its Hessian as one matrix, which here would have thousands of rows; hence a loop of its own.
 
@@ -70,7 +70,7 @@ class BundleAdjustment(NamedTuple):
 
     Attributes:
         poses: `wxyz_xyz` of T_world_cam; the identity where the initial one was not finite.
-        X_world: Points in metres; the origin where the initial one was not finite.
+        X_world: Points in meters; the origin where the initial one was not finite.
         initial_cost: `½ Σ w ρ(s)` before.
         cost: The same after.
         status: A `BundleStatus`.
@@ -120,7 +120,7 @@ def bundle_adjust(
 
     Args:
         poses: Where to start, `wxyz_xyz` of T_world_cam.
-        X_world: Where the points start, metres.
+        X_world: Where the points start, meters.
         observations: What is seen.
         fixed_poses: Poses that do not move.
         fixed_points: Points that do not move; `None` for none.

@@ -28,7 +28,7 @@ from jaxslam_kernels.bundle.lens import (
     lens_hessian,
     shift_cameras,
 )
-from jaxslam_kernels.camera import MIN_DEPTH, Intrinsics, normalise
+from jaxslam_kernels.camera import MIN_DEPTH, Intrinsics, normalize
 from jaxslam_kernels.checks import checked
 from jaxslam_kernels.pose.pose_cost import UNKNOWN_CHI2, positive
 from jaxslam_kernels.robust import Loss, loss_value, loss_weight
@@ -50,8 +50,8 @@ class Observations(NamedTuple):
     Attributes:
         camera: Row of the pose.
         point: Column of the point.
-        xy: Measured directions, undistorted normalised coordinates; with lenses, pixels from the principal point.
-        depth: Measured depths in metres; 0 or NaN where there is none.
+        xy: Measured directions, undistorted normalized coordinates; with lenses, pixels from the principal point.
+        depth: Measured depths in meters; 0 or NaN where there is none.
         precision: Factors that whiten the three residuals: `fx / σ_px`, `fy / σ_px`, `1 / σ_depth`; with lenses,
             `1 / σ_px` twice.
         weights: Factor of each observation's cost, not negative.
@@ -80,7 +80,7 @@ def observe(
     weights: Weights | None = None,
     valid: Mask | None = None,
 ) -> Observations:
-    """Observations from pixels of the distorted images of one camera model, with standard deviations (pixels, metres).
+    """Observations from pixels of the distorted images of one camera model, with standard deviations (pixels, meters).
 
     Anything that is not finite, or a deviation that is not positive, takes out the observation, or only its depth.
     """
@@ -92,7 +92,7 @@ def observe(
     return Observations(
         camera=camera,
         point=point,
-        xy=normalise(intrinsics, uv),
+        xy=normalize(intrinsics, uv),
         depth=depth,
         precision=jnp.stack([intrinsics.fx * inverse_px, intrinsics.fy * inverse_px, inverse_depth]),
         weights=jnp.ones(n, dtype) if weights is None else weights,

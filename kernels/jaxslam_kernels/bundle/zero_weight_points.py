@@ -18,8 +18,8 @@ from jaxslam_kernels.pose.pose_cost import FARTHEST_M
 from jaxslam_kernels.robust import Loss, loss_value
 from jaxslam_kernels.types import Mask, Points, Weights
 
-_MOST_STEPS = 100
-_INITIAL_DAMPING, _DAMPING_FACTOR, _MOST_DAMPING = 1e-4, 10.0, 1e9
+_MAX_STEPS = 100
+_INITIAL_DAMPING, _DAMPING_FACTOR, _MAX_DAMPING = 1e-4, 10.0, 1e9
 
 
 class Idle(NamedTuple):
@@ -29,7 +29,7 @@ class Idle(NamedTuple):
         mask: Which points are idle.
         rising: Those that a rising weight of the point would give observations: the others need more than one weight
             to rise, and any single observation can be fitted exactly, at no cost.
-        X_world: Where the points count, metres: idle ones that are rising at their own optimum, others where they are.
+        X_world: Where the points count, meters: idle ones that are rising at their own optimum, others where they are.
     """
 
     mask: Mask
@@ -50,7 +50,7 @@ def idle_points(cameras: Cameras, X_world: Points, problem: BundleProblem, relat
 
     Args:
         cameras: The adjusted cameras.
-        X_world: The adjusted points, metres.
+        X_world: The adjusted points, meters.
         problem: The problem that was solved.
         relative: Weights of the observations on the grid, without those of the points.
         loss: The robust loss, static.
@@ -84,13 +84,13 @@ def _settled(cameras: Cameras, X_world: Points, problem: BundleProblem, free: Ma
             X_world=jnp.where(better[None, :], trial, state.X_world),
             cost=jnp.where(better, cost, state.cost),
             damping=jnp.maximum(damping, 4.0 * epsilon),
-            done=state.done | small | (damping > _MOST_DAMPING),
+            done=state.done | small | (damping > _MAX_DAMPING),
             num_steps=state.num_steps + 1,
         )
 
     damping = jnp.full_like(X_world[0], _INITIAL_DAMPING)
     start = _Search(X_world, cost_of(X_world), damping, ~free, jnp.zeros((), jnp.int32))
-    more = lambda state: ~state.done.all() & (state.num_steps < _MOST_STEPS)
+    more = lambda state: ~state.done.all() & (state.num_steps < _MAX_STEPS)
     return lax.while_loop(more, step, start).X_world
 
 

@@ -1,6 +1,6 @@
 """Density-based clusters (DBSCAN) with fixed shapes: groups of points that lie close together, and noise.
 
-A point with enough neighbours is a core point; core points within the radius of each other belong together, however
+A point with enough neighbors is a core point; core points within the radius of each other belong together, however
 long the chain between them; other points within the radius of a core point are the border of its cluster; what is
 left is noise. All pairs of points are looked at, `O(n²)`, for hundreds of points.
 
@@ -26,7 +26,7 @@ class Clusters(NamedTuple):
     Attributes:
         label: `(n,)` the cluster of each point, from 0 to `num - 1` in the order of the clusters' first points; -1
             for noise and for points that do not count.
-        core: `(n,)` points that have at least `min_points` neighbours, themselves included, within the radius.
+        core: `(n,)` points that have at least `min_points` neighbors, themselves included, within the radius.
         num: How many clusters.
     """
 
@@ -44,11 +44,11 @@ def dbscan(
     A choice, constant for a derivative: labels are whole numbers and nothing in the result has a gradient.
 
     Args:
-        points: `(d, n)` coordinates in any unit, pixels or metres; d of 1 or more.
+        points: `(d, n)` coordinates in any unit, pixels or meters; d of 1 or more.
         mask: `(n,)` which of them count. One that is not finite does not count either.
-        radius: How far neighbours are apart at most, in the unit of the points, traced. Infinite: all points are
-            neighbours. Negative or NaN: none are, and all is noise.
-        min_points: How many neighbours, itself included, make a core point, traced. Below 1 it counts as 1.
+        radius: How far neighbors are apart at most, in the unit of the points, traced. Infinite: all points are
+            neighbors. Negative or NaN: none are, and all is noise.
+        min_points: How many neighbors, itself included, make a core point, traced. Below 1 it counts as 1.
 
     Returns:
         `Clusters`. A border point equally near to several core points, up to rounding, belongs to the first of them.
@@ -82,7 +82,7 @@ def _squared_radius(radius: Scalar) -> Scalar:
 def _nearest_core(squared: Float[Array, "n n"], core: Mask) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
     """Index of and squared distance to the nearest core point; index n - 1 and infinity where there is none.
 
-    Two minima instead of argmin, which XLA does not vectorise: a tenth of the time. It computes the distances anew for
+    Two minima instead of argmin, which XLA does not vectorize: a tenth of the time. It computes the distances anew for
     each, perhaps rounded differently, hence the tolerance.
     """
     n = core.shape[0]
@@ -96,7 +96,7 @@ def _nearest_core(squared: Float[Array, "n n"], core: Mask) -> tuple[Int[Array, 
 def _connected(near: Bool[Array, "n n"], core: Mask) -> Int[Array, " n"]:
     """The same index for all core points of a cluster, that of one of them; for other points their own.
 
-    Labels fall to the least of the neighbours' until they rest. The root of a tree falls too, and ways to the root
+    Labels fall to the least of the neighbors' until they rest. The root of a tree falls too, and ways to the root
     are halved, so that a chain takes steps with the logarithm of its length.
     """
     n = core.shape[0]

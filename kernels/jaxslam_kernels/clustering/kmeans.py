@@ -122,7 +122,7 @@ def _given(
     return jnp.where(usable[None, :], initial - origin[:, None], 0), usable
 
 
-class _Labelled(NamedTuple):
+class _Labeled(NamedTuple):
     """Labels of points, -1 for none, and the centers they stand for."""
 
     label: Int[Array, " n"]
@@ -131,7 +131,7 @@ class _Labelled(NamedTuple):
 
 def _lloyd(
     points: Float[Array, "d n"], counts: Mask, centers: Float[Array, "d k"], num_steps: int
-) -> tuple[_Labelled, _Labelled]:
+) -> tuple[_Labeled, _Labeled]:
     """What the last step begins with, and what it ends with.
 
     One time more is gone round, at first without any labels, which leaves all centers where they are. So labels are
@@ -139,12 +139,12 @@ def _lloyd(
     for everything they are used for, which takes longer than ten steps.
     """
 
-    def step(_: Array, state: tuple[_Labelled, _Labelled]) -> tuple[_Labelled, _Labelled]:
+    def step(_: Array, state: tuple[_Labeled, _Labeled]) -> tuple[_Labeled, _Labeled]:
         before = state[1]
         moved = _means(points, before.label, before.centers)
-        return before, _Labelled(jnp.where(counts, _nearest(points, moved)[0], -1), moved)
+        return before, _Labeled(jnp.where(counts, _nearest(points, moved)[0], -1), moved)
 
-    nothing = _Labelled(jnp.full(counts.shape, -1, jnp.int32), centers)
+    nothing = _Labeled(jnp.full(counts.shape, -1, jnp.int32), centers)
     return lax.fori_loop(0, num_steps + 1, step, (nothing, nothing))
 
 

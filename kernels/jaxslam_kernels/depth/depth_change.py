@@ -47,14 +47,14 @@ def depth_change(
     """Compare two depth images of one camera.
 
     Args:
-        depth: The present one, metres; 0 or not a number where missing.
+        depth: The present one, meters; 0 or not a number where missing.
         depth_then: The earlier one, of the same size.
         T_then_now: From the present camera to the earlier one.
         intrinsics: Of both; their distortion is left out.
         same_share: Differences of depth up to this share of the depth,
-        same_m: and so many metres more, are none.
+        same_m: and so many meters more, are none.
         new_share: The earlier depth must be greater by this share,
-        new_m: and so many metres more, for the surface to be new.
+        new_m: and so many meters more, for the surface to be new.
     """
     height, width = depth.shape
     v, u = jnp.mgrid[:height, :width].astype(depth.dtype)

@@ -15,7 +15,7 @@ from jaxslam_kernels.se3 import to_camera
 from jaxslam_kernels.types import DepthImage, Mask, Points, Scalar
 
 
-class SeenFrom(NamedTuple):
+class Visibility(NamedTuple):
     """What a depth image says of points; of one out of view or hidden, neither.
 
     Attributes:
@@ -28,7 +28,7 @@ class SeenFrom(NamedTuple):
 
 
 @checked
-def seen_from(
+def classify_visibility(
     X_world: Points,
     T_world_cam: SE3,
     depth: DepthImage,
@@ -37,17 +37,17 @@ def seen_from(
     *,
     same_share: Scalar,
     same_m: Scalar,
-) -> SeenFrom:
+) -> Visibility:
     """Compare points with a depth image.
 
     Args:
-        X_world: `(3, n)` metres.
+        X_world: `(3, n)` meters.
         T_world_cam: Pose of the camera.
-        depth: `(h, w)` metres; 0 or not a number where missing.
+        depth: `(h, w)` meters; 0 or not a number where missing.
         least: `(h, w)` the least depth around each pixel, 0 where some is missing: outlines see nothing past.
         intrinsics: Of the image.
         same_share: A surface is where a point is if their depths differ by no more than this share,
-        same_m: and so many metres; it is clearly behind if it is further than twice that.
+        same_m: and so many meters; it is clearly behind if it is further than twice that.
     """
     height, width = depth.shape
     X_cam = to_camera(T_world_cam, X_world)
@@ -58,4 +58,4 @@ def seen_from(
     seen, nearest = depth.reshape(-1)[at], least.reshape(-1)[at]
     limit = same_share * z + same_m
     there = visible & (seen > 0) & (jnp.abs(seen - z) <= limit)
-    return SeenFrom(there, visible & (nearest > 0) & (nearest - z > 2 * limit))
+    return Visibility(there, visible & (nearest > 0) & (nearest - z > 2 * limit))

@@ -22,7 +22,7 @@ NO_ROW = -1
 HALF = 32768
 """Voxels along each axis, from the origin in either direction; OctoMap has as many."""
 _FREE = -(2**31)
-_MOST_ROUNDS = 64
+_MAX_ROUNDS = 64
 """A table that is half full leaves one point in 10^19 without a row."""
 
 
@@ -80,7 +80,7 @@ def voxel_keys(X: Points, voxel_m: Scalar) -> tuple[Keys, Mask]:
 
 @checked
 def key_corners(keys: Keys, voxel_m: Scalar) -> Points:
-    """`(3, n)` the corners of voxels from which their coordinates count, metres."""
+    """`(3, n)` the corners of voxels from which their coordinates count, meters."""
     low, sixteen = jnp.uint32(0xFFFF), jnp.uint32(16)
     index = jnp.stack([keys[0] >> sixteen, keys[0] & low, keys[1]])
     return (index.astype(voxel_m.dtype) - HALF) * voxel_m
@@ -115,7 +115,7 @@ def find_rows(table: HashTable, keys: Keys, mask: Mask) -> tuple[HashTable, Rows
 
     nowhere = jnp.full(n, NO_ROW, jnp.int32)
     begin = _Search(table.slots, nowhere, nowhere, mask, jnp.zeros((), jnp.int32))
-    done = lax.while_loop(lambda search: jnp.any(search.open) & (search.round < _MOST_ROUNDS), step, begin)
+    done = lax.while_loop(lambda search: jnp.any(search.open) & (search.round < _MAX_ROUNDS), step, begin)
     first = done.found == -2 - index
     # XLA's own `cumsum` takes four times as long.
     given = table.num + lax.associative_scan(jnp.add, first.astype(jnp.int32)) - 1
@@ -130,7 +130,7 @@ def find_rows(table: HashTable, keys: Keys, mask: Mask) -> tuple[HashTable, Rows
 def _slot(keys: Keys, round: Code, size: int) -> Rows:
     """The slot that each key looks at in a round: double hashing, with the mixer of MurmurHash3.
 
-    Neighbours must not share their ways: with the round added to a coordinate, a surface took several times as long.
+    Neighbors must not share their ways: with the round added to a coordinate, a surface took several times as long.
     """
     mixed = keys[0] * jnp.uint32(0xCC9E2D51) ^ keys[1] * jnp.uint32(0x1B873593)
     mixed = (mixed ^ (mixed >> jnp.uint32(16))) * jnp.uint32(0x85EBCA6B)

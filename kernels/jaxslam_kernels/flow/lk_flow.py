@@ -13,7 +13,7 @@ from jaxslam_kernels.flow.lk_row_search import MORE_BORDER, settle_in_rows
 from jaxslam_kernels.flow.lk_search import FlowPlan, LevelPlan, difference, look, make_template, mean_absolute, search
 from jaxslam_kernels.image.patches import Window
 from jaxslam_kernels.image.pyramid import Pyramid
-from jaxslam_kernels.implicit_positions import Found, implicit_positions
+from jaxslam_kernels.implicit_positions import ConvergedPositions, implicit_positions
 from jaxslam_kernels.types import Mask, Pixels, Scalar
 
 __all__ = ["Flow", "FlowPlan", "FlowStatus", "LevelPlan", "lk_flow", "lk_flow_forward_backward"]
@@ -167,12 +167,12 @@ class _End(NamedTuple):
     last_step: Float[Array, " n"]
 
 
-def _solve(inputs: _Inputs, *, plan: FlowPlan) -> Found:
+def _solve(inputs: _Inputs, *, plan: FlowPlan) -> ConvergedPositions:
     how = {"settle": settle_in_rows} if plan.along_rows else {}
     end = search(*inputs, plan=plan, **how)
     tracked = inputs.usable & (end.texture > inputs.min_texture) & (end.last_step < plan.finest.accepted**2)
     tracked &= _inside(end.position, inputs.current)
-    return Found(end.position, tracked, _End(end.residual, end.texture, end.last_step))
+    return ConvergedPositions(end.position, tracked, _End(end.residual, end.texture, end.last_step))
 
 
 def _explain(position: Pixels, inputs: _Inputs, *, plan: FlowPlan) -> tuple[Pixels, _End]:

@@ -226,7 +226,7 @@ def iterate(search: Search, template: Template, level: Float[Array, "h w"], bord
 def _move_inside(position: Pixels, flow: Pixels, level: Float[Array, "h w"], border: int, window: Window) -> Pixels:
     """The nearest positions whose windows, there and at `position + flow`, lie in the image.
 
-    A coarse level gives no more than a guess to the next, and that of a neighbour with a whole window is better than
+    A coarse level gives no more than a guess to the next, and that of a neighbor with a whole window is better than
     a point's own with half a window.
     """
     low, high = patches.bounds(level, border)

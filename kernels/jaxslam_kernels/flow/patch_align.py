@@ -19,7 +19,7 @@ from jaxslam_kernels.flow.lk_search import LevelPlan, Search, Template, in_chunk
 from jaxslam_kernels.image import patches
 from jaxslam_kernels.image.patches import Window
 from jaxslam_kernels.image.pyramid import Pyramid
-from jaxslam_kernels.implicit_positions import Found, implicit_positions
+from jaxslam_kernels.implicit_positions import ConvergedPositions, implicit_positions
 from jaxslam_kernels.types import Mask, Pixels, Scalar, Weights
 
 DEFAULT_PLAN = LevelPlan(21, 8, 0.05)
@@ -35,7 +35,7 @@ class PatchMatch(NamedTuple):
 
     Attributes:
         points: `(2, n)` pixel coordinates in the current image.
-        correlation: `(n,)` zero-mean normalised cross-correlation of the warped patch and what is there, -1 to 1.
+        correlation: `(n,)` zero-mean normalized cross-correlation of the warped patch and what is there, -1 to 1.
         converged: `(n,)` whether the search settled, inside the image and at a correlation above 0.
     """
 
@@ -48,7 +48,7 @@ class PatchMatch(NamedTuple):
 def warped_patches(
     pictures: Num[Array, "k h w"],
     picture: Int[Array, " n"],
-    centre: Pixels,
+    center: Pixels,
     warp: Float[Array, "2 2 n"],
     *,
     side: int,
@@ -59,32 +59,32 @@ def warped_patches(
     Args:
         pictures: `k` pictures of one size.
         picture: `(n,)` which picture each point is in.
-        centre: `(2, n)` pixel coordinates of the points in their pictures.
+        center: `(2, n)` pixel coordinates of the points in their pictures.
         warp: `(2, 2, n)` offset in the picture for an offset in the patch, `[to, from]`.
         side: Rows of the patch, odd, static; its middle row and column `side // 2` is the point.
         stride: Columns of the patch, static.
 
     Returns:
         `(n, side * stride)` intensities, and which of them lie in the picture; past its edge it repeats. None does
-        where `centre` or `warp` is not finite.
+        where `center` or `warp` is not finite.
     """
     height, width = pictures.shape[1:]
-    known = _finite(centre) & _finite(warp)
-    centre, warp = _held(centre, known), _held(warp, known)
+    known = _finite(center) & _finite(warp)
+    center, warp = _held(center, known), _held(warp, known)
     offset = jnp.arange(side * stride)
-    du = (offset % stride - side // 2).astype(centre.dtype)[None, :]
-    dv = (offset // stride - side // 2).astype(centre.dtype)[None, :]
+    du = (offset % stride - side // 2).astype(center.dtype)[None, :]
+    dv = (offset // stride - side // 2).astype(center.dtype)[None, :]
     column = lambda array: array[:, None]
-    u = column(centre[0]) + column(warp[0, 0]) * du + column(warp[0, 1]) * dv
-    v = column(centre[1]) + column(warp[1, 0]) * du + column(warp[1, 1]) * dv
+    u = column(center[0]) + column(warp[0, 0]) * du + column(warp[0, 1]) * dv
+    v = column(center[1]) + column(warp[1, 0]) * du + column(warp[1, 1]) * dv
     inside = column(known) & (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
-    # Held one pixel inside, so that the neighbours right and below exist.
+    # Held one pixel inside, so that the neighbors right and below exist.
     u, v = jnp.clip(u, 0, width - 1.001), jnp.clip(v, 0, height - 1.001)
     left, top = jnp.floor(u), jnp.floor(v)
     fu, fv = u - left, v - top
     index = (column(picture) * height + top.astype(jnp.int32)) * width + left.astype(jnp.int32)
     flat = pictures.reshape(-1)
-    at = lambda shift: jnp.take(flat, index + shift, mode="clip").astype(centre.dtype)
+    at = lambda shift: jnp.take(flat, index + shift, mode="clip").astype(center.dtype)
     upper, lower = (1 - fu) * at(0) + fu * at(1), (1 - fu) * at(width) + fu * at(width + 1)
     return (1 - fv) * upper + fv * lower, inside
 
@@ -102,7 +102,7 @@ def _held(array: Float[Array, "... n"], mask: Mask) -> Float[Array, "... n"]:
 class _Inputs(NamedTuple):
     pictures: Num[Array, "k h w"]
     picture: Int[Array, " n"]
-    centre: Pixels
+    center: Pixels
     warp: Float[Array, "2 2 n"]
     guess: Pixels
     mask: Mask
@@ -113,7 +113,7 @@ class _Inputs(NamedTuple):
 def _template(inputs: _Inputs, window: Window, border: int, once: _Once) -> tuple[Template, Float[Array, "n l"]]:
     """The templates, and 1 for each of their pixels that counts, 0 for the others."""
     sample = lambda: warped_patches(
-        inputs.pictures, inputs.picture, inputs.centre, inputs.warp, side=window.side + 2, stride=window.stride
+        inputs.pictures, inputs.picture, inputs.center, inputs.warp, side=window.side + 2, stride=window.stride
     )
     smooth, inside = (jnp.pad(array, ((0, 0), (0, 2))) for array in once(sample))
     counts = (inside[:, _middle(window)] & window.columns()[None, :]).astype(smooth.dtype)
@@ -138,14 +138,17 @@ def _matched(
 
     Source: Hager and Belhumeur, Efficient Region Tracking With Parametric Models of Geometry and Illumination, 1998.
     """
-    (centred, _), (centred_there, mean_there) = _centred(smooth[:, _middle(window)], counts), _centred(there, counts)
-    area, power = _area(counts), _dot(centred, centred)
-    gain = jnp.sqrt(jnp.clip((_dot(centred_there, centred_there) + area) / (power + area), *_GAIN_SQUARED))
+    (centered, _), (centered_there, mean_there) = (
+        _centered(smooth[:, _middle(window)], counts),
+        _centered(there, counts),
+    )
+    area, power = _area(counts), _dot(centered, centered)
+    gain = jnp.sqrt(jnp.clip((_dot(centered_there, centered_there) + area) / (power + area), *_GAIN_SQUARED))
     gradient = patches.gradients(smooth, window) * counts[:, None, :]
     mean = jnp.sum(gradient, axis=2, keepdims=True) / area[:, :, None]
-    share = jnp.einsum("nkl,nl->nk", gradient, centred) / jnp.maximum(power, 1)
-    free = gradient - mean * counts[:, None, :] - share[:, :, None] * centred[:, None, :]
-    return gain * centred + mean_there, gain[:, :, None] * free
+    share = jnp.einsum("nkl,nl->nk", gradient, centered) / jnp.maximum(power, 1)
+    free = gradient - mean * counts[:, None, :] - share[:, :, None] * centered[:, None, :]
+    return gain * centered + mean_there, gain[:, :, None] * free
 
 
 def _there(position: Pixels, inputs: _Inputs, window: Window, border: int, once: _Once) -> Float[Array, "n l"]:
@@ -163,7 +166,7 @@ def _area(counts: Float[Array, "n l"]) -> Float[Array, "n 1"]:
     return jnp.maximum(jnp.sum(counts, axis=1, keepdims=True), 1)
 
 
-def _centred(
+def _centered(
     patch: Float[Array, "n l"], counts: Float[Array, "n l"]
 ) -> tuple[Float[Array, "n l"], Float[Array, "n 1"]]:
     """Patches less their mean, 0 where a pixel does not count, and the mean."""
@@ -172,16 +175,16 @@ def _centred(
 
 
 def _correlation(patch: Float[Array, "n l"], there: Float[Array, "n l"], counts: Float[Array, "n l"]) -> Weights:
-    first, second = (_centred(array, counts)[0] for array in (patch, there))
+    first, second = (_centered(array, counts)[0] for array in (patch, there))
     return (_dot(first, second) / jnp.sqrt(_dot(first, first) * _dot(second, second) + 1))[:, 0]
 
 
-def _solve(inputs: _Inputs, *, plan: LevelPlan, border: int, chunk: int) -> Found:
+def _solve(inputs: _Inputs, *, plan: LevelPlan, border: int, chunk: int) -> ConvergedPositions:
     """Where the search ends, and the correlation there."""
     window = Window(plan.window)
 
-    def search_chunk(inputs: _Inputs) -> Found:
-        once = partial(patches.at_once, alive=jnp.all(jnp.isfinite(inputs.centre)))
+    def search_chunk(inputs: _Inputs) -> ConvergedPositions:
+        once = partial(patches.at_once, alive=jnp.all(jnp.isfinite(inputs.center)))
         template, counts = _template(inputs, window, border, once)
         enough = 2 * jnp.sum(counts, axis=1) > window.side**2
         active = inputs.mask & enough & (template.texture > inputs.min_texture)
@@ -192,15 +195,15 @@ def _solve(inputs: _Inputs, *, plan: LevelPlan, border: int, chunk: int) -> Foun
         settled = known & (correlation > 0) & (end.last_step < plan.accepted**2)
         low, high = patches.bounds(inputs.current, border)
         inside = jnp.all((end.position >= low) & (end.position <= high), axis=0)
-        return Found(end.position, settled & inside, jnp.where(known, correlation, -1))
+        return ConvergedPositions(end.position, settled & inside, jnp.where(known, correlation, -1))
 
     # One of a batch after the other, as in `lk_search.search`, and for the same reasons.
     @jax.custom_batching.sequential_vmap
-    def search_all(inputs: _Inputs) -> Found:
-        run = lambda picture, centre, warp, guess, mask: search_chunk(
-            inputs._replace(picture=picture, centre=centre, warp=warp, guess=guess, mask=mask)
+    def search_all(inputs: _Inputs) -> ConvergedPositions:
+        run = lambda picture, center, warp, guess, mask: search_chunk(
+            inputs._replace(picture=picture, center=center, warp=warp, guess=guess, mask=mask)
         )
-        each = (inputs.picture, inputs.centre, inputs.warp, inputs.guess, inputs.mask)
+        each = (inputs.picture, inputs.center, inputs.warp, inputs.guess, inputs.mask)
         return in_chunks(run, each, inputs.mask, chunk)
 
     found = search_all(inputs)
@@ -221,7 +224,7 @@ def _explain(position: Pixels, inputs: _Inputs, *, plan: LevelPlan, border: int)
 def align_patches(
     pictures: Num[Array, "k h w"],
     picture: Int[Array, " n"],
-    centre: Pixels,
+    center: Pixels,
     warp: Float[Array, "2 2 n"],
     current: Pyramid,
     guess: Pixels,
@@ -233,14 +236,14 @@ def align_patches(
 ) -> PatchMatch:
     """Look points up in the current image by the patches around them in older pictures.
 
-    Differentiable in the pictures (when they are floating point), the current image, `centre` and `warp`, by the
+    Differentiable in the pictures (when they are floating point), the current image, `center` and `warp`, by the
     implicit function theorem; neither guess nor brightness has an influence. The derivative of a point that did not
     converge is zero.
 
     Args:
-        pictures: `k` pictures, grey, of any number type.
+        pictures: `k` pictures, gray, of any number type.
         picture: `(n,)` which of them each point is in.
-        centre: `(2, n)` pixel coordinates there. Pixels of a patch outside its picture do not count, and half of them
+        center: `(2, n)` pixel coordinates there. Pixels of a patch outside its picture do not count, and half of them
             must.
         warp: `(2, 2, n)` offset in the picture for an offset in the current image, `[to, from]`.
         current: Pyramid of the current image, its border at least half the window plus 6; its finest level is
@@ -262,10 +265,10 @@ def align_patches(
     """
     if current.border < Window(plan.window).border:
         raise ValueError(f"border: at least {Window(plan.window).border} pixels needed, got {current.border}")
-    usable = mask & _finite(guess) & _finite(centre) & _finite(warp)
-    centre, warp, guess = (_held(array, usable) for array in (centre, warp, guess))
-    threshold = jnp.asarray(min_texture, centre.dtype)
-    inputs = _Inputs(pictures, picture, centre, warp, guess, usable, current.levels[0], threshold)
+    usable = mask & _finite(guess) & _finite(center) & _finite(warp)
+    center, warp, guess = (_held(array, usable) for array in (center, warp, guess))
+    threshold = jnp.asarray(min_texture, center.dtype)
+    inputs = _Inputs(pictures, picture, center, warp, guess, usable, current.levels[0], threshold)
     settings = {"plan": plan, "border": current.border}
     found = implicit_positions(partial(_solve, chunk=chunk, **settings), partial(_explain, **settings), inputs)
     return PatchMatch(found.positions, found.measures, found.converged)

@@ -69,7 +69,7 @@ def grid_corners(score: Image, allowed: Bool[Array, "h w"], *, cell: int) -> Cor
     """
     rows, columns = score.shape[0] // cell, score.shape[1] // cell
     usable = jnp.where(allowed & jnp.isfinite(score), score, 0)[: rows * cell, : columns * cell]
-    # Down the columns, then along the rows, without argmax, which XLA does not vectorise: a tenth of the time.
+    # Down the columns, then along the rows, without argmax, which XLA does not vectorize: a tenth of the time.
     strips = usable.reshape(rows, cell, columns * cell)
     top = jnp.max(strips, axis=1)
     down = jnp.min(jnp.where(strips == top[:, None], jnp.arange(cell)[None, :, None], cell), axis=1)

@@ -1,7 +1,7 @@
 """Windows of an image around many points: cutting, sampling, gradients. The inner loops of `lk_flow`.
 
 A patch is a flat row with a stride of `side + 3` pixels, so that bilinear sampling is four shifted reads of one
-contiguous row, which XLA vectorises. Columns past the window hold neighbouring pixels that nobody asked for; the
+contiguous row, which XLA vectorizes. Columns past the window hold neighboring pixels that nobody asked for; the
 gradient there is zero, so that they drop out of every sum.
 """
 

@@ -18,7 +18,7 @@ class Pyramid(eqx.Module):
 
     Attributes:
         levels: Finest first; level `l` has shape `(h / 2**l + 2 * border, w / 2**l + 2 * border)`, halves rounded up.
-            Pixel `(u, v)` of level 0 lies at `(u, v) / 2**l` of level `l` (as in OpenCV, so the centre of the
+            Pixel `(u, v)` of level 0 lies at `(u, v) / 2**l` of level `l` (as in OpenCV, so the center of the
             top-left pixel stays (0, 0)).
         border: Width of the padding in pixels, static.
     """
@@ -69,7 +69,7 @@ def build_pyramid(
     """A pyramid of `num_levels` levels, the image itself first.
 
     Args:
-        image: Grey image, at least 3 pixels a side at the coarsest level but one; whole numbers as they come from a
+        image: Gray image, at least 3 pixels a side at the coarsest level but one; whole numbers as they come from a
             camera are faster than the same in floating point.
         num_levels: Number of levels, static, at least 1.
         border: Padding of each level in pixels, static; `lk_flow` needs `window // 2 + 6`.

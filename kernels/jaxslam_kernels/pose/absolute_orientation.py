@@ -1,7 +1,7 @@
 """The rigid motion between two triangles, in closed form, for many pairs at once.
 
 Three points span a plane. The best rotation brings the two planes together and then turns within the plane by the
-angle that maximises the correlation of the centred corners: no eigenvalue problem, no iteration, and exact for
+angle that maximizes the correlation of the centered corners: no eigenvalue problem, no iteration, and exact for
 congruent triangles. Of the two ways in which planes coincide it is always the one with normal on normal, as both
 normals see the corners in the same order.
 
@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 from jaxslam_kernels.checks import checked
 
 Triangles: TypeAlias = Float[Array, "3 3 *h"]
-"""Coordinate, corner, and any number of further axes: one triangle an entry, metres."""
+"""Coordinate, corner, and any number of further axes: one triangle an entry, meters."""
 
 _MIN_SINE = 1e-4
 """Of the angle at the first corner; below it the corners count as on a line."""
@@ -36,20 +36,20 @@ def absolute_orientation(
     Differentiable; where there is no plane the gradient is zero.
 
     Args:
-        source: `(3, 3, *h)` corners (coordinate, corner, ...) before the motion, metres.
+        source: `(3, 3, *h)` corners (coordinate, corner, ...) before the motion, meters.
         target: `(3, 3, *h)` the same corners after it.
 
     Returns:
-        R `(3, 3, *h)` (row, column, ...), t `(3, *h)` metres, and `(*h,)` whether both triangles span a plane. Where
+        R `(3, 3, *h)` (row, column, ...), t `(3, *h)` meters, and `(*h,)` whether both triangles span a plane. Where
         they do not (corners on a line, in one place, or not finite) the motion is the identity.
     """
     valid = _spans_plane(source) & _spans_plane(target)
     unit_triangle = jnp.eye(3, dtype=source.dtype).reshape(3, 3, *(1,) * (source.ndim - 2))
     source, target = (jnp.where(valid[None, None], corners, unit_triangle) for corners in (source, target))
-    source_centre, target_centre = source.mean(axis=1), target.mean(axis=1)
+    source_center, target_center = source.mean(axis=1), target.mean(axis=1)
     source_axes, target_axes = _plane_axes(source), _plane_axes(target)
     cosine, sine = _turn_in_plane(
-        _in_plane(source, source_centre, source_axes), _in_plane(target, target_centre, target_axes)
+        _in_plane(source, source_center, source_axes), _in_plane(target, target_center, target_axes)
     )
     first, second, normal = target_axes
     turned = [
@@ -61,12 +61,12 @@ def absolute_orientation(
         [_dot([axis[row] for axis in turned], [axis[column] for axis in source_axes]) for column in range(3)]
         for row in range(3)
     ]
-    t = [target_centre[row] - _dot(R[row], source_centre) for row in range(3)]
+    t = [target_center[row] - _dot(R[row], source_center) for row in range(3)]
     return jnp.stack([jnp.stack(row) for row in R]), jnp.stack(t), valid
 
 
 def _turn_in_plane(source: list[tuple[Array, Array]], target: list[tuple[Array, Array]]) -> tuple[Array, Array]:
-    """Cosine and sine of the angle that maximises `Σ qᵀ R(angle) p` over corners p and q in the plane.
+    """Cosine and sine of the angle that maximizes `Σ qᵀ R(angle) p` over corners p and q in the plane.
 
     The sum is never zero there, as both triangles go round the same way; `tiny` is for the rounded one.
     """
@@ -92,9 +92,9 @@ def _plane_axes(triangle: Array) -> _Axes:
     return first, _cross(normal, first), normal
 
 
-def _in_plane(triangle: Array, centre: Array, axes: _Axes) -> list[tuple[Array, Array]]:
-    """Each corner relative to the centre along the two axes in the plane."""
-    corners = [triangle[:, corner] - centre for corner in range(3)]
+def _in_plane(triangle: Array, center: Array, axes: _Axes) -> list[tuple[Array, Array]]:
+    """Each corner relative to the center along the two axes in the plane."""
+    corners = [triangle[:, corner] - center for corner in range(3)]
     return [(_dot(axes[0], corner), _dot(axes[1], corner)) for corner in corners]
 
 

@@ -61,10 +61,10 @@ def p3p(
 
     Args:
         bearings: `(3, 3, h)` (coordinate, point, triple) unit vectors towards the points, camera frame.
-        X_world: `(3, 3, h)` (coordinate, point, triple) the points, metres; in any frame, only distances count.
+        X_world: `(3, 3, h)` (coordinate, point, triple) the points, meters; in any frame, only distances count.
 
     Returns:
-        `(3, 4, h)` (point, solution, triple) distances in metres, 0 where there is no solution, and `(4, h)` which
+        `(3, 4, h)` (point, solution, triple) distances in meters, 0 where there is no solution, and `(4, h)` which
         solutions are real with all distances positive. The same solution may come twice. None for a triple that is
         not finite or in one place. All finite, whatever came in.
     """

@@ -80,16 +80,16 @@ def ransac_pnp(
 
     Args:
         key: Random key; the same key gives the same answer.
-        X_world: Points in the world, metres. At least `SAMPLE_SIZE` usable ones, not all on a line.
+        X_world: Points in the world, meters. At least `SAMPLE_SIZE` usable ones, not all on a line.
         uv: Where they are seen, pixels of the distorted image.
         intrinsics: The camera.
         weights: How likely each point is to be drawn, and its part in the score; `None` for one each. The derivative by
             a weight of 0 is the limit from above.
-        depth: Measured depths in metres, 0 or NaN where missing; `None` for pixels alone. They take part in the
+        depth: Measured depths in meters, 0 or NaN where missing; `None` for pixels alone. They take part in the
             choice of the root, in the score and in the refinement.
         initial: A predicted pose, tried as one more hypothesis.
         threshold_px: Largest error of an inlier in the image, pixels: about three standard deviations.
-        threshold_depth: Largest error of an inlier along the optical axis, metres. The two combine:
+        threshold_depth: Largest error of an inlier along the optical axis, meters. The two combine:
             `e² = (pixels / threshold_px)² + (depth / threshold_depth)² < 1`.
         min_inliers: Fewer than this is no consensus.
         num_hypotheses: How many samples are drawn, static.
@@ -129,7 +129,7 @@ def ransac_pnp(
     return _result(refined.T_world_cam, refined.status, fixed, fallback, scores.max() >= 0, min_inliers, averaged)
 
 
-_MOST_COMPARED = 2**15
+_MAX_COMPARED = 2**15
 """Up to so many weights times samples comparing with all is faster than halving, and twenty times less code."""
 
 
@@ -147,7 +147,7 @@ def draw_samples(
     """
     if weights.size == 0:
         raise ValueError("draw_samples: weights: expected at least one, got none")
-    search = "compare_all" if weights.size * num_samples <= _MOST_COMPARED else "scan"
+    search = "compare_all" if weights.size * num_samples <= _MAX_COMPARED else "scan"
     ends = jnp.cumsum(weights)
     starts, total = ends - weights, ends[-1]
     uniform = jax.random.uniform(key, (size, num_samples), weights.dtype)

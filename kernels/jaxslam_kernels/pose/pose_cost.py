@@ -4,7 +4,7 @@ Shared by `pose_refine` and `pnp`. A point gives three residuals, each divided b
 
     (fx (x/z - x̂) / σ_px,  fy (y/z - ŷ) / σ_px,  (z - ẑ) / σ_depth),
 
-with `(x̂, ŷ)` the measured pixel undistorted and normalised, so pixels are those of an ideal camera. A missing depth
+with `(x̂, ŷ)` the measured pixel undistorted and normalized, so pixels are those of an ideal camera. A missing depth
 drops the third one. The robust loss acts on the squared norm of all three: a point lies on the static scene or it
 does not, and one that moves along the ray agrees with the pixel and not with the depth. Cost and derivatives are for
 the perturbation `T_world_cam @ exp(tangent)`, tangent = (translation, rotation).
@@ -18,7 +18,7 @@ from jax import lax
 from jaxlie import SE3
 from jaxtyping import Array, Float
 
-from jaxslam_kernels.camera import MIN_DEPTH, Intrinsics, normalise
+from jaxslam_kernels.camera import MIN_DEPTH, Intrinsics, normalize
 from jaxslam_kernels.levenberg_marquardt import NormalEquations
 from jaxslam_kernels.robust import LARGEST_SQUARED, Loss, loss_value, loss_weight
 from jaxslam_kernels.se3 import to_camera
@@ -28,7 +28,7 @@ UNKNOWN_CHI2 = 1e4
 """Squared residual of a point behind the camera or without a value: 100 standard deviations, and no derivative."""
 
 FARTHEST_M = 1e9
-"""Metres. For derivatives by weights of 0, a point farther away than this is no point: products would overflow."""
+"""Meters. For derivatives by weights of 0, a point farther away than this is no point: products would overflow."""
 
 
 class PosePrior(NamedTuple):
@@ -39,7 +39,7 @@ class PosePrior(NamedTuple):
 
     Attributes:
         T_world_cam: The predicted pose.
-        information: Inverse covariance Λ in its right tangent (translation in metres, rotation in radians), of which
+        information: Inverse covariance Λ in its right tangent (translation in meters, rotation in radians), of which
             the symmetric part counts.
     """
 
@@ -51,9 +51,9 @@ class PoseProblem(NamedTuple):
     """Clean observations of one camera: everything finite, and weight 0 where something is missing.
 
     Attributes:
-        X_world: Points in metres.
-        xy: Measured directions, undistorted normalised coordinates.
-        depth: Measured depths in metres; anything where there is none.
+        X_world: Points in meters.
+        xy: Measured directions, undistorted normalized coordinates.
+        depth: Measured depths in meters; anything where there is none.
         precision: Factors that whiten the three residuals: `fx / σ_px`, `fy / σ_px`, `1 / σ_depth` or 0.
         weights: Factor of each point's cost.
         scale: Scale of the robust loss, in standard deviations.
@@ -100,7 +100,7 @@ def pose_problem(
     known = known & positive(sigma_px)
     focal = jnp.stack([intrinsics.fx, intrinsics.fy])
     inverse_depth_sigma = jnp.where(has_depth, 1.0 / jnp.where(has_depth, sigma_depth, 1.0), 0.0)
-    xy, clean_prior = normalise(intrinsics, uv), _usable_prior(prior)
+    xy, clean_prior = normalize(intrinsics, uv), _usable_prior(prior)
 
     def problem_of(counts: Mask) -> PoseProblem:
         safe_sigma = jnp.where(counts, sigma_px, 1.0)
@@ -168,7 +168,7 @@ class PoseCost(NamedTuple):
 
 def pose_cost(T_world_cam: SE3, problem: PoseProblem, loss: Loss) -> PoseCost:
     """Evaluates the cost and its derivatives along `T_world_cam @ exp(tangent)`."""
-    residuals, rows, front = _linearise(T_world_cam, problem)
+    residuals, rows, front = _linearize(T_world_cam, problem)
     chi2 = jnp.where(front, sum(jnp.square(r) for r in residuals), UNKNOWN_CHI2)
     robust_weights = jnp.where(front, loss_weight(chi2, problem.scale, loss), 0.0)
     weights = problem.weights * robust_weights
@@ -186,7 +186,7 @@ def pose_cost(T_world_cam: SE3, problem: PoseProblem, loss: Loss) -> PoseCost:
     return PoseCost(cost, NormalEquations(gradient, hessian), chi2, robust_weights)
 
 
-def _linearise(T_world_cam: SE3, problem: PoseProblem) -> tuple[list[Array], list[list[Array]], Mask]:
+def _linearize(T_world_cam: SE3, problem: PoseProblem) -> tuple[list[Array], list[list[Array]], Mask]:
     """Whitened residuals, their derivatives along the tangent, and which points are in front of the camera.
 
     With X' = X - v - ω × X in the camera's frame, a residual of gradient a along X has the row (-a, a × X).

@@ -118,14 +118,14 @@ def refine_pose(
 
     Args:
         T_world_cam: Where to start, near the answer.
-        X_world: Points in the world, metres.
+        X_world: Points in the world, meters.
         uv: Where they are seen, pixels of the distorted image.
         intrinsics: The camera.
         weights: Factor of each point's cost, `None` for one each. Points of weight 0 have no influence; the derivative
             by their weight is the limit from above.
-        depth: Measured depths in metres, 0 or NaN where missing; `None` for pixels alone.
+        depth: Measured depths in meters, 0 or NaN where missing; `None` for pixels alone.
         sigma_px: Standard deviation of a pixel, each coordinate, in pixels.
-        sigma_depth: Standard deviation of a depth, metres.
+        sigma_depth: Standard deviation of a depth, meters.
         loss: The robust loss, static.
         scale: Its scale in standard deviations, traced.
         prior: A pose known beforehand, with its information.

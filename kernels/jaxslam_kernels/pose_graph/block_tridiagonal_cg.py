@@ -1,8 +1,8 @@
 """Sparse symmetric systems of a graph: conjugate gradients, preconditioned by a block-tridiagonal Cholesky factor.
 
 The nodes, in a given order, are cut into groups of fixed size. The factor is that of the matrix without the coupling
-of groups that are not neighbours; their diagonal stays, so it is positive definite whatever is left out. Where the
-order brings every edge within neighbouring groups the factor is exact and one iteration is enough; otherwise it is an
+of groups that are not neighbors; their diagonal stays, so it is positive definite whatever is left out. Where the
+order brings every edge within neighboring groups the factor is exact and one iteration is enough; otherwise it is an
 incomplete factor. The order is data and the size of a group is static, so nothing recompiles when the graph grows.
 
 Source: Golub and Van Loan, "Matrix Computations", 2013, sections 4.5.1 and 11.5; Cuthill and McKee, "Reducing the
@@ -60,8 +60,8 @@ def multiply(matrix: GraphMatrix, x: Vector) -> Vector:
     return y.at[matrix.target].add(jnp.einsum("mij,mi->mj", matrix.coupling, x[matrix.source]))
 
 
-def factorise(matrix: GraphMatrix, rank: Int[Array, " k"], group_size: int) -> BandFactor:
-    """Factorises the part that couples neighbouring groups.
+def factorize(matrix: GraphMatrix, rank: Int[Array, " k"], group_size: int) -> BandFactor:
+    """Factorizes the part that couples neighboring groups.
 
     Args:
         matrix: Positive definite, a Gauss-Newton matrix with a positive damping.
@@ -92,10 +92,10 @@ def factorise(matrix: GraphMatrix, rank: Int[Array, " k"], group_size: int) -> B
     below = below.at[row_group, row_slot, :, column_slot, :].add(only(row_group == column_group + 1, matrix.coupling))
     below = below.at[column_group, column_slot, :, row_slot, :].add(only(column_group == row_group + 1, transposed))
     size = group_size * d
-    return BandFactor(*_factorise(corner.reshape(groups, size, size), below.reshape(groups, size, size)), rank)
+    return BandFactor(*_factorize(corner.reshape(groups, size, size), below.reshape(groups, size, size)), rank)
 
 
-def _factorise(corner: Array, below: Array) -> tuple[Array, Array]:
+def _factorize(corner: Array, below: Array) -> tuple[Array, Array]:
     def step(previous: Array, blocks: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array]]:
         diagonal, coupling = blocks
         left = solve_triangular(previous, coupling.T, lower=True).T

@@ -1,4 +1,4 @@
-"""Optimises a pose graph, SE(3) or Sim(3): closes loops over thousands of nodes, differentiably.
+"""Optimizes a pose graph, SE(3) or Sim(3): closes loops over thousands of nodes, differentiably.
 
 Levenberg-Marquardt on the cost of `pose_graph_cost`; each step solves the sparse normal equations, by the conjugate
 gradients of `block_band` or, much faster for graphs of thousands of nodes, on the host by `pose_graph_sparse`. The
@@ -30,7 +30,7 @@ from jaxslam_kernels.pose_graph.block_tridiagonal_cg import (
     GraphMatrix,
     Vector,
     conjugate_gradients,
-    factorise,
+    factorize,
     multiply,
     solve_factor,
 )
@@ -63,7 +63,7 @@ Elimination = Literal["band", "host"]
 _GROUP_SIZES = (16, 32, 64)
 """Those that `suitable_group_size` chooses from: beyond, the host is faster."""
 _INITIAL_DAMPING = 1e-5  # relative to the diagonal of the Hessian
-_LEAST_DAMPING, _MOST_DAMPING = 1e-9, 1e9
+_MIN_DAMPING, _MAX_DAMPING = 1e-9, 1e9
 _STEP_TOLERANCE = 1e-2  # of the conjugate gradients in a step
 
 
@@ -82,7 +82,7 @@ class PoseGraphStatus(IntEnum):
 
 
 class PoseGraph(NamedTuple):
-    """An optimised pose graph.
+    """An optimized pose graph.
 
     Attributes:
         T_world_cam: k poses, `wxyz_xyz` `(k, 7)`.
@@ -139,7 +139,7 @@ class _Search(NamedTuple):
 
 
 @checked
-def optimise_pose_graph(
+def optimize_pose_graph(
     T_world_cam: Annotated[SE3, "k"],
     edges: PoseGraphEdges,
     fixed: Bool[Array, " k"],
@@ -263,7 +263,7 @@ def suitable_group_size(source: np.ndarray, target: np.ndarray, rank: np.ndarray
 
 
 def _anchored(problem: GraphProblem, fixed: Bool[Array, " k"]) -> Bool[Array, " k"]:
-    """Which nodes have a path to a fixed one: labels fall to the least of the neighbours' until they rest."""
+    """Which nodes have a path to a fixed one: labels fall to the least of the neighbors' until they rest."""
     k, used = fixed.shape[0], problem.weights > 0
     source, target = problem.source, problem.target
 
@@ -302,7 +302,7 @@ def _solve(initial: Nodes, graph: _Graph, solver: _Solver) -> _Search:
         short = promised <= jnp.maximum(epsilon * k, 8.0 * epsilon * s.cost)
         level = jnp.abs(won) <= 8.0 * epsilon * s.cost
         eased = jnp.maximum(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)
-        damping = jnp.clip(s.damping * jnp.where(better, eased, s.growth), _LEAST_DAMPING, _MOST_DAMPING)
+        damping = jnp.clip(s.damping * jnp.where(better, eased, s.growth), _MIN_DAMPING, _MAX_DAMPING)
         nodes, cost = jnp.where(better, trial, s.nodes), jnp.where(better, trial_cost, s.cost)
         return _Search(
             nodes=nodes,
@@ -331,7 +331,7 @@ def _preconditioner(matrix: GraphMatrix, graph: _Graph, solver: _Solver) -> Call
     """The inverse of the matrix, exact on the host and as good as the band is otherwise."""
     if solver.elimination == "host":
         return partial(solve_on_host, matrix)
-    return partial(solve_factor, factorise(matrix, graph.rank, solver.group_size))
+    return partial(solve_factor, factorize(matrix, graph.rank, solver.group_size))
 
 
 def _diagonal(equations: GraphEquations, graph: _Graph) -> Steps:
@@ -366,7 +366,7 @@ def _optimum_shift(solver: _Solver, converged: Flag, optimum: Nodes, graph: _Gra
 
 @_optimum_shift.defjvp
 def _optimum_shift_jvp(solver: _Solver, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    converged, optimum, graph, idle = first_order(primals, "optimise_pose_graph")
+    converged, optimum, graph, idle = first_order(primals, "optimize_pose_graph")
     free = graph.free[:, None]
     value = _optimum_shift(solver, converged, optimum, graph, idle)
     still = jnp.where(free, 0.0, tangents[1])  # the initial values of the free nodes do not matter
@@ -393,7 +393,7 @@ def _solve_exact(solver: _Solver, optimum: Nodes, graph: _Graph, right: Steps) -
         return jnp.where(free, moved, steps)
 
     epsilon = float(jnp.finfo(right.dtype).eps)
-    matrix = _system(graph_equations(optimum, graph.problem, solver.loss), graph, _LEAST_DAMPING)
+    matrix = _system(graph_equations(optimum, graph.problem, solver.loss), graph, _MIN_DAMPING)
     precondition = _preconditioner(matrix, graph, solver)
 
     def solve(_: object, b: Steps) -> Steps:

@@ -2,7 +2,7 @@
 
 For graphs whose band is wide in any order: a minimum-degree order of the nodes keeps the factor sparse, which XLA
 cannot express without compiling for each structure. It is pure, batches one by one and blocks no other thread of
-Python while it factorises; it has no derivative of its own.
+Python while it factorizes; it has no derivative of its own.
 
 Source: Li, "An Overview of SuperLU", 2005; Liu, "Modification of the Minimum-Degree Algorithm by Multiple
 Elimination", 1985, for the order.
@@ -78,7 +78,7 @@ def _solve(
 
 
 def _elimination_order(source: np.ndarray, target: np.ndarray, num_nodes: int) -> np.ndarray:
-    """Minimum degree, by nodes: SuperLU finds it on its way to factorising any matrix of this structure."""
+    """Minimum degree, by nodes: SuperLU finds it on its way to factorizing any matrix of this structure."""
     from scipy.sparse import coo_array  # noqa: PLC0415 - only for graphs, on the host
     from scipy.sparse.linalg import splu  # noqa: PLC0415
 

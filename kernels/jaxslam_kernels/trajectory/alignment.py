@@ -24,7 +24,7 @@ AlignmentKind: TypeAlias = Literal["none", "se3", "sim3"]
 """What is fitted before positions are compared: nothing, a rigid motion, a rigid motion with a scale."""
 
 MAX_DISTANCE = 1e9
-"""Metres. A position further out than this is no position: it counts as not finite."""
+"""Meters. A position further out than this is no position: it counts as not finite."""
 
 _Matrix: TypeAlias = Float[Array, "3 3"]
 _Vector: TypeAlias = Float[Array, "3"]
@@ -81,7 +81,7 @@ class AbsoluteErrors(NamedTuple):
     """Absolute trajectory error (ATE).
 
     Attributes:
-        distances: `(n,)` metres between aligned estimate and reference, 0 where a pose does not count.
+        distances: `(n,)` meters between aligned estimate and reference, 0 where a pose does not count.
         statistics: Figures of the distances; `statistics.rmse` is what papers call the ATE.
         alignment: What was applied to the estimate.
         num_poses: How many poses count.
@@ -97,7 +97,7 @@ class RelativeErrors(NamedTuple):
     """Relative pose error (RPE), one a pair; 0 where a pair does not count.
 
     Attributes:
-        translations: `(m,)` metres.
+        translations: `(m,)` meters.
         rotations: `(m,)` radians, 0 to pi.
         translation: Figures of the translations.
         rotation: Figures of the rotations.
@@ -119,8 +119,8 @@ def align(estimate_xyz: Points, reference_xyz: Points, weights: Weights, *, with
     trajectories. Where the rotation is undetermined about an axis, its derivative about that axis is zero.
 
     Args:
-        estimate_xyz: `(3, n)` estimated positions, metres.
-        reference_xyz: `(3, n)` true positions at the same times, metres.
+        estimate_xyz: `(3, n)` estimated positions, meters.
+        reference_xyz: `(3, n)` true positions at the same times, meters.
         weights: `(n,)` non-negative weights; a mask works as `mask.astype(dtype)`.
         with_scale: Whether to estimate a scale too, static.
 
@@ -139,8 +139,8 @@ def ate(
     """Distances between positions at the same times, after alignment.
 
     Args:
-        estimate_xyz: `(3, n)` estimated positions, metres; `T_world_cam.translation().T` of a batch of poses.
-        reference_xyz: `(3, n)` true positions, metres.
+        estimate_xyz: `(3, n)` estimated positions, meters; `T_world_cam.translation().T` of a batch of poses.
+        reference_xyz: `(3, n)` true positions, meters.
         weights: `(n,)` non-negative weights, of the alignment and of the statistics alike.
         alignment: What to align, static.
     """
@@ -189,9 +189,9 @@ def rpe(
 
 @jax.custom_jvp
 def nearest_rotation(matrix: _Matrix) -> _Matrix:
-    """The rotation R that maximises `tr(Rᵀ M)`: the polar factor of M, kept proper.
+    """The rotation R that maximizes `tr(Rᵀ M)`: the polar factor of M, kept proper.
 
-    The identity for the zero matrix; one of the maximisers where several are equally good.
+    The identity for the zero matrix; one of the maximizers where several are equally good.
     """
     U, _, Vt = jnp.linalg.svd(matrix)
     u, v = U.T, Vt
@@ -235,8 +235,8 @@ def _axes(P: _Matrix) -> tuple[_Matrix, _Vector, Bool[Array, "3"]]:
 def _fit(x: Points, y: Points, weights: Weights, with_scale: bool) -> tuple[Alignment, Points]:
     """The alignment of usable x to y, and what remains, `scale R x + t - y`, computed about the centroids."""
     share = _shares(weights)
-    x_mean, x = _centred(x, share)
-    y_mean, y = _centred(y, share)
+    x_mean, x = _centered(x, share)
+    y_mean, y = _centered(y, share)
     covariance = _matmul(share[None, :] * y, x.T)
     R = nearest_rotation(covariance)
     variance = jnp.sum(share * jnp.sum(x * x, axis=0))
@@ -281,7 +281,7 @@ def _shares(weights: Weights) -> Weights:
     return weights / jnp.where(total > 0, total, 1.0)
 
 
-def _centred(xyz: Points, share: Weights) -> tuple[_Vector, Points]:
+def _centered(xyz: Points, share: Weights) -> tuple[_Vector, Points]:
     """Weighted mean, and positions relative to it.
 
     Summed relative to one of the positions: if all are equal the result is exactly zero, and distance from

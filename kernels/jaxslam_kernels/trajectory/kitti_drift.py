@@ -28,8 +28,8 @@ class SegmentErrors(NamedTuple):
     """Errors of the motion over segments of `k` lengths from `s` beginnings, divided by the length.
 
     Attributes:
-        translations: `(k, s)` metres a metre, 0 where there is no such segment.
-        rotations: `(k, s)` radians a metre, 0 where there is no such segment.
+        translations: `(k, s)` meters a meter, 0 where there is no such segment.
+        rotations: `(k, s)` radians a meter, 0 where there is no such segment.
         translation: Mean of the translations that count, 0 if none does; times 100 the `t_rel` of papers, percent.
         rotation: Mean of the rotations that count; as degrees times 100 the `r_rel` of papers, degrees per 100 m.
         num_segments: How many segments count.
@@ -57,14 +57,14 @@ def segment_errors(
     there along the path. Its error is that of `rpe`, divided by the length asked for, as in the benchmark, not by that
     of the path. Where segments begin and end is a constant for differentiation.
 
-    In float32 the way along kilometres is off by centimetres, so that a segment may end a pose earlier or later.
+    In float32 the way along kilometers is off by centimeters, so that a segment may end a pose earlier or later.
 
     Args:
         estimate: Batch of `n` poses `T_world_cam` in the order of time.
         reference: Batch of `n` true poses at the same times, in any world frame.
         mask: `(n,)` which poses count. Those that cannot be used (see `alignment`) do not; they are left out of
             the path and of the count of steps.
-        lengths: `(k,)` metres; one below a millimetre has no segments.
+        lengths: `(k,)` meters; one below a millimeter has no segments.
         step: From one beginning to the next, at least 1, static. There are `s = ceil(n / step)`, some beyond the end.
     """
     _, estimate_known = usable_poses(estimate)
@@ -83,7 +83,7 @@ def segment_errors(
 
 
 def _way(xyz: Float[Array, "n 3"], count: Code) -> Float[Array, " n"]:
-    """Metres along the path from the first position to each; beyond the last that counts it does not go on."""
+    """Meters along the path from the first position to each; beyond the last that counts it does not go on."""
     xyz = lax.stop_gradient(xyz)
     steps = jnp.linalg.norm(xyz[1:] - xyz[:-1], axis=1)
     steps = jnp.where(jnp.arange(1, len(xyz), dtype=count.dtype) < count, steps, 0.0)

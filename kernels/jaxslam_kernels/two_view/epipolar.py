@@ -4,7 +4,7 @@ A fundamental matrix F maps a pixel of the first view, `p1 = (u, v, 1)`, to the 
 its partner p2 lies: `p2ᵀ F p1 = 0`. Its scale and sign mean nothing.
 
 Source: Hartley and Zisserman, "Multiple View Geometry in Computer Vision", 2004, sections 11.1.2 (seven points) and
-11.4.3 (Sampson distance); Hartley, "In Defense of the Eight-Point Algorithm", 1997, for the normalisation.
+11.4.3 (Sampson distance); Hartley, "In Defense of the Eight-Point Algorithm", 1997, for the normalization.
 """
 
 import math
@@ -21,7 +21,7 @@ from jaxslam_kernels.types import Pixels, Weights
 
 _CUBIC_STEPS = 2  # after the closed form, which float32 leaves short of a few digits
 _TINY = 1e-20  # a squared length from which on a line has a direction
-LEAST_SLOPE = 1e-12  # squared; second derivatives by it are finite in float32
+MIN_SLOPE = 1e-12  # squared; second derivatives by it are finite in float32
 
 Matrices = Float[Array, "3 3 *batch"]
 
@@ -68,7 +68,7 @@ def sampson_squared(F: Matrices, before: Pixels, after: Pixels) -> Float[Array, 
     u, v = (x.reshape((1,) * (F.ndim - 2) + (-1,)) for x in after)
     x, y = a * u + d * v + g, b * u + e * v + h
     error = u * X + v * Y + Z
-    return error * error / jnp.maximum(X * X + Y * Y + x * x + y * y, LEAST_SLOPE)
+    return error * error / jnp.maximum(X * X + Y * Y + x * x + y * y, MIN_SLOPE)
 
 
 @checked
@@ -109,8 +109,8 @@ def seven_point(
         where not, or where a sample is not finite.
     """
     known = jnp.isfinite(uv_before).all(axis=(0, 1)) & jnp.isfinite(uv_after).all(axis=(0, 1))
-    (u1, v1), shift1, scale1 = _normalised(jnp.where(known[None, None, :], uv_before, 0.0))
-    (u2, v2), shift2, scale2 = _normalised(jnp.where(known[None, None, :], uv_after, 0.0))
+    (u1, v1), shift1, scale1 = _normalized(jnp.where(known[None, None, :], uv_before, 0.0))
+    (u2, v2), shift2, scale2 = _normalized(jnp.where(known[None, None, :], uv_after, 0.0))
     ones = jnp.ones_like(u1)
     columns = jnp.stack([u2 * u1, u2 * v1, u2, v2 * u1, v2 * v1, v2, u1, v1, ones])  # (entry of F, pair, sample)
     pencil = _null_space(columns)
@@ -150,13 +150,13 @@ def _ratio(error: Array, squared: Array, known: Array) -> Array:
     return jnp.where(usable, jnp.abs(error) * lax.rsqrt(jnp.where(usable, squared, 1.0)), 0.0)
 
 
-def _normalised(uv: Array) -> tuple[Array, Array, Array]:
+def _normalized(uv: Array) -> tuple[Array, Array, Array]:
     """Points around the origin, √2 away on average, and what has been subtracted and multiplied."""
     shift = uv.mean(axis=1)
-    centred = uv - shift[:, None]
-    spread = jnp.sqrt(jnp.square(centred).sum(axis=0)).mean(axis=0)
+    centered = uv - shift[:, None]
+    spread = jnp.sqrt(jnp.square(centered).sum(axis=0)).mean(axis=0)
     scale = math.sqrt(2.0) / jnp.where(spread > 0, spread, math.sqrt(2.0))
-    return centred * scale[None, None, :], shift, scale
+    return centered * scale[None, None, :], shift, scale
 
 
 def _in_pixels(F: Array, shift1: Array, scale1: Array, shift2: Array, scale2: Array) -> Array:

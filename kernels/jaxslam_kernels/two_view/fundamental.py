@@ -174,8 +174,8 @@ def _two_views(
     fixed = lax.stop_gradient(both)
     number = jnp.maximum(counts.sum(), 1).astype(dtype)
     shift = fixed.sum(axis=2) / number
-    centred = jnp.where(counts[None, None], fixed - shift[:, :, None], 0.0)
-    spread = jnp.sqrt(jnp.square(centred).sum() / (2.0 * number))
+    centered = jnp.where(counts[None, None], fixed - shift[:, :, None], 0.0)
+    spread = jnp.sqrt(jnp.square(centered).sum() / (2.0 * number))
     scale = 1.0 / jnp.where(spread > 1e-6, spread, 1.0)
     before, after = jnp.where(counts[None, None], (both - shift[:, :, None]) * scale, 0.0)
     threshold = jnp.where(jnp.isfinite(threshold) & (threshold > 0), threshold, 1.0) * scale

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from jaxslam_kernels.first_order import first_order
 from jaxslam_kernels.levenberg_marquardt import ManifoldLevenbergMarquardt, NormalEquations
 from jaxslam_kernels.robust import Loss, loss_value, loss_weight
-from jaxslam_kernels.two_view.epipolar import LEAST_SLOPE, adjugate, sampson_squared
+from jaxslam_kernels.two_view.epipolar import MIN_SLOPE, adjugate, sampson_squared
 from jaxslam_kernels.types import Flag, Pixels, Scalar, Weights
 
 Matrix = Float[Array, "3 3"]
@@ -113,7 +113,7 @@ def _equations(F: FramedMatrix, views: TwoViews, loss: Loss, scale: float) -> tu
     line, back = F.S @ p1[:2], F.S.T @ p2[:2]  # in the axes of U and V; their last entries are 0
     error = (p2[:2] * line).sum(axis=0)
     slope, slope_back = F.U[:2, :2] @ line, F.V[:2, :2] @ back
-    inverse = lax.rsqrt(jnp.maximum((jnp.square(slope) + jnp.square(slope_back)).sum(axis=0), LEAST_SLOPE))
+    inverse = lax.rsqrt(jnp.maximum((jnp.square(slope) + jnp.square(slope_back)).sum(axis=0), MIN_SLOPE))
     unit = inverse / views.threshold
     residual = error * unit
     # d residual / d entry (i, j) in those axes: of the error, and of the length that it is divided by

@@ -267,7 +267,7 @@ class TestDataFiles:
         assert {figure.reported_by for figure in FIGURES if figure not in named} == {COLLECTION}
 
     @pytest.mark.parametrize("sequence", SEQUENCES)
-    def test_sequence_is_one_that_loaders_recognise(self, sequence: str, tmp_path: Path) -> None:
+    def test_sequence_is_one_that_loaders_recognize(self, sequence: str, tmp_path: Path) -> None:
         folder = tmp_path / sequence
         folder.mkdir()
         (folder / "rgb.txt").touch()

@@ -135,8 +135,8 @@ class TestJson:
     @pytest.mark.parametrize(
         ("words", "keys"),
         [
-            (["models", "list"], {"name", "licence", "size_bytes", "sha256", "here"}),
-            (["data", "list"], {"name", "licence", "size_bytes", "url", "here"}),
+            (["models", "list"], {"name", "license", "size_bytes", "sha256", "here"}),
+            (["data", "list"], {"name", "license", "size_bytes", "url", "here"}),
             (["data", "list", "--missing"], {"name", "page"}),
             (["bench"], {"suite", "sequences", "presets", "runs", "about"}),
         ],

@@ -156,7 +156,7 @@ class TestList:
         out = capsys.readouterr().out
         for name, known in recordings.known_recordings().items():
             row = self.row(out, name)
-            assert f"{known.dataset}, licence: {known.licence}, see {known.page}" in out
+            assert f"{known.dataset}, license: {known.license}, see {known.page}" in out
             assert row.split()[-1] == ("yes" if name == BONN else "no")
         assert f"{BONN}: {here}" in out.splitlines()
         assert "0.53 GB" in self.row(out, TUM)
@@ -190,7 +190,7 @@ class TestGet:
         out = capsys.readouterr().out
         assert names_in(cache) == [name]
         assert find_recording(name) == cache / name
-        assert f"licence: {known.licence}, see {known.page}" in out
+        assert f"license: {known.license}, see {known.page}" in out
         assert all(word in out for word in ("Downloading", "Unpacking"))
         assert out.splitlines()[-1] == f"To track it: jaxslam run {cache / name}"
         dataset = open_dataset(cache / name)

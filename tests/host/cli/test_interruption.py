@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from jaxslam.results.run_results import RESULT_FILES
 from small_scene import CONFIG, SETTINGS, Clip, clip
 
 from jaxslam import datasets
@@ -22,7 +23,6 @@ from jaxslam.cli.interruption import Interruption
 from jaxslam.cli.tracking_run import track
 from jaxslam.io.atomic_files import write_atomically
 from jaxslam.map.npz_file import load_map
-from jaxslam.results.run_results import RESULT_FILES
 from jaxslam.slam import slam as slam_module
 from jaxslam.slam.slam import Slam
 from jaxslam.tracking.state import TrackStatus
@@ -323,5 +323,5 @@ class TestSlam:
         assert len(slam.trajectory) == FRAMES
         assert len(load_map(tmp_path / "a.map").ids) == len(slam.map.ids) > 0
         statuses = [slam.track(frame).status for frame in recording.frames[FRAMES + 1 : FRAMES + 8]]
-        assert TrackStatus.RELOCALISED in statuses
+        assert TrackStatus.RELOCALIZED in statuses
         assert TrackStatus.STARTED not in statuses

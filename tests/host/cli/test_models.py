@@ -45,7 +45,7 @@ pytestmark = pytest.mark.usefixtures("models_cache")
 
 @pytest.fixture
 def image(tmp_path: Path) -> Path:
-    path = tmp_path / "grey.png"
+    path = tmp_path / "gray.png"
     cv2.imwrite(str(path), np.full((HEIGHT, WIDTH, 3), 100, np.uint8))
     return path
 

@@ -15,18 +15,18 @@ from hypothesis import strategies as st
 
 from jaxslam.config import schema as config_module
 from jaxslam.config.schema import Config, RunConfig, TrackConfig, configs_dir, load_config, presets, to_yaml, updated
-from jaxslam.config.validation import Checked, Range, checked_value
+from jaxslam.config.validation import Range, ValidatedConfig, checked_value
 from jaxslam.errors import ConfigError
 
 
 @dataclass(frozen=True)
-class Leaf(Checked):
+class Leaf(ValidatedConfig):
     gain: Annotated[float, Range(above=0, at_most=1)] = 0.5
     sizes: tuple[Annotated[int, Range(at_least=1)], ...] = (3, 5)
 
 
 @dataclass(frozen=True)
-class Branch(Checked):
+class Branch(ValidatedConfig):
     leaf: Leaf = field(default_factory=Leaf)
     extra: Leaf | None = None
     mode: Literal["off", "fast", 3] = "off"
@@ -36,7 +36,7 @@ class Branch(Checked):
 
 
 @dataclass(frozen=True)
-class Root(Checked):
+class Root(ValidatedConfig):
     branch: Branch = field(default_factory=Branch)
     enabled: bool = True
 
@@ -189,6 +189,11 @@ class TestPrecedence:
         assert config.run == RunConfig(deterministic=False, seed=5, prefetch_frames=2)
 
 
+def schema_renamed() -> dict[str, str]:
+    """The table of earlier names of settings."""
+    return config_module._RENAMED
+
+
 class TestRefusals:
     @pytest.mark.parametrize(
         ("override", "words"),
@@ -218,6 +223,13 @@ class TestRefusals:
     def test_override_within_a_value(self) -> None:
         with pytest.raises(ConfigError, match="needs a section, but 'track' is set to 3"):
             load_config(overrides=["track=3", "track.num_points=400"])
+
+    @pytest.mark.parametrize(("old", "new"), sorted(schema_renamed().items()))
+    def test_old_key_names_the_new_one(self, old: str, new: str) -> None:
+        with pytest.raises(ConfigError, match=rf"override: {old}: renamed, use {new}$"):
+            load_config(overrides=[f"{old}=1"])
+        section, key = new.split(".")
+        assert hasattr(getattr(Config(), section), key)
 
     def test_file_is_named(self, tmp_path: Path) -> None:
         (tmp_path / "mine.yaml").write_text("run: {sed: 1}\n")

@@ -1,4 +1,4 @@
-"""The catalogue of public recordings, and finding their folders on this machine."""
+"""The catalog of public recordings, and finding their folders on this machine."""
 
 import os
 from pathlib import Path
@@ -17,7 +17,7 @@ KNOWN = known_recordings()
 ENTRY = """
 - dataset: Ours
   kind: tum
-  licence: CC0
+  license: CC0
   page: https://example.org
   url: https://example.org/{name}.tgz
   recordings:
@@ -51,13 +51,13 @@ def recording(folder: Path) -> Path:
     return folder
 
 
-class TestCatalogue:
+class TestCatalog:
     @pytest.mark.parametrize("name", KNOWN)
     def test_entry_is_complete(self, name: str) -> None:
         entry = KNOWN[name]
         assert entry.name == name
         assert entry.page.startswith("https://")
-        assert entry.licence
+        assert entry.license
         assert bool(entry.url) != bool(entry.how)
         if entry.url is not None:
             assert entry.url.startswith("https://")
@@ -90,8 +90,8 @@ class TestCatalogue:
     def test_holds_what_papers_use(self, names: list[str]) -> None:
         assert set(names) <= set(KNOWN)
 
-    def test_licences(self) -> None:
-        assert {entry.kind: entry.licence for entry in KNOWN.values()} == {
+    def test_licenses(self) -> None:
+        assert {entry.kind: entry.license for entry in KNOWN.values()} == {
             "tum": "CC BY 4.0",
             "bonn": "see page",
             "kitti": "CC BY-NC-SA 3.0",
@@ -117,7 +117,7 @@ class TestCatalogue:
             known_recording("zzz")
 
 
-class TestCatalogueFile:
+class TestCatalogFile:
     def read(self, tmp_path: Path, text: str) -> dict[str, module.Recording]:
         path = tmp_path / "recordings.yaml"
         path.write_text(text)
@@ -131,7 +131,7 @@ class TestCatalogueFile:
         ("change", "expected"),
         [
             (("about: a walk", "abuot: a walk"), "dataset 1: walk: unknown key 'abuot' (did you mean 'about'?)"),
-            (("  licence: CC0\n", ""), "dataset 1: walk: missing 'licence'"),
+            (("  license: CC0\n", ""), "dataset 1: walk: missing 'license'"),
             (("kind: tum", "kind: tmu"), "walk: Recording.kind: expected"),
             (("about: a walk", "about: a walk\n      size_bytes: -1"), "walk: Recording.size_bytes: expected"),
             (("about: a walk", "about: a walk\n      size_bytes: many"), "walk: Recording.size_bytes: expected"),

@@ -36,8 +36,8 @@ NAMES = ["1", "2", "10"]
 
 
 class TestFolder:
-    def test_colour_and_depth(self, tmp_path: Path) -> None:
-        """Numbers in the order of their value, times by the rate of the camera, depth in metres."""
+    def test_color_and_depth(self, tmp_path: Path) -> None:
+        """Numbers in the order of their value, times by the rate of the camera, depth in meters."""
         _images(tmp_path / "color", NAMES)
         _depths(tmp_path / "depth", NAMES)
         dataset = open_dataset(tmp_path, camera=DEPTH)
@@ -47,7 +47,7 @@ class TestFolder:
         assert frame.depth_m is not None
         np.testing.assert_allclose(frame.depth_m, 1.5)
 
-    def test_depth_in_metres(self, tmp_path: Path) -> None:
+    def test_depth_in_meters(self, tmp_path: Path) -> None:
         _images(tmp_path / "rgb", ["a"])
         (tmp_path / "depth").mkdir()
         plane = np.full((HEIGHT, WIDTH), 2.5)
@@ -133,7 +133,7 @@ class TestTartanAir:
         assert (float(depth_m[50, 50]), float(depth_m[200, 50])) == (0, 3)
 
     def test_poses_in_axes_of_opencv(self, tmp_path: Path) -> None:
-        """A metre forward is one along z; a turn to the right (about down) is one about y."""
+        """A meter forward is one along z; a turn to the right (about down) is one about y."""
         truth = open_dataset(_tartanair(tmp_path / "P001")).ground_truth
         assert truth is not None
         np.testing.assert_allclose(truth.positions, [[2, 3, 1], [2, 3, 2]])

@@ -1,4 +1,4 @@
-"""Recordings: what is read, how colour and depth are matched, what is refused, and reading ahead."""
+"""Recordings: what is read, how color and depth are matched, what is refused, and reading ahead."""
 
 import threading
 from pathlib import Path
@@ -65,14 +65,14 @@ class TestReading:
             with pytest.raises(IndexError):
                 dataset[index]
 
-    def test_grey_and_jpeg(self, tmp_path: Path) -> None:
+    def test_gray_and_jpeg(self, tmp_path: Path) -> None:
         write_recording(tmp_path, count=1)
-        grey = cv2.GaussianBlur(color(0)[..., 0], (0, 0), 3)
-        (tmp_path / "rgb.txt").write_text("100.0 rgb/grey.jpg\n")
-        cv2.imwrite(str(tmp_path / "rgb" / "grey.jpg"), grey)
+        gray = cv2.GaussianBlur(color(0)[..., 0], (0, 0), 3)
+        (tmp_path / "rgb.txt").write_text("100.0 rgb/gray.jpg\n")
+        cv2.imwrite(str(tmp_path / "rgb" / "gray.jpg"), gray)
         image = open_tiny(tmp_path)[0].image
         assert image.shape == (HEIGHT, WIDTH, 3)
-        assert np.abs(image[..., 0] - grey.astype(int)).max() < 16
+        assert np.abs(image[..., 0] - gray.astype(int)).max() < 16
         np.testing.assert_array_equal(image[..., 0], image[..., 2])
 
     def test_windows_line_ends_byte_order_mark_commas_and_blank_lines(self, tmp_path: Path) -> None:
@@ -261,7 +261,7 @@ class TestBadImages:
             (np.ones((HEIGHT, WIDTH, 3), np.uint16), "expected depth as one uint16 a pixel, got 3 x uint16"),
             (np.ones((12, 16), np.uint16), "expected 32x24 pixels, the size of camera 'tiny', got 16x12"),
         ],
-        ids=["8 bit", "colour", "size"],
+        ids=["8 bit", "color", "size"],
     )
     def test_depth(self, tmp_path: Path, pixels: np.ndarray, words: str) -> None:
         file = min((write_recording(tmp_path) / "depth").iterdir())

@@ -120,7 +120,7 @@ class TestWarnings:
 
     def test_association(self, tmp_path: Path) -> None:
         folder = write_recording(tmp_path / "walk", color_times=times(8), depth_times=times(6))
-        self.check(folder, "association", "2 colour and 0 depth images have no partner")
+        self.check(folder, "association", "2 color and 0 depth images have no partner")
 
     @pytest.mark.parametrize(
         ("changes", "words"),
@@ -128,10 +128,10 @@ class TestWarnings:
             ({"fx": 300.0, "fy": 300.0}, "field of view of 6 degrees"),
             ({"fx": 3.0, "fy": 3.0}, "field of view of 159 degrees"),
             ({"fy": 40.0}, "fx 30 and fy 40 far apart"),
-            ({"cx": 8.0}, "a principal point (8, 11.5) far from the centre"),
+            ({"cx": 8.0}, "a principal point (8, 11.5) far from the center"),
             ({"distortion": (-2.0, 0.0, 0.0, 0.0, 0.0)}, "folds the image over"),
         ],
-        ids=["narrow", "wide", "oblong", "off centre", "distortion"],
+        ids=["narrow", "wide", "oblong", "off center", "distortion"],
     )
     def test_calibration(self, sound: Path, changes: dict[str, object], words: str) -> None:
         self.check(sound, "calibration", words, dataclasses.replace(CAMERA, **changes))

@@ -33,7 +33,7 @@ def tiny(tmp_path: Path, written: Path) -> Path:
 
 
 class TestTracked:
-    def test_every_pair_to_millimetres(self, flight: Path) -> None:
+    def test_every_pair_to_millimeters(self, flight: Path) -> None:
         """Rotation counts too: poses are of the rectified left camera, not of the body nor of the raw one."""
         dataset = open_dataset(flight)
         assert (dataset.name, len(dataset), dataset.camera.fps) == ("V1_01", FRAMES, 20)
@@ -76,7 +76,7 @@ class TestFolder:
         dataset = open_dataset(tiny, camera=camera)
         assert dataset.camera == camera
         assert (dataset[0].image != open_dataset(tiny)[0].image).any()
-        with pytest.raises(CameraError, match="baseline_m: expected metres for a stereo pair"):
+        with pytest.raises(CameraError, match="baseline_m: expected meters for a stereo pair"):
             open_dataset(tiny, camera="bonn")
 
 

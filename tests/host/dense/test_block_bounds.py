@@ -4,8 +4,8 @@ import numpy as np
 from small_scene import clip
 
 from jaxslam.dense.block_bounds import RowBoxes
-from jaxslam.dense.depth_view import View
-from jaxslam.geometry.se3 import IDENTITY, moved, to_local
+from jaxslam.dense.depth_view import DepthView
+from jaxslam.geometry.se3 import IDENTITY, retract, to_local
 
 VOXEL_M = 0.02
 
@@ -23,10 +23,10 @@ def _boxes() -> tuple[RowBoxes, np.ndarray]:
 def test_what_is_seen_is_in_view() -> None:
     """No block of which the camera sees a point is left out, and most of the others are."""
     boxes, X = _boxes()
-    view = View(clip().camera, 2, 6.0, 0.3)
+    view = DepthView(clip().camera, 2, 6.0, 0.3)
     rng = np.random.default_rng(1)
     for _ in range(20):
-        pose = moved(IDENTITY, rng.normal(0, 1, 6))
+        pose = retract(IDENTITY, rng.normal(0, 1, 6))
         x, y, z = to_local(pose, X)
         (left, top), (right, bottom) = view.borders
         seen = (z > 0.3) & (z < 6) & (x > left * z) & (x < right * z) & (y > top * z) & (y < bottom * z)
@@ -40,4 +40,4 @@ def test_nothing_there() -> None:
     boxes, _ = _boxes()
     assert len(boxes) == 45
     boxes.clear()
-    assert len(boxes.in_view(IDENTITY, View(clip().camera, 2, 6.0, 0.3), VOXEL_M)) == 0
+    assert len(boxes.in_view(IDENTITY, DepthView(clip().camera, 2, 6.0, 0.3), VOXEL_M)) == 0

@@ -22,10 +22,10 @@ from jaxslam.dense.dense_map import DenseMap
 from jaxslam.dense.point_cloud import DenseCloud
 from jaxslam.dense.render import picture
 from jaxslam.errors import ConfigError, MapFileError
-from jaxslam.geometry.se3 import IDENTITY, moved
-from jaxslam.map.dynamic_removal import Movers
+from jaxslam.geometry.se3 import IDENTITY, retract
+from jaxslam.map.dynamic_removal import DynamicObservations
 from jaxslam.map.types import Map, empty_map
-from jaxslam.mapping.local_mapping import NewKeyframe, Tracks
+from jaxslam.mapping.local_mapping import NewKeyframe, TrackedObservations
 from jaxslam.results.dense_results import DENSE_FILES
 from jaxslam.results.run_results import RunInfo, write_results
 from jaxslam.semantics import Detections
@@ -35,7 +35,7 @@ from jaxslam.slam.slam import Slam
 
 EVERY = 12
 SMALL = DenseConfig(enabled=True, max_points=150_000, keyframe_points=16_384)
-NO_TRACKS = Tracks(np.zeros(0), np.zeros((2, 0)), np.zeros((3, 0)), np.zeros(0))
+NO_TRACKS = TrackedObservations(np.zeros(0), np.zeros((2, 0)), np.zeros((3, 0)), np.zeros(0))
 
 
 @functools.cache
@@ -73,7 +73,7 @@ def _tracked_at(pose: np.ndarray) -> Any:
 
 def _hand_over(dense: DenseMapping, index: int, frame: SyntheticFrame, ignore: np.ndarray | None = None) -> None:
     new = NewKeyframe(index, frame.timestamp_ns, _arrays(frame, ignore), index - 1, IDENTITY, 0, np.zeros(6), NO_TRACKS)
-    dense.keyframe_made(new, frame.rgb, frame.T_world_cam, EVERY * index)
+    dense.insert_keyframe(new, frame.rgb, frame.T_world_cam, EVERY * index)
 
 
 def _look(dense: DenseMapping, frame: SyntheticFrame) -> None:
@@ -92,7 +92,7 @@ def _made(source, frames, config=SMALL, *, masks=False, late=False) -> DenseMapp
         poses.append(frame.T_world_cam)
         dense.map_made(_map(source, poses), index, 0)
         if masks and late:
-            dense.remove(Movers(index, who, np.zeros(0, np.int64)), 0)
+            dense.remove(DynamicObservations(index, who, np.zeros(0, np.int64)), 0)
     dense.finish()
     return dense
 
@@ -114,7 +114,7 @@ class TestSurface:
         assert np.mean(KDTree(surface[::2]).query(cloud.points)[0]) < 0.015
         assert np.mean(KDTree(cloud.points).query(surface[::37])[0] < 0.03) > 0.9
         assert len(cloud.points) < 0.25 * sum(np.count_nonzero(frame.depth_m) for frame in frames)
-        assert cloud.points.shape == cloud.colours.shape == (len(cloud.counts), 3)
+        assert cloud.points.shape == cloud.colors.shape == (len(cloud.counts), 3)
 
     @pytest.mark.parametrize(("path", "seed"), [("xyz", 0), ("halfsphere", 1)])
     def test_of_a_run(self, path: CameraPathKind, seed: int) -> None:
@@ -132,13 +132,13 @@ class TestSurface:
         assert found.mean_m < 0.015
         assert found.coverage > 0.9
 
-    def test_colours(self) -> None:
-        """Of a picture in one colour, whatever its depth, every point has it."""
+    def test_colors(self) -> None:
+        """Of a picture in one color, whatever its depth, every point has it."""
         source, frames = _room(people=0)
         red = replace(frames[0], rgb=np.full_like(frames[0].rgb, (200, 30, 10)))
         cloud = _made(source, [red]).cloud()
         assert len(cloud.points) > 5000
-        np.testing.assert_array_equal(cloud.colours, np.broadcast_to((200, 30, 10), cloud.colours.shape))
+        np.testing.assert_array_equal(cloud.colors, np.broadcast_to((200, 30, 10), cloud.colors.shape))
 
 
 class TestGhosts:
@@ -174,7 +174,7 @@ class TestCorrections:
         config = replace(SMALL, carve=False)
         right = _made(source, frames[:4], config).cloud()
         rng = np.random.default_rng(0)
-        wrong = [replace(f, T_world_cam=moved(f.T_world_cam, rng.normal(0, 0.1, 6))) for f in frames[:4]]
+        wrong = [replace(f, T_world_cam=retract(f.T_world_cam, rng.normal(0, 0.1, 6))) for f in frames[:4]]
         dense = _made(source, wrong, config)
         assert np.mean(KDTree(right.points).query(dense.cloud().points)[0]) > 0.03
         dense.map_made(_map(source, [frame.T_world_cam for frame in frames[:4]]), -1, 0)
@@ -189,8 +189,8 @@ class TestCorrections:
         source, frames = _room(people=0)
         dense = _made(source, frames[:3])
         all_three = len(dense.cloud().points)
-        map = _map(source, [frame.T_world_cam for frame in frames[:3]])
-        dense.map_made(map._replace(submap=np.array([0, 1, 0], np.int32)), -1, 0)
+        slam_map = _map(source, [frame.T_world_cam for frame in frames[:3]])
+        dense.map_made(slam_map._replace(submap=np.array([0, 1, 0], np.int32)), -1, 0)
         dense.finish()
         assert 0 < len(dense.cloud().points) < all_three
 
@@ -257,10 +257,10 @@ class TestBounds:
 def test_the_whole_path_is_in_the_picture() -> None:
     """Of a road, which is seen from 8 m ahead on only."""
     points = np.random.default_rng(0).uniform([-3, -1, 8], [3, 1, 60], (2000, 3)).astype(np.float32)
-    grey, once = np.full((2000, 3), 90, np.uint8), np.ones(2000, np.int32)
+    gray, once = np.full((2000, 3), 90, np.uint8), np.ones(2000, np.int32)
     poses = np.tile(IDENTITY, (30, 1))
     poses[:, 6] = np.linspace(0, 40, 30)
-    drawn = picture(DenseCloud(points, grey, once, np.zeros(2000, bool), 0.1), poses)
+    drawn = picture(DenseCloud(points, gray, once, np.zeros(2000, bool), 0.1), poses)
     is_path = (drawn == (255, 160, 0)).all(axis=2)
     for panel in np.split(is_path, 2, axis=1):
         rows, _ = np.nonzero(panel)
@@ -311,7 +311,7 @@ class TestRun:
             assert slam.dense is None
             assert slam.dense_mapping is None
 
-    @pytest.mark.parametrize("bad", ["voxel_m=0", "pixel_step=0", "max_points=10", "memory_mb=-1", "colour=true"])
+    @pytest.mark.parametrize("bad", ["voxel_m=0", "pixel_step=0", "max_points=10", "memory_mb=-1", "color=true"])
     def test_settings_are_checked(self, bad: str) -> None:
         with pytest.raises(ConfigError, match=f"dense.{bad.partition('=')[0]}"):
             load_config(overrides=[f"dense.{bad}"])

@@ -14,7 +14,7 @@ pyoctomap = pytest.importorskip("pyoctomap")
 
 @pytest.fixture(scope="module")
 def cells() -> Occupancy:
-    """What five views of a wavy wall say, from places half a metre apart."""
+    """What five views of a wavy wall say, from places half a meter apart."""
     v, u = np.mgrid[:60, :80]
     rays = np.stack([(u.ravel() - 40) / 68, (v.ravel() - 30) / 68]).astype(np.float32)
     depths = [(2 + 0.5 * np.sin(u / 10 + view)).astype(np.float32) for view in range(5)]

@@ -10,15 +10,15 @@ import pytest
 from cue_scenes import MOTIONS, N, check_finite, moves, scene
 from jax.test_util import check_grads
 from jaxslam_kernels.camera import make_intrinsics
-from jaxslam_kernels.se3 import moved, to_camera
+from jaxslam_kernels.se3 import retract, to_camera
 
 from jaxslam.dynamics.cluster_cue import ClusterCue, ClusterParams, make_cluster_cue
-from jaxslam.dynamics.cue import Scene
+from jaxslam.dynamics.cue import CueInput
 from jaxslam.dynamics.regions import (
+    RegionCueResult,
     RegionPlan,
     Regions,
-    RegionVerdict,
-    even_votes,
+    balance_regions,
     find_regions,
     lasting_weights,
     moving_pixels,
@@ -96,7 +96,7 @@ class TestRegions:
 
     def test_verdicts_become_one(self) -> None:
         one, known = jnp.array([0.5, 1.0, 0.0]), jnp.array([True, True, True])
-        verdicts = [RegionVerdict(one, jnp.zeros(3), known), RegionVerdict(jnp.array([0.5, 1.0, 1.0]), one, known)]
+        verdicts = [RegionCueResult(one, jnp.zeros(3), known), RegionCueResult(jnp.array([0.5, 1.0, 1.0]), one, known)]
         assert region_weights(verdicts[:1]).tolist() == [0.5, 1.0, 0.0]
         assert region_weights(verdicts).tolist() == [0.25, 1.0, 0.0]
 
@@ -105,13 +105,13 @@ class TestRegions:
         found = divided(box_before_wall())
         found = found._replace(num_pixels=jnp.array([9, 9, 9, 9, 0, 9]))
         known = jnp.array([True, True, True, False, True, True])
-        first = RegionVerdict(jnp.ones(6), jnp.array([2.0, 0.9, 1.4, 9, 0, 9]), known)
-        second = RegionVerdict(jnp.ones(6), jnp.array([1.5, 0.2, 1.6, 9, 0, 0]), known.at[3].set(False))
+        first = RegionCueResult(jnp.ones(6), jnp.array([2.0, 0.9, 1.4, 9, 0, 9]), known)
+        second = RegionCueResult(jnp.ones(6), jnp.array([1.5, 0.2, 1.6, 9, 0, 0]), known.at[3].set(False))
         before = jnp.array([1.0, 0.0, 0.6, 0.2, 0.0, 1.0])
         plan = PLAN._replace(recover_frames=5)
         weight = remembered_weights(found, [first, second], before, plan)
         assert weight.tolist() == pytest.approx([0.75, 0.1, 0.45, 0.2, 1, 0])
-        at_rest = RegionVerdict(jnp.ones(6), jnp.full(6, 0.9), known)
+        at_rest = RegionCueResult(jnp.ones(6), jnp.full(6, 0.9), known)
         for _ in range(4):
             weight = remembered_weights(found, [at_rest], weight, plan)
         assert weight.tolist() == pytest.approx([1, 0.5, 0.85, 0.2, 1, 0.4])
@@ -121,7 +121,7 @@ class TestRegions:
         of_point = jnp.array([0] * 6 + [1] * 4 + [2] * 9 + [-1])
         found = divided(box_before_wall())._replace(of_point=of_point, num_pixels=jnp.full(6, 9))
         evidence = jnp.array([0.0, 0.0, 3.0, 0, 0, 0])
-        verdict = RegionVerdict((evidence <= 1).astype(float), evidence, jnp.ones(6, bool))
+        verdict = RegionCueResult((evidence <= 1).astype(float), evidence, jnp.ones(6, bool))
         last = lambda before, agreeing=True: lasting_weights(
             found, [verdict], jnp.array(before), jnp.full(20, agreeing), PLAN._replace(recover_frames=5)
         ).tolist()
@@ -133,12 +133,12 @@ class TestRegions:
         """Ten points on the box and two on the wall, of which one has half the weight; one in no region."""
         found = divided(box_before_wall())._replace(of_point=jnp.array([0] * 10 + [1, 2, -1]))
         weights = jnp.ones(13).at[11].set(0.5)
-        votes = np.asarray(even_votes(weights, found))
+        votes = np.asarray(balance_regions(weights, found))
         assert votes[:10].sum() == pytest.approx(11.5 / PLAN.num_regions)
         assert votes[10:].tolist() == [1.0, 0.5, 1.0]
 
 
-def in_regions(given: Scene) -> Scene:
+def in_regions(given: CueInput) -> CueInput:
     """With points that move and those at rest in regions of their own, 0 and 1; the last point in none."""
     label = jnp.where(jnp.asarray(moves()), 0, 1).at[-1].set(-1)
     return given._replace(regions=Regions(jnp.zeros((2, 2), int), label, jnp.zeros((3, 3)), jnp.ones(3, int)))
@@ -221,7 +221,7 @@ class TestCue:
 
         def total(thresholds: Any, tangent: Any, uv: Any) -> Any:
             times_mean, robust_px = jnp.asarray(thresholds)
-            pose = moved(given.T_world_cam, jnp.asarray(tangent))
+            pose = retract(given.T_world_cam, jnp.asarray(tangent))
             chosen = params(temperature=0.4, least_px=0.1)._replace(times_mean=times_mean, robust_px=robust_px)
             found = cluster_cue(given._replace(T_world_cam=pose, uv=jnp.asarray(uv)), chosen)
             return jnp.sum(found.weight * jnp.linspace(1, 2, N))

@@ -11,9 +11,9 @@ from cue_scenes import MOTIONS, N, check_finite, moves, scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax.test_util import check_grads
-from jaxslam_kernels.se3 import moved, to_camera, to_world
+from jaxslam_kernels.se3 import retract, to_camera, to_world
 
-from jaxslam.dynamics.cue import Verdict, combined, judge
+from jaxslam.dynamics.cue import CueResult, combine_cues, threshold_evidence
 from jaxslam.dynamics.occlusion import PointState, next_states, occluded_share, occlusion_weights
 from jaxslam.dynamics.scene_flow_cue import TrajectoryParams, trajectory_cue
 
@@ -32,13 +32,15 @@ def params(*, as_published: bool = False, temperature: float = 0.0) -> Trajector
 
 class TestJudge:
     def test_by_the_limit(self) -> None:
-        found = judge(jnp.array([0.0, 1.0, 1.001, 5.0, jnp.nan, jnp.inf]), jnp.ones(6, bool), jnp.array(0.0))
+        found = threshold_evidence(
+            jnp.array([0.0, 1.0, 1.001, 5.0, jnp.nan, jnp.inf]), jnp.ones(6, bool), jnp.array(0.0)
+        )
         assert found.weight.tolist() == [1, 1, 0, 0, 1, 1]
         assert found.known.tolist() == [True] * 4 + [False] * 2
         assert found.evidence.tolist() == pytest.approx([0, 1, 1.001, 5, 0, 0])
 
     def test_nothing_known(self) -> None:
-        found = judge(jnp.array([5.0, 5.0]), jnp.zeros(2, bool), jnp.array(0.3))
+        found = threshold_evidence(jnp.array([5.0, 5.0]), jnp.zeros(2, bool), jnp.array(0.3))
         assert found.weight.tolist() == [1, 1]
 
     @given(EVIDENCE)
@@ -47,14 +49,14 @@ class TestJudge:
         """Whatever is not at the limit itself, where the smooth one is one half."""
         values = jnp.asarray(evidence, float)
         away, known = np.abs(np.asarray(values) - 1) > 1e-3, jnp.ones(len(evidence), bool)
-        hard, soft = (np.asarray(judge(values, known, jnp.array(t)).weight) for t in (0.0, 1e-5))
+        hard, soft = (np.asarray(threshold_evidence(values, known, jnp.array(t)).weight) for t in (0.0, 1e-5))
         np.testing.assert_allclose(soft[away], hard[away], atol=1e-12)
-        assert judge(jnp.ones(1), jnp.ones(1, bool), jnp.array(0.5)).weight.tolist() == [0.5]
+        assert threshold_evidence(jnp.ones(1), jnp.ones(1, bool), jnp.array(0.5)).weight.tolist() == [0.5]
 
     def test_every_cue_has_a_veto(self) -> None:
-        made = [Verdict(jnp.array(w), jnp.zeros(3), jnp.ones(3, bool)) for w in ([1.0, 0.0, 0.5], [1.0, 1.0, 0.5])]
-        assert combined(made, jnp.array([1.0, 1.0, 0.8])).tolist() == pytest.approx([1.0, 0.0, 0.2])
-        assert combined([], jnp.array([0.5])).tolist() == [0.5]
+        made = [CueResult(jnp.array(w), jnp.zeros(3), jnp.ones(3, bool)) for w in ([1.0, 0.0, 0.5], [1.0, 1.0, 0.5])]
+        assert combine_cues(made, jnp.array([1.0, 1.0, 0.8])).tolist() == pytest.approx([1.0, 0.0, 0.2])
+        assert combine_cues([], jnp.array([0.5])).tolist() == [0.5]
 
 
 class TestTrajectory:
@@ -106,7 +108,7 @@ class TestTrajectory:
         given = scene(MOTIONS[motion], (0.02, 0.01, 0))
 
         def total(tolerances: Any, tangent: Any, depth: Any) -> Any:
-            pose = moved(given.T_world_cam, jnp.asarray(tangent))
+            pose = retract(given.T_world_cam, jnp.asarray(tangent))
             changed = given._replace(T_world_cam=pose, depth=depth)
             chosen = params(as_published=as_published, temperature=0.3)
             near, per_m = jnp.asarray(tolerances)

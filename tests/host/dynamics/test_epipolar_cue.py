@@ -12,7 +12,7 @@ from jaxslam_kernels.camera import project, undistort_pixels
 from jaxslam_kernels.se3 import to_camera
 from quick_compile import quick_compile
 
-from jaxslam.dynamics.cue import Scene
+from jaxslam.dynamics.cue import CueInput
 from jaxslam.dynamics.epipolar_cue import EpipolarParams, make_epipolar_cue
 
 ASIDE: Any = (0.15, 0, 0)
@@ -26,14 +26,14 @@ def x64() -> Iterator[None]:
         yield
 
 
-def ideal(given: Scene) -> Scene:
+def ideal(given: CueInput) -> CueInput:
     """As a camera without distortion sees it: lines are straight there."""
     k = given.intrinsics
     seen = {"uv_before": undistort_pixels(k, given.uv_before), "uv": undistort_pixels(k, given.uv)}
     return given._replace(intrinsics=k._replace(distortion=jnp.zeros(5)), **seen)
 
 
-def inside(given: Scene, border_px: float = 0.0) -> np.ndarray:
+def inside(given: CueInput, border_px: float = 0.0) -> np.ndarray:
     """`(n,)` which points are in both pictures, off the border."""
     u, v = np.asarray(jnp.stack([given.uv_before, given.uv], axis=1))
     clear = (u >= border_px) & (u <= 639 - border_px) & (v >= border_px) & (v <= 479 - border_px)

@@ -14,11 +14,11 @@ from jaxslam.dynamics.object_motion import (
     MeasuredPoints,
     MotionMemory,
     MotionState,
-    judge_motion,
+    classify_motion,
     labels_at,
     no_motion,
 )
-from jaxslam.masks.depth_instances import ObjectFinder, object_labels
+from jaxslam.masks.depth_instances import InstanceFinder, object_labels
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame
 from jaxslam.sensors.frame_arrays import frame_arrays
@@ -60,7 +60,7 @@ def _judged(
     )
     background = jnp.asarray((of_point == 0).astype(np.float32))
     limits, pose = _motion(**changes), SE3.identity()
-    return judge_motion(points, jnp.asarray(of_point), background, pose, before, limits, as_published=as_published)
+    return classify_motion(points, jnp.asarray(of_point), background, pose, before, limits, as_published=as_published)
 
 
 def _start() -> MotionMemory:
@@ -131,7 +131,7 @@ def test_share_of_points() -> None:
         )
         background = jnp.asarray((ON == 0).astype(np.float32))
         pose, limits = SE3.identity(), _motion()
-        state = judge_motion(points, jnp.asarray(ON), background, pose, _start(), limits, as_published=True)
+        state = classify_motion(points, jnp.asarray(ON), background, pose, _start(), limits, as_published=True)
         assert (state.verdict.weight[0] == 1) == expected, share
 
 
@@ -184,7 +184,7 @@ def test_a_hole_in_depth_belongs_to_the_object_around_it() -> None:
 
 
 def test_what_is_in_no_object_is_left_out() -> None:
-    finder = ObjectFinder(CAMERA, 4)
+    finder = InstanceFinder(CAMERA, 4)
     mask, depth = np.zeros((240, 320), bool), np.full((240, 320), 2.0, np.float32)
     nothing = finder.divided(mask, depth)
     assert not nothing.labels.any()
@@ -214,7 +214,7 @@ def test_what_the_caller_masks_is_left_out_in_any_case() -> None:
     image = (rng.uniform(size=(240, 320)) * 255).astype(np.uint8)
     mask = np.zeros((240, 320), bool)
     mask[50:150, 50:150] = True
-    with Slam(CAMERA, load_config("usd", overrides=("semantics.model=null", "dynamics.newcomers=true"))) as slam:
+    with Slam(CAMERA, load_config("usd", overrides=("semantics.model=null", "dynamics.new_surfaces=true"))) as slam:
         for number in range(8):
             frame = Frame(number * 33_000_000, image, np.full((240, 320), 2.0, np.float32), dynamic_mask=mask)
             assert slam.track(frame).dynamic_mask[mask].all()

@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from jaxslam.dynamics.cue import Verdict
+from jaxslam.dynamics.cue import CueResult
 from jaxslam.dynamics.point_mask import mask_around, moving_points
 
 
-def verdict(weight: list[float], known: list[bool]) -> Verdict:
-    return Verdict(np.array(weight), np.zeros(len(weight)), np.array(known))  # pyright: ignore[reportArgumentType]
+def verdict(weight: list[float], known: list[bool]) -> CueResult:
+    return CueResult(np.array(weight), np.zeros(len(weight)), np.array(known))  # pyright: ignore[reportArgumentType]
 
 
 class TestMovingPoints:

@@ -32,7 +32,7 @@ def flipped(descriptor: np.ndarray, number: int, random: np.random.Generator) ->
 def some_features(n: int, random: np.random.Generator, **given: np.ndarray) -> Features:
     uv = random.uniform(0, (320, 240), (n, 2)).T.astype(np.float32)
     return Features(
-        seen_uv=uv,
+        uv_raw=uv,
         uv=uv,
         depth=np.ones(n, np.float32),
         octave=random.integers(0, 8, n).astype(np.uint8),

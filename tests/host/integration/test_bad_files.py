@@ -24,7 +24,7 @@ MEGABYTE = 10**6
 LAUGHS = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"{name}: &{name} [{', '.join([f'*{before}'] * 9)}]\n" for before, name in zip("abcdefgh", "bcdefghi", strict=True)
 )
-RECORDINGS = "- {dataset: D, kind: tum, licence: L, page: P, about: A, recordings: {r: {url: URL}}}\n"
+RECORDINGS = "- {dataset: D, kind: tum, license: L, page: P, about: A, recordings: {r: {url: URL}}}\n"
 
 
 def _config(path: Path) -> Any:

@@ -14,12 +14,12 @@ from quick_compile import quick_compile
 from small_scene import HEIGHT, PLAN, TRACK, WIDTH, at, clip, new_state, params, stacked
 
 from jaxslam.config.schema import Config, DynamicsConfig, load_config, presets
-from jaxslam.dynamics.cue import Scene, Verdict, judge
+from jaxslam.dynamics.cue import CueInput, CueResult, threshold_evidence
 from jaxslam.dynamics.regions import Regions
 from jaxslam.errors import ConfigError
 from jaxslam.slam.slam import Slam
 from jaxslam.tracking.cue_registry import with_cue_params, with_cues
-from jaxslam.tracking.dynamic_rejection import Judged
+from jaxslam.tracking.dynamic_rejection import DynamicRejection
 from jaxslam.tracking.state import TrackOutput, TrackParams, TrackPlan, TrackState, TrackStatus
 from jaxslam.tracking.step import init_state, track_step
 
@@ -39,9 +39,9 @@ AT_OPTIMUM_M = 1e-10
 _step = quick_compile(track_step, static_argnames="plan")
 
 
-def left_of(scene: Scene, limit_px: Any) -> Verdict:
+def left_of(scene: CueInput, limit_px: Any) -> CueResult:
     """One's own cue: nothing in the left of the picture is at rest."""
-    return judge(limit_px / jnp.maximum(scene.uv[0], 1), scene.followed, jnp.zeros_like(limit_px))
+    return threshold_evidence(limit_px / jnp.maximum(scene.uv[0], 1), scene.followed, jnp.zeros_like(limit_px))
 
 
 def tracked(plan: TrackPlan, cue_params: tuple[Any, ...], people: int = 0) -> tuple[TrackState, TrackOutput]:
@@ -59,7 +59,7 @@ class TestOwnCue:
         plan = PLAN._replace(cues=(left_of,))
         _, output = tracked(plan, (jnp.asarray(WIDTH / 2),))
         assert int(output.status) in (TrackStatus.OK, TrackStatus.WEAK)
-        (verdict,), kept = output.verdicts, np.asarray(output.tracked)
+        (verdict,), kept = output.cue_results, np.asarray(output.tracked)
         assert kept.sum() > 10
         assert (np.asarray(output.uv)[0, kept] > WIDTH / 2 - 2).all()
         assert set(np.asarray(verdict.weight)[np.asarray(verdict.known)].tolist()) == {0.0, 1.0}
@@ -69,18 +69,18 @@ class TestOwnCue:
         _, output = tracked(PLAN._replace(cues=(left_of,)), (jnp.asarray(float(10 * WIDTH)),))
         assert int(output.status) == TrackStatus.OK
         np.testing.assert_allclose(output.T_world_cam.wxyz_xyz, without.T_world_cam.wxyz_xyz, atol=1e-6)
-        assert not np.asarray(output.verdicts[0].weight)[np.asarray(output.verdicts[0].known)].any()
+        assert not np.asarray(output.cue_results[0].weight)[np.asarray(output.cue_results[0].known)].any()
 
     def test_that_lets_all_pass_changes_nothing(self) -> None:
         _, without = tracked(PLAN, ())
         _, passed = tracked(PLAN._replace(cues=(left_of,)), (jnp.asarray(0.0),))
         np.testing.assert_allclose(passed.T_world_cam.wxyz_xyz, without.T_world_cam.wxyz_xyz, atol=1e-6)
-        assert without.verdicts == ()
+        assert without.cue_results == ()
 
     def test_parameters_do_not_compile_anew(self) -> None:
         traces = 0
 
-        def counted(scene: Scene, limit_px: Any) -> Verdict:
+        def counted(scene: CueInput, limit_px: Any) -> CueResult:
             nonlocal traces
             traces += 1
             return left_of(scene, limit_px)
@@ -98,13 +98,13 @@ class TestWitnesses:
         pixels = np.zeros((4, 40), bool)
         pixels[:, :34] = True  # the first region, and four points of the second
         regions = Regions(jnp.zeros((1, 1), int), jnp.asarray(of_point), jnp.zeros((3, 2)), jnp.ones(2, int))
-        judged = Judged((), regions, moving=jnp.asarray(pixels))
+        judged = DynamicRejection((), regions, moving=jnp.asarray(pixels))
         uv = jnp.stack([jnp.arange(num, dtype=float), jnp.ones(num)])
         age = jnp.asarray(np.where((np.arange(num) >= 20) & (np.arange(num) < 27), 3, 0))
         asked = jnp.ones(num, bool).at[30].set(False)
-        chosen = np.flatnonzero(np.asarray(judged.witnesses(uv, age, asked)))
+        chosen = np.flatnonzero(np.asarray(judged.monitor_points(uv, age, asked)))
         assert chosen.tolist() == [0, 1, 2, *range(20, 27), 31, 32, 33]
-        assert not np.asarray(judged._replace(moving=None).witnesses(uv, age, asked)).any()
+        assert not np.asarray(judged._replace(moving=None).monitor_points(uv, age, asked)).any()
 
 
 class TestSettings:
@@ -120,7 +120,7 @@ class TestSettings:
         """With somebody walking through the room, and nothing else that would leave him out."""
         recording = clip(1)
         slam = Slam(
-            recording.camera, Config(track=TRACK, dynamics=DynamicsConfig(cues=("trajectory",), even_votes=False))
+            recording.camera, Config(track=TRACK, dynamics=DynamicsConfig(cues=("trajectory",), balance_regions=False))
         )
         with slam:
             records = slam.run(recording)

@@ -23,8 +23,8 @@ from jaxslam.trajectory.evaluation import evaluate
 WIDTH, HEIGHT = 320, 240
 PAIR = Camera("pair", WIDTH, HEIGHT, 300.0, 300.0, 159.5, 119.5, baseline_m=0.2)
 DEPTH = dataclasses.replace(PAIR, baseline_m=None, depth_scale_per_m=5000.0)
-GREY = np.full((HEIGHT, WIDTH), 90, np.uint8)
-METRES = np.ones((HEIGHT, WIDTH), np.float32)
+GRAY = np.full((HEIGHT, WIDTH), 90, np.uint8)
+METERS = np.ones((HEIGHT, WIDTH), np.float32)
 
 
 def _settings(**track: object):
@@ -38,29 +38,29 @@ def _room(baseline_m: float | None, frames: int = 40) -> SyntheticDataset:
 class TestFrame:
     def test_neither_depth_nor_right(self) -> None:
         with pytest.raises(FrameError, match=r"depth_m: expected .* or a right image of a stereo pair, got neither"):
-            Frame(0, GREY)
+            Frame(0, GRAY)
 
     def test_right_of_another_kind(self) -> None:
         with pytest.raises(
             FrameError, match=r"right: expected the shape of the left image, \(240, 320\), got \(240, 3"
         ):
-            Frame(0, GREY, right=np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+            Frame(0, GRAY, right=np.zeros((HEIGHT, WIDTH, 3), np.uint8))
         with pytest.raises(FrameError, match=r"right: .* got float64"):
-            Frame(0, GREY, right=np.zeros((HEIGHT, WIDTH)))
+            Frame(0, GRAY, right=np.zeros((HEIGHT, WIDTH)))
 
     def test_camera_of_another_kind(self) -> None:
         with Slam(PAIR, _settings()) as slam, pytest.raises(FrameError, match="right: expected the right image"):
-            slam.track(Frame(0, GREY, METRES))
+            slam.track(Frame(0, GRAY, METERS))
         with Slam(DEPTH, _settings()) as slam, pytest.raises(FrameError, match="depth_m: expected depth"):
-            slam.track(Frame(0, GREY, right=GREY))
+            slam.track(Frame(0, GRAY, right=GRAY))
 
     def test_arrays_need_rough_depth(self) -> None:
         with pytest.raises(FrameError, match="depth for matching to begin with, got none"):
-            frame_arrays(Frame(0, GREY, right=GREY), 0.1)
-        arrays = frame_arrays(Frame(0, GREY, METRES, right=GREY), 0.1)
-        held = FrameMemory(HEIGHT, WIDTH, pairs=True).hold(Frame(0, GREY, METRES, right=GREY), 0.1)
-        np.testing.assert_array_equal(arrays.right, GREY)
-        np.testing.assert_array_equal(held.right, GREY)
+            frame_arrays(Frame(0, GRAY, right=GRAY), 0.1)
+        arrays = frame_arrays(Frame(0, GRAY, METERS, right=GRAY), 0.1)
+        held = FrameMemory(HEIGHT, WIDTH, pairs=True).hold(Frame(0, GRAY, METERS, right=GRAY), 0.1)
+        np.testing.assert_array_equal(arrays.right, GRAY)
+        np.testing.assert_array_equal(held.right, GRAY)
 
 
 class TestRoughDepth:
@@ -80,7 +80,7 @@ class TestRoughDepth:
 
     @pytest.mark.parametrize(
         ("change", "message"),
-        [({"baseline_m": None}, "baseline_m: expected metres"), ({"distortion": (0.1, 0, 0, 0, 0.0)}, "rectified")],
+        [({"baseline_m": None}, "baseline_m: expected meters"), ({"distortion": (0.1, 0, 0, 0, 0.0)}, "rectified")],
     )
     def test_cameras_that_are_no_pair(self, change: dict, message: str) -> None:
         with pytest.raises(CameraError, match=message):
@@ -94,7 +94,7 @@ class TestRoughDepth:
         rough = RoughDepth(camera).of(left, right)
         arrays = frame_arrays(Frame(0, left, rough, right=right), 0.1)
         features = features_of(arrays, np.zeros(6, np.float32), track_params(camera, _settings().track))
-        column, row = features.seen_uv.round().astype(int)
+        column, row = features.uv_raw.round().astype(int)
         known = np.isfinite(true[row, column]) & (features.depth > 0) & (rough[row, column] > 0)
         errors = [
             np.abs(995.0 * 0.193 / depth[known] - true[row, column][known])
@@ -104,7 +104,7 @@ class TestRoughDepth:
         assert np.median(errors[0]) < 0.5 * np.median(errors[1])
 
     def test_nothing_to_see(self) -> None:
-        assert not RoughDepth(PAIR).of(GREY, GREY).any()
+        assert not RoughDepth(PAIR).of(GRAY, GRAY).any()
 
 
 class TestSettings:
@@ -142,10 +142,10 @@ class TestRoom:
         assert frame.right is not None
         v, u = np.mgrid[:480, :640].astype(np.float32)
         disparity = (dataset.fx * 0.1 / frame.exact_depth_m).astype(np.float32)
-        grey, right = (cv2.GaussianBlur(image[..., 1], (0, 0), 1.5) for image in (frame.rgb, frame.right))
+        gray, right = (cv2.GaussianBlur(image[..., 1], (0, 0), 1.5) for image in (frame.rgb, frame.right))
         back = cv2.remap(right, u - disparity, v, cv2.INTER_LINEAR)
         inner = np.s_[8:-8, 80:-8]
-        difference = lambda image: np.mean(np.abs(image[inner].astype(float) - grey[inner]))
+        difference = lambda image: np.mean(np.abs(image[inner].astype(float) - gray[inner]))
         assert difference(back) < 0.4 * difference(right)
         assert frame.measured.depth_m is None
 
@@ -187,10 +187,10 @@ class TestRoom:
             write_tum(_room(0.1, frames=1), tmp_path / "room")
 
 
-def _kitti_folder(tmp_path: Path, frames: int = 3, colour: bool = False) -> Path:
+def _kitti_folder(tmp_path: Path, frames: int = 3, color: bool = False) -> Path:
     """A folder in the layout of KITTI, with poses."""
     folder = tmp_path / "sequences" / "77"
-    sides = ("image_2", "image_3") if colour else ("image_0", "image_1")
+    sides = ("image_2", "image_3") if color else ("image_0", "image_1")
     for shift, side in enumerate(sides):
         (folder / side).mkdir(parents=True)
         for index in range(frames):
@@ -207,7 +207,7 @@ def _kitti_folder(tmp_path: Path, frames: int = 3, colour: bool = False) -> Path
 
 
 class TestKitti:
-    def test_grey(self, tmp_path: Path) -> None:
+    def test_gray(self, tmp_path: Path) -> None:
         dataset = open_dataset(_kitti_folder(tmp_path))
         assert isinstance(dataset, KittiDataset)
         assert dataset.name == "kitti_77"
@@ -223,9 +223,9 @@ class TestKitti:
         assert dataset.ground_truth is not None
         np.testing.assert_allclose(dataset.ground_truth.positions, [[0, 0, 0], [0, 0, 1], [0, 0, 2]], atol=1e-12)
 
-    def test_colour(self, tmp_path: Path) -> None:
-        """The left camera for colour stands beside that of the poses: `K t = (6, 0, 0)`, 10 cm to the left."""
-        dataset = open_dataset(_kitti_folder(tmp_path, colour=True), "kitti")
+    def test_color(self, tmp_path: Path) -> None:
+        """The left camera for color stands beside that of the poses: `K t = (6, 0, 0)`, 10 cm to the left."""
+        dataset = open_dataset(_kitti_folder(tmp_path, color=True), "kitti")
         assert dataset[0].image.shape == (48, 64, 3)
         assert dataset.camera.baseline_m == pytest.approx(0.5)
         assert dataset.ground_truth is not None
@@ -266,7 +266,7 @@ class TestKitti:
             open_dataset(folder)
 
     def test_depth_camera(self, tmp_path: Path) -> None:
-        with pytest.raises(CameraError, match="baseline_m: expected metres for a stereo pair"):
+        with pytest.raises(CameraError, match="baseline_m: expected meters for a stereo pair"):
             open_dataset(_kitti_folder(tmp_path), camera=dataclasses.replace(DEPTH, width=64, height=48, cx=30, cy=20))
 
     def test_real(self, data_dir: Path) -> None:

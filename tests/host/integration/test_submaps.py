@@ -8,6 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from jaxslam.results.run_results import RunInfo, write_results
 from replay import BLACK, SUBMAP, Played
 from room_round import TRACK, room
 
@@ -16,7 +17,6 @@ from jaxslam.config.schema import Config
 from jaxslam.geometry.se3 import between
 from jaxslam.map.npz_file import save_map
 from jaxslam.map.types import empty_map
-from jaxslam.results.run_results import RunInfo, write_results
 from jaxslam.sensors.frame import Frame
 from jaxslam.slam.frame_result import FrameRecord
 from jaxslam.slam.slam import Slam, _track_followed
@@ -65,7 +65,7 @@ class TestResults:
         assert statuses[0] == TrackStatus.STARTED
         began = statuses.index(TrackStatus.STARTED, 1)
         assert SECOND + TRACK.restart_after // 4 < began < SECOND + 15
-        assert TrackStatus.RELOCALISED in statuses[SECOND + len(B) + 3 :]
+        assert TrackStatus.RELOCALIZED in statuses[SECOND + len(B) + 3 :]
 
     def test_which_submap(self, played: tuple[Played, Path, list[str]]) -> None:
         """Every pose of B, relocalized ones too, is told to be in another world than the map's."""
@@ -88,7 +88,7 @@ class TestResults:
         assert results[len(A)].reason == TrackReason.NO_POINTS.text
         began = played[0].first(TrackStatus.STARTED, 1)
         assert {result.reason for result in results[SECOND:began]} == {TrackReason.PLACE_NOT_IN_MAP.text}
-        found = results[played[0].first(TrackStatus.RELOCALISED)]
+        found = results[played[0].first(TrackStatus.RELOCALIZED)]
         assert found.reason in {reason.text for reason in TrackReason} - {""}
 
     def test_log(self, played: tuple[Played, Path, list[str]]) -> None:
@@ -140,7 +140,7 @@ class TestLoaded:
         """A start where only submap 1 has been is said to be there."""
         with Slam.load(played[1], config=QUICK) as slam:
             again = Played(slam, room(), [*range(10, 20)], FPS)
-        assert again.statuses[0] == TrackStatus.RELOCALISED
+        assert again.statuses[0] == TrackStatus.RELOCALIZED
         assert {(result.submap, result.in_map_frame) for result in again.results} == {(1, False)}
         assert len(slam.trajectory) == 0
         assert len(slam.trajectories[1]) == 10

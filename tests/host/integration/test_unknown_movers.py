@@ -40,7 +40,7 @@ def ate_m(preset: str, *overrides: str, true_masks: bool = False) -> float:
     return max(evaluate(slam.trajectory, clip.ground_truth).ate_rmse_m, FLOOR_M)
 
 
-WITHOUT = ("dynamics.cues=[]", "dynamics.even_votes=false")
+WITHOUT = ("dynamics.cues=[]", "dynamics.balance_regions=false")
 
 
 def test_votes_of_points_follow_a_box() -> None:

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.sensors.camera import Camera
-from jaxslam.sensors.frame import Frame, to_grey
+from jaxslam.sensors.frame import Frame, to_gray
 from jaxslam.slam.slam import Slam
 from jaxslam.tracking.state import TrackStatus
 from jaxslam.trajectory.evaluation import evaluate
@@ -47,7 +47,7 @@ def slam() -> Slam:
 
 
 def points(uv: np.ndarray, frame: Frame, camera: Camera) -> np.ndarray:
-    """`(n, 3)` metres in the axes of the camera, of `(n, 2)` pixels; depth 0 where it is missing."""
+    """`(n, 3)` meters in the axes of the camera, of `(n, 2)` pixels; depth 0 where it is missing."""
     u, v = np.clip(np.round(uv).astype(int), 0, [camera.width - 1, camera.height - 1]).T
     assert frame.depth_m is not None
     depth = frame.depth_m[v, u]
@@ -56,9 +56,9 @@ def points(uv: np.ndarray, frame: Frame, camera: Camera) -> np.ndarray:
 
 def motion(before: Frame, after: Frame, camera: Camera) -> np.ndarray:
     """`(4, 4)` of the new camera in the old one: optical flow, and the rigid motion with the least squares of all."""
-    grey = to_grey(before.image)
-    corners = cv2.goodFeaturesToTrack(grey, 500, 0.01, 8)
-    found, ok, _ = cv2.calcOpticalFlowPyrLK(grey, to_grey(after.image), corners, np.zeros_like(corners))
+    gray = to_gray(before.image)
+    corners = cv2.goodFeaturesToTrack(gray, 500, 0.01, 8)
+    found, ok, _ = cv2.calcOpticalFlowPyrLK(gray, to_gray(after.image), corners, np.zeros_like(corners))
     old, new = points(corners[:, 0], before, camera), points(found[:, 0], after, camera)
     usable = (ok[:, 0] == 1) & (old[:, 2] > 0) & (new[:, 2] > 0)
     old, new = old[usable], new[usable]

@@ -18,13 +18,13 @@ from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.errors import CameraError, ConfigError, DatasetError, FrameError
 from jaxslam.map.types import Map, empty_map
 from jaxslam.semantics import load_detector
-from jaxslam.semantics.checked_detector import WatchedDetector
+from jaxslam.semantics.checked_detector import CheckedDetector
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.depth_checks import contradiction_of_depth
 from jaxslam.sensors.frame import Frame
 from jaxslam.sensors.image_checks import scaled_to_one
 from jaxslam.sensors.stereo_rig import Lens, Rig
-from jaxslam.slam.input_checks import InputWatch
+from jaxslam.slam.input_checks import InputChecks
 from jaxslam.slam.input_warnings import InputWarnings
 from jaxslam.slam.slam import Slam
 
@@ -56,7 +56,7 @@ class Trackers:
     def of_map(self, **changes: object) -> str:
         """What is said of a map that a camera with some changes made."""
         camera = replace(clip().camera, **changes)  # pyright: ignore[reportArgumentType]
-        with Slam(clip().camera, CONFIG, map=self.map._replace(camera=camera)) as slam:
+        with Slam(clip().camera, CONFIG, slam_map=self.map._replace(camera=camera)) as slam:
             return "\n".join(slam.track(clip().frames[0]).warnings)
 
 
@@ -73,7 +73,7 @@ def depth_of(frame: Frame) -> np.ndarray:
 def seen(camera: Camera, frames: Iterable[Frame]) -> str:
     """What is said of frames when they are looked at, without tracking."""
     warnings = InputWarnings()
-    watch = InputWatch(camera, warnings, None)
+    watch = InputChecks(camera, warnings, None)
     for frame in islice(frames, FRAMES):
         watch.look(frame)
     return "\n".join(warnings.all)
@@ -176,7 +176,7 @@ WRONG: dict[str, tuple[Callable[[Trackers], str], str]] = {
     ),
     "localize_only in an empty map": (
         lambda _: raised(
-            ConfigError, lambda: Slam(clip().camera, CONFIG, map=empty_map(clip().camera), localize_only=True)
+            ConfigError, lambda: Slam(clip().camera, CONFIG, slam_map=empty_map(clip().camera), localize_only=True)
         ),
         "localize_only: needs the map to localize in.* got a map without keyframes",
     ),
@@ -202,7 +202,7 @@ def test_only_first_frames_and_every_hundredth_are_looked_at() -> None:
     frame = clip().frames[0]
     wrong = replace(frame, depth_m=1000 * depth_of(frame))
     warnings = InputWarnings()
-    watch = InputWatch(clip().camera, warnings, None)
+    watch = InputChecks(clip().camera, warnings, None)
     named_at = []
     for number in range(101):
         watch.look(frame if number < FRAMES else wrong)
@@ -271,9 +271,9 @@ class TestDarkness:
 
 
 def people_named(frames: Sequence[Frame], *, swap: bool) -> str:
-    detector = WatchedDetector(load_detector(Path(MODELS or "") / "yolox_nano.onnx"))
+    detector = CheckedDetector(load_detector(Path(MODELS or "") / "yolox_nano.onnx"))
     warnings = InputWarnings()
-    watch = InputWatch(clip().camera, warnings, detector)
+    watch = InputChecks(clip().camera, warnings, detector)
     for frame in frames:
         detector(np.ascontiguousarray(frame.image[..., ::-1]) if swap else frame.image)
     watch.look(frames[-1])

@@ -16,7 +16,7 @@ from jaxslam.errors import DatasetError
 from jaxslam.io import archive as module
 from jaxslam.io.archive import unpack
 
-FILES = {"walk/rgb.txt": b"colour", "walk/depth.txt": b"depth", "walk/rgb/1.png": bytes(range(256)) * 500}
+FILES = {"walk/rgb.txt": b"color", "walk/depth.txt": b"depth", "walk/rgb/1.png": bytes(range(256)) * 500}
 
 
 def tgz(path: Path, files: dict[str, bytes] = FILES, *more: tarfile.TarInfo) -> Path:
@@ -237,7 +237,7 @@ class TestDamaged:
         refused(tmp_path / "a", target, "rgb.txt")
 
     def test_password(self, tmp_path: Path, target: Path) -> None:
-        archive = zipped(tmp_path / "a", {"walk/rgb.txt": b"colour"})
+        archive = zipped(tmp_path / "a", {"walk/rgb.txt": b"color"})
         content = bytearray(archive.read_bytes())
         content[content.index(b"PK\x01\x02") + 8] |= 1
         archive.write_bytes(content)
@@ -245,7 +245,7 @@ class TestDamaged:
 
     def test_odd_compression(self, tmp_path: Path, target: Path) -> None:
         with zipfile.ZipFile(tmp_path / "a", "w", zipfile.ZIP_LZMA) as archive:
-            archive.writestr("walk/rgb.txt", b"colour")
+            archive.writestr("walk/rgb.txt", b"color")
         refused(tmp_path / "a", target, "expected the usual compression")
 
 

@@ -321,7 +321,7 @@ class TestErrors:
 
     def test_no_end(self, monkeypatch: pytest.MonkeyPatch, site: Site, target: Path) -> None:
         """Nobody knows the length."""
-        monkeypatch.setattr(module, "_MOST_BYTES", len(FIRST) - 1)
+        monkeypatch.setattr(module, "_MAX_BYTES", len(FIRST) - 1)
         site.length = "chunked"
         self.fails(site.url, target, f"the server gives more than {len(FIRST) - 1} bytes")
         assert not list(target.parent.iterdir())

@@ -10,15 +10,15 @@ from small_map import same, small_map
 
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.features.orb import DEFAULT_PLAN, Features, features_of
-from jaxslam.geometry.se3 import IDENTITY, between, compose, moved, to_local
+from jaxslam.geometry.se3 import IDENTITY, between, compose, retract, to_local
 from jaxslam.loop_closing import loop_detector as module
 from jaxslam.loop_closing.essential_graph import poses_with_loop
 from jaxslam.loop_closing.loop_correction import with_loop_closed
 from jaxslam.loop_closing.loop_detector import LoopClosing, LoopClosure
 from jaxslam.loop_closing.place_index import PlaceIndex
-from jaxslam.loop_closing.visibility_check import seen_through
+from jaxslam.loop_closing.visibility_check import see_through_ratio
 from jaxslam.map.edit import transformed, with_keyframe, without_keyframe
-from jaxslam.map.types import NONE, Keyframe, Map, standing
+from jaxslam.map.types import NONE, Keyframe, Map, surviving_keyframes
 from jaxslam.map.validate import problems
 from jaxslam.sensors.frame_arrays import frame_arrays
 
@@ -28,34 +28,34 @@ ROUND = [*range(0, FRAMES, STEP), *range(STEP // 4, 3 * STEP, STEP)]
 TIGHT = np.linalg.inv(np.diag([0.01**2] * 3 + [0.005**2] * 3))
 
 
-def drifted(map: Map, metres: float, radians: float, seed: int = 0) -> Map:
+def drifted(slam_map: Map, meters: float, radians: float, seed: int = 0) -> Map:
     """Every keyframe's step from the one before wrong by as much, at random: relative poses stay nearly right."""
-    rng, poses = np.random.default_rng(seed), map.T_world_cam.copy()
+    rng, poses = np.random.default_rng(seed), slam_map.T_world_cam.copy()
     for row in range(1, len(poses)):
-        step = between(map.T_world_cam[row - 1], map.T_world_cam[row])
-        error = rng.normal(0, [metres] * 3 + [radians] * 3)
-        poses[row] = compose(poses[row - 1], moved(step, error))
-    return map._replace(T_world_cam=poses)
+        step = between(slam_map.T_world_cam[row - 1], slam_map.T_world_cam[row])
+        error = rng.normal(0, [meters] * 3 + [radians] * 3)
+        poses[row] = compose(poses[row - 1], retract(step, error))
+    return slam_map._replace(T_world_cam=poses)
 
 
-def errors(map: Map, truth: Map) -> np.ndarray:
-    """`(k,)` metres."""
-    return np.linalg.norm(map.T_world_cam[:, 4:] - truth.T_world_cam[:, 4:], axis=1)
+def errors(slam_map: Map, truth: Map) -> np.ndarray:
+    """`(k,)` meters."""
+    return np.linalg.norm(slam_map.T_world_cam[:, 4:] - truth.T_world_cam[:, 4:], axis=1)
 
 
-def look_at_all(map: Map, prefix: bool = True) -> list[LoopClosure]:
+def look_at_all(slam_map: Map, prefix: bool = True) -> list[LoopClosure]:
     """What loop closing finds in a recording whose keyframes come one by one, until it finds one."""
     closing, found = LoopClosing(PlaceIndex(), params(), DEFAULT_PLAN), []
-    for keyframe_id in map.ids.tolist():
-        found.append(closing.look(until(map, keyframe_id) if prefix else map, keyframe_id))
+    for keyframe_id in slam_map.ids.tolist():
+        found.append(closing.look(until(slam_map, keyframe_id) if prefix else slam_map, keyframe_id))
     return [closure for closure in found if closure is not None]
 
 
-def until(map: Map, keyframe_id: int) -> Map:
+def until(slam_map: Map, keyframe_id: int) -> Map:
     """The map when a keyframe was the latest."""
-    num = map.row(keyframe_id) + 1
-    parts = {name: getattr(map, name)[:num] for name in ("keyframes", "ids", "T_world_cam", "parent", "submap")}
-    return map._replace(**parts, next_keyframe=keyframe_id + 1)
+    num = slam_map.row(keyframe_id) + 1
+    parts = {name: getattr(slam_map, name)[:num] for name in ("keyframes", "ids", "T_world_cam", "parent", "submap")}
+    return slam_map._replace(**parts, next_keyframe=keyframe_id + 1)
 
 
 @pytest.fixture(scope="module")
@@ -74,13 +74,13 @@ class TestLook:
         assert loop.target > 15
         measured = between(between(truth.pose(loop.source), truth.pose(loop.target)), loop.T_source_target)
         assert np.linalg.norm(measured[4:]) < 0.01
-        map = until(before, loop.target)
-        after = with_loop_closed(map, loop)
+        slam_map = until(before, loop.target)
+        after = with_loop_closed(slam_map, loop)
         there = until(truth, loop.target)
         assert problems(after) == []
-        assert errors(map, there)[-1] > 0.03
-        assert errors(after, there)[-1] < 0.4 * errors(map, there)[-1]
-        assert np.sqrt(np.mean(errors(after, there) ** 2)) < 0.7 * np.sqrt(np.mean(errors(map, there) ** 2))
+        assert errors(slam_map, there)[-1] > 0.03
+        assert errors(after, there)[-1] < 0.4 * errors(slam_map, there)[-1]
+        assert np.sqrt(np.mean(errors(after, there) ** 2)) < 0.7 * np.sqrt(np.mean(errors(slam_map, there) ** 2))
         assert after.loops.target.tolist() == [loop.target]
 
     def test_what_was_seen_just_now_is_no_loop(self):
@@ -139,16 +139,16 @@ def rng_direction(rng: np.random.Generator) -> np.ndarray:
 class TestWrongLoops:
     """A recognition that contradicts the odometry must be refused, however sure it is of itself."""
 
-    def accepted(self, map: Map, error: np.ndarray, information: np.ndarray = TIGHT) -> bool:
-        source, target = int(map.ids[0]), int(map.ids[-1])
-        measured = moved(between(map.pose(source), map.pose(target)), error)
-        return poses_with_loop(map, source, target, measured, information) is not None
+    def accepted(self, slam_map: Map, error: np.ndarray, information: np.ndarray = TIGHT) -> bool:
+        source, target = int(slam_map.ids[0]), int(slam_map.ids[-1])
+        measured = retract(between(slam_map.pose(source), slam_map.pose(target)), error)
+        return poses_with_loop(slam_map, source, target, measured, information) is not None
 
-    @pytest.mark.parametrize("metres", [0.3, 0.5, 1.0, 3.0])
-    def test_by_metres(self, truth, metres):
+    @pytest.mark.parametrize("meters", [0.3, 0.5, 1.0, 3.0])
+    def test_by_meters(self, truth, meters):
         rng = np.random.default_rng(4)
         for _ in range(5):
-            assert not self.accepted(truth, np.r_[metres * rng_direction(rng), 0, 0, 0])
+            assert not self.accepted(truth, np.r_[meters * rng_direction(rng), 0, 0, 0])
 
     @pytest.mark.parametrize("degrees", [5, 20, 90, 180])
     def test_by_degrees(self, truth, degrees):
@@ -211,7 +211,7 @@ class TestAliased:
         """A sixth of a round of some rooms, one after the other, each shifted against the one before."""
         joined = map_of([])
         for part, seed in enumerate(seeds):
-            where = moved(IDENTITY, np.r_[0, shift * part, 0.5 * shift * part, 0, 0, 0])
+            where = retract(IDENTITY, np.r_[0, shift * part, 0.5 * shift * part, 0, 0, 0])
             for index in range(0, 200, 40):
                 number = joined.next_keyframe
                 seen = crowded(index, seed) if moving else features(index, seed)
@@ -221,34 +221,34 @@ class TestAliased:
             joined = self.waited(joined)
         return joined
 
-    def waited(self, map: Map) -> Map:
+    def waited(self, slam_map: Map) -> Map:
         """Keyframes that show nothing, so that what was seen is not the latest any more."""
-        blank = map.keyframes[-1].features
+        blank = slam_map.keyframes[-1].features
         blank = type(blank)(*(a[:0] if n == "descriptor" else a[..., :0] for n, a in blank._asdict().items()))
         for _ in range(10):
-            number = map.next_keyframe
-            frame = map.keyframes[-1]._replace(id=number, features=blank)
-            map = with_keyframe(map, frame, map.T_world_cam[-1], number - 1, 0)
-        return map
+            number = slam_map.next_keyframe
+            frame = slam_map.keyframes[-1]._replace(id=number, features=blank)
+            slam_map = with_keyframe(slam_map, frame, slam_map.T_world_cam[-1], number - 1, 0)
+        return slam_map
 
 
 class TestSeenThrough:
     def test_places_that_are_what_they_are_said_to_be(self, truth):
         for first, second in ((0, 1), (3, 4), (0, 20)):
             relative = between(truth.pose(first), truth.pose(second))
-            assert seen_through(truth.camera, features(ROUND[first]), features(ROUND[second]), relative) < 0.1
+            assert see_through_ratio(truth.camera, features(ROUND[first]), features(ROUND[second]), relative) < 0.1
 
     def test_places_that_are_not(self, truth):
-        """Half a metre too far back, the walls would have to be seen through."""
-        relative = moved(between(truth.pose(0), truth.pose(1)), np.r_[0, 0, 0.6, 0, 0, 0])
-        assert seen_through(truth.camera, features(ROUND[0]), features(ROUND[1]), relative) > 0.8
+        """Half a meter too far back, the walls would have to be seen through."""
+        relative = retract(between(truth.pose(0), truth.pose(1)), np.r_[0, 0, 0.6, 0, 0, 0])
+        assert see_through_ratio(truth.camera, features(ROUND[0]), features(ROUND[1]), relative) > 0.8
 
     def test_what_cannot_be_compared_says_nothing(self, truth):
         back = np.r_[0.0, 0, 1, 0, 0, 0, 0]  # turned round
-        assert seen_through(truth.camera, features(0), features(0), back) == 0
+        assert see_through_ratio(truth.camera, features(0), features(0), back) == 0
         bare = features(0)._replace(depth=0 * features(0).depth)
-        assert seen_through(truth.camera, bare, features(0), IDENTITY) == 0
-        assert seen_through(truth.camera, features(0), bare, IDENTITY) == 0
+        assert see_through_ratio(truth.camera, bare, features(0), IDENTITY) == 0
+        assert see_through_ratio(truth.camera, features(0), bare, IDENTITY) == 0
 
     def test_a_keyframe_that_contradicts_its_surroundings_is_not_taken(self, truth, monkeypatch):
         before = drifted(truth, 0.006, 0.004)
@@ -259,28 +259,30 @@ class TestSeenThrough:
 class TestBent:
     def test_all_that_the_loop_does_not_name_moves_along(self):
         """A keyframe made since, the points, and what was culled keep their place among those they hang on."""
-        map = small_map(num_keyframes=6, num_points=60, seed=2)
-        named = map.ids[:4]
-        poses = np.array([moved(map.pose(int(number)), 0.1 * number * np.ones(6)) for number in named])
+        slam_map = small_map(num_keyframes=6, num_points=60, seed=2)
+        named = slam_map.ids[:4]
+        poses = np.array([retract(slam_map.pose(int(number)), 0.1 * number * np.ones(6)) for number in named])
         loop = LoopClosure(0, 3, between(poses[0], poses[3]), np.eye(6), named, poses)
-        after = with_loop_closed(map, loop)
+        after = with_loop_closed(slam_map, loop)
         assert problems(after) == []
         np.testing.assert_allclose(after.T_world_cam[:4], poses, atol=1e-12)
         for child in (4, 5):
-            parent = int(map.parent[child])
+            parent = int(slam_map.parent[child])
             np.testing.assert_allclose(
-                between(after.pose(parent), after.pose(child)), between(map.pose(parent), map.pose(child)), atol=1e-12
+                between(after.pose(parent), after.pose(child)),
+                between(slam_map.pose(parent), slam_map.pose(child)),
+                atol=1e-12,
             )
-        for column, maker in enumerate(standing(map, map.points.made_by).tolist()):
-            local = [to_local(m.pose(maker), m.points.X_world[:, column : column + 1]) for m in (map, after)]
+        for column, maker in enumerate(surviving_keyframes(slam_map, slam_map.points.reference_keyframe).tolist()):
+            local = [to_local(m.pose(maker), m.points.X_world[:, column : column + 1]) for m in (slam_map, after)]
             np.testing.assert_allclose(local[1], local[0], atol=1e-12)
 
     def test_a_map_carried_elsewhere_since_is_bent_where_it_is(self):
-        map = small_map(num_keyframes=5, num_points=20, seed=2)
-        poses = np.array([moved(map.pose(int(number)), 0.1 * number * np.ones(6)) for number in map.ids])
-        loop = LoopClosure(0, 4, between(poses[0], poses[4]), np.eye(6), map.ids, poses)
+        slam_map = small_map(num_keyframes=5, num_points=20, seed=2)
+        poses = np.array([retract(slam_map.pose(int(number)), 0.1 * number * np.ones(6)) for number in slam_map.ids])
+        loop = LoopClosure(0, 4, between(poses[0], poses[4]), np.eye(6), slam_map.ids, poses)
         away = any_pose(np.random.default_rng(1), 1.0, 5.0)
-        then, now = with_loop_closed(map, loop), with_loop_closed(transformed(map, away, 0, 0), loop)
+        then, now = with_loop_closed(slam_map, loop), with_loop_closed(transformed(slam_map, away, 0, 0), loop)
         np.testing.assert_allclose(now.points.X_world, transformed(then, away, 0, 0).points.X_world, atol=1e-9)
         carried = compose(np.tile(away, (5, 1)), then.T_world_cam)
         apart = between(carried, now.T_world_cam)
@@ -288,17 +290,19 @@ class TestBent:
         np.testing.assert_allclose(apart[:, 1:], 0, atol=1e-9)
 
     def test_keyframes_culled_since_are_left_out(self):
-        map = small_map(num_keyframes=5, num_points=20, seed=2)
-        poses = np.array([moved(map.pose(int(number)), 0.1 * number * np.ones(6)) for number in map.ids])
-        loop = LoopClosure(0, 4, between(poses[0], poses[4]), np.eye(6), map.ids, poses)
-        after = with_loop_closed(without_keyframe(map, 2), loop)
+        slam_map = small_map(num_keyframes=5, num_points=20, seed=2)
+        poses = np.array([retract(slam_map.pose(int(number)), 0.1 * number * np.ones(6)) for number in slam_map.ids])
+        loop = LoopClosure(0, 4, between(poses[0], poses[4]), np.eye(6), slam_map.ids, poses)
+        after = with_loop_closed(without_keyframe(slam_map, 2), loop)
         assert problems(after) == []
         np.testing.assert_allclose(after.T_world_cam, poses[[0, 1, 3, 4]], atol=1e-12)
 
     def test_a_loop_that_asks_for_nothing_changes_nothing(self):
-        map = small_map(num_keyframes=5, num_points=20, seed=2)
-        loop = LoopClosure(0, 4, between(map.pose(0), map.pose(4)), np.eye(6), map.ids, map.T_world_cam)
-        after = with_loop_closed(map, loop)
-        np.testing.assert_allclose(after.T_world_cam, map.T_world_cam, atol=1e-12)
-        np.testing.assert_allclose(after.points.X_world, map.points.X_world, atol=1e-12)
-        assert not same(after, map)  # it has one loop more
+        slam_map = small_map(num_keyframes=5, num_points=20, seed=2)
+        loop = LoopClosure(
+            0, 4, between(slam_map.pose(0), slam_map.pose(4)), np.eye(6), slam_map.ids, slam_map.T_world_cam
+        )
+        after = with_loop_closed(slam_map, loop)
+        np.testing.assert_allclose(after.T_world_cam, slam_map.T_world_cam, atol=1e-12)
+        np.testing.assert_allclose(after.points.X_world, slam_map.points.X_world, atol=1e-12)
+        assert not same(after, slam_map)  # it has one loop more

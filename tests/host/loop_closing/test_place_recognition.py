@@ -1,4 +1,4 @@
-"""Recognising places: the index against exhaustive search, poses against the truth, and nothing where nothing is."""
+"""Recognizing places: the index against exhaustive search, poses against the truth, and nothing where nothing is."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,7 +18,7 @@ from jaxslam.features.pose_from_matches import MAX_SIGMA_M, MIN_INLIERS
 from jaxslam.geometry.se3 import angle, between
 from jaxslam.loop_closing import place_recognition
 from jaxslam.loop_closing.place_index import PlaceIndex
-from jaxslam.loop_closing.place_recognition import Recognition, recognise, verify
+from jaxslam.loop_closing.place_recognition import Recognition, recognize, verify
 from jaxslam.map.edit import with_keyframe, without_keyframe
 from jaxslam.map.types import NONE, Keyframe, Map, empty_map
 from jaxslam.sensors.frame_arrays import frame_arrays
@@ -147,30 +147,30 @@ def round_index(round_map) -> PlaceIndex:
     return PlaceIndex.from_map(round_map)
 
 
-def error(map: Map, found: Recognition, T_world_cam: np.ndarray) -> tuple[float, float]:
-    """Metres and radians."""
-    wrong = between(between(map.pose(found.keyframe), T_world_cam), found.T_keyframe_cam)
+def error(slam_map: Map, found: Recognition, T_world_cam: np.ndarray) -> tuple[float, float]:
+    """Meters and radians."""
+    wrong = between(between(slam_map.pose(found.keyframe), T_world_cam), found.T_keyframe_cam)
     return float(np.linalg.norm(wrong[4:])), float(angle(wrong))
 
 
-def test_recognises_places_of_the_room(round_map, round_index):
-    recognised = [(i, recognise(round_map, round_index, features(i), params())) for i in range(10, FRAMES, 80)]
-    sure = [(index, found) for index, found in recognised if found is not None]
+def test_recognizes_places_of_the_room(round_map, round_index):
+    recognized = [(i, recognize(round_map, round_index, features(i), params())) for i in range(10, FRAMES, 80)]
+    sure = [(index, found) for index, found in recognized if found is not None]
     assert len(sure) >= 8
     for index, found in sure:
-        metres, radians = error(round_map, found, room().T_world_cam[index])
-        assert metres < 0.01
+        meters, radians = error(round_map, found, room().T_world_cam[index])
+        assert meters < 0.01
         assert radians < np.radians(0.4)
         assert found.num_inliers == found.pairs.shape[1] >= MIN_INLIERS
         np.testing.assert_array_equal(found.covariance, found.covariance.T)
         assert 0 < np.linalg.eigvalsh(found.covariance[:3, :3])[-1] <= MAX_SIGMA_M**2
-        assert metres**2 < 25 * found.covariance[:3, :3].trace()
-    near = [recognise(round_map, round_index, features(index + 10), params()) for index in ROUND]
+        assert meters**2 < 25 * found.covariance[:3, :3].trace()
+    near = [recognize(round_map, round_index, features(index + 10), params()) for index in ROUND]
     assert [found.keyframe for found in near if found is not None] == round_map.ids.tolist()
 
 
 def test_same_call_same_bytes(round_map):
-    found = [recognise(round_map, PlaceIndex.from_map(round_map), features(130), params()) for _ in range(2)]
+    found = [recognize(round_map, PlaceIndex.from_map(round_map), features(130), params()) for _ in range(2)]
     assert found[0] is not None
     for first, second in zip(*found, strict=True):
         assert np.asarray(first).tobytes() == np.asarray(second).tobytes()
@@ -178,21 +178,21 @@ def test_same_call_same_bytes(round_map):
 
 def test_passes_over_what_is_excluded_or_no_longer_in_the_map(round_map, round_index):
     sought, best = features(130), 1
-    found = recognise(round_map, round_index, sought, params())
+    found = recognize(round_map, round_index, sought, params())
     assert found is not None
     assert found.keyframe == best
-    other = recognise(round_map, round_index, sought, params(), exclude={best})
+    other = recognize(round_map, round_index, sought, params(), exclude={best})
     assert other is None or other.keyframe != best
     culled = without_keyframe(round_map, best)
-    elsewhere = recognise(culled, round_index, sought, params())
+    elsewhere = recognize(culled, round_index, sought, params())
     assert elsewhere is None or elsewhere.keyframe != best
 
 
-def test_another_room_is_not_recognised(round_map, round_index):
+def test_another_room_is_not_recognized(round_map, round_index):
     for seed in range(1, 4):
         assert round_index.query(features(0, seed)), "nothing was looked at"
         for index in range(0, FRAMES, 160):
-            assert recognise(round_map, round_index, features(index, seed), params()) is None
+            assert recognize(round_map, round_index, features(index, seed), params()) is None
 
 
 def test_too_little_to_be_certain(round_map, monkeypatch):
@@ -250,34 +250,38 @@ def recorded(dataset: Dataset, indices: range, *, moving: bool) -> tuple[list[Fe
 
 
 def recorded_map(dataset: Dataset, found: list[Features], poses: list[np.ndarray]) -> Map:
-    map = empty_map(dataset.camera)
+    slam_map = empty_map(dataset.camera)
     for one, pose in zip(found, poses, strict=True):
-        map = with_keyframe(
-            map, Keyframe(map.next_keyframe, map.next_keyframe, one, b""), pose, NONE, map.next_keyframe
+        slam_map = with_keyframe(
+            slam_map,
+            Keyframe(slam_map.next_keyframe, slam_map.next_keyframe, one, b""),
+            pose,
+            NONE,
+            slam_map.next_keyframe,
         )
-    return map
+    return slam_map
 
 
 def test_real_places(data_dir: Path):
-    """TUM fr1_rpy: revisits are recognised where they are; Bonn's lecture hall is not, nor the other way round."""
+    """TUM fr1_rpy: revisits are recognized where they are; Bonn's lecture hall is not, nor the other way round."""
     desk = open_dataset(data_dir / "tum" / "rgbd_dataset_freiburg1_rpy_excerpt")
     hall = open_dataset(data_dir / "bonn" / "rgbd_bonn_crowd")
     seen, poses = recorded(desk, range(0, 160, 5), moving=True)
     others, places = recorded(hall, range(0, 900, 60), moving=False)
-    map = recorded_map(desk, seen[::2], poses[::2])
-    index, parameters = PlaceIndex.from_map(map), track_params(desk.camera, TrackConfig())
+    slam_map = recorded_map(desk, seen[::2], poses[::2])
+    index, parameters = PlaceIndex.from_map(slam_map), track_params(desk.camera, TrackConfig())
     errors = []
     for i, (one, pose) in enumerate(zip(seen, poses, strict=True)):
-        neighbours = {k for k in range(len(map.ids)) if abs(10 * k - 5 * i) <= 15}
-        found = recognise(map, index, one, parameters, exclude=neighbours)
+        neighbors = {k for k in range(len(slam_map.ids)) if abs(10 * k - 5 * i) <= 15}
+        found = recognize(slam_map, index, one, parameters, exclude=neighbors)
         if found is not None:
-            errors.append(error(map, found, pose))
-    metres, radians = np.transpose(errors)
+            errors.append(error(slam_map, found, pose))
+    meters, radians = np.transpose(errors)
     assert len(errors) >= 0.75 * len(seen)
-    assert np.median(metres) < 0.012
-    assert metres.max() < 0.08
+    assert np.median(meters) < 0.012
+    assert meters.max() < 0.08
     assert np.degrees(radians).max() < 4
-    assert all(recognise(map, index, one, parameters, limit=10) is None for one in others)
+    assert all(recognize(slam_map, index, one, parameters, limit=10) is None for one in others)
     elsewhere, hall_params = recorded_map(hall, others, places), track_params(hall.camera, TrackConfig())
     hall_index = PlaceIndex.from_map(elsewhere)
-    assert all(recognise(elsewhere, hall_index, one, hall_params, limit=10) is None for one in seen)
+    assert all(recognize(elsewhere, hall_index, one, hall_params, limit=10) is None for one in seen)

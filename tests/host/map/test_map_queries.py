@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from small_map import CAMERA, keyframe, pose, small_map
 
-from jaxslam.map.edit import with_keyframe, without_keyframe, without_sightings
+from jaxslam.map.edit import with_keyframe, without_keyframe, without_observations
 from jaxslam.map.spanning_tree import children, subtree
 from jaxslam.map.types import (
     NONE,
@@ -15,22 +15,24 @@ from jaxslam.map.types import (
     covisible,
     empty_map,
     has,
-    neighbourhood,
+    neighborhood,
     point_submaps,
     rows,
-    standing,
+    surviving_keyframes,
     visibility,
 )
 from jaxslam.map.validate import problems
 
 
-def seen_by(map: Map, seen: dict[int, list[int]]) -> Map:
-    """Sightings cut down to these points of each keyframe."""
+def seen_by(slam_map: Map, seen: dict[int, list[int]]) -> Map:
+    """Observations cut down to these points of each keyframe."""
     keep = [
         point in seen[number]
-        for number, point in zip(map.sightings.keyframe.tolist(), map.sightings.point.tolist(), strict=True)
+        for number, point in zip(
+            slam_map.observations.keyframe.tolist(), slam_map.observations.point.tolist(), strict=True
+        )
     ]
-    return without_sightings(map, ~np.array(keep))
+    return without_observations(slam_map, ~np.array(keep))
 
 
 def test_rows_and_has():
@@ -48,14 +50,14 @@ class TestPose:
             small_map().pose(9)
 
     def test_of_one_in_the_map(self):
-        map = small_map()
-        np.testing.assert_allclose(map.pose(2), map.T_world_cam[2], atol=1e-15)
-        assert map.keyframe(2).id == 2
+        slam_map = small_map()
+        np.testing.assert_allclose(slam_map.pose(2), slam_map.T_world_cam[2], atol=1e-15)
+        assert slam_map.keyframe(2).id == 2
 
 
 def test_visibility_counts_points_in_common():
-    map = seen_by(small_map(num_keyframes=3, num_points=5), {0: [0, 1, 2], 1: [2, 3], 2: [0, 1, 2, 4]})
-    seen = visibility(map)
+    slam_map = seen_by(small_map(num_keyframes=3, num_points=5), {0: [0, 1, 2], 1: [2, 3], 2: [0, 1, 2, 4]})
+    seen = visibility(slam_map)
     assert seen.shape == (3, 5)
     assert (seen @ seen.T).toarray().tolist() == [[3, 1, 3], [1, 2, 1], [3, 1, 4]]
 
@@ -73,30 +75,30 @@ class TestCovisible:
         assert covisible(self.MAP, 0, at_least=3)[0].tolist() == [2]
         assert covisible(self.MAP, 4, at_least=1)[0].tolist() == []
 
-    def test_neighbourhood(self):
-        ids, seen = neighbourhood(self.MAP, 0, at_least=2, at_most=2)
+    def test_neighborhood(self):
+        ids, seen = neighborhood(self.MAP, 0, at_least=2, at_most=2)
         assert (ids.tolist(), seen.tolist()) == ([0, 2, 3], [0, 1, 2, 3])
 
-    def test_neighbourhood_takes_the_parent_along(self):
-        assert neighbourhood(self.MAP, 4, at_least=1)[0].tolist() == [4, 3]
-        assert neighbourhood(self.MAP, 2, at_least=1, at_most=1)[0].tolist() == [2, 1]
+    def test_neighborhood_takes_the_parent_along(self):
+        assert neighborhood(self.MAP, 4, at_least=1)[0].tolist() == [4, 3]
+        assert neighborhood(self.MAP, 2, at_least=1, at_most=1)[0].tolist() == [2, 1]
 
 
 def test_tree():
-    map = small_map(num_keyframes=6)._replace(parent=np.array([NONE, 0, 0, 1, 3, 2]))
-    assert children(map, 0).tolist() == [1, 2]
-    assert subtree(map, 1).tolist() == [1, 3, 4]
-    assert subtree(map, 5).tolist() == [5]
+    slam_map = small_map(num_keyframes=6)._replace(parent=np.array([NONE, 0, 0, 1, 3, 2]))
+    assert children(slam_map, 0).tolist() == [1, 2]
+    assert subtree(slam_map, 1).tolist() == [1, 3, 4]
+    assert subtree(slam_map, 5).tolist() == [5]
 
 
 def test_submap_of_points_whose_keyframe_is_gone():
-    map, rng = small_map(), np.random.default_rng(1)
-    map = with_keyframe(map, keyframe(map, rng), pose(rng), NONE, 3)
-    map = without_keyframe(without_keyframe(map, 2), 1)
-    assert standing(map, np.array([2, 4, 1, 3])).tolist() == [0, 4, 0, 3]
-    assert set(point_submaps(map).tolist()) == {0}
+    slam_map, rng = small_map(), np.random.default_rng(1)
+    slam_map = with_keyframe(slam_map, keyframe(slam_map, rng), pose(rng), NONE, 3)
+    slam_map = without_keyframe(without_keyframe(slam_map, 2), 1)
+    assert surviving_keyframes(slam_map, np.array([2, 4, 1, 3])).tolist() == [0, 4, 0, 3]
+    assert set(point_submaps(slam_map).tolist()) == {0}
     with pytest.raises(KeyError):
-        standing(map, np.array([5]))
+        surviving_keyframes(slam_map, np.array([5]))
 
 
 def test_empty_map_is_whole():
@@ -105,13 +107,13 @@ def test_empty_map_is_whole():
 
 def broken(**changes: Callable[[Any], Any]) -> Map:
     """A small map, after a keyframe was culled, with some fields changed: `points__ids` is `points.ids`."""
-    map = without_keyframe(small_map(num_keyframes=5), 2)
+    slam_map = without_keyframe(small_map(num_keyframes=5), 2)
     for key, change in changes.items():
         name, _, field = key.partition("__")
-        record = getattr(map, name)
+        record = getattr(slam_map, name)
         after = record._replace(**{field: change(getattr(record, field))}) if field else change(record)
-        map = map._replace(**{name: after})
-    return map
+        slam_map = slam_map._replace(**{name: after})
+    return slam_map
 
 
 def put(index: Any, number: float) -> Callable[[np.ndarray], np.ndarray]:
@@ -135,24 +137,24 @@ def put(index: Any, number: float) -> Callable[[np.ndarray], np.ndarray]:
         ({"points__ids": put(3, 2)}, "points.ids: expected them to ascend from 0 and end before 10"),
         ({"culled__ids": put(0, 3)}, "culled.ids: one is given twice, or still in the map"),
         ({"parent": put(2, 2)}, "parent: 2 is not in the map"),
-        ({"points__made_by": put(0, 12)}, "points.made_by: 12 is not in the map"),
-        ({"sightings__keyframe": put(0, 2)}, "sightings.keyframe: 2 is not in the map"),
-        ({"sightings__point": put(0, 99)}, "sightings.point: 99 is not in the map"),
+        ({"points__reference_keyframe": put(0, 12)}, "points.reference_keyframe: 12 is not in the map"),
+        ({"observations__keyframe": put(0, 2)}, "observations.keyframe: 2 is not in the map"),
+        ({"observations__point": put(0, 99)}, "observations.point: 99 is not in the map"),
         ({"loops__target": put(0, 2)}, "loops.target: 2 is not in the map"),
         ({"culled__anchor": put(0, 99)}, "culled.anchor: 99 is not in the map"),
         ({"T_world_cam": put((0, 5), np.nan)}, "T_world_cam: holds a number that is not finite"),
         ({"T_world_cam": put((0, 0), 3.0)}, "T_world_cam: a quaternion is not of unit length"),
-        ({"sightings__weight": put(0, 1.5)}, "sightings.weight: expected 0 to 1"),
-        ({"sightings__sigma_px": put(0, 0)}, "sightings.sigma_px: expected more than 0"),
-        ({"sightings__depth": put(0, -1)}, "sightings.depth: expected 0 or more"),
+        ({"observations__weight": put(0, 1.5)}, "observations.weight: expected 0 to 1"),
+        ({"observations__sigma_px": put(0, 0)}, "observations.sigma_px: expected more than 0"),
+        ({"observations__depth": put(0, -1)}, "observations.depth: expected 0 or more"),
         ({"points__weight": put(0, -0.5)}, "points.weight: expected 0 to 1"),
         ({"parent": lambda a: np.array([1, 3, 0, 0], a.dtype)}, "parent: goes round in a circle"),
         ({"parent": put(1, NONE)}, "parent: expected one tree in each submap"),
         ({"submap": put(3, 1)}, "parent: expected one tree in each submap"),
         ({"loops__source": put(0, 4)}, "loops: one leads from a keyframe to itself"),
-        ({"sightings__point": put(0, 1)}, "sightings: a keyframe sees a point twice"),
-        ({"sightings__feature": put(1, 0)}, "sightings: two points are one feature"),
-        ({"sightings__feature": put(1, 12)}, "sightings.feature: the keyframe has no such feature"),
+        ({"observations__point": put(0, 1)}, "observations: a keyframe sees a point twice"),
+        ({"observations__feature": put(1, 0)}, "observations: two points are one feature"),
+        ({"observations__feature": put(1, 12)}, "observations.feature: the keyframe has no such feature"),
         ({"culled__anchor": put(0, 2)}, "culled.anchor: goes round in a circle"),
     ],
 )
@@ -163,14 +165,16 @@ def test_problems_names_what_is_wrong(changes, message):
 
 
 def test_problems_looks_into_keyframes():
-    map = small_map(num_keyframes=1)
-    first = map.keyframes[0]
+    slam_map = small_map(num_keyframes=1)
+    first = slam_map.keyframes[0]
     cut = first._replace(features=first.features._replace(angle=first.features.angle[1:]))
-    assert problems(map._replace(keyframes=(cut,))) == ["keyframe 0: angle: expected float32 (12,), got float32 (11,)"]
+    assert problems(slam_map._replace(keyframes=(cut,))) == [
+        "keyframe 0: angle: expected float32 (12,), got float32 (11,)"
+    ]
 
 
 def test_problems_knows_submaps():
-    map, rng = small_map(num_keyframes=2), np.random.default_rng(1)
-    map = with_keyframe(map, keyframe(map, rng), pose(rng), NONE, 1)
-    seen = map.sightings._replace(keyframe=put(0, 2)(map.sightings.keyframe))
-    assert problems(map._replace(sightings=seen)) == ["sightings: a keyframe sees a point of another submap"]
+    slam_map, rng = small_map(num_keyframes=2), np.random.default_rng(1)
+    slam_map = with_keyframe(slam_map, keyframe(slam_map, rng), pose(rng), NONE, 1)
+    seen = slam_map.observations._replace(keyframe=put(0, 2)(slam_map.observations.keyframe))
+    assert problems(slam_map._replace(observations=seen)) == ["observations: a keyframe sees a point of another submap"]

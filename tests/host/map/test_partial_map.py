@@ -4,88 +4,98 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from small_map import arrays, keyframe, pose, same, sightings, small_map
+from small_map import arrays, keyframe, observations, pose, same, small_map
 
 from jaxslam.map.edit import (
-    fused,
-    moved,
+    with_fused_points,
     with_keyframe,
-    with_sightings,
+    with_observations,
+    with_positions,
     without_keyframe,
+    without_observations,
     without_points,
-    without_sightings,
 )
-from jaxslam.map.partial_map import most_shared, part_around, put_back
+from jaxslam.map.partial_map import extract_around, merge_back, most_shared
 from jaxslam.map.types import NONE, Map, covisible
 from jaxslam.map.validate import problems
 
 
 def thinned(seed: int, num_keyframes: int = 6, num_points: int = 40) -> Map:
     """Every keyframe sees about a third of the points."""
-    map = small_map(num_keyframes, num_points, seed)
-    map = without_sightings(map, np.random.default_rng(seed).random(len(map.sightings.point)) < 0.65)
-    return without_points(map, np.setdiff1d(map.points.ids, map.sightings.point))
+    slam_map = small_map(num_keyframes, num_points, seed)
+    slam_map = without_observations(
+        slam_map, np.random.default_rng(seed).random(len(slam_map.observations.point)) < 0.65
+    )
+    return without_points(slam_map, np.setdiff1d(slam_map.points.ids, slam_map.observations.point))
 
 
-def in_order(map: Map) -> Map:
-    """The sightings in the order of keyframes and points: which of them came first is lost on the way."""
-    order = np.lexsort((map.sightings.point, map.sightings.keyframe))
-    return map._replace(sightings=type(map.sightings)(*(column[..., order] for column in map.sightings)))
+def in_order(slam_map: Map) -> Map:
+    """The observations in the order of keyframes and points: which of them came first is lost on the way."""
+    order = np.lexsort((slam_map.observations.point, slam_map.observations.keyframe))
+    return slam_map._replace(
+        observations=type(slam_map.observations)(*(column[..., order] for column in slam_map.observations))
+    )
 
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32), st.sets(st.integers(0, 5), max_size=4), st.sets(st.integers(0, 39), max_size=3))
 def test_cut_out_and_put_back_is_the_same(seed, around, besides):
-    map = thinned(seed % 1000)
-    ids, more = np.array(sorted(around), np.int64), np.intersect1d(np.array(sorted(besides), np.int64), map.points.ids)
-    part = part_around(map, ids, more)
-    wanted = np.union1d(map.sightings.point[np.isin(map.sightings.keyframe, ids)], more)
+    slam_map = thinned(seed % 1000)
+    ids, more = (
+        np.array(sorted(around), np.int64),
+        np.intersect1d(np.array(sorted(besides), np.int64), slam_map.points.ids),
+    )
+    part = extract_around(slam_map, ids, more)
+    wanted = np.union1d(slam_map.observations.point[np.isin(slam_map.observations.keyframe, ids)], more)
     assert part.map.points.ids.tolist() == wanted.tolist()
-    assert np.count_nonzero(np.isin(map.sightings.point, wanted)) == len(part.map.sightings.point)
+    assert np.count_nonzero(np.isin(slam_map.observations.point, wanted)) == len(part.map.observations.point)
     assert problems(part.map) == []
-    assert same(in_order(put_back(map, part, part.map)), in_order(map))
+    assert same(in_order(merge_back(slam_map, part, part.map)), in_order(slam_map))
     for number in ids.tolist():
-        for whole, here in zip(covisible(map, number, 1), covisible(part.map, number, 1), strict=True):
+        for whole, here in zip(covisible(slam_map, number, 1), covisible(part.map, number, 1), strict=True):
             np.testing.assert_array_equal(here, whole)
 
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 999))
 def test_edits_of_a_part_are_edits_of_the_whole(seed):
-    rng, map = np.random.default_rng(seed), thinned(seed)
-    before = {name: array.copy() for name, array in arrays(map).items()}
-    part = part_around(map, np.array([2, 3, 4, 5]))  # 3 hangs on 2, which goes
+    rng, slam_map = np.random.default_rng(seed), thinned(seed)
+    before = {name: array.copy() for name, array in arrays(slam_map).items()}
+    part = extract_around(slam_map, np.array([2, 3, 4, 5]))  # 3 hangs on 2, which goes
 
-    def edited(map: Map, ids: np.ndarray) -> Map:
+    def edited(slam_map: Map, ids: np.ndarray) -> Map:
         rng = np.random.default_rng(seed)
-        map = fused(map, ids[:1], ids[3:4])
-        map = moved(map, np.array([4]), pose(rng)[None], ids[5:7], rng.normal(size=(3, 2)))
-        map = without_points(map, ids[8:9])
-        map = with_keyframe(map, keyframe(map, rng), pose(rng), 5, 0)
-        map = with_sightings(map, sightings(map, np.full(3, 6), ids[9:12], np.array([0, 1, NONE]), rng))
-        return without_points(without_keyframe(map, 2), np.zeros(0, np.int64))
+        slam_map = with_fused_points(slam_map, ids[:1], ids[3:4])
+        slam_map = with_positions(slam_map, np.array([4]), pose(rng)[None], ids[5:7], rng.normal(size=(3, 2)))
+        slam_map = without_points(slam_map, ids[8:9])
+        slam_map = with_keyframe(slam_map, keyframe(slam_map, rng), pose(rng), 5, 0)
+        slam_map = with_observations(
+            slam_map, observations(slam_map, np.full(3, 6), ids[9:12], np.array([0, 1, NONE]), rng)
+        )
+        return without_points(without_keyframe(slam_map, 2), np.zeros(0, np.int64))
 
     ids = rng.permutation(part.map.points.ids)
     if len(ids) < 12:
         return
-    after, expected = put_back(map, part, edited(part.map, ids)), edited(map, ids)
+    after, expected = merge_back(slam_map, part, edited(part.map, ids)), edited(slam_map, ids)
     assert problems(after) == []
     assert same(in_order(after), in_order(expected))
-    for name, array in arrays(map).items():
+    for name, array in arrays(slam_map).items():
         np.testing.assert_array_equal(array, before[name])
 
 
 def test_most_shared():
-    map = thinned(3)
-    wanted = map.points.ids[::2]
+    slam_map = thinned(3)
+    wanted = slam_map.points.ids[::2]
     counts = {
-        number: np.isin(map.sightings.point[map.sightings.keyframe == number], wanted).sum() for number in range(6)
+        number: np.isin(slam_map.observations.point[slam_map.observations.keyframe == number], wanted).sum()
+        for number in range(6)
     }
     order = sorted(counts, key=lambda number: (-counts[number], -number))
-    assert most_shared(map, wanted, 4).tolist() == order[:4]
-    assert most_shared(map, wanted[:0], 4).tolist() == []
+    assert most_shared(slam_map, wanted, 4).tolist() == order[:4]
+    assert most_shared(slam_map, wanted[:0], 4).tolist() == []
 
 
 def test_an_id_that_was_never_given():
     with pytest.raises(IndexError):
-        part_around(small_map(), np.array([77]))
+        extract_around(small_map(), np.array([77]))

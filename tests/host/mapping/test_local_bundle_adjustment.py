@@ -7,10 +7,10 @@ import pytest
 from exact_map import exact_map
 from small_map import same
 
-from jaxslam.geometry.se3 import moved as shifted
+from jaxslam.geometry.se3 import retract as shifted
 from jaxslam.geometry.se3 import to_local
-from jaxslam.map.edit import moved
-from jaxslam.map.types import Map, rows, sightings_at
+from jaxslam.map.edit import with_positions
+from jaxslam.map.types import Map, observations_at, rows
 from jaxslam.map.validate import problems
 from jaxslam.mapping import local_bundle_adjustment as module
 from jaxslam.mapping.local_bundle_adjustment import AdjustPlan, adjust_all, adjust_around, compile_adjustment
@@ -18,15 +18,19 @@ from jaxslam.mapping.local_bundle_adjustment import AdjustPlan, adjust_all, adju
 PLAN = AdjustPlan()
 
 
-def disturbed(map: Map, keyframes: np.ndarray, seed: int = 1, metres: float = 0.01) -> Map:
+def disturbed(slam_map: Map, keyframes: np.ndarray, seed: int = 1, meters: float = 0.01) -> Map:
     """Keyframes and all points out of place."""
     rng = np.random.default_rng(seed)
-    tangents = rng.normal(0, [metres] * 3 + [metres / 2] * 3, (len(keyframes), 6))
+    tangents = rng.normal(0, [meters] * 3 + [meters / 2] * 3, (len(keyframes), 6))
     poses = np.array(
-        [shifted(map.pose(int(number)), tangent) for number, tangent in zip(keyframes, tangents, strict=True)]
+        [shifted(slam_map.pose(int(number)), tangent) for number, tangent in zip(keyframes, tangents, strict=True)]
     )
-    return moved(
-        map, keyframes, poses, map.points.ids, map.points.X_world + rng.normal(0, metres, map.points.X_world.shape)
+    return with_positions(
+        slam_map,
+        keyframes,
+        poses,
+        slam_map.points.ids,
+        slam_map.points.X_world + rng.normal(0, meters, slam_map.points.X_world.shape),
     )
 
 
@@ -47,18 +51,18 @@ def test_window_comes_back_to_where_it_was_seen(truth):
     assert problems(after) == []
     assert apart(before, truth, free).max() > 0.01
     assert apart(after, truth, free).max() < 1e-4
-    ids, views = np.unique(truth.sightings.point[truth.sightings.keyframe >= 8], return_counts=True)
+    ids, views = np.unique(truth.observations.point[truth.observations.keyframe >= 8], return_counts=True)
     at = rows(after.points.ids, ids[views > 1])
     assert np.abs(after.points.X_world[:, at] - truth.points.X_world[:, at]).max() < 1e-3
-    assert len(after.sightings.point) == len(truth.sightings.point), "a good sighting was dropped"
+    assert len(after.observations.point) == len(truth.observations.point), "a good observation was dropped"
 
 
 def test_points_that_only_one_keyframe_sees_move_along_with_it(truth):
-    alone = ~np.isin(truth.sightings.point, truth.points.ids[::7]) | (truth.sightings.keyframe == 15)
-    map = truth._replace(sightings=sightings_at(truth.sightings, alone))
-    lone = np.intersect1d(map.points.ids[::7], map.sightings.point)
+    alone = ~np.isin(truth.observations.point, truth.points.ids[::7]) | (truth.observations.keyframe == 15)
+    slam_map = truth._replace(observations=observations_at(truth.observations, alone))
+    lone = np.intersect1d(slam_map.points.ids[::7], slam_map.observations.point)
     assert len(lone) > 20
-    before = disturbed(map, np.arange(8, 16))
+    before = disturbed(slam_map, np.arange(8, 16))
     after = adjust_around(before, 15, PLAN)
     places = [to_local(m.pose(15), m.points.X_world[:, rows(m.points.ids, lone)]) for m in (before, after)]
     np.testing.assert_allclose(places[1], places[0], atol=1e-9)
@@ -66,9 +70,9 @@ def test_points_that_only_one_keyframe_sees_move_along_with_it(truth):
 
 
 def test_far_from_the_origin_of_the_world(truth):
-    """In float32, a millimetre is not told apart at ten kilometres; windows are solved around their keyframe."""
+    """In float32, a millimeter is not told apart at ten kilometers; windows are solved around their keyframe."""
     far = np.array([1e4, -1e4, 5e3])
-    moved_away = moved(
+    moved_away = with_positions(
         truth,
         truth.ids,
         truth.T_world_cam + np.concatenate([np.zeros(4), far]),
@@ -80,32 +84,34 @@ def test_far_from_the_origin_of_the_world(truth):
 
 
 def test_what_is_outside_the_window_stays(truth):
-    before = disturbed(truth, np.arange(16), metres=0.003)
+    before = disturbed(truth, np.arange(16), meters=0.003)
     after = adjust_around(before, 15, PLAN)
     np.testing.assert_array_equal(after.T_world_cam[:8], before.T_world_cam[:8])
-    outside = ~np.isin(before.points.ids, before.sightings.point[before.sightings.keyframe >= 8])
+    outside = ~np.isin(before.points.ids, before.observations.point[before.observations.keyframe >= 8])
     assert outside.any()
     np.testing.assert_array_equal(after.points.X_world[:, outside], before.points.X_world[:, outside])
     assert not np.array_equal(after.T_world_cam[8:], before.T_world_cam[8:])
 
 
 def test_only_what_may_move_moves(truth):
-    before = disturbed(truth, np.arange(16), metres=0.003)
+    before = disturbed(truth, np.arange(16), meters=0.003)
     movable = np.array([3, 13, 15])
     after = adjust_around(before, 15, PLAN, movable)
     changed = before.ids[(after.T_world_cam != before.T_world_cam).any(axis=1)]
     assert changed.tolist() == [13, 15]  # 3 shares nothing with 15
 
 
-def test_sightings_that_do_not_fit_are_dropped(truth):
+def test_observations_that_do_not_fit_are_dropped(truth):
     rng = np.random.default_rng(2)
-    seen = truth.sightings
+    seen = truth.observations
     wrong = (rng.random(len(seen.point)) < 0.08) & (seen.keyframe >= 8)
     uv = seen.uv + np.where(wrong, rng.choice([-1, 1], seen.uv.shape) * rng.uniform(15, 60, seen.uv.shape), 0)
-    before = disturbed(truth._replace(sightings=seen._replace(uv=uv.astype(np.float32))), np.arange(8, 16))
+    before = disturbed(truth._replace(observations=seen._replace(uv=uv.astype(np.float32))), np.arange(8, 16))
     after = adjust_around(before, 15, PLAN)
     assert apart(after, truth, np.arange(8, 16)).max() < 1e-3
-    kept = {(k, p) for k, p in zip(after.sightings.keyframe.tolist(), after.sightings.point.tolist(), strict=True)}
+    kept = {
+        (k, p) for k, p in zip(after.observations.keyframe.tolist(), after.observations.point.tolist(), strict=True)
+    }
     was = list(zip(seen.keyframe.tolist(), seen.point.tolist(), strict=True))
     dropped = np.array([pair not in kept for pair in was])
     in_window = np.isin(seen.point, seen.point[seen.keyframe == 15])
@@ -115,11 +121,11 @@ def test_sightings_that_do_not_fit_are_dropped(truth):
 
 def test_points_count_by_their_weight(truth):
     """A third of the points have moved together since, and are known to be worth nothing."""
-    seen, gone = truth.sightings, truth.points.ids % 3 == 0
+    seen, gone = truth.observations, truth.points.ids % 3 == 0
     shift = np.where(gone[rows(truth.points.ids, seen.point)] & (seen.keyframe == 15), np.float32(6), 0)
     uv = seen.uv + np.stack([shift, 0 * shift]).astype(np.float32)
     weight = np.where(gone, np.float32(0), 1).astype(np.float32)
-    weighted = truth._replace(sightings=seen._replace(uv=uv), points=truth.points._replace(weight=weight))
+    weighted = truth._replace(observations=seen._replace(uv=uv), points=truth.points._replace(weight=weight))
     after = adjust_around(disturbed(weighted, np.arange(8, 16)), 15, PLAN)
     assert apart(after, truth, np.arange(8, 16)).max() < 1e-4
 
@@ -140,35 +146,43 @@ def test_more_points_than_a_window_has_room_for():
 
 
 def test_adjust_all_spreads_what_is_known(truth):
-    before = disturbed(truth, np.arange(1, 16), metres=0.005)
+    before = disturbed(truth, np.arange(1, 16), meters=0.005)
     after = adjust_all(before, PLAN, truth.ids)
     assert problems(after) == []
     np.testing.assert_array_equal(after.T_world_cam[0], before.T_world_cam[0])
     assert apart(after, truth, truth.ids).max() < 0.35 * apart(before, truth, truth.ids).max()  # 0.31 measured
 
 
-def _in_common(map: Map) -> Map:
-    alone = np.isin(map.sightings.keyframe, [3]) == np.isin(map.sightings.point, map.sightings.point[::2])
-    return map._replace(sightings=sightings_at(map.sightings, alone))
+def _in_common(slam_map: Map) -> Map:
+    alone = np.isin(slam_map.observations.keyframe, [3]) == np.isin(
+        slam_map.observations.point, slam_map.observations.point[::2]
+    )
+    return slam_map._replace(observations=observations_at(slam_map.observations, alone))
 
 
-def _points_at(map: Map, X_world: np.ndarray) -> Map:
-    return moved(map, map.ids[:0], np.zeros((0, 7)), map.points.ids, X_world)
+def _points_at(slam_map: Map, X_world: np.ndarray) -> Map:
+    return with_positions(slam_map, slam_map.ids[:0], np.zeros((0, 7)), slam_map.points.ids, X_world)
 
 
-def _sightings(map: Map, **columns: np.ndarray) -> Map:
-    return map._replace(sightings=map.sightings._replace(**columns))
+def _observations(slam_map: Map, **columns: np.ndarray) -> Map:
+    return slam_map._replace(observations=slam_map.observations._replace(**columns))
 
 
 SPOILT: dict[str, Callable[[Map], Map]] = {
     "nothing in common": _in_common,
-    "no sightings": lambda map: map._replace(sightings=sightings_at(map.sightings, np.arange(0))),
-    "behind the camera": lambda map: _points_at(map, map.points.X_world * [[1], [1], [-1]]),
-    "at the camera": lambda map: _points_at(map, 0 * map.points.X_world),
-    "all outliers": lambda map: _sightings(map, uv=np.float32(480) - map.sightings.uv[::-1]),
-    "no weight": lambda map: _sightings(map, weight=0 * map.sightings.weight),
-    "all in one place": lambda map: moved(
-        map, map.ids, np.tile(map.T_world_cam[:1], (len(map.ids), 1)), map.ids[:0], np.zeros((3, 0))
+    "no observations": lambda slam_map: slam_map._replace(
+        observations=observations_at(slam_map.observations, np.arange(0))
+    ),
+    "behind the camera": lambda slam_map: _points_at(slam_map, slam_map.points.X_world * [[1], [1], [-1]]),
+    "at the camera": lambda slam_map: _points_at(slam_map, 0 * slam_map.points.X_world),
+    "all outliers": lambda slam_map: _observations(slam_map, uv=np.float32(480) - slam_map.observations.uv[::-1]),
+    "no weight": lambda slam_map: _observations(slam_map, weight=0 * slam_map.observations.weight),
+    "all in one place": lambda slam_map: with_positions(
+        slam_map,
+        slam_map.ids,
+        np.tile(slam_map.T_world_cam[:1], (len(slam_map.ids), 1)),
+        slam_map.ids[:0],
+        np.zeros((3, 0)),
     ),
 }
 """Maps on which a window of keyframe 3 cannot be solved well, or not at all."""
@@ -184,13 +198,13 @@ def test_degenerate_windows_leave_a_whole_map(kind):
 
 
 def test_one_keyframe_has_nothing_to_adjust():
-    map = exact_map(num_keyframes=1)
-    assert same(adjust_around(map, 0, PLAN), map)
+    slam_map = exact_map(num_keyframes=1)
+    assert same(adjust_around(slam_map, 0, PLAN), slam_map)
 
 
 def test_compiles_every_size_beforehand(truth, monkeypatch):
     compile_adjustment(PLAN)
     sizes = module._adjust._cache_size()  # type: ignore[attr-defined]
-    for map in (truth, exact_map(num_keyframes=4, num_points=100), exact_map(14, 6000, reach=1.5)):
-        adjust_around(map, int(map.ids[-1]), PLAN)
+    for slam_map in (truth, exact_map(num_keyframes=4, num_points=100), exact_map(14, 6000, reach=1.5)):
+        adjust_around(slam_map, int(slam_map.ids[-1]), PLAN)
     assert module._adjust._cache_size() == sizes  # type: ignore[attr-defined]

@@ -13,13 +13,13 @@ from wall_map import BEHIND, POINTS, at, seen_from
 from jaxslam.config.schema import Config
 from jaxslam.features.orb import Features, features_of
 from jaxslam.features.pose_from_matches import MIN_CELLS
-from jaxslam.geometry.se3 import IDENTITY, angle, between, compose, inverse, moved
-from jaxslam.map.types import Map, empty_map, sightings_at
+from jaxslam.geometry.se3 import IDENTITY, angle, between, compose, inverse, retract
+from jaxslam.map.types import Map, empty_map, observations_at
 from jaxslam.mapping.local_map_tracking import keyframes_in_view, local_keyframes, match_local_map
 from jaxslam.mapping.local_mapping import mapping_plan
 from jaxslam.sensors.frame import Frame
 from jaxslam.sensors.frame_arrays import frame_arrays
-from jaxslam.slam.frame_result import Tracked
+from jaxslam.slam.frame_result import FrameResult
 from jaxslam.slam.slam import Slam
 from jaxslam.tracking.from_config import track_params
 from jaxslam.tracking.state import TrackReason, TrackStatus
@@ -31,7 +31,7 @@ NUM_FRAMES, LATER = 60, 50
 
 
 @functools.cache
-def mapped() -> tuple[Map, tuple[Tracked, ...]]:
+def mapped() -> tuple[Map, tuple[FrameResult, ...]]:
     """The map of the first frames, and where each was."""
     with Slam(room().camera, CONFIG) as slam:
         results = tuple(slam.track(frame) for frame in room().frames[:NUM_FRAMES])
@@ -49,17 +49,17 @@ def params() -> Any:
     return track_params(room().camera, TRACK)
 
 
-def nearest_keyframe(map: Map, T_world_cam: np.ndarray) -> int:
-    return int(map.ids[np.argmin(np.linalg.norm(map.T_world_cam[:, 4:] - T_world_cam[4:], axis=1))])
+def nearest_keyframe(slam_map: Map, T_world_cam: np.ndarray) -> int:
+    return int(slam_map.ids[np.argmin(np.linalg.norm(slam_map.T_world_cam[:, 4:] - T_world_cam[4:], axis=1))])
 
 
-def match(map: Map, index: int, error: np.ndarray, seen: Features | None = None) -> tuple[Any, np.ndarray]:
+def match(slam_map: Map, index: int, error: np.ndarray, seen: Features | None = None) -> tuple[Any, np.ndarray]:
     """What comes of a frame whose pose is wrong by `error`, and its pose in the axes of the same keyframe."""
     pose = mapped()[1][index].T_world_cam
-    keyframe_id = nearest_keyframe(map, pose)
-    true = between(map.pose(keyframe_id), pose)
+    keyframe_id = nearest_keyframe(slam_map, pose)
+    true = between(slam_map.pose(keyframe_id), pose)
     seen = features(index) if seen is None else seen
-    return match_local_map(map, keyframe_id, moved(true, error), seen, params(), PLAN), true
+    return match_local_map(slam_map, keyframe_id, retract(true, error), seen, params(), PLAN), true
 
 
 class TestKeyframesInView:
@@ -124,14 +124,14 @@ class TestMatchLocalMap:
 
     def test_points_that_count_for_nothing(self) -> None:
         """As those of a thing that moves: they are no part of what the frame is held to."""
-        map = mapped()[0]
-        points = map.points._replace(weight=np.zeros_like(map.points.weight))
-        assert match(map._replace(points=points), LATER, np.zeros(6))[0] is None
+        slam_map = mapped()[0]
+        points = slam_map.points._replace(weight=np.zeros_like(slam_map.points.weight))
+        assert match(slam_map._replace(points=points), LATER, np.zeros(6))[0] is None
 
     def test_local_keyframes_begin_with_the_one_asked_for(self) -> None:
-        map = mapped()[0]
-        near = local_keyframes(map, int(map.ids[-1]))
-        assert near[0] == map.ids[-1]
+        slam_map = mapped()[0]
+        near = local_keyframes(slam_map, int(slam_map.ids[-1]))
+        assert near[0] == slam_map.ids[-1]
         assert len(np.unique(near)) == len(near) > 1
 
 
@@ -141,12 +141,12 @@ class TestPointsInView:
     @staticmethod
     def alone() -> Map:
         """The map, but the keyframe near `LATER` has no point."""
-        map = mapped()[0]
-        lonely = nearest_keyframe(map, mapped()[1][LATER].T_world_cam)
-        others = np.flatnonzero(map.sightings.keyframe != lonely)
-        map = map._replace(sightings=sightings_at(map.sightings, others))
-        assert local_keyframes(map, lonely).tolist() == [lonely]
-        return map
+        slam_map = mapped()[0]
+        lonely = nearest_keyframe(slam_map, mapped()[1][LATER].T_world_cam)
+        others = np.flatnonzero(slam_map.observations.keyframe != lonely)
+        slam_map = slam_map._replace(observations=observations_at(slam_map.observations, others))
+        assert local_keyframes(slam_map, lonely).tolist() == [lonely]
+        return slam_map
 
     def test_are_used(self, monkeypatch: pytest.MonkeyPatch) -> None:
         found, true = match(self.alone(), LATER, np.array([0.03, -0.02, 0.02, 0, 0, 0]))
@@ -158,9 +158,9 @@ class TestPointsInView:
         assert match(self.alone(), LATER, np.zeros(6))[0] is None
 
     def test_not_those_of_another_submap(self) -> None:
-        map = self.alone()
-        lonely = nearest_keyframe(map, mapped()[1][LATER].T_world_cam)
-        apart = map._replace(submap=np.where(map.ids == lonely, map.submap, map.submap + 1))
+        slam_map = self.alone()
+        lonely = nearest_keyframe(slam_map, mapped()[1][LATER].T_world_cam)
+        apart = slam_map._replace(submap=np.where(slam_map.ids == lonely, slam_map.submap, slam_map.submap + 1))
         assert match(apart, LATER, np.zeros(6))[0] is None
 
     def test_more_than_without(self, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -178,7 +178,7 @@ class TestNotFarFromWhereItWasThoughtToBe:
     """What is found further away is another place that looks alike."""
 
     @pytest.mark.parametrize("off_m", [0.12, 0.2])
-    def test_metres(self, off_m: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_meters(self, off_m: float, monkeypatch: pytest.MonkeyPatch) -> None:
         ahead = np.array([0, 0, off_m, 0, 0, 0])
         assert (match(mapped()[0], LATER, ahead)[0] is not None) == (off_m < 0.15)
         monkeypatch.setattr("jaxslam.mapping.local_map_tracking._NEAR_M", 1.0)
@@ -205,14 +205,14 @@ class TestFewFeatures:
         return Features(**fields, descriptor=seen.descriptor[kept])
 
     def test_few_cells_are_enough(self) -> None:
-        """A person leaves little of the picture; a place is not recognised by so little."""
+        """A person leaves little of the picture; a place is not recognized by so little."""
         found, true = match(mapped()[0], LATER, np.zeros(6), self.within(78, 60, 1000))
         assert found is not None
         off_m = np.linalg.norm(between(true, found.T_origin_cam)[4:])
         print(f"{len(found.agree)} points, {off_m * 1e3:.1f} mm off")
         assert off_m < 0.03
 
-    def test_fewer_are_not_enough_to_recognise_a_place(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_fewer_are_not_enough_to_recognize_a_place(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr("jaxslam.mapping.local_map_tracking._MIN_CELLS", MIN_CELLS)
         assert match(mapped()[0], LATER, np.zeros(6), self.within(78, 60, 1000))[0] is None
 
@@ -252,7 +252,7 @@ class TestWeakFrames:
             slam.track(frame)
         pose = slam._last_pose
         wrong = compose(pose, np.array([1.0, 0, 0, 0, 0.04, 0, 0]))
-        state = slam._back._link.moved(slam._state, compose(wrong, inverse(pose)), is_keyframe=False)
+        state = slam._back._link.apply_correction(slam._state, compose(wrong, inverse(pose)), is_keyframe=False)
         slam._state = state._replace(keyframes=state.keyframes._replace(weight=0 * state.keyframes.weight))
         result = slam.track(room()[LATER])
         assert result.num_matched > 0
@@ -263,20 +263,20 @@ class TestWeakFrames:
 
 class TestLostFrames:
     def test_are_sought_in_the_local_map_first(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        """No place is recognised here; the map around where the camera may be shows it."""
-        monkeypatch.setattr("jaxslam.slam.back_end.recognise", lambda *_, **__: None)
+        """No place is recognized here; the map around where the camera may be shows it."""
+        monkeypatch.setattr("jaxslam.slam.back_end.recognize", lambda *_, **__: None)
         with Slam(room().camera, CONFIG) as slam:
             for frame in room().frames[:40]:
                 slam.track(frame)
             last, arrays = slam._last_pose, frame_arrays(room()[40], 1 / 15)
-            placed, _ = slam._back.regain(arrays, last)
+            placed, _ = slam._back.relocalize(arrays, last)
             assert placed is not None
-            assert np.linalg.norm((slam._back.pose(placed.hung) - mapped()[1][40].T_world_cam)[4:]) < 0.015
-            assert slam._back.regain(arrays, None) == (None, True)
+            assert np.linalg.norm((slam._back.pose(placed.anchored) - mapped()[1][40].T_world_cam)[4:]) < 0.015
+            assert slam._back.relocalize(arrays, None) == (None, True)
 
     def test_go_on_from_there(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        """A camera turned too fast for flow, while no place is recognised."""
-        monkeypatch.setattr("jaxslam.slam.back_end.recognise", lambda *_, **__: None)
+        """A camera turned too fast for flow, while no place is recognized."""
+        monkeypatch.setattr("jaxslam.slam.back_end.recognize", lambda *_, **__: None)
         with Slam(room().camera, CONFIG) as slam:
             for frame in room().frames[:LATER]:
                 slam.track(frame)
@@ -284,7 +284,7 @@ class TestLostFrames:
                 points=slam._state.points._replace(valid=np.zeros(TRACK.num_points, bool))
             )
             result = slam.track(room()[LATER])
-            assert result.status is TrackStatus.RELOCALISED
+            assert result.status is TrackStatus.RELOCALIZED
             assert result.num_matched >= 30
             off_m = np.linalg.norm((result.T_world_cam - mapped()[1][LATER].T_world_cam)[4:])
             print(f"{result.num_matched} points, {off_m * 1e3:.1f} mm off")
@@ -295,5 +295,5 @@ class TestLostFrames:
 def test_nothing_in_an_empty_map() -> None:
     """The first frames come before the map is there."""
     frame: Frame = room()[0]
-    with Slam(room().camera, ALWAYS_WEAK, map=empty_map(room().camera)) as slam:
+    with Slam(room().camera, ALWAYS_WEAK, slam_map=empty_map(room().camera)) as slam:
         assert slam.track(frame).num_matched == 0

@@ -8,12 +8,12 @@ from small_map import arrays, same
 
 from jaxslam.geometry.se3 import between, compose, to_local, transform
 from jaxslam.loop_closing.loop_detector import LoopClosure
-from jaxslam.map.edit import without_sightings
+from jaxslam.map.edit import without_observations
 from jaxslam.map.types import NONE, Map, covisible, rows
 from jaxslam.map.validate import problems
 from jaxslam.mapping import local_mapping
 from jaxslam.mapping.culling import CONFIRM_WITHIN, KEEP_LATEST, without_redundant, without_unconfirmed
-from jaxslam.mapping.local_mapping import LocalMapping, recalled_id
+from jaxslam.mapping.local_mapping import LocalMapping, reloaded_id
 
 COUNT = 8
 
@@ -35,55 +35,55 @@ def test_every_map_is_whole_and_stays_as_it_was():
             np.testing.assert_array_equal(array, before[name])
 
 
-def test_points_the_tracker_saw_get_a_sighting_in_every_keyframe(maps):
+def test_points_the_tracker_saw_get_a_observation_in_every_keyframe(maps):
     """Every track is one point all along, seen where the tracker saw it."""
-    map = maps[2]
+    slam_map = maps[2]
     last = new_keyframe(2, 2 * STEP, STEP).tracks
-    by_flow = map.sightings.feature == NONE
-    seen = map.sightings.point[(map.sightings.keyframe == 2) & by_flow]
+    by_flow = slam_map.observations.feature == NONE
+    seen = slam_map.observations.point[(slam_map.observations.keyframe == 2) & by_flow]
     assert np.count_nonzero(last.weight) * 0.97 < len(seen) <= np.count_nonzero(last.weight)
     for other in (0, 1):
         both = np.count_nonzero((last.weight > 0) & (new_keyframe(other, other * STEP, None).tracks.weight > 0))
-        shared = np.intersect1d(seen, map.sightings.point[(map.sightings.keyframe == other) & by_flow])
+        shared = np.intersect1d(seen, slam_map.observations.point[(slam_map.observations.keyframe == other) & by_flow])
         assert both * 0.95 < len(shared) <= both
 
 
 def test_a_point_recalled_from_the_map_is_known_again():
     """The tracker starts anew and finds points of the map by their picture: it says so by their numbers."""
     mapping, _ = mapped(3, noisy=False)
-    map = mapping.map
-    seen = np.flatnonzero((map.sightings.keyframe == 2) & (map.sightings.feature != NONE))[:50]
-    ids, where = map.sightings.point[seen], map.sightings.seen_uv[:, seen]
-    X_cam = to_local(map.pose(2), map.points.X_world[:, rows(map.points.ids, ids)])
+    slam_map = mapping.map
+    seen = np.flatnonzero((slam_map.observations.keyframe == 2) & (slam_map.observations.feature != NONE))[:50]
+    ids, where = slam_map.observations.point[seen], slam_map.observations.uv_raw[:, seen]
+    X_cam = to_local(slam_map.pose(2), slam_map.points.X_world[:, rows(slam_map.points.ids, ids)])
     again = new_keyframe(3, 2 * STEP, 2 * STEP)
-    unknown = recalled_id(np.array([map.next_point + 10**6]))
+    unknown = reloaded_id(np.array([slam_map.next_point + 10**6]))
     again = again._replace(
         tracks=again.tracks._replace(
-            id=np.append(recalled_id(ids), unknown),
-            seen_uv=np.append(where, where[:, :1], axis=1),
+            id=np.append(reloaded_id(ids), unknown),
+            uv_raw=np.append(where, where[:, :1], axis=1),
             X_cam=np.append(X_cam, X_cam[:, :1], axis=1).astype(np.float32),
             weight=np.ones(51, np.float32),
         )
     )
     after = mapping.add(again)
-    assert np.isin(ids, after.sightings.point[after.sightings.keyframe == 3]).mean() > 0.95
+    assert np.isin(ids, after.observations.point[after.observations.keyframe == 3]).mean() > 0.95
     assert problems(after) == []
 
 
 def test_features_found_again_are_the_same_places(maps):
     """What was found is where the true poses put it: within the search radius of its octave, most within a pixel."""
-    map, truth = maps[-1], room().T_world_cam
-    camera, seen = map.camera, map.sightings
-    focal, centre = np.array([[camera.fx], [camera.fy]]), np.array([[camera.cx], [camera.cy]])
+    slam_map, truth = maps[-1], room().T_world_cam
+    camera, seen = slam_map.camera, slam_map.observations
+    focal, center = np.array([[camera.fx], [camera.fy]]), np.array([[camera.cx], [camera.cy]])
     errors = []
-    for number in map.ids[1:].tolist():
+    for number in slam_map.ids[1:].tolist():
         here = (seen.keyframe == number) & (seen.feature != NONE)
         there = (seen.keyframe == number - 1) & (seen.feature != NONE) & (seen.depth > 0)
         _, i, j = np.intersect1d(seen.point[here], seen.point[there], return_indices=True)
-        rays = np.concatenate([(seen.uv[:, there][:, j] - centre) / focal, np.ones((1, len(j)))])
+        rays = np.concatenate([(seen.uv[:, there][:, j] - center) / focal, np.ones((1, len(j)))])
         X = transform(truth[(number - 1) * STEP], rays * seen.depth[there][j])
         local = to_local(truth[number * STEP], X)
-        apart = local[:2] / local[2] * focal + centre - seen.uv[:, here][:, i]
+        apart = local[:2] / local[2] * focal + center - seen.uv[:, here][:, i]
         errors.append(np.linalg.norm(apart, axis=0) / seen.sigma_px[here][i])
     error = np.concatenate(errors)
     assert len(error) > 1000
@@ -94,9 +94,9 @@ def test_features_found_again_are_the_same_places(maps):
 
 
 def test_every_feature_with_depth_is_a_point():
-    map = mapped(1)[1][0]
-    depth = map.keyframes[0].features.depth
-    feature = map.sightings.feature[map.sightings.feature != NONE]
+    slam_map = mapped(1)[1][0]
+    depth = slam_map.keyframes[0].features.depth
+    feature = slam_map.observations.feature[slam_map.observations.feature != NONE]
     assert np.array_equal(np.sort(feature), np.flatnonzero(depth > 0))
 
 
@@ -108,17 +108,17 @@ def test_features_without_depth_are_triangulated(maps):
         depth = np.array(new.frame.depth)
         depth[:, 320:] = 0
         mapping.add(new._replace(frame=new.frame._replace(depth=depth)))
-    map = mapping.map
-    assert problems(map) == []
-    seen = rows(map.points.ids, map.sightings.point)
-    measured = np.bincount(seen[map.sightings.depth > 0], minlength=len(map.points.ids)) > 0
-    made = ~measured & map.points.recognisable
+    slam_map = mapping.map
+    assert problems(slam_map) == []
+    seen = rows(slam_map.points.ids, slam_map.observations.point)
+    measured = np.bincount(seen[slam_map.observations.depth > 0], minlength=len(slam_map.points.ids)) > 0
+    made = ~measured & slam_map.points.has_descriptor
     assert np.count_nonzero(made) > 20
     errors = []
     for number in range(4):
-        mine = (map.sightings.keyframe == number) & made[seen] & (map.sightings.feature != NONE)
-        expected = to_local(map.pose(number), map.points.X_world[:, seen[mine]])[2]
-        truth = features(number * STEP).depth[map.sightings.feature[mine]]  # of the whole picture
+        mine = (slam_map.observations.keyframe == number) & made[seen] & (slam_map.observations.feature != NONE)
+        expected = to_local(slam_map.pose(number), slam_map.points.X_world[:, seen[mine]])[2]
+        truth = features(number * STEP).depth[slam_map.observations.feature[mine]]  # of the whole picture
         errors.append(expected[truth > 0] / truth[truth > 0])
     ratio = np.concatenate(errors)
     assert np.abs(np.median(ratio) - 1) < 0.02
@@ -145,15 +145,15 @@ def test_same_input_same_bytes(maps):
 
 
 def test_unconfirmed_points_go(maps):
-    map = maps[-1]
-    counts = np.bincount(rows(map.points.ids, map.sightings.point), minlength=len(map.points.ids))
-    old = map.points.made_by <= map.ids[-1] - CONFIRM_WITHIN
+    slam_map = maps[-1]
+    counts = np.bincount(rows(slam_map.points.ids, slam_map.observations.point), minlength=len(slam_map.points.ids))
+    old = slam_map.points.reference_keyframe <= slam_map.ids[-1] - CONFIRM_WITHIN
     assert counts.min() >= 1
     assert counts[old].min() >= 2
     assert (counts[~old] == 1).any(), "nothing to confirm"
-    assert without_unconfirmed(map, int(map.ids[-1])).points.ids.tolist() == map.points.ids.tolist()
-    later = without_unconfirmed(map, int(map.ids[-1]) + 100)  # ids may have gaps
-    assert np.bincount(rows(later.points.ids, later.sightings.point)).min() >= 2
+    assert without_unconfirmed(slam_map, int(slam_map.ids[-1])).points.ids.tolist() == slam_map.points.ids.tolist()
+    later = without_unconfirmed(slam_map, int(slam_map.ids[-1]) + 100)  # ids may have gaps
+    assert np.bincount(rows(later.points.ids, later.observations.point)).min() >= 2
 
 
 def still(count: int) -> LocalMapping:
@@ -171,7 +171,7 @@ CROWD = KEEP_LATEST + 4
 def crowded() -> Map:
     """Before any goes."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(local_mapping, "without_redundant", lambda map, keyframe_id, among: map)
+        patch.setattr(local_mapping, "without_redundant", lambda slam_map, keyframe_id, among: slam_map)
         return still(CROWD).map
 
 
@@ -186,18 +186,18 @@ class TestRedundant:
 
     def test_those_that_see_more_exactly_stay(self, crowded):
         """Others that see the points by features two levels coarser do not replace one; a level does not matter."""
-        seen = crowded.sightings
+        seen = crowded.observations
         for factor, stays in ((1.2, False), (1.44, True)):
             sigma = np.where(seen.keyframe == 2, 1, np.float32(factor)) * seen.sigma_px
-            map = crowded._replace(sightings=seen._replace(sigma_px=sigma.astype(np.float32)))
-            assert (2 in without_redundant(map, CROWD - 1, np.array([2])).ids) == stays
+            slam_map = crowded._replace(observations=seen._replace(sigma_px=sigma.astype(np.float32)))
+            assert (2 in without_redundant(slam_map, CROWD - 1, np.array([2])).ids) == stays
 
     def test_those_with_enough_of_their_own_stay(self, crowded):
         """If a fifth of its points are its own, a keyframe stays."""
-        mine = np.unique(crowded.sightings.point[crowded.sightings.keyframe == 2])[::5]
-        others = (crowded.sightings.keyframe != 2) & np.isin(crowded.sightings.point, mine)
-        map = without_sightings(crowded, others)
-        assert 2 in without_redundant(map, CROWD - 1, np.array([2])).ids
+        mine = np.unique(crowded.observations.point[crowded.observations.keyframe == 2])[::5]
+        others = (crowded.observations.keyframe != 2) & np.isin(crowded.observations.point, mine)
+        slam_map = without_observations(crowded, others)
+        assert 2 in without_redundant(slam_map, CROWD - 1, np.array([2])).ids
 
 
 def test_a_parent_that_was_culled_holds_a_keyframe_nevertheless():
@@ -206,10 +206,10 @@ def test_a_parent_that_was_culled_holds_a_keyframe_nevertheless():
     number = mapping.map.next_keyframe
     truth = room().T_world_cam
     new = new_keyframe(number, STEP, gone % 3)._replace(parent=gone)
-    map = mapping.add(new)
-    assert problems(map) == []
-    assert map.parent[-1] in map.ids
-    apart = between(between(truth[0], truth[STEP]), between(map.pose(0), map.pose(number)))
+    slam_map = mapping.add(new)
+    assert problems(slam_map) == []
+    assert slam_map.parent[-1] in slam_map.ids
+    apart = between(between(truth[0], truth[STEP]), between(slam_map.pose(0), slam_map.pose(number)))
     assert np.linalg.norm(apart[4:]) < 0.005
 
 
@@ -234,7 +234,7 @@ def test_loop_between_submaps_makes_one_of_them():
         index = number * STEP if number < 3 else (number - 3) * STEP + 4
         apart = between(between(truth[0], truth[index]), between(closed.pose(0), closed.pose(number)))
         assert np.linalg.norm(apart[4:]) < 0.005
-    assert len(closed.points.ids) < len(before.points.ids) - 100, "nothing was recognised as the same"
+    assert len(closed.points.ids) < len(before.points.ids) - 100, "nothing was recognized as the same"
     assert covisible(closed, 4, at_least=30)[0][0] in (0, 1, 2, 3, 5)
     again = mapping.close_loop(LoopClosure(1, 77, measured, np.eye(6), *nothing))
     assert again is mapping.map

@@ -5,20 +5,20 @@ import pytest
 from exact_map import CAMERA
 
 from jaxslam.features.orb import DEFAULT_PLAN, Features
-from jaxslam.geometry.se3 import IDENTITY, moved, to_local
-from jaxslam.map.edit import with_keyframe, with_points, with_sightings, without_sightings
+from jaxslam.geometry.se3 import IDENTITY, retract, to_local
+from jaxslam.map.edit import with_keyframe, with_observations, with_points, without_observations
 from jaxslam.map.types import NONE, Keyframe, Map, MapPoints, empty_map, rows
 from jaxslam.map.validate import problems
 from jaxslam.mapping.map_point_matching import (
-    Recognisable,
-    feature_sightings,
+    DescribedPoints,
+    described_points_in,
+    feature_observations,
     find_points,
     fuse_duplicates,
-    recognisable_in,
 )
 
 COUNT = 200
-POSES = [moved(IDENTITY, np.r_[0.1 * k, 0, 0.02 * k, 0, 0.01 * k, 0]) for k in range(3)]
+POSES = [retract(IDENTITY, np.r_[0.1 * k, 0, 0.02 * k, 0, 0.01 * k, 0]) for k in range(3)]
 
 
 @pytest.fixture(scope="module")
@@ -40,40 +40,40 @@ def seen(places: np.ndarray, descriptors: np.ndarray, T_world_cam: np.ndarray) -
     return Features(uv, uv, depth, (2 * ones).astype(np.uint8), 0 * ones, descriptors)
 
 
-def made(map: Map, keyframe_id: int, places: np.ndarray, index: np.ndarray) -> Map:
+def made(slam_map: Map, keyframe_id: int, places: np.ndarray, index: np.ndarray) -> Map:
     """Features of a keyframe as points."""
-    features = map.keyframe(keyframe_id).features
+    features = slam_map.keyframe(keyframe_id).features
     points = MapPoints(
-        ids=map.next_point + np.arange(len(index)),
+        ids=slam_map.next_point + np.arange(len(index)),
         X_world=places[:, index],
         weight=np.ones(len(index), np.float32),
         descriptor=features.descriptor[index],
-        recognisable=np.ones(len(index), bool),
-        made_by=np.full(len(index), keyframe_id, np.int64),
+        has_descriptor=np.ones(len(index), bool),
+        reference_keyframe=np.full(len(index), keyframe_id, np.int64),
         state=np.zeros(len(index), np.int8),
     )
-    found = feature_sightings(keyframe_id, features, points.ids, index, DEFAULT_PLAN)
-    return with_sightings(with_points(map, points), found)
+    found = feature_observations(keyframe_id, features, points.ids, index, DEFAULT_PLAN)
+    return with_observations(with_points(slam_map, points), found)
 
 
 @pytest.fixture(scope="module")
 def three(places, descriptors) -> Map:
     """Three keyframes without points."""
-    map = empty_map(CAMERA)
+    slam_map = empty_map(CAMERA)
     for number, pose in enumerate(POSES):
         frame = Keyframe(number, number, seen(places, descriptors, pose), b"")
-        map = with_keyframe(map, frame, pose, number - 1 if number else NONE, 0)
-    return map
+        slam_map = with_keyframe(slam_map, frame, pose, number - 1 if number else NONE, 0)
+    return slam_map
 
 
-def found_in(map: Map, points: Recognisable, features: Features, **settings: float) -> np.ndarray:
-    return find_points(map, points, features, POSES[1], DEFAULT_PLAN, **({"radius_px": 3.0} | settings))  # type: ignore[arg-type]
+def found_in(slam_map: Map, points: DescribedPoints, features: Features, **settings: float) -> np.ndarray:
+    return find_points(slam_map, points, features, POSES[1], DEFAULT_PLAN, **({"radius_px": 3.0} | settings))  # type: ignore[arg-type]
 
 
 class TestFindPoints:
     @pytest.fixture
-    def points(self, three, places) -> Recognisable:
-        return recognisable_in(made(three, 0, places, np.arange(COUNT)), np.array([0]))
+    def points(self, three, places) -> DescribedPoints:
+        return described_points_in(made(three, 0, places, np.arange(COUNT)), np.array([0]))
 
     def test_finds_those_in_view(self, three, places, points):
         index, feature = found_in(three, points, three.keyframes[1].features)
@@ -108,46 +108,46 @@ class TestFindPoints:
             assert found_in(three, points._replace(X_world=X_world), three.keyframes[1].features).shape == (2, 0)
 
     def test_nothing_among_nothing(self, three, points):
-        none = Recognisable(*(c[..., :0] if c.ndim < 2 or len(c) == 3 else c[:0] for c in points))
+        none = DescribedPoints(*(c[..., :0] if c.ndim < 2 or len(c) == 3 else c[:0] for c in points))
         assert found_in(three, none, three.keyframes[1].features).shape == (2, 0)
 
 
-def test_recognisable_are_those_seen_by_a_feature(three, places):
-    map = made(three, 0, places, np.arange(10))
-    map = map._replace(points=map.points._replace(recognisable=np.arange(10) > 2))
-    assert recognisable_in(map, np.array([0])).ids.tolist() == list(range(3, 10))
-    assert recognisable_in(map, np.array([1])).ids.tolist() == []
-    by_flow = map._replace(sightings=map.sightings._replace(feature=np.full(10, NONE, np.int32)))
-    assert recognisable_in(by_flow, np.array([0])).ids.tolist() == []
+def test_recognizable_are_those_seen_by_a_feature(three, places):
+    slam_map = made(three, 0, places, np.arange(10))
+    slam_map = slam_map._replace(points=slam_map.points._replace(has_descriptor=np.arange(10) > 2))
+    assert described_points_in(slam_map, np.array([0])).ids.tolist() == list(range(3, 10))
+    assert described_points_in(slam_map, np.array([1])).ids.tolist() == []
+    by_flow = slam_map._replace(observations=slam_map.observations._replace(feature=np.full(10, NONE, np.int32)))
+    assert described_points_in(by_flow, np.array([0])).ids.tolist() == []
 
 
 class TestFuse:
     def test_points_that_are_there_twice_become_one(self, three, places):
         """Keyframes 0 and 1 have made points of the same features, 100 of them each."""
-        map = made(made(three, 0, places, np.arange(100)), 1, places, np.arange(100))
-        after, keep, drop = fuse_duplicates(map, 1, np.array([0]), DEFAULT_PLAN, radius_px=3.0)
+        slam_map = made(made(three, 0, places, np.arange(100)), 1, places, np.arange(100))
+        after, keep, drop = fuse_duplicates(slam_map, 1, np.array([0]), DEFAULT_PLAN, radius_px=3.0)
         assert problems(after) == []
         np.testing.assert_array_equal(drop, keep + 100)
         assert len(drop) > 90
         assert len(after.points.ids) == 200 - len(drop)
-        seen = after.sightings.point == keep[0]
-        assert sorted(after.sightings.keyframe[seen].tolist()) == [0, 1]
+        seen = after.observations.point == keep[0]
+        assert sorted(after.observations.keyframe[seen].tolist()) == [0, 1]
 
-    def test_features_that_are_no_point_yet_become_sightings(self, three, places):
-        map = made(three, 1, places, np.arange(100))
-        after, keep, drop = fuse_duplicates(map, 1, np.array([0, 2]), DEFAULT_PLAN, radius_px=3.0)
+    def test_features_that_are_no_point_yet_become_observations(self, three, places):
+        slam_map = made(three, 1, places, np.arange(100))
+        after, keep, drop = fuse_duplicates(slam_map, 1, np.array([0, 2]), DEFAULT_PLAN, radius_px=3.0)
         assert problems(after) == []
         assert len(keep) == len(drop) == 0
-        assert np.bincount(rows(after.points.ids, after.sightings.point)).mean() > 2.7
-        at = rows(after.points.ids, after.sightings.point)
-        np.testing.assert_array_equal(after.sightings.feature, at)  # features and points are in one order
+        assert np.bincount(rows(after.points.ids, after.observations.point)).mean() > 2.7
+        at = rows(after.points.ids, after.observations.point)
+        np.testing.assert_array_equal(after.observations.feature, at)  # features and points are in one order
 
-    def test_chains_over_several_neighbours(self, three, places):
+    def test_chains_over_several_neighbors(self, three, places):
         """Every keyframe has points of its own for the same features: they all become those of the first."""
-        map = three
+        slam_map = three
         for number in range(3):
-            map = made(map, number, places, np.arange(50))
-        after, keep, drop = fuse_duplicates(map, 2, np.array([1, 0]), DEFAULT_PLAN, radius_px=3.0)
+            slam_map = made(slam_map, number, places, np.arange(50))
+        after, keep, drop = fuse_duplicates(slam_map, 2, np.array([1, 0]), DEFAULT_PLAN, radius_px=3.0)
         assert problems(after) == []
         assert len(after.points.ids) < 60 + 50
         assert (keep < drop).all()
@@ -155,9 +155,9 @@ class TestFuse:
         assert len(again.points.ids) < 65
 
     def test_nobody_near(self, three, places):
-        map = made(three, 1, places, np.arange(10))
-        after, keep, _ = fuse_duplicates(map, 1, np.zeros(0, np.int64), DEFAULT_PLAN, radius_px=3.0)
+        slam_map = made(three, 1, places, np.arange(10))
+        after, keep, _ = fuse_duplicates(slam_map, 1, np.zeros(0, np.int64), DEFAULT_PLAN, radius_px=3.0)
         assert len(keep) == 0
-        assert len(after.sightings.point) == 10
-        bare = without_sightings(map, np.ones(10, bool))
-        assert len(fuse_duplicates(bare, 1, np.array([0]), DEFAULT_PLAN, radius_px=3.0)[0].sightings.point) == 0
+        assert len(after.observations.point) == 10
+        bare = without_observations(slam_map, np.ones(10, bool))
+        assert len(fuse_duplicates(bare, 1, np.array([0]), DEFAULT_PLAN, radius_px=3.0)[0].observations.point) == 0

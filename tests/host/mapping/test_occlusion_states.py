@@ -26,22 +26,29 @@ from jaxslam.errors import MapFileError
 from jaxslam.features.orb import FeaturePlan, Features
 from jaxslam.features.pose_from_matches import FeaturePose
 from jaxslam.geometry.se3 import IDENTITY, between, to_local
-from jaxslam.map.edit import fused, with_keyframe, with_points, with_sightings, with_states, without_points
+from jaxslam.map.edit import (
+    with_fused_points,
+    with_keyframe,
+    with_observations,
+    with_points,
+    with_states,
+    without_points,
+)
 from jaxslam.map.npz_file import load_map, save_map
-from jaxslam.map.partial_map import part_around, put_back
+from jaxslam.map.partial_map import extract_around, merge_back
 from jaxslam.map.types import NONE, Keyframe, Map, empty_map, rows
 from jaxslam.map.validate import problems
 from jaxslam.mapping.local_bundle_adjustment import AdjustPlan, adjust_all, adjust_around
 from jaxslam.mapping.local_map_tracking import match_local_map
 from jaxslam.mapping.local_mapping import LocalMapping, NewKeyframe, mapping_plan
-from jaxslam.mapping.map_point_matching import feature_sightings
+from jaxslam.mapping.map_point_matching import feature_observations
 from jaxslam.mapping.occlusion_states import PointStates, StateChanges, occluded_shares, with_changes
 from jaxslam.mapping.point_creation import new_points
 from jaxslam.results.run_results import RunInfo, write_results
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame
 from jaxslam.sensors.frame_arrays import FrameArrays
-from jaxslam.slam.frame_result import Tracked
+from jaxslam.slam.frame_result import FrameResult
 from jaxslam.slam.slam import Slam
 from jaxslam.tracking.from_config import track_params
 from jaxslam.tracking.state import TrackStatus
@@ -61,26 +68,28 @@ def arrays(mask: np.ndarray = CLEAR, depth_m: float | np.ndarray = 0.0) -> Frame
 
 
 def wall(*shown: int) -> Map:
-    """A wall two metres ahead, of which keyframes at one place show so many points."""
+    """A wall two meters ahead, of which keyframes at one place show so many points."""
     return seen_from([at()] * len(shown), list(shown))
 
 
-def states_of(map: Map, *, guard: bool = True, camera: Camera = CAMERA) -> PointStates:
+def states_of(slam_map: Map, *, guard: bool = True, camera: Camera = CAMERA) -> PointStates:
     config = OcclusionConfig(enabled=True, guard=guard)
-    return PointStates(config, track_params(camera, TrackConfig()), map, POINTS)
+    return PointStates(config, track_params(camera, TrackConfig()), slam_map, POINTS)
 
 
-def look(states: PointStates, map: Map, frame: FrameArrays, pose: np.ndarray = IDENTITY, keyframe: int = 0) -> float:
-    return states.see(map, keyframe, pose, np.zeros(6, np.float32), frame)
+def look(
+    states: PointStates, slam_map: Map, frame: FrameArrays, pose: np.ndarray = IDENTITY, keyframe: int = 0
+) -> float:
+    return states.see(slam_map, keyframe, pose, np.zeros(6, np.float32), frame)
 
 
-def now(states: PointStates, map: Map) -> np.ndarray:
+def now(states: PointStates, slam_map: Map) -> np.ndarray:
     """The state of every point of a map."""
-    return states._of(map, map.points.ids)
+    return states._of(slam_map, slam_map.points.ids)
 
 
-def left_of_the_mask(map: Map) -> np.ndarray:
-    X = map.points.X_world
+def left_of_the_mask(slam_map: Map) -> np.ndarray:
+    X = slam_map.points.X_world
     return np.round(CAMERA.fx * X[0] / X[2] + CAMERA.cx) < 31
 
 
@@ -88,62 +97,62 @@ class TestFrames:
     """A mask passes before a wall of points."""
 
     def test_blocked_while_it_passes_and_occluded_afterwards(self) -> None:
-        map = wall(POINTS)
-        states, left = states_of(map), left_of_the_mask(map)
+        slam_map = wall(POINTS)
+        states, left = states_of(slam_map), left_of_the_mask(slam_map)
         assert 20 < left.sum() < 80
-        assert look(states, map, arrays()) == 0
-        assert (now(states, map) == STATIC).all()
-        assert look(states, map, arrays(LEFT)) == 0
-        np.testing.assert_array_equal(now(states, map), np.where(left, BLOCKED, STATIC))
-        assert look(states, map, arrays()) == pytest.approx(left.mean())
-        np.testing.assert_array_equal(now(states, map), np.where(left, OCCLUDED, STATIC))
-        look(states, map, arrays(EVERYWHERE))
-        np.testing.assert_array_equal(now(states, map), np.where(left, OCCLUDED, BLOCKED))
+        assert look(states, slam_map, arrays()) == 0
+        assert (now(states, slam_map) == STATIC).all()
+        assert look(states, slam_map, arrays(LEFT)) == 0
+        np.testing.assert_array_equal(now(states, slam_map), np.where(left, BLOCKED, STATIC))
+        assert look(states, slam_map, arrays()) == pytest.approx(left.mean())
+        np.testing.assert_array_equal(now(states, slam_map), np.where(left, OCCLUDED, STATIC))
+        look(states, slam_map, arrays(EVERYWHERE))
+        np.testing.assert_array_equal(now(states, slam_map), np.where(left, OCCLUDED, BLOCKED))
 
     def test_only_points_of_the_reference_keyframe(self) -> None:
-        map = wall(40, POINTS)
-        states = states_of(map)
-        look(states, map, arrays(EVERYWHERE), keyframe=0)
-        assert now(states, map).tolist() == [BLOCKED] * 40 + [STATIC] * 60
+        slam_map = wall(40, POINTS)
+        states = states_of(slam_map)
+        look(states, slam_map, arrays(EVERYWHERE), keyframe=0)
+        assert now(states, slam_map).tolist() == [BLOCKED] * 40 + [STATIC] * 60
 
     def test_what_is_blocked_is_followed_on_from_another_keyframe(self) -> None:
         """One that was made while something stood there, and does not see the points behind."""
-        map = seen_from([at(), at(x=0.1)], [POINTS, 30])
-        states = states_of(map)
-        look(states, map, arrays(EVERYWHERE), keyframe=0)
-        share = look(states, map, arrays(LEFT), at(x=-0.1), keyframe=1)  # the same pose, in its axes
-        np.testing.assert_array_equal(now(states, map), np.where(left_of_the_mask(map), BLOCKED, OCCLUDED))
-        assert share == pytest.approx((~left_of_the_mask(map)[:30]).mean())
+        slam_map = seen_from([at(), at(x=0.1)], [POINTS, 30])
+        states = states_of(slam_map)
+        look(states, slam_map, arrays(EVERYWHERE), keyframe=0)
+        share = look(states, slam_map, arrays(LEFT), at(x=-0.1), keyframe=1)  # the same pose, in its axes
+        np.testing.assert_array_equal(now(states, slam_map), np.where(left_of_the_mask(slam_map), BLOCKED, OCCLUDED))
+        assert share == pytest.approx((~left_of_the_mask(slam_map)[:30]).mean())
 
     def test_not_into_another_submap(self) -> None:
         """Its world is another."""
-        map = seen_from([at(), at()], [POINTS, POINTS], [0, 1])
-        states = states_of(map)
-        look(states, map, arrays(EVERYWHERE), keyframe=0)
-        look(states, map, arrays(), keyframe=1)
-        assert now(states, map).tolist() == [BLOCKED] * POINTS + [STATIC] * POINTS
+        slam_map = seen_from([at(), at()], [POINTS, POINTS], [0, 1])
+        states = states_of(slam_map)
+        look(states, slam_map, arrays(EVERYWHERE), keyframe=0)
+        look(states, slam_map, arrays(), keyframe=1)
+        assert now(states, slam_map).tolist() == [BLOCKED] * POINTS + [STATIC] * POINTS
 
     @pytest.mark.parametrize("pose", [at(x=5.0), at(turn=np.pi), at(z=1.9)], ids=["beside", "behind", "close"])
     def test_outside_the_picture_nothing_is_learnt(self, pose: np.ndarray) -> None:
         """Beside it, behind the camera, or all but one at its sides."""
-        map = wall(POINTS)
-        states = states_of(map)
-        look(states, map, arrays(LEFT))
-        before = now(states, map)
-        X = to_local(pose, map.points.X_world)
+        slam_map = wall(POINTS)
+        states = states_of(slam_map)
+        look(states, slam_map, arrays(LEFT))
+        before = now(states, slam_map)
+        X = to_local(pose, slam_map.points.X_world)
         z = np.where(X[2] > 0.15, X[2], np.inf)
         u, v = CAMERA.fx * X[0] / z + CAMERA.cx, CAMERA.fy * X[1] / z + CAMERA.cy
         outside = ~(np.isfinite(z) & (np.abs(u - 31.5) < 31) & (np.abs(v - 23.5) < 23))
         assert outside.sum() > 90
-        look(states, map, arrays(), pose)
-        np.testing.assert_array_equal(now(states, map)[outside], before[outside])
+        look(states, slam_map, arrays(), pose)
+        np.testing.assert_array_equal(now(states, slam_map)[outside], before[outside])
 
     def test_pixels_of_the_lens(self) -> None:
         """Each point is where OpenCV's model of the same lens has it."""
         camera = replace(CAMERA, distortion=(1.0, -0.3, 0.05, -0.04, 0.05))
-        map = wall(POINTS)
+        slam_map = wall(POINTS)
         K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-        X = np.ascontiguousarray(map.points.X_world.T)
+        X = np.ascontiguousarray(slam_map.points.X_world.T)
         uv = cv2.projectPoints(X, np.zeros(3), np.zeros(3), K, np.array(camera.distortion))[0].reshape(-1, 2)
         bent = np.hypot(*(uv - X[:, :2] / 2 * [CAMERA.fx, CAMERA.fy] - [CAMERA.cx, CAMERA.cy]).T)
         assert bent.max() > 1
@@ -151,9 +160,9 @@ class TestFrames:
         mask = np.zeros(SHAPE, bool)
         u, v = np.round(uv).astype(int).T
         mask[v[::4], u[::4]] = True
-        states = states_of(map, camera=camera)
-        look(states, map, arrays(mask))
-        np.testing.assert_array_equal(now(states, map)[clear], np.where(mask[v, u], BLOCKED, STATIC)[clear])
+        states = states_of(slam_map, camera=camera)
+        look(states, slam_map, arrays(mask))
+        np.testing.assert_array_equal(now(states, slam_map)[clear], np.where(mask[v, u], BLOCKED, STATIC)[clear])
 
 
 class TestGuard:
@@ -162,13 +171,13 @@ class TestGuard:
     @staticmethod
     def after(depth_m: float | np.ndarray, *, guard: bool = True, first: np.ndarray = EVERYWHERE) -> np.ndarray:
         """States of points that were blocked, then seen where they should be, then with this depth."""
-        map = wall(POINTS)
-        states = states_of(map, guard=guard)
-        look(states, map, arrays(first))
-        look(states, map, arrays(CLEAR, 2.0))
-        assert (now(states, map) == (OCCLUDED if first.any() else STATIC)).all()
-        look(states, map, arrays(CLEAR, depth_m))
-        return now(states, map)
+        slam_map = wall(POINTS)
+        states = states_of(slam_map, guard=guard)
+        look(states, slam_map, arrays(first))
+        look(states, slam_map, arrays(CLEAR, 2.0))
+        assert (now(states, slam_map) == (OCCLUDED if first.any() else STATIC)).all()
+        look(states, slam_map, arrays(CLEAR, depth_m))
+        return now(states, slam_map)
 
     @pytest.mark.parametrize("depth_m", [3.0, 2.3, 1.7, 1.0])
     def test_another_surface(self, depth_m: float) -> None:
@@ -186,50 +195,50 @@ class TestGuard:
         assert (self.after(np.tile(stripes, (CAMERA.height, 1))) == OCCLUDED).all()
 
     def test_what_is_hidden_by_what_no_mask_covers_is_not_seen_again(self) -> None:
-        map = wall(POINTS)
-        states = states_of(map)
-        look(states, map, arrays(EVERYWHERE))
-        look(states, map, arrays(CLEAR, 1.0))
-        assert (now(states, map) == STATIC).all()
+        slam_map = wall(POINTS)
+        states = states_of(slam_map)
+        look(states, slam_map, arrays(EVERYWHERE))
+        look(states, slam_map, arrays(CLEAR, 1.0))
+        assert (now(states, slam_map) == STATIC).all()
 
     def test_depth_under_the_mask_says_nothing(self) -> None:
         """It is that of what passes."""
-        map = wall(POINTS)
-        states = states_of(map)
+        slam_map = wall(POINTS)
+        states = states_of(slam_map)
         for mask in (EVERYWHERE, CLEAR, EVERYWHERE):
-            look(states, map, arrays(mask, np.where(mask, 1.0, 2.0)))
-        assert (now(states, map) == OCCLUDED).all()
+            look(states, slam_map, arrays(mask, np.where(mask, 1.0, 2.0)))
+        assert (now(states, slam_map) == OCCLUDED).all()
 
 
 class TestExchange:
     """What the tracker has seen, and what the map has."""
 
     def test_goes_over_once_and_comes_back(self) -> None:
-        map = wall(POINTS)
-        states = states_of(map)
-        look(states, map, arrays(LEFT))
+        slam_map = wall(POINTS)
+        states = states_of(slam_map)
+        look(states, slam_map, arrays(LEFT))
         first = states.handed_over()
-        assert first.ids.tolist() == map.points.ids[left_of_the_mask(map)].tolist()
+        assert first.ids.tolist() == slam_map.points.ids[left_of_the_mask(slam_map)].tolist()
         assert set(first.states.tolist()) == {BLOCKED}
-        look(states, map, arrays())
+        look(states, slam_map, arrays())
         assert first.states.max() == BLOCKED  # a copy
         second = states.handed_over()
         assert second.number > first.number
         assert (second.ids.tolist(), set(second.states.tolist())) == (first.ids.tolist(), {OCCLUDED})
         assert len(states.handed_over().ids) == 0
-        whole = with_changes(with_changes(map, first), second)
-        np.testing.assert_array_equal(whole.points.state, now(states, map))
+        whole = with_changes(with_changes(slam_map, first), second)
+        np.testing.assert_array_equal(whole.points.state, now(states, slam_map))
         states.arrived(whole, second.number)
         np.testing.assert_array_equal(now(states, whole), whole.points.state)
 
     def test_what_has_changed_meanwhile_stays_ahead(self) -> None:
         """A map is late: it knows what was handed over with its keyframe, and no more."""
-        map = wall(POINTS)
-        states, left = states_of(map), left_of_the_mask(map)
-        look(states, map, arrays(LEFT))
+        slam_map = wall(POINTS)
+        states, left = states_of(slam_map), left_of_the_mask(slam_map)
+        look(states, slam_map, arrays(LEFT))
         first = states.handed_over()
-        look(states, map, arrays())
-        late = with_changes(map, first)
+        look(states, slam_map, arrays())
+        late = with_changes(slam_map, first)
         assert set(late.points.state[left].tolist()) == {BLOCKED}
         states.arrived(late, first.number)
         np.testing.assert_array_equal(now(states, late), np.where(left, OCCLUDED, STATIC))
@@ -237,20 +246,20 @@ class TestExchange:
 
     def test_the_map_knows_better_what_it_has(self) -> None:
         """As of a point that has become one with one that is OCCLUDED."""
-        map = wall(POINTS)
-        states = states_of(map)
-        look(states, map, arrays(LEFT))
+        slam_map = wall(POINTS)
+        states = states_of(slam_map)
+        look(states, slam_map, arrays(LEFT))
         changes = states.handed_over()
-        other = with_states(with_changes(map, changes), changes.ids[:1], np.array([OCCLUDED]))
+        other = with_states(with_changes(slam_map, changes), changes.ids[:1], np.array([OCCLUDED]))
         states.arrived(other, changes.number)
         assert now(states, other)[changes.ids[0]] == OCCLUDED
 
     def test_new_points_and_points_that_have_left(self) -> None:
-        map = wall(POINTS)
-        states = states_of(map)
-        look(states, map, arrays(EVERYWHERE))
+        slam_map = wall(POINTS)
+        states = states_of(slam_map)
+        look(states, slam_map, arrays(EVERYWHERE))
         changes = states.handed_over()
-        smaller = without_points(map, map.points.ids[::2])
+        smaller = without_points(slam_map, slam_map.points.ids[::2])
         bigger = with_points(smaller, new_points(smaller, 0, np.full((3, 7), 2.0)))
         merged = with_changes(bigger, changes)
         assert merged.points.state.tolist() == [BLOCKED] * (POINTS // 2) + [STATIC] * 7
@@ -260,14 +269,14 @@ class TestExchange:
 
     def test_weights(self) -> None:
         """Those of points that are OCCLUDED by now, whatever the map knows of it; their average is one."""
-        map = wall(POINTS)
-        states, left = states_of(map), left_of_the_mask(map)
-        look(states, map, arrays(LEFT))
-        assert set(states.weights(map, map.points.ids).tolist()) == {1.0}
-        look(states, map, arrays())
-        weights = states.weights(map, map.points.ids)
+        slam_map = wall(POINTS)
+        states, left = states_of(slam_map), left_of_the_mask(slam_map)
+        look(states, slam_map, arrays(LEFT))
+        assert set(states.weights(slam_map, slam_map.points.ids).tolist()) == {1.0}
+        look(states, slam_map, arrays())
+        weights = states.weights(slam_map, slam_map.points.ids)
         np.testing.assert_allclose(weights, np.where(left, 3, 1) / (1 + 2 * left.mean()), rtol=1e-6)
-        assert len(states.weights(map, map.points.ids[:0])) == 0
+        assert len(states.weights(slam_map, slam_map.points.ids[:0])) == 0
 
 
 class TestMap:
@@ -276,59 +285,59 @@ class TestMap:
 
     def test_highest_state_survives_fusion(self) -> None:
         """Also along a chain, and whichever of them is kept."""
-        map = with_states(small_map(), np.arange(10), np.array([0, 1, 2, 0, 0, 1, 2, 1, 0, 0]))
-        after = fused(map, np.array([0, 1, 3, 5, 8]), np.array([2, 7, 4, 6, 3]))
+        slam_map = with_states(small_map(), np.arange(10), np.array([0, 1, 2, 0, 0, 1, 2, 1, 0, 0]))
+        after = with_fused_points(slam_map, np.array([0, 1, 3, 5, 8]), np.array([2, 7, 4, 6, 3]))
         kept = dict(zip(after.points.ids.tolist(), after.points.state.tolist(), strict=True))
         assert kept == {0: OCCLUDED, 1: BLOCKED, 5: OCCLUDED, 8: STATIC, 9: STATIC}
-        assert map.points.state.tolist() == [0, 1, 2, 0, 0, 1, 2, 1, 0, 0]
+        assert slam_map.points.state.tolist() == [0, 1, 2, 0, 0, 1, 2, 1, 0, 0]
         assert problems(after) == []
 
     def test_with_states_changes_these_and_refuses_others(self) -> None:
-        map = small_map()
-        after = with_states(map, np.array([7, 2]), np.array([OCCLUDED, STATIC], np.int8))
+        slam_map = small_map()
+        after = with_states(slam_map, np.array([7, 2]), np.array([OCCLUDED, STATIC], np.int8))
         assert (after.points.state[7], after.points.state[2], after.points.state.dtype) == (OCCLUDED, STATIC, np.int8)
-        assert np.count_nonzero(after.points.state != map.points.state) <= 2
+        assert np.count_nonzero(after.points.state != slam_map.points.state) <= 2
         with pytest.raises(ValueError, match="states: expected 0 to 2"):
-            with_states(map, np.array([7]), np.array([3]))
+            with_states(slam_map, np.array([7]), np.array([3]))
         with pytest.raises(KeyError, match="77"):
-            with_states(map, np.array([77]), np.array([1]))
+            with_states(slam_map, np.array([77]), np.array([1]))
 
     def test_part_of_a_map(self) -> None:
-        map = wall(40, POINTS)
-        part = part_around(map, np.array([0]))
+        slam_map = wall(40, POINTS)
+        part = extract_around(slam_map, np.array([0]))
         assert len(part.map.points.state) == 40
-        after = put_back(map, part, with_states(part.map, np.arange(40), np.full(40, OCCLUDED)))
+        after = merge_back(slam_map, part, with_states(part.map, np.arange(40), np.full(40, OCCLUDED)))
         assert after.points.state.tolist() == [OCCLUDED] * 40 + [STATIC] * 60
 
     def test_share_of_each_keyframe(self) -> None:
-        map = wall(40, POINTS, 0)
-        map = with_states(map, np.arange(20), np.full(20, OCCLUDED))
-        assert occluded_shares(map).tolist() == pytest.approx([0.5, 0.2, 0.0])
+        slam_map = wall(40, POINTS, 0)
+        slam_map = with_states(slam_map, np.arange(20), np.full(20, OCCLUDED))
+        assert occluded_shares(slam_map).tolist() == pytest.approx([0.5, 0.2, 0.0])
         assert occluded_shares(empty_map(CAMERA)).tolist() == []
 
     def test_checked(self) -> None:
-        map = small_map()
-        wrong = map._replace(points=map.points._replace(state=map.points.state + np.int8(1)))
+        slam_map = small_map()
+        wrong = slam_map._replace(points=slam_map.points._replace(state=slam_map.points.state + np.int8(1)))
         assert problems(wrong) == ["points.state: expected 0 to 2"]
 
     def test_file(self, tmp_path: Path) -> None:
-        map = small_map()
-        assert set(map.points.state.tolist()) == {STATIC, BLOCKED, OCCLUDED}
-        save_map(tmp_path / "a.map", map)
-        assert same(load_map(tmp_path / "a.map"), map)
+        slam_map = small_map()
+        assert set(slam_map.points.state.tolist()) == {STATIC, BLOCKED, OCCLUDED}
+        save_map(tmp_path / "a.map", slam_map)
+        assert same(load_map(tmp_path / "a.map"), slam_map)
 
     def test_file_of_version_1(self, tmp_path: Path) -> None:
         """It has no states: nothing is known to have passed before anything."""
-        path, map = tmp_path / "a.map", small_map()
-        save_map(path, map)
+        path, slam_map = tmp_path / "a.map", small_map()
+        save_map(path, slam_map)
         with zipfile.ZipFile(path) as archive:
             members = {name: archive.read(name) for name in archive.namelist()}
         header = json.loads(members["header.json"]) | {"version": 1}
         old = members | {"header.json": json.dumps(header).encode()}
         del old["points.state.npy"]
         path.write_bytes(_packed(old))
-        points = map.points._replace(state=np.zeros(len(map.points.ids), np.int8))
-        assert same(load_map(path), map._replace(points=points))
+        points = slam_map.points._replace(state=np.zeros(len(slam_map.points.ids), np.int8))
+        assert same(load_map(path), slam_map._replace(points=points))
         path.write_bytes(_packed(old | {"points.state.npy": members["points.state.npy"]}))
         with pytest.raises(MapFileError, match=r"unknown or missing members: points\.state\.npy"):
             load_map(path)
@@ -362,17 +371,18 @@ class TestMotionOnly:
             angle=np.zeros(count, np.float32),
             descriptor=rng.integers(0, 256, (count, 32)).astype(np.uint8),
         )
-        map = with_keyframe(empty_map(EXACT), Keyframe(0, 0, seen, b""), IDENTITY, NONE, 0)
+        slam_map = with_keyframe(empty_map(EXACT), Keyframe(0, 0, seen, b""), IDENTITY, NONE, 0)
         wrong = np.arange(count) % 2 == 0
-        points = new_points(map, 0, places + MOVED_M * wrong * np.eye(3)[:, :1], seen.descriptor)
-        map = with_sightings(
-            with_points(map, points), feature_sightings(0, seen, points.ids, np.arange(count, dtype=np.int32), PLAN)
+        points = new_points(slam_map, 0, places + MOVED_M * wrong * np.eye(3)[:, :1], seen.descriptor)
+        slam_map = with_observations(
+            with_points(slam_map, points),
+            feature_observations(0, seen, points.ids, np.arange(count, dtype=np.int32), PLAN),
         )
         state = np.where(~wrong if occluded is None else occluded, OCCLUDED, STATIC)
-        map = with_states(map, map.points.ids, state)
+        slam_map = with_states(slam_map, slam_map.points.ids, state)
         params = track_params(EXACT, TrackConfig())
-        states = None if config is None else PointStates(config, params, map, count)
-        pose = match_local_map(map, 0, IDENTITY, seen, params, PLAN, states)
+        states = None if config is None else PointStates(config, params, slam_map, count)
+        pose = match_local_map(slam_map, 0, IDENTITY, seen, params, PLAN, states)
         assert pose is not None
         return pose, float(np.linalg.norm(pose.T_origin_cam[4:]))
 
@@ -402,7 +412,7 @@ def _pixels(X: np.ndarray) -> np.ndarray:
 
 
 class TestAdjustment:
-    """Half the sightings of the newest keyframe are off: those of points that are OCCLUDED are not."""
+    """Half the observations of the newest keyframe are off: those of points that are OCCLUDED are not."""
 
     @staticmethod
     @functools.cache
@@ -410,26 +420,28 @@ class TestAdjustment:
         return exact_map()
 
     def wrong(self) -> Map:
-        map = self.truth()
-        seen = map.sightings
+        slam_map = self.truth()
+        seen = slam_map.observations
         off = (seen.keyframe == 15) & (seen.point % 2 == 0)
         uv = seen.uv + np.float32(0.6) * off * np.array([[1], [0]], np.float32)
-        map = map._replace(sightings=seen._replace(uv=uv))
-        odd = map.points.ids[1::2]
-        return with_states(map, odd, np.full(len(odd), OCCLUDED))
+        slam_map = slam_map._replace(observations=seen._replace(uv=uv))
+        odd = slam_map.points.ids[1::2]
+        return with_states(slam_map, odd, np.full(len(odd), OCCLUDED))
 
-    def error_px(self, map: Map) -> float:
+    def error_px(self, slam_map: Map) -> float:
         """How far from where they should be the newest keyframe has the points that it sees."""
-        seen = self.truth().sightings.point[self.truth().sightings.keyframe == 15]
+        seen = self.truth().observations.point[self.truth().observations.keyframe == 15]
         X = self.truth().points.X_world[:, seen]
-        apart = _pixels(to_local(map.pose(15), X)) - _pixels(to_local(self.truth().pose(15), X))
+        apart = _pixels(to_local(slam_map.pose(15), X)) - _pixels(to_local(self.truth().pose(15), X))
         return float(np.hypot(*apart).mean())
 
     @pytest.mark.parametrize("everywhere", [False, True], ids=["local", "global"])
     def test_goes_to_the_occluded_points(self, everywhere: bool) -> None:
         def adjusted(weight: float) -> float:
-            plan, map = AdjustPlan(occluded_weight=weight), self.wrong()
-            after = adjust_all(map, plan, map.ids, sweeps=1) if everywhere else adjust_around(map, 15, plan)
+            plan, slam_map = AdjustPlan(occluded_weight=weight), self.wrong()
+            after = (
+                adjust_all(slam_map, plan, slam_map.ids, sweeps=1) if everywhere else adjust_around(slam_map, 15, plan)
+            )
             return self.error_px(after)
 
         errors = [adjusted(weight) for weight in (1.0, 3.0, 30.0)]
@@ -440,9 +452,9 @@ class TestAdjustment:
 
     def test_off_to_the_bit(self) -> None:
         """Whatever states a map has that was made with the settings on."""
-        map = self.wrong()
-        static = map._replace(points=map.points._replace(state=np.zeros_like(map.points.state)))
-        first, second = adjust_around(map, 15, AdjustPlan()), adjust_around(static, 15, AdjustPlan())
+        slam_map = self.wrong()
+        static = slam_map._replace(points=slam_map.points._replace(state=np.zeros_like(slam_map.points.state)))
+        first, second = adjust_around(slam_map, 15, AdjustPlan()), adjust_around(static, 15, AdjustPlan())
         assert same(first._replace(points=first.points._replace(state=second.points.state)), second)
 
     def test_settings(self) -> None:
@@ -492,10 +504,10 @@ def settings(*overrides: str, preset: str = "occlusion") -> Config:
 class _Run:
     """A recording tracked, and what came of it."""
 
-    def __init__(self, config: Config, map: Map | None = None, *, localize_only: bool = False) -> None:
+    def __init__(self, config: Config, slam_map: Map | None = None, *, localize_only: bool = False) -> None:
         clip, detector = _scene()
-        with Slam(clip.camera, config, map=map, localize_only=localize_only, detector=detector) as slam:
-            self.results: list[Tracked] = [slam.track(frame) for frame in clip.frames]
+        with Slam(clip.camera, config, slam_map=slam_map, localize_only=localize_only, detector=detector) as slam:
+            self.results: list[FrameResult] = [slam.track(frame) for frame in clip.frames]
             slam.finish()
             self.map, self.trajectory = slam.map, slam.trajectory.T_world_cam
             assert problems(self.map) == []
@@ -639,9 +651,9 @@ class TestRoomWithPeople:
 
     def test_in_a_map_that_stays_as_it_is(self) -> None:
         """States go on beside it, from those it has."""
-        map = as_published().map
-        run = _Run(settings(), map, localize_only=True)
-        assert run.map is map
+        slam_map = as_published().map
+        run = _Run(settings(), slam_map, localize_only=True)
+        assert run.map is slam_map
         shares = [share for share in run.shares if share is not None]
         assert len(shares) > FRAMES // 2
         assert max(shares) > 0.2
@@ -669,12 +681,12 @@ class TestRoomWithPeople:
 
 def test_changes_are_values() -> None:
     """What threads exchange shares no memory with what goes on."""
-    map = wall(POINTS)
-    states = states_of(map)
-    look(states, map, arrays(EVERYWHERE))
+    slam_map = wall(POINTS)
+    states = states_of(slam_map)
+    look(states, slam_map, arrays(EVERYWHERE))
     changes = states.handed_over()
     assert isinstance(changes, StateChanges)
     assert not np.shares_memory(changes.states, states._state)
-    after = with_changes(map, changes)
-    assert not np.shares_memory(after.points.state, map.points.state)
-    assert not map.points.state.any()
+    after = with_changes(slam_map, changes)
+    assert not np.shares_memory(after.points.state, slam_map.points.state)
+    assert not slam_map.points.state.any()

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from jaxslam.features.orb import DEFAULT_PLAN, Features
-from jaxslam.geometry.se3 import IDENTITY, moved, to_local
+from jaxslam.geometry.se3 import IDENTITY, retract, to_local
 from jaxslam.mapping.triangulation import at_baseline, triangulate
 from jaxslam.sensors.camera import Camera
 
 CAMERA = Camera("exact", 640, 480, 525.0, 520.0, 319.5, 239.5)
 COUNT = 150
-SIDEWAYS = moved(IDENTITY, np.array([0.3, 0.05, -0.02, 0.02, -0.05, 0.01]))
+SIDEWAYS = retract(IDENTITY, np.array([0.3, 0.05, -0.02, 0.02, -0.05, 0.01]))
 
 
 def places(seed: int = 0) -> np.ndarray:
@@ -25,7 +25,7 @@ def seen(
     uv = X_cam[:2] / X_cam[2] * [[CAMERA.fx], [CAMERA.fy]] + [[CAMERA.cx], [CAMERA.cy]]
     uv = (uv + np.random.default_rng(8).normal(0, noise_px, uv.shape)).astype(np.float32)[:, order]
     return Features(
-        seen_uv=uv,
+        uv_raw=uv,
         uv=uv,
         depth=np.zeros(len(order), np.float32),
         octave=np.broadcast_to(np.asarray(octave, np.uint8), order.shape),
@@ -63,12 +63,12 @@ def test_coarse_features_may_be_farther_off():
 @pytest.mark.parametrize(
     ("name", "second", "T"),
     [
-        ("too little parallax", lambda X, T: seen(to_local(T, X)), moved(IDENTITY, np.r_[0.02, np.zeros(5)])),
-        ("only turned", lambda X, T: seen(to_local(T, X)), moved(IDENTITY, np.r_[0, 0, 0, 0.1, 0.1, 0])),
+        ("too little parallax", lambda X, T: seen(to_local(T, X)), retract(IDENTITY, np.r_[0.02, np.zeros(5)])),
+        ("only turned", lambda X, T: seen(to_local(T, X)), retract(IDENTITY, np.r_[0, 0, 0, 0.1, 0.1, 0])),
         (
             "off the line",
             lambda X, T: seen(to_local(T, X) + np.array([[0], [0.1], [0]])),
-            moved(IDENTITY, np.r_[0.3, np.zeros(5)]),
+            retract(IDENTITY, np.r_[0.3, np.zeros(5)]),
         ),
         ("another scale", lambda X, T: seen(to_local(T, X), octave=4), SIDEWAYS),
         ("behind", lambda X, T: seen(to_local(T, -X)), SIDEWAYS),
@@ -89,7 +89,7 @@ def test_what_looks_alike_along_one_line_is_not_matched():
     X = np.repeat(places()[:, :1], 2, axis=1) * [[1.0, 1.2]]
     first, second = seen(X), seen(to_local(SIDEWAYS, X))
     same = second._replace(descriptor=np.repeat(second.descriptor[:1], 2, axis=0))
-    level = moved(IDENTITY, np.r_[0.3, np.zeros(5)])
+    level = retract(IDENTITY, np.r_[0.3, np.zeros(5)])
     assert len(triangulate(CAMERA, first, same, level, DEFAULT_PLAN).first) == 0
 
 
@@ -104,5 +104,5 @@ def test_few_or_none(numbers):
 def test_baseline():
     depth = np.array([0, 2.0, 2.0, 2.0], np.float32)
     assert at_baseline(IDENTITY, SIDEWAYS, depth)
-    assert not at_baseline(IDENTITY, moved(IDENTITY, np.r_[0.03, np.zeros(5)]), depth)
+    assert not at_baseline(IDENTITY, retract(IDENTITY, np.r_[0.03, np.zeros(5)]), depth)
     assert not at_baseline(IDENTITY, SIDEWAYS, 0 * depth)

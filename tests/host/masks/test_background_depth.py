@@ -14,11 +14,11 @@ from jaxslam.config.schema import Config, DynamicsConfig, SemanticsConfig
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset, SyntheticFrame
 from jaxslam.datasets.synthetic.camera_path_kind import CameraPathKind
 from jaxslam.geometry.se3 import IDENTITY, angle, between, compose
-from jaxslam.masks.background_depth import SurfaceMemory, Surfaces, newcomers
+from jaxslam.masks.background_depth import BackgroundSurfaces, SurfaceMemory, new_surfaces
 from jaxslam.sensors.camera import Camera
-from jaxslam.sensors.downscale import Raster
-from jaxslam.sensors.frame import Frame, to_grey
-from jaxslam.slam.mask_pipeline import DynamicMasks, FrameMask, MaskSource
+from jaxslam.sensors.downscale import ImageGrid
+from jaxslam.sensors.frame import Frame, to_gray
+from jaxslam.slam.mask_pipeline import FrameMask, MaskPipeline, MaskSource
 from jaxslam.slam.slam import Slam
 from jaxslam.tracking.state import TrackStatus
 
@@ -32,7 +32,7 @@ AGO_S = 0.27
 TRACKER = Config(
     track=replace(TRACK, num_points=256, points_per_source=96, cell_px=16),
     semantics=SemanticsConfig(model=None),
-    dynamics=DynamicsConfig(newcomers=True, cues=(), even_votes=False),
+    dynamics=DynamicsConfig(new_surfaces=True, cues=(), balance_regions=False),
 )
 
 
@@ -61,14 +61,14 @@ class Watcher:
 
     def __init__(self, camera: Camera | None = None) -> None:
         self.camera = camera or small_camera()
-        self.memory, self.frame = SurfaceMemory(Raster.of(self.camera)), 0
+        self.memory, self.frame = SurfaceMemory(ImageGrid.of(self.camera)), 0
 
     def look(
         self, time_s: float, depth: np.ndarray, pose: np.ndarray = IDENTITY, turn_rad_per_s: float = 0.0
     ) -> np.ndarray:
         """What is new in the next frame."""
         seen = self.memory.compare(time_s, pose, turn_rad_per_s, depth)
-        mask = self.memory.with_newcomers(np.zeros(depth.shape, bool), seen)
+        mask = self.memory.with_new_surfaces(np.zeros(depth.shape, bool), seen)
         self.memory.remember(self.frame, time_s, pose, turn_rad_per_s, mask)
         self.frame += 1
         return mask
@@ -88,17 +88,19 @@ def is_box(mask: np.ndarray, box: tuple[slice, slice] = BOX) -> bool:
     return bool(((mask == whole) | near_edges(whole)).all())
 
 
-class TestNewcomers:
+class TestNewSurfaces:
     """Of surfaces as they are compared, at the coarse size."""
 
     SHAPE = (120, 160)
     ROWS, COLUMNS = slice(30, 80), slice(50, 90)
 
-    def seen(self, *, new: np.ndarray, unmoved: np.ndarray | None = None, displaced_px: float = 0.0) -> Surfaces:
+    def seen(
+        self, *, new: np.ndarray, unmoved: np.ndarray | None = None, displaced_px: float = 0.0
+    ) -> BackgroundSurfaces:
         depth = with_box(wall(self.SHAPE), (self.ROWS, self.COLUMNS))
         nothing = np.zeros(self.SHAPE, bool)
         standing = depth == WALL_M if unmoved is None else unmoved
-        return Surfaces(depth, nothing, nothing, standing, new, displaced_px)
+        return BackgroundSurfaces(depth, nothing, nothing, standing, new, displaced_px)
 
     def area(self, rows: slice, columns: slice) -> np.ndarray:
         area = np.zeros(self.SHAPE, bool)
@@ -108,30 +110,30 @@ class TestNewcomers:
     def test_all_of_an_object_of_which_a_part_is_new(self) -> None:
         """Nothing could be compared in the rest: it hangs together with it, at the same depth."""
         box, part = self.area(self.ROWS, self.COLUMNS), self.area(self.ROWS, slice(50, 60))
-        np.testing.assert_array_equal(newcomers(self.seen(new=part), np.zeros(self.SHAPE, bool)), box)
+        np.testing.assert_array_equal(new_surfaces(self.seen(new=part), np.zeros(self.SHAPE, bool)), box)
 
     def test_not_what_is_known_to_stand(self) -> None:
         part, rest = self.area(self.ROWS, slice(50, 70)), self.area(self.ROWS, slice(70, 90))
         seen = self.seen(new=part, unmoved=~part)
         assert rest.any()
-        np.testing.assert_array_equal(newcomers(seen, np.zeros(self.SHAPE, bool)), part)
+        np.testing.assert_array_equal(new_surfaces(seen, np.zeros(self.SHAPE, bool)), part)
 
     def test_not_what_is_as_far_away_elsewhere(self) -> None:
         box, apart = self.area(self.ROWS, self.COLUMNS), self.area(slice(30, 80), slice(110, 150))
         seen = self.seen(new=box)
         seen.depth[apart] = BOX_M
-        np.testing.assert_array_equal(newcomers(seen, np.zeros(self.SHAPE, bool)), box)
+        np.testing.assert_array_equal(new_surfaces(seen, np.zeros(self.SHAPE, bool)), box)
 
     def test_not_what_is_nearer_or_farther(self) -> None:
         box, beside = self.area(self.ROWS, self.COLUMNS), self.area(self.ROWS, slice(90, 120))
         for other_m in (BOX_M - 0.25, BOX_M + 0.25):
             seen = self.seen(new=box)
             seen.depth[beside] = other_m
-            np.testing.assert_array_equal(newcomers(seen, np.zeros(self.SHAPE, bool)), box)
+            np.testing.assert_array_equal(new_surfaces(seen, np.zeros(self.SHAPE, bool)), box)
 
     def test_not_what_is_in_the_mask(self) -> None:
         box = self.area(self.ROWS, self.COLUMNS)
-        assert not newcomers(self.seen(new=box), box).any()
+        assert not new_surfaces(self.seen(new=box), box).any()
 
     @pytest.mark.parametrize("displaced_px", [0.0, 1.0, 2.5, 3.5, 4.5, 5.5, 7.5])
     def test_exactly_the_object(self, displaced_px: float) -> None:
@@ -140,26 +142,26 @@ class TestNewcomers:
         for beside_m in (0.0, WALL_M):
             depth = np.where(new, np.float32(BOX_M), np.float32(beside_m))
             nothing = np.zeros(self.SHAPE, bool)
-            seen = Surfaces(depth, nothing, nothing, nothing, new, displaced_px)
-            np.testing.assert_array_equal(newcomers(seen, nothing), new)
+            seen = BackgroundSurfaces(depth, nothing, nothing, nothing, new, displaced_px)
+            np.testing.assert_array_equal(new_surfaces(seen, nothing), new)
 
     @pytest.mark.parametrize(("wide", "displaced_px"), [(2, 0.0), (5, 5.0), (9, 9.0)])
     def test_thin_edges(self, wide: int, displaced_px: float) -> None:
-        """As wide as edges are displaced they are no newcomers; three times as wide they are."""
+        """As wide as edges are displaced they are no new_surfaces; three times as wide they are."""
         none = np.zeros(self.SHAPE, bool)
         edge = self.area(self.ROWS, slice(50, 50 + wide))
-        assert not newcomers(self.seen(new=edge, unmoved=~edge, displaced_px=displaced_px), none).any()
+        assert not new_surfaces(self.seen(new=edge, unmoved=~edge, displaced_px=displaced_px), none).any()
         broad = self.area(self.ROWS, slice(50, 50 + 3 * wide))
         np.testing.assert_array_equal(
-            newcomers(self.seen(new=broad, unmoved=~broad, displaced_px=displaced_px), none), broad
+            new_surfaces(self.seen(new=broad, unmoved=~broad, displaced_px=displaced_px), none), broad
         )
 
     def test_small_ones(self) -> None:
         none = np.zeros(self.SHAPE, bool)
         small, large = self.area(slice(30, 37), slice(50, 58)), self.area(slice(30, 38), slice(50, 58))
         assert small.sum() < 0.003 * small.size < large.sum()
-        assert not newcomers(self.seen(new=small), none).any()
-        np.testing.assert_array_equal(newcomers(self.seen(new=large, unmoved=~large), none), large)
+        assert not new_surfaces(self.seen(new=small), none).any()
+        np.testing.assert_array_equal(new_surfaces(self.seen(new=large, unmoved=~large), none), large)
 
 
 class TestMemory:
@@ -219,7 +221,7 @@ class TestMemory:
 
     def test_without_still_pixels(self) -> None:
         """Whole areas leave a mask; single pixels of the coarse size do not."""
-        memory, everywhere = SurfaceMemory(Raster.of(small_camera())), np.ones((HEIGHT, WIDTH), bool)
+        memory, everywhere = SurfaceMemory(ImageGrid.of(small_camera())), np.ones((HEIGHT, WIDTH), bool)
         drop = np.zeros((HEIGHT // STEP_PX, WIDTH // STEP_PX), bool)
         drop[5, 7] = True
         assert memory.without(everywhere, drop).all()
@@ -314,14 +316,14 @@ def rendered(
 
 def masks_at_true_poses(source: SyntheticDataset, frames: tuple[SyntheticFrame, ...]) -> list[FrameMask]:
     """The masks that depth alone makes when it is known where the camera is."""
-    masks = DynamicMasks(source.camera, None, deterministic=True, latency_frames=2, dilate_px=0)
+    masks = MaskPipeline(source.camera, None, deterministic=True, latency_frames=2, dilate_px=0)
     turns = np.array([angle(between(a.T_world_cam, b.T_world_cam)) for a, b in itertools.pairwise(frames)])
     turns = np.append(turns, turns[-1:]) * source.fps
     made = []
     for index, (frame, turn) in enumerate(zip(frames, turns.tolist(), strict=True)):
         known = (index, 1e-9 * frame.timestamp_ns)
-        made.append(masks.of_frame(index, frame.rgb, to_grey(frame.rgb), frame.depth_m))
-        masks.tracked(*known, frame.T_world_cam, turn)
+        made.append(masks.mask_frame(index, frame.rgb, to_gray(frame.rgb), frame.depth_m))
+        masks.frame_tracked(*known, frame.T_world_cam, turn)
     return made
 
 

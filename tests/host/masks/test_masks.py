@@ -16,15 +16,15 @@ from jaxslam.masks.point_sampling import CELL_PX, sample_mask
 from jaxslam.masks.propagation import (
     CAPACITY,
     PYRAMID_LEVELS,
-    Followed,
-    Origin,
+    MaskFlow,
+    TrackedMask,
     as_objects,
     follow,
     make_origin,
     predicted_mask,
 )
 from jaxslam.semantics import Detections, no_detections
-from jaxslam.sensors.frame import to_grey
+from jaxslam.sensors.frame import to_gray
 
 HEIGHT, WIDTH = 240, 320
 FIRST, LAST = 10, 14
@@ -37,9 +37,9 @@ def room() -> SyntheticDataset:
 
 @functools.cache
 def seen(index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Grey image, depth, and true mask of people."""
+    """Gray image, depth, and true mask of people."""
     frame = room().render(index)
-    return to_grey(frame.rgb), frame.depth_m, frame.instance_mask > 0
+    return to_gray(frame.rgb), frame.depth_m, frame.instance_mask > 0
 
 
 def detections(boxes: list[list[float]]) -> Detections:
@@ -50,8 +50,8 @@ def detections(boxes: list[list[float]]) -> Detections:
     )
 
 
-def pyramid(grey: np.ndarray) -> Pyramid:
-    return build_pyramid(jnp.asarray(grey), num_levels=PYRAMID_LEVELS)
+def pyramid(gray: np.ndarray) -> Pyramid:
+    return build_pyramid(jnp.asarray(gray), num_levels=PYRAMID_LEVELS)
 
 
 def overlap(a: np.ndarray, b: np.ndarray) -> float:
@@ -96,8 +96,8 @@ class TestBoxMask:
         own[0, :10] = True
         found = detections([[35, 15, 75, 85]])._replace(masks=own)
         np.testing.assert_array_equal(mask_of_detections(found, self.DEPTH, dilate_px=0), own[0])
-        labelled = no_detections()._replace(class_mask=own[0])
-        np.testing.assert_array_equal(mask_of_detections(labelled, self.DEPTH, dilate_px=0), own[0])
+        labeled = no_detections()._replace(class_mask=own[0])
+        np.testing.assert_array_equal(mask_of_detections(labeled, self.DEPTH, dilate_px=0), own[0])
 
     def test_people_of_the_room(self) -> None:
         _, depth, truth = seen(FIRST)
@@ -131,8 +131,8 @@ class TestBoxMask:
 
 class TestSampleMask:
     def test_one_in_every_cell(self) -> None:
-        grey, _, truth = seen(FIRST)
-        points, spacing = sample_mask(truth, grey, WIDTH * HEIGHT, 0)
+        gray, _, truth = seen(FIRST)
+        points, spacing = sample_mask(truth, gray, WIDTH * HEIGHT, 0)
         assert spacing == 1
         column, row = points.astype(int)
         assert truth[row, column].all()
@@ -157,63 +157,63 @@ class TestSampleMask:
 
     def test_best_corners_of_the_whole_image(self) -> None:
         """Also at the edge of the mask, and of the image, of which only a part is looked at."""
-        grey = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH), np.uint8)
-        score = cv2.cornerMinEigenVal(grey, 5)
+        gray = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH), np.uint8)
+        score = cv2.cornerMinEigenVal(gray, 5)
         for rows, columns in ((slice(0, 40), slice(0, 100)), (slice(97, 152), slice(203, WIDTH)), (slice(0, 240),) * 2):
-            mask = np.zeros(grey.shape, bool)
+            mask = np.zeros(gray.shape, bool)
             mask[rows, columns] = True
-            column, row = sample_mask(mask, grey, WIDTH * HEIGHT, 0).uv.astype(int)
+            column, row = sample_mask(mask, gray, WIDTH * HEIGHT, 0).uv.astype(int)
             masked = np.where(mask, score, -1)[:, : WIDTH // CELL_PX * CELL_PX]
             best = masked.reshape(HEIGHT // CELL_PX, CELL_PX, -1, CELL_PX).max(axis=(1, 3)).ravel()
             np.testing.assert_array_equal(score[row, column], best[best >= 0])
 
     def test_fewer_than_cells(self) -> None:
         """They are all over the mask, not only where the picture has most texture."""
-        grey, everywhere = np.zeros((HEIGHT, WIDTH), np.uint8), np.ones((HEIGHT, WIDTH), bool)
-        grey[:60, :80] = np.random.default_rng(0).integers(0, 256, (60, 80))
-        column, row = sample_mask(everywhere, grey, 60, 0).uv
+        gray, everywhere = np.zeros((HEIGHT, WIDTH), np.uint8), np.ones((HEIGHT, WIDTH), bool)
+        gray[:60, :80] = np.random.default_rng(0).integers(0, 256, (60, 80))
+        column, row = sample_mask(everywhere, gray, 60, 0).uv
         num, _, _ = np.histogram2d(row, column, bins=[3, 4], range=[[0, HEIGHT], [0, WIDTH]])
         print(num)
         assert num.sum() == 60
         assert num.min() >= 2
 
     def test_spacing(self) -> None:
-        mask, grey = np.zeros((HEIGHT, WIDTH), bool), np.zeros((HEIGHT, WIDTH), np.uint8)
+        mask, gray = np.zeros((HEIGHT, WIDTH), bool), np.zeros((HEIGHT, WIDTH), np.uint8)
         mask[: 10 * CELL_PX, : 10 * CELL_PX] = True
-        assert [sample_mask(mask, grey, capacity, 0).spacing for capacity in (200, 100, 25)] == [1, 1, 2]
+        assert [sample_mask(mask, gray, capacity, 0).spacing for capacity in (200, 100, 25)] == [1, 1, 2]
 
     def test_small_pieces_keep_their_points(self) -> None:
         """Somebody far away beside somebody near: the one has all he can have, the other gives way."""
-        mask, grey = np.zeros((HEIGHT, WIDTH), bool), np.zeros((HEIGHT, WIDTH), np.uint8)
+        mask, gray = np.zeros((HEIGHT, WIDTH), bool), np.zeros((HEIGHT, WIDTH), np.uint8)
         near, far = (slice(0, 26 * CELL_PX), slice(0, 16 * CELL_PX)), (slice(CELL_PX, 5 * CELL_PX), slice(200, 216))
         mask[near] = mask[far] = True
-        (column, row), spacing = sample_mask(mask, grey, 72, 0)
+        (column, row), spacing = sample_mask(mask, gray, 72, 0)
         is_far = column >= 200
         assert (np.sum(is_far), np.sum(~is_far)) == (8, 64)
         assert spacing == pytest.approx(np.sqrt(26 * 16 / 64))
         assert np.ptp(row[~is_far]) > 20 * CELL_PX
 
     def test_more_pieces_than_points(self) -> None:
-        mask, grey = np.zeros((HEIGHT, WIDTH), bool), np.zeros((HEIGHT, WIDTH), np.uint8)
+        mask, gray = np.zeros((HEIGHT, WIDTH), bool), np.zeros((HEIGHT, WIDTH), np.uint8)
         mask[::16, ::16] = True
-        column, row = sample_mask(mask, grey, 50, 0).uv.astype(int)
+        column, row = sample_mask(mask, gray, 50, 0).uv.astype(int)
         assert len(column) == 50
         assert mask[row, column].all()
 
     def test_nothing(self) -> None:
-        grey = seen(FIRST)[0]
-        assert sample_mask(np.zeros(grey.shape, bool), grey, 20, 0).uv.shape == (2, 0)
+        gray = seen(FIRST)[0]
+        assert sample_mask(np.zeros(gray.shape, bool), gray, 20, 0).uv.shape == (2, 0)
 
 
-def carried(first: int, last: int) -> tuple[np.ndarray, Origin, Followed]:
-    grey, _, mask = seen(first)
-    origin = make_origin(mask, grey, 0)
+def carried(first: int, last: int) -> tuple[np.ndarray, TrackedMask, MaskFlow]:
+    gray, _, mask = seen(first)
+    origin = make_origin(mask, gray, 0)
     pyramids = [pyramid(seen(index)[0]) for index in range(first, last)]
     _, followed = follow(origin, pyramids, seen(last)[0], seen(last)[1])
     return predicted_mask(origin, followed, seen(last)[1]), origin, followed
 
 
-def moved(mask: np.ndarray, shift_px: tuple[int, int], depth: np.ndarray) -> tuple[Origin, Followed]:
+def moved(mask: np.ndarray, shift_px: tuple[int, int], depth: np.ndarray) -> tuple[TrackedMask, MaskFlow]:
     """A mask, and its points, all moved by so much."""
     origin = make_origin(mask, np.zeros(mask.shape, np.uint8), 0)
     now = origin.uv + np.array(shift_px, np.float32)[:, None]
@@ -287,9 +287,9 @@ class TestPropagation:
         assert overlap(new, truth) > overlap(old, truth)
 
     def test_nothing_to_follow(self) -> None:
-        grey, depth, _ = seen(FIRST)
-        origin = make_origin(np.zeros(grey.shape, bool), grey, 0)
-        _, followed = follow(origin, [pyramid(grey)], grey, depth)
+        gray, depth, _ = seen(FIRST)
+        origin = make_origin(np.zeros(gray.shape, bool), gray, 0)
+        _, followed = follow(origin, [pyramid(gray)], gray, depth)
         assert (np.asarray(followed.label) == -1).all()
         assert not predicted_mask(origin, followed, depth).any()
 

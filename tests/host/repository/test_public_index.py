@@ -6,7 +6,7 @@ import numpy as np
 import jaxslam
 from jaxslam import (
     FlowPlan,
-    Followed,
+    FlowResult,
     Intrinsics,
     KeyframeReason,
     LevelPlan,
@@ -24,7 +24,7 @@ from jaxslam import (
 from jaxslam.config.schema import TrackConfig
 
 FLOW = FlowPlan(finest=LevelPlan(9, 6, 0.03))
-SMALL = TrackPlan(num_points=4, num_levels=2, num_keyframes=1, num_recalled=0, num_sources=1, flow=FLOW)
+SMALL = TrackPlan(num_points=4, num_levels=2, num_keyframes=1, num_reloaded=0, num_sources=1, flow=FLOW)
 
 
 def told(output: TrackOutput) -> tuple[str, str, str, str]:
@@ -39,7 +39,7 @@ def halved(state: TrackState) -> TrackState:
     return state._replace(points=points._replace(weight=0.5 * points.weight))
 
 
-def predicted_m(followed: Followed) -> float:
+def predicted_m(followed: FlowResult) -> float:
     """How far from the origin the camera should be."""
     return float(jnp.linalg.norm(followed.predicted.translation()))
 

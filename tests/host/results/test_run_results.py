@@ -16,13 +16,13 @@ from small_scene import CONFIG, clip
 
 from jaxslam.cli.entry_point import main
 from jaxslam.config.schema import load_config
-from jaxslam.results.dense_results import DENSE_FILES
 from jaxslam.errors import TrajectoryError
+from jaxslam.results.dense_results import DENSE_FILES
 from jaxslam.results.frame_table import read_errors, read_track_ms
 from jaxslam.results.run_results import RESULT_FILES, RunInfo, write_results
-from jaxslam.visualization.snapshots import RunPictures
 from jaxslam.slam.slam import Slam
 from jaxslam.trajectory.trajectory import Trajectory, read_tum
+from jaxslam.visualization.snapshots import RunPictures
 
 MODELS = os.environ.get("JAXSLAM_MODELS")  # before it is hidden from tests
 PROMISED = {

@@ -17,16 +17,16 @@ from jaxslam.io.folder_ownership import why_not_own
 from jaxslam.runtime import compile_cache as xla
 from jaxslam.runtime import trace_cache
 from jaxslam.runtime.compile_cache import cache_dir, enable_compile_cache
-from jaxslam.runtime.trace_cache import traced_once
+from jaxslam.runtime.trace_cache import cached_trace
 
-FOLDER, LEAST_S = "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs"
+FOLDER, MIN_S = "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs"
 ENABLED = "jax_enable_compilation_cache"
 
 
 @pytest.fixture(autouse=True)
 def _settings_stay(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(trace_cache, "_sources", lambda: "these")
-    before = {name: jax.config.values[name] for name in (FOLDER, LEAST_S, ENABLED)}
+    before = {name: jax.config.values[name] for name in (FOLDER, MIN_S, ENABLED)}
     compilation_cache.reset_cache()
     yield
     for name, value in before.items():
@@ -52,7 +52,7 @@ def _read_only(*_: object, **__: object) -> None:
 def enable_as_chosen(folder: Path) -> None:
     """As a user who has set `JAX_COMPILATION_CACHE_DIR`; every program is kept."""
     jax.config.update(FOLDER, str(folder))
-    jax.config.update(LEAST_S, 0.0)
+    jax.config.update(MIN_S, 0.0)
     assert enable_compile_cache() == folder
 
 
@@ -60,18 +60,18 @@ def enable_as_chosen(folder: Path) -> None:
 def test_small_programs_are_kept_too(tmp_path: Path, own: bool) -> None:
     """A tracker has some 25 programs that JAX alone would compile at every start."""
     jax.config.update(FOLDER, str(tmp_path) if own else None)
-    jax.config.update(LEAST_S, 1.0)
+    jax.config.update(MIN_S, 1.0)
     folder = enable_compile_cache()
     assert folder == (tmp_path if own else cache_dir())
     assert jax.config.values[FOLDER] == str(folder)
-    assert jax.config.values[LEAST_S] < 0.1
+    assert jax.config.values[MIN_S] < 0.1
 
 
 def test_limit_of_the_user(tmp_path: Path) -> None:
     jax.config.update(FOLDER, str(tmp_path))
-    jax.config.update(LEAST_S, 3.0)
+    jax.config.update(MIN_S, 3.0)
     assert enable_compile_cache() == tmp_path
-    assert jax.config.values[LEAST_S] == 3.0
+    assert jax.config.values[MIN_S] == 3.0
 
 
 def warnings_of(log: pytest.LogCaptureFixture) -> list[str]:
@@ -84,7 +84,7 @@ def test_folder_that_cannot_be_made_is_one_line(tmp_path: Path, caplog: pytest.L
     jax.config.update(FOLDER, str(tmp_path / "file" / "xla"))
     for factor in (3, 4):
         assert enable_compile_cache() is None
-        jax.jit(traced_once(_of_jaxslam(factor)))(jnp.ones(2)).block_until_ready()
+        jax.jit(cached_trace(_of_jaxslam(factor)))(jnp.ones(2)).block_until_ready()
     (line,) = warnings_of(caplog)
     assert line.startswith(f"{tmp_path}/file/xla: not used to keep compiled code, so that every start takes longer: ")
 
@@ -95,7 +95,7 @@ def test_folder_that_cannot_be_written_is_one_line(
     """What is in it is still read. Root may write everywhere, so that the disk is taken to be read-only."""
     enable_as_chosen(tmp_path)
     written = _of_jaxslam(5)
-    jax.jit(traced_once(written))(jnp.ones(2)).block_until_ready()
+    jax.jit(cached_trace(written))(jnp.ones(2)).block_until_ready()
     before = sorted(tmp_path.rglob("*"))
     assert len(before) > 1
     xla._is_writable.cache_clear()
@@ -108,7 +108,7 @@ def test_folder_that_cannot_be_written_is_one_line(
         assert enable_compile_cache() == tmp_path
     jax.clear_caches()
     for function in (written, _of_jaxslam(6), _of_jaxslam(7)):
-        jax.jit(traced_once(function))(jnp.ones(2)).block_until_ready()
+        jax.jit(cached_trace(function))(jnp.ones(2)).block_until_ready()
     lines = warnings_of(caplog)
     assert lines[0].startswith(f"{tmp_path}: compiled code cannot be kept")
     assert len(lines) == 1
@@ -140,7 +140,7 @@ def test_folders_that_are_made_are_the_users_own(tmp_path: Path) -> None:
     umask = os.umask(0o002)
     try:
         enable_as_chosen(tmp_path / "new")
-        jax.jit(traced_once(_of_jaxslam(8)))(jnp.ones(2)).block_until_ready()
+        jax.jit(cached_trace(_of_jaxslam(8)))(jnp.ones(2)).block_until_ready()
     finally:
         os.umask(umask)
     assert why_not_own(tmp_path / "new") is None

@@ -20,12 +20,12 @@ import pytest
 from jaxlie import SO3
 
 from jaxslam.runtime import trace_cache
-from jaxslam.runtime.trace_cache import traced_once
+from jaxslam.runtime.trace_cache import cached_trace
 
 FOLDER = "jax_compilation_cache_dir"
 
 
-class Colour(Enum):
+class Color(Enum):
     """Static."""
 
     RED = 1
@@ -37,7 +37,7 @@ class Plan(NamedTuple):
 
     factor: float = 1
     name: str = "a"
-    colour: Colour | None = None
+    color: Color | None = None
     functions: tuple[Callable[..., Any], ...] = ()
 
 
@@ -87,7 +87,7 @@ class Strict:
         raise AssertionError
 
 
-@functools.wraps(trace_cache.traced_once)
+@functools.wraps(trace_cache.cached_trace)
 def around_ours() -> None:
     """A function of a user, which says it was one of jaxslam."""
 
@@ -98,7 +98,7 @@ _TWICE = Plan(2.0)
 
 def called(a: Any = (1.0, 2.0), plan: Plan = _TWICE) -> Given:
     """The program as the next process would call it: with nothing in memory."""
-    jitted = jax.jit(traced_once(_program), static_argnames="plan", donate_argnums=0)
+    jitted = jax.jit(cached_trace(_program), static_argnames="plan", donate_argnums=0)
     turn = SO3.from_z_radians(jnp.float32(0.3))
     return jitted(jnp.array(a, jnp.float32), turn, jax.random.key(7), plan=plan)
 
@@ -140,7 +140,7 @@ class TestFound:
     def test_arguments_are_given_away(self) -> None:
         for _ in range(2):
             a = jnp.array([1.0, 2.0], jnp.float32)
-            jitted = jax.jit(traced_once(_program), static_argnames="plan", donate_argnums=0)
+            jitted = jax.jit(cached_trace(_program), static_argnames="plan", donate_argnums=0)
             jitted(a, SO3.identity(), jax.random.key(0), plan=Plan())
             assert a.is_deleted()
 
@@ -151,11 +151,11 @@ class TestFound:
 
         a = jnp.arange(6, dtype=jnp.float32).reshape(3, 2)
         for _ in range(2):
-            np.testing.assert_array_equal(jax.jit(traced_once(of_jaxslam(several)))(a), jax.jit(several)(a))
+            np.testing.assert_array_equal(jax.jit(cached_trace(of_jaxslam(several)))(a), jax.jit(several)(a))
         assert len(kept(folder)) == 1
 
     def test_without_jit_it_is_the_function(self, folder: Path) -> None:
-        result = traced_once(_program)(jnp.ones(2), SO3.identity(), jax.random.key(0), plan=Plan())
+        result = cached_trace(_program)(jnp.ones(2), SO3.identity(), jax.random.key(0), plan=Plan())
         assert isinstance(result, Given)
         assert not kept(folder)
 
@@ -164,7 +164,7 @@ class TestFound:
             raise ValueError("no")
 
         with pytest.raises(ValueError, match="no"):
-            jax.jit(traced_once(of_jaxslam(wrong)))(1.0)
+            jax.jit(cached_trace(of_jaxslam(wrong)))(1.0)
         assert not kept(folder)
 
 
@@ -177,14 +177,14 @@ class TestOther:
             {"a": (1.0, 2.0, 3.0)},
             {"plan": Plan(2.5)},
             {"plan": Plan(2.0, "b")},
-            {"plan": Plan(2.0, colour=Colour.BLUE)},
+            {"plan": Plan(2.0, color=Color.BLUE)},
             {"plan": Plan(2.0, functions=(make_function(1),))},
         ],
         ids=lambda other: "_".join(map(str, other.values()))[:40],
     )
     def test_argument(self, folder: Path, other: dict[str, Any]) -> None:
         called()
-        called(plan=Plan(2.0, colour=Colour.RED))
+        called(plan=Plan(2.0, color=Color.RED))
         called(plan=Plan(2.0, functions=(make_function(2),)))
         expected, got = called(**other), called(**other)
         assert len(traces) == len(kept(folder)) == 4

@@ -49,7 +49,7 @@ def everything(worker: AnyWorker) -> list[int | str]:
     found: list[int | str] = []
     while True:
         try:
-            results = worker.drain()
+            results = worker.flush()
         except WrongError as error:
             found.append(str(error))
             continue
@@ -69,27 +69,27 @@ class TestResults:
     def test_in_order_once(self, make: Make) -> None:
         worker = make(double)
         for job in range(50):
-            worker.offer(job, job)
-        assert worker.drain() == [2 * job for job in range(50)]
-        assert worker.drain() == worker.take(EVER) == []
+            worker.submit(job, job)
+        assert worker.flush() == [2 * job for job in range(50)]
+        assert worker.flush() == worker.collect(EVER) == []
 
     def test_latency(self) -> None:
         worker = InlineWorker(double, "test", LATENCY)
-        worker.offer(1, 10)
-        worker.offer(2, 12)
-        assert [worker.take(frame) for frame in range(10, 17)] == [[], [], [], [2], [], [4], []]
+        worker.submit(1, 10)
+        worker.submit(2, 12)
+        assert [worker.collect(frame) for frame in range(10, 17)] == [[], [], [], [2], [], [4], []]
 
     def test_thread_is_not_waited_for(self) -> None:
         gate = threading.Event()
         worker = ThreadWorker(lambda job: job if gate.wait(10) else -1, "test")
-        worker.offer(1, 0)
-        assert worker.take(EVER) == []
+        worker.submit(1, 0)
+        assert worker.collect(EVER) == []
         gate.set()
-        assert worker.drain() == [1]
+        assert worker.flush() == [1]
         worker.close()
 
     def test_drain_of_nothing(self, make: Make) -> None:
-        assert make(double).drain() == []
+        assert make(double).flush() == []
 
 
 class TestErrors:
@@ -97,20 +97,20 @@ class TestErrors:
     def test_come_once_in_their_place(self, make: Make, jobs: list[int]) -> None:
         worker = make(double)
         for job in jobs:
-            worker.offer(job, 0)
+            worker.submit(job, 0)
         assert everything(worker) == [f"job {job}" if job >= 100 else 2 * job for job in jobs]
 
     def test_take_loses_nothing(self) -> None:
         """An error in the middle of what is due: first what came before, then the error, then the rest."""
         worker = InlineWorker(double, "test", LATENCY)
         for job in (1, 100, 2):
-            worker.offer(job, 0)
-        worker.offer(3, 1)
-        assert worker.take(3) == [2]
+            worker.submit(job, 0)
+        worker.submit(3, 1)
+        assert worker.collect(3) == [2]
         with pytest.raises(WrongError, match="job 100"):
-            worker.take(3)
-        assert worker.take(3) == [4]
-        assert worker.take(4) == [6]
+            worker.collect(3)
+        assert worker.collect(3) == [4]
+        assert worker.collect(4) == [6]
 
     def test_the_thread_lives_on(self) -> None:
         """Even after what is no `Exception`."""
@@ -119,39 +119,39 @@ class TestErrors:
             return sys.exit(job) if job else 7
 
         worker = ThreadWorker(leave, "test")
-        worker.offer(3, 0)
-        worker.offer(0, 0)
+        worker.submit(3, 0)
+        worker.submit(0, 0)
         with pytest.raises(SystemExit):
-            worker.drain()
-        assert worker.drain() == [7]
+            worker.flush()
+        assert worker.flush() == [7]
         worker.close()
 
 
 class TestClose:
     def test_twice(self, make: Make) -> None:
         worker = make(double)
-        worker.offer(1, 0)
+        worker.submit(1, 0)
         worker.close()
         worker.close()
-        assert set(worker.drain()) <= {2}  # the thread may not have begun
-        assert worker.drain() == []
+        assert set(worker.flush()) <= {2}  # the thread may not have begun
+        assert worker.flush() == []
 
     def test_before_the_first_job(self, make: Make) -> None:
         worker = make(double)
         worker.close()
-        assert worker.drain() == []
+        assert worker.flush() == []
 
     def test_offering_after_it_is_an_error(self, make: Make) -> None:
         worker = make(double)
         worker.close()
         with pytest.raises(RuntimeError, match="test is closed"):
-            worker.offer(1, 0)
+            worker.submit(1, 0)
 
     def test_what_is_done_can_be_taken(self, make: Make) -> None:
         done: list[int] = []
         worker = make(lambda job: done.append(job) or double(job))
-        worker.offer(1, 0)
-        worker.offer(100, 0)
+        worker.submit(1, 0)
+        worker.submit(100, 0)
         assert eventually(lambda: len(done) == 2)
         worker.close()
         assert everything(worker) == [2, "job 100"]
@@ -160,7 +160,7 @@ class TestClose:
         begun, gate = [], threading.Event()
         worker = ThreadWorker(lambda job: (begun.append(job), gate.wait(10), job)[-1], "test")
         for job in range(5):
-            worker.offer(job, 0)
+            worker.submit(job, 0)
         assert eventually(lambda: begun == [0])
         worker.stop()
         gate.set()
@@ -169,17 +169,17 @@ class TestClose:
         assert everything(worker) == [0]
 
     def test_in_two_seconds(self) -> None:
-        """Three workers together, each with a job that takes longer; none is waited for again by `drain`."""
+        """Three workers together, each with a job that takes longer; none is waited for again by `flush`."""
         begun: list[float] = []
         work = lambda seconds: (begun.append(seconds), time.sleep(seconds))[0]
         workers = [ThreadWorker(work, f"slow-{number}") for number in range(3)]
         for worker in workers:
-            worker.offer(4.0, 0)
-            worker.offer(4.0, 0)
+            worker.submit(4.0, 0)
+            worker.submit(4.0, 0)
         assert eventually(lambda: len(begun) == 3)
         began = time.monotonic()
         close_all(workers)
-        assert all(worker.drain() == [] for worker in workers)
+        assert all(worker.flush() == [] for worker in workers)
         assert 1.5 < time.monotonic() - began < 2.0
         slow = [thread for thread in threading.enumerate() if thread.name.startswith("slow-")]
         assert len(slow) == 3
@@ -193,8 +193,8 @@ class TestThread:
 
             def __init__(self) -> None:
                 self.worker = ThreadWorker(self.work, "owned")
-                self.worker.offer(1, 0)
-                self.worker.drain()
+                self.worker.submit(1, 0)
+                self.worker.flush()
 
             def work(self, job: int) -> int:
                 return job
@@ -211,7 +211,7 @@ class TestThread:
         """It waits for the job at hand, two seconds at most."""
         script = (
             "import time; from jaxslam.runtime.worker import ThreadWorker\n"
-            f"worker = ThreadWorker(time.sleep, 'left'); worker.offer({seconds}, 0); worker.offer({seconds}, 0)\n"
+            f"worker = ThreadWorker(time.sleep, 'left'); worker.submit({seconds}, 0); worker.submit({seconds}, 0)\n"
             "time.sleep(0.05); print('end', flush=True)"
         )
         with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as process:

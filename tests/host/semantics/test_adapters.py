@@ -1,4 +1,4 @@
-"""Every family of networks: recognised from its graph, and what it finds comes back in pixels of the image."""
+"""Every family of networks: recognized from its graph, and what it finds comes back in pixels of the image."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -18,8 +18,8 @@ FAMILIES: dict[str, tuple[Build, str, str]] = {
     "nanodet": (tiny_models.nanodet, "nanodet", "corner"),
     "nanodet_plus": (tiny_models.nanodet_plus, "nanodet_plus", "corner"),
     "fastestdet": (tiny_models.fastestdet, "fastestdet", "stretch"),
-    "yolov8": (tiny_models.yolov8, "yolov8", "centre"),
-    "yolov8_seg": (tiny_models.yolov8_seg, "yolov8_seg", "centre"),
+    "yolov8": (tiny_models.yolov8, "yolov8", "center"),
+    "yolov8_seg": (tiny_models.yolov8_seg, "yolov8_seg", "center"),
     "tensorflow": (tiny_models.tensorflow_ssd, "ssd", "stretch"),
     "tensorflow_lite": (tiny_models.lite_ssd, "ssd", "stretch"),
     "torchvision": (tiny_models.torchvision_ssd, "ssd", "stretch"),
@@ -45,7 +45,7 @@ def in_image(box: tuple[float, ...], size: tuple[int, int], fit: str) -> np.ndar
     scale = np.array([WIDTH / size[0], HEIGHT / size[1]])
     if fit != "stretch":
         scale[:] = scale.min()
-    margin = (np.array([WIDTH, HEIGHT]) - scale * size) / 2 * (fit == "centre")
+    margin = (np.array([WIDTH, HEIGHT]) - scale * size) / 2 * (fit == "center")
     return (np.array(box) - np.tile(margin, 2)) / np.tile(scale, 2)
 
 
@@ -205,7 +205,7 @@ SSD = tuple(Port(name, (1, 9, 4)[: 3 - (i > 0)], "float32") for i, name in enume
 
 
 class TestInput:
-    """What the networks see of an image of one colour."""
+    """What the networks see of an image of one color."""
 
     @pytest.mark.parametrize(
         ("name", "shape", "dtype", "outputs", "expected", "pad"),

@@ -8,7 +8,7 @@ from small_scene import CONFIG, HEIGHT, WIDTH, clip
 
 from jaxslam.errors import ModelError
 from jaxslam.semantics import Detections, no_detections
-from jaxslam.semantics.checked_detector import WatchedDetector
+from jaxslam.semantics.checked_detector import CheckedDetector
 from jaxslam.semantics.detection_checks import check_answer
 from jaxslam.slam.slam import Slam
 from jaxslam.tracking.state import TrackStatus
@@ -62,7 +62,7 @@ def test_detector_of_ones_own_is_asked_once_an_image() -> None:
         calls.append(image.size)
         return GOOD
 
-    detector = WatchedDetector(looks)
+    detector = CheckedDetector(looks)
     for one in clip().frames[:6]:
         assert detector(one.image) is GOOD
     assert len(calls) == 6

@@ -275,14 +275,14 @@ class TestChoose:
 
 class TestPlacement:
     @pytest.mark.parametrize("size", [(1, 500), (500, 1), (1, 1), (3, 2)])
-    @pytest.mark.parametrize("fit", ["corner", "centre", "stretch"])
+    @pytest.mark.parametrize("fit", ["corner", "center", "stretch"])
     def test_odd_images(self, size: tuple[int, int], fit) -> None:
         canvas, placement = place(np.full((size[1], size[0], 3), 9, np.uint8), (WIDTH, HEIGHT), fit, 114)
         assert canvas.shape == (HEIGHT, WIDTH, 3)
         assert np.any(canvas == 9)
         assert min(placement.scale) > 0
 
-    @pytest.mark.parametrize("fit", ["corner", "centre", "stretch"])
+    @pytest.mark.parametrize("fit", ["corner", "center", "stretch"])
     @pytest.mark.parametrize("cell", [1, 4])
     def test_plane_and_back(self, fit, cell: int) -> None:
         """The input's own coordinates, as a plane over it, are those of the image's pixels in it."""

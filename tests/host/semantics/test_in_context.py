@@ -34,20 +34,20 @@ from jaxslam.semantics.prompted import (
     read_examples,
     with_masks,
 )
-from jaxslam.sensors.frame import to_grey
-from jaxslam.slam.mask_pipeline import DynamicMasks, MaskSource
+from jaxslam.sensors.frame import to_gray
+from jaxslam.slam.mask_pipeline import MaskPipeline, MaskSource
 
 fails = failing("models")
 missing = failing("models", code=2)
-RED, GREEN, GREY = (220, 30, 30), (30, 200, 40), (90, 90, 90)
+RED, GREEN, GRAY = (220, 30, 30), (30, 200, 40), (90, 90, 90)
 SIZES = {"square": (112, 112), "landscape": (640, 480), "portrait": (480, 640), "odd": (301, 777)}
 
 
 def picture(size: tuple[int, int], *things: tuple[tuple[int, int, int, int], tuple[int, int, int]]) -> np.ndarray:
-    """Grey, with boxes of colours."""
-    image = np.full((size[1], size[0], 3), GREY, np.uint8)
-    for (left, top, right, bottom), colour in things:
-        image[top:bottom, left:right] = colour
+    """Gray, with boxes of colors."""
+    image = np.full((size[1], size[0], 3), GRAY, np.uint8)
+    for (left, top, right, bottom), color in things:
+        image[top:bottom, left:right] = color
     return image
 
 
@@ -66,8 +66,8 @@ def mask_of(size: tuple[int, int], box: tuple[int, int, int, int], value: int = 
 def folder(tmp_path: Path) -> Path:
     """Pictures of a red and a green thing, with masks."""
     box = (28, 14, 84, 98)
-    for name, colour in (("red", RED), ("green", GREEN)):
-        save(tmp_path / f"{name}.png", picture((112, 112), (box, colour)))
+    for name, color in (("red", RED), ("green", GREEN)):
+        save(tmp_path / f"{name}.png", picture((112, 112), (box, color)))
         save(tmp_path / f"{name}_mask.png", mask_of((112, 112), box))
     save(tmp_path / "empty.png", picture((112, 112)))
     return tmp_path
@@ -414,11 +414,11 @@ class TestSettings:
         room = SyntheticDataset(SyntheticConfig(frames=1, width=192, height=128, people=0))
         frame, detector = room[0], detector_of(SemanticsConfig(model=yolox, **pair))
         assert frame.depth_m is not None
-        made = DynamicMasks(
-            room.camera, detector, deterministic=True, latency_frames=0, propagate=True, newcomers=False, dilate_px=0
+        made = MaskPipeline(
+            room.camera, detector, deterministic=True, latency_frames=0, propagate=True, new_surfaces=False, dilate_px=0
         )
         try:
-            mask = made.of_frame(0, frame.image, to_grey(frame.image), frame.depth_m)
+            mask = made.mask_frame(0, frame.image, to_gray(frame.image), frame.depth_m)
         finally:
             made.close()
         assert (mask.error, mask.source) == ("", MaskSource.DETECTOR)

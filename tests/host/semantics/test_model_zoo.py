@@ -42,10 +42,10 @@ class TestTable:
     def test_default_can_be_downloaded_and_used_freely(self) -> None:
         model = known_model(DEFAULT_MODEL)
         assert model.url is not None
-        assert model.licence == "Apache-2.0"
+        assert model.license == "Apache-2.0"
 
     def test_nothing_under_agpl_is_downloaded(self) -> None:
-        restricted = [model for model in KNOWN_MODELS.values() if model.licence.startswith("AGPL")]
+        restricted = [model for model in KNOWN_MODELS.values() if model.license.startswith("AGPL")]
         assert restricted
         assert all(model.url is None and "AGPL-3.0" in model.how for model in restricted)
 

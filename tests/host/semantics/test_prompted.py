@@ -144,8 +144,8 @@ class TestGeometry:
         expected = disc_mask((150, 150), size, fit) & ~disc_mask((200, 150), size, fit)
         assert differing(segmenter(white(size), asked).masks[0], expected) < 0.06
 
-    def test_colours(self, tmp_path: Path) -> None:
-        """RGB, normalised by ImageNet; what is beside the image is 0."""
+    def test_colors(self, tmp_path: Path) -> None:
+        """RGB, normalized by ImageNet; what is beside the image is 0."""
         image = np.zeros((64, 128, 3), np.uint8)
         image[:] = (255, 128, 0)
         expected = (np.array([255, 128, 0]) - tiny_segmenters.MEAN) / tiny_segmenters.STD

@@ -151,7 +151,7 @@ class TestOrbSlam2:
         with pytest.raises(CameraError, match=f"missing '{key}'"):
             load(tmp_path, ORB_SLAM2.replace(f"{key}:", "Camera.other:"))
 
-    def test_factor_of_zero_means_metres(self, tmp_path: Path) -> None:
+    def test_factor_of_zero_means_meters(self, tmp_path: Path) -> None:
         assert load(tmp_path, ORB_SLAM2.replace("5000.0", "0")).depth_scale_per_m == 1.0
 
     def test_stereo_without_depth_images(self, tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxslam.errors import FrameError
-from jaxslam.sensors.frame import Frame, check_frame, to_grey
+from jaxslam.sensors.frame import Frame, check_frame, to_gray
 
 HEIGHT, WIDTH = 12, 16
 RGB = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
@@ -16,7 +16,7 @@ def make(**fields: object) -> Frame:
 
 
 class TestStructure:
-    @pytest.mark.parametrize("image", [RGB, RGB[..., 0], RGB[..., ::-1]], ids=["rgb", "grey", "view"])
+    @pytest.mark.parametrize("image", [RGB, RGB[..., 0], RGB[..., ::-1]], ids=["rgb", "gray", "view"])
     @pytest.mark.parametrize("mask", [None, np.zeros((HEIGHT, WIDTH), bool)], ids=["no mask", "mask"])
     def test_accepts(self, image: np.ndarray, mask: np.ndarray | None) -> None:
         assert make(image=image, dynamic_mask=mask).size == (WIDTH, HEIGHT)
@@ -85,15 +85,15 @@ class TestCheckFrame:
             check_frame(make(), HEIGHT, WIDTH)
 
 
-class TestToGrey:
+class TestToGray:
     def test_weighs_red_green_and_blue(self) -> None:
         expected = RGB @ np.array([0.299, 0.587, 0.114])
-        assert np.abs(to_grey(RGB) - expected).max() <= 0.51
-        assert to_grey(RGB).dtype == np.uint8
+        assert np.abs(to_gray(RGB) - expected).max() <= 0.51
+        assert to_gray(RGB).dtype == np.uint8
 
     def test_takes_views(self) -> None:
-        np.testing.assert_array_equal(to_grey(RGB[::2, ::-1]), to_grey(RGB[::2, ::-1].copy()))
+        np.testing.assert_array_equal(to_gray(RGB[::2, ::-1]), to_gray(RGB[::2, ::-1].copy()))
 
-    def test_keeps_grey(self) -> None:
-        grey = RGB[..., 1]
-        assert to_grey(grey) is grey
+    def test_keeps_gray(self) -> None:
+        gray = RGB[..., 1]
+        assert to_gray(gray) is gray

@@ -17,7 +17,7 @@ def frame(time_ms: int, size: tuple[int, int] = (6, 4), **fields) -> Frame:
 
 
 class TestFrameArrays:
-    def test_colour_becomes_grey_and_nothing_is_ignored(self) -> None:
+    def test_color_becomes_gray_and_nothing_is_ignored(self) -> None:
         arrays = frame_arrays(frame(100), 0.1)
         np.testing.assert_array_equal(arrays.image, np.full((4, 6), 100, np.uint8))
         assert not np.any(arrays.ignore)

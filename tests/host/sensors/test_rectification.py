@@ -69,10 +69,10 @@ class TestRectified:
 
     def test_frame_has_the_camera_of_the_pair(self) -> None:
         pair = RectifiedPair(_rig(far_depth_baselines=40.0, fps=15.0))
-        grey = np.full((HEIGHT, WIDTH), 90, np.uint8)
-        frame = pair.of(17, grey, grey)
+        gray = np.full((HEIGHT, WIDTH), 90, np.uint8)
+        frame = pair.of(17, gray, gray)
         assert frame.right is not None
-        assert (frame.timestamp_ns, frame.size, frame.right.shape) == (17, (WIDTH, HEIGHT), grey.shape)
+        assert (frame.timestamp_ns, frame.size, frame.right.shape) == (17, (WIDTH, HEIGHT), gray.shape)
         camera = pair.camera
         assert (camera.is_stereo, camera.fps, camera.fx) == (True, 15, camera.fy)
         assert camera.baseline_m == pytest.approx(0.1)
@@ -182,7 +182,7 @@ class TestNoPair:
     @pytest.mark.parametrize(
         ("change", "message"),
         [
-            ({"T_left_right": (1, 0, 0, 0, 0, 0, 0)}, "expected a baseline in metres, got 0 0 0"),
+            ({"T_left_right": (1, 0, 0, 0, 0, 0, 0)}, "expected a baseline in meters, got 0 0 0"),
             ({"T_left_right": (1, 0, 0, 0, -0.1, 0, 0)}, "left and right swapped, or the transform the other way"),
             ({"T_left_right": (1, 0, 0, 0, 0.01, 0.1, 0)}, r"one above the other\?"),
             ({"T_left_right": (1, 0, 0, 0, 0.01, 0, 0.1)}, r"one behind the other\?"),
@@ -203,10 +203,10 @@ class TestNoPair:
 
     def test_images(self) -> None:
         pair = RectifiedPair(_rig())
-        grey = np.zeros((HEIGHT, WIDTH), np.uint8)
+        gray = np.zeros((HEIGHT, WIDTH), np.uint8)
         with pytest.raises(FrameError, match="right: expected the 640x480 pixels of rig 'rig', got 480x640"):
-            pair.of(0, grey, grey.T.copy())
+            pair.of(0, gray, gray.T.copy())
         with pytest.raises(FrameError, match=r"left: expected .* uint8, got float64"):
-            pair.of(0, grey.astype(float), grey)
+            pair.of(0, gray.astype(float), gray)
         with pytest.raises(FrameError, match="right: expected the shape of the left image"):
-            pair.of(0, grey, np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+            pair.of(0, gray, np.zeros((HEIGHT, WIDTH, 3), np.uint8))

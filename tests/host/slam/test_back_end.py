@@ -115,7 +115,7 @@ def write_run(folder: Path) -> None:
 class TestCompiling:
     @KINDS
     def test_nothing_while_frames_come(self, compiled: list[str], config: Config) -> None:
-        """Not for the work of mapping, a loss and a place recognised, corrections and recalls."""
+        """Not for the work of mapping, a loss and a place recognized, corrections and recalls."""
         jax.clear_caches()
         with new_slam(config) as slam:
             compiled.clear()
@@ -127,10 +127,10 @@ class TestCompiling:
                 if config is LIVE:
                     time.sleep(0.02)  # so that mapping keeps up
             slam.finish()
-            assert TrackStatus.RELOCALISED in statuses
+            assert TrackStatus.RELOCALIZED in statuses
             assert len(slam.map.ids) >= 4
             # In turn, the optimization of loops is compiled beside the frames, in a thread of its own.
-            assert set(compiled) <= ({"jit(_optimise)"} if config is INLINE else set())
+            assert set(compiled) <= ({"jit(_optimize)"} if config is INLINE else set())
 
 
 class TestClose:
@@ -156,7 +156,7 @@ class TestClose:
 
         monkeypatch.setattr(owner, method, slow)
         if method == "close_loop":
-            monkeypatch.setattr(LoopClosing, "look", lambda self, map, keyframe_id: loop_at(map, keyframe_id))
+            monkeypatch.setattr(LoopClosing, "look", lambda self, slam_map, keyframe_id: loop_at(slam_map, keyframe_id))
         slam = new_slam(LIVE)
         while not begun.is_set():
             for frame in _frames():
@@ -177,7 +177,7 @@ class TestClose:
                 release.wait(10)
             return add(self, new)
 
-        def slow_look(self: LoopClosing, map: Map, keyframe_id: int) -> None:
+        def slow_look(self: LoopClosing, slam_map: Map, keyframe_id: int) -> None:
             begun[1].set()
             release.wait(10)
 
@@ -232,12 +232,12 @@ def closes_in_time(slam: Slam) -> None:
     assert time.monotonic() - began < 2.0
 
 
-def loop_at(map: Map, keyframe_id: int) -> LoopClosure | None:
+def loop_at(slam_map: Map, keyframe_id: int) -> LoopClosure | None:
     """A loop from the first keyframe that asks for no change."""
     if keyframe_id == 0:
         return None
-    relative = between(map.pose(0), map.pose(keyframe_id))
-    return LoopClosure(0, keyframe_id, relative, 1e4 * np.eye(6), map.ids, map.T_world_cam)
+    relative = between(slam_map.pose(0), slam_map.pose(keyframe_id))
+    return LoopClosure(0, keyframe_id, relative, 1e4 * np.eye(6), slam_map.ids, slam_map.T_world_cam)
 
 
 class TestErrors:
@@ -248,10 +248,10 @@ class TestErrors:
         add = LocalMapping.add
 
         def wrong(self: LocalMapping, new: NewKeyframe) -> Map:
-            map = add(self, new)
+            slam_map = add(self, new)
             if new.id in failing:
                 raise WrongError(f"keyframe {new.id}")
-            return map
+            return slam_map
 
         monkeypatch.setattr(LocalMapping, "add", wrong)
         with new_slam(config) as slam:
@@ -271,8 +271,8 @@ class TestErrors:
     def test_in_looking_for_loops(self, monkeypatch: pytest.MonkeyPatch, config: Config) -> None:
         look = LoopClosing.look
 
-        def wrong(self: LoopClosing, map: Map, keyframe_id: int) -> LoopClosure | None:
-            found = look(self, map, keyframe_id)
+        def wrong(self: LoopClosing, slam_map: Map, keyframe_id: int) -> LoopClosure | None:
+            found = look(self, slam_map, keyframe_id)
             if keyframe_id == 1:
                 raise WrongError("loop 1")
             return found
@@ -285,7 +285,7 @@ class TestErrors:
     @KINDS
     def test_while_finishing(self, monkeypatch: pytest.MonkeyPatch, config: Config) -> None:
         """After an error one can finish again, and track on."""
-        monkeypatch.setattr(LoopClosing, "look", lambda self, map, keyframe_id: _raise(f"loop {keyframe_id}"))
+        monkeypatch.setattr(LoopClosing, "look", lambda self, slam_map, keyframe_id: _raise(f"loop {keyframe_id}"))
         with new_slam(config) as slam:
             slam.track(_frames()[0])
             with pytest.raises(WrongError, match="loop 0"):
@@ -295,7 +295,7 @@ class TestErrors:
             assert slam.track(_frames()[1]).status is TrackStatus.OK
 
     def test_in_closing_a_loop(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(LoopClosing, "look", lambda self, map, keyframe_id: loop_at(map, keyframe_id))
+        monkeypatch.setattr(LoopClosing, "look", lambda self, slam_map, keyframe_id: loop_at(slam_map, keyframe_id))
         monkeypatch.setattr(LocalMapping, "close_loop", lambda self, loop: _raise("close"))
         with new_slam() as slam:
             assert set(track_through(slam)) == {"close"}
@@ -330,7 +330,7 @@ def track_through(slam: Slam) -> list[str]:
 class TestFinish:
     def test_hands_over_loops_that_are_on_their_way(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """The map of a keyframe has come, what was looked for in it has not: the loop is closed all the same."""
-        monkeypatch.setattr(LoopClosing, "look", lambda self, map, keyframe_id: loop_at(map, keyframe_id))
+        monkeypatch.setattr(LoopClosing, "look", lambda self, slam_map, keyframe_id: loop_at(slam_map, keyframe_id))
         last = keyframe_frames()[1]
         with new_slam() as slam:
             for frame in _frames()[: last + INLINE.mapping.latency_frames + 2]:
@@ -344,7 +344,7 @@ class TestFinish:
     def test_its_correction_is_told_with_the_next_frame(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """A jump is told from a motion, also if the map was waited for."""
         monkeypatch.setattr(
-            "jaxslam.mapping.local_bundle_adjustment._LEAST_KEYFRAMES", 2
+            "jaxslam.mapping.local_bundle_adjustment._MIN_KEYFRAMES", 2
         )  # so that the second one corrects
         second = keyframe_frames()[1]
         with new_slam() as slam:

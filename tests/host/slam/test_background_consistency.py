@@ -13,7 +13,7 @@ from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.datasets.synthetic.camera_path_kind import CameraPathKind
 from jaxslam.geometry.se3 import between
 from jaxslam.sensors.frame import Frame
-from jaxslam.slam.frame_result import Tracked
+from jaxslam.slam.frame_result import FrameResult
 from jaxslam.slam.slam import Slam
 from jaxslam.tracking.state import TrackReason, TrackStatus
 
@@ -26,7 +26,7 @@ def near_only(frame: Frame, farthest_m: float) -> Frame:
     return replace(frame, depth_m=np.where(frame.depth_m > farthest_m, np.float32(0), frame.depth_m))
 
 
-def tracked(path: CameraPathKind, people: int, seed: int, reach_m: float) -> tuple[list[Tracked], np.ndarray]:
+def tracked(path: CameraPathKind, people: int, seed: int, reach_m: float) -> tuple[list[FrameResult], np.ndarray]:
     """Results with depth as far as `reach_m`, and how far each is from the truth, the first frame as their world."""
     frames = 40
     room = SyntheticDataset(
@@ -41,7 +41,7 @@ def tracked(path: CameraPathKind, people: int, seed: int, reach_m: float) -> tup
     return results[first:], np.linalg.norm(apart, axis=1)[first:]
 
 
-def sigma_m(result: Tracked) -> float:
+def sigma_m(result: FrameResult) -> float:
     return float(np.sqrt(np.trace(result.covariance[:3, :3])))
 
 

@@ -17,13 +17,13 @@ from small_scene import CONFIG, HEIGHT, WIDTH, clip
 from jaxslam.errors import DatasetError, FrameError
 from jaxslam.sensors.frame import Frame
 from jaxslam.sensors.rectification import RectifiedPair
-from jaxslam.slam.frame_result import Rejected, Tracked
+from jaxslam.slam.frame_result import FrameResult, Rejected
 from jaxslam.slam.slam import Slam
 from jaxslam.tracking.state import TrackStatus
 
 HELPERS = str(Path(__file__).resolve().parents[2] / "helpers")
 
-MOST_CHARACTERS, MOST_S = 300, 2.0
+MAX_CHARACTERS, MAX_S = 300, 2.0
 AFTER = 5
 IMAGE, DEPTH_M = clip().frames[AFTER].image, clip().frames[AFTER].depth_m
 NOW = clip().frames[AFTER].timestamp_ns
@@ -121,12 +121,12 @@ def begun(slam: Slam) -> None:
 
 
 @pytest.fixture(scope="module")
-def undisturbed(slam: Slam) -> Tracked:
+def undisturbed(slam: Slam) -> FrameResult:
     begun(slam)
     return slam.track(frame()())
 
 
-def assert_same(tracked: Tracked, undisturbed: Tracked) -> None:
+def assert_same(tracked: FrameResult, undisturbed: FrameResult) -> None:
     assert tracked.status is TrackStatus.OK
     np.testing.assert_array_equal(tracked.T_world_cam, undisturbed.T_world_cam)
 
@@ -136,20 +136,20 @@ def test_thirty_frames() -> None:
 
 
 @pytest.mark.parametrize("kind", REFUSED)
-def test_frame_is_refused_and_forgotten(slam: Slam, undisturbed: Tracked, kind: str) -> None:
+def test_frame_is_refused_and_forgotten(slam: Slam, undisturbed: FrameResult, kind: str) -> None:
     make, words = REFUSED[kind]
     begun(slam)
     began = time.monotonic()
     with pytest.raises(FrameError, match=words) as error:
         slam.track(make())
-    assert time.monotonic() - began < MOST_S
+    assert time.monotonic() - began < MAX_S
     assert "\n" not in str(error.value)
-    assert len(str(error.value)) <= MOST_CHARACTERS
+    assert len(str(error.value)) <= MAX_CHARACTERS
     assert_same(slam.track(frame()()), undisturbed)
 
 
 @pytest.mark.parametrize("layout", TAKEN)
-def test_any_layout_gives_the_same_pose(slam: Slam, undisturbed: Tracked, layout: str) -> None:
+def test_any_layout_gives_the_same_pose(slam: Slam, undisturbed: FrameResult, layout: str) -> None:
     begun(slam)
     fields = {"image": TAKEN[layout](IMAGE), "depth_m": TAKEN[layout](depth_as("f4"))}
     assert_same(slam.track(frame(**fields)()), undisturbed)
@@ -215,7 +215,7 @@ class TestRun:
         recording: Any = clip(frames=60)
         recording.frames, recording.timestamps_ns = recording.frames[:4], recording.timestamps_ns[:4]
         recording.frames[2] = None
-        results: list[Tracked | Rejected] = []
+        results: list[FrameResult | Rejected] = []
         slam.reset()
         slam.run(recording, lambda _, result: results.append(result))
         rejected = results[2]
@@ -228,7 +228,7 @@ class TestRun:
 def test_threads_wait_for_each_other(slam: Slam) -> None:
     """Frames from two threads: each is tracked or, where a later one came first, refused; nothing else goes wrong."""
     slam.reset()
-    results: list[Tracked] = []
+    results: list[FrameResult] = []
     errors: list[Exception] = []
 
     def feed(frames: list[Frame]) -> None:

@@ -10,7 +10,7 @@ from small_scene import CONFIG, HEIGHT, WIDTH, Clip, clip, truth_from_start
 from jaxslam.config.schema import DynamicsConfig
 from jaxslam.errors import DatasetError, FrameError
 from jaxslam.sensors.frame import Frame
-from jaxslam.slam.frame_result import Tracked
+from jaxslam.slam.frame_result import FrameResult
 from jaxslam.slam.slam import Slam
 from jaxslam.tracking.state import TrackStatus
 
@@ -50,15 +50,15 @@ def slam() -> Slam:
 @pytest.fixture(scope="module")
 def without_cues() -> Slam:
     """Another one, that takes everything for fixed."""
-    return Slam(clip().camera, replace(CONFIG, dynamics=DynamicsConfig(cues=(), even_votes=False)))
+    return Slam(clip().camera, replace(CONFIG, dynamics=DynamicsConfig(cues=(), balance_regions=False)))
 
 
-def track(slam: Slam, frames: list[Frame]) -> list[Tracked]:
+def track(slam: Slam, frames: list[Frame]) -> list[FrameResult]:
     slam.reset()
     return [slam.track(frame) for frame in frames]
 
 
-def assert_finite(result: Tracked) -> None:
+def assert_finite(result: FrameResult) -> None:
     for name in ("T_world_cam", "covariance", "uv", "weights", "inlier_ratio", "residual_px"):
         assert np.isfinite(getattr(result, name)).all(), name
     assert abs(np.linalg.norm(result.T_world_cam[:4]) - 1) < 1e-5
@@ -66,22 +66,22 @@ def assert_finite(result: Tracked) -> None:
 
 
 @pytest.fixture(scope="module")
-def undisturbed(slam: Slam) -> list[Tracked]:
+def undisturbed(slam: Slam) -> list[FrameResult]:
     """The whole clip without a bad frame: what every other run is compared with."""
     return track(slam, clip().frames)
 
 
-def positions(results: list[Tracked]) -> np.ndarray:
+def positions(results: list[FrameResult]) -> np.ndarray:
     return np.array([result.T_world_cam[4:] for result in results])
 
 
-def moved_m(results: list[Tracked], undisturbed: list[Tracked]) -> np.ndarray:
+def moved_m(results: list[FrameResult], undisturbed: list[FrameResult]) -> np.ndarray:
     """Distance of each pose from that of the same frame in the undisturbed run; no smaller than the error added."""
     same = {result.timestamp_ns: result for result in undisturbed}
     return np.linalg.norm(positions(results) - positions([same[result.timestamp_ns] for result in results]), axis=1)
 
 
-def errors_m(results: list[Tracked], recording: Clip) -> np.ndarray:
+def errors_m(results: list[FrameResult], recording: Clip) -> np.ndarray:
     """Distance of each pose from the true one, without alignment: the world is the first camera."""
     truth = dict(
         zip(
@@ -96,7 +96,7 @@ def errors_m(results: list[Tracked], recording: Clip) -> np.ndarray:
 
 class TestBadImages:
     @pytest.mark.parametrize("kind", SPOILED)
-    def test_is_reported_and_survived(self, slam: Slam, undisturbed: list[Tracked], kind: str) -> None:
+    def test_is_reported_and_survived(self, slam: Slam, undisturbed: list[FrameResult], kind: str) -> None:
         frames = clip().frames
         last_good = frames[BAD.start - 1]
         frames[BAD] = [SPOILED[kind](frame, last_good) for frame in frames[BAD]]
@@ -112,7 +112,7 @@ class TestBadImages:
         assert {result.status for result in after} == {TrackStatus.OK}
         assert moved_m(after, undisturbed).max() < MOVED_BY_BAD_FRAMES_M
 
-    def test_single_frame_of_noise(self, slam: Slam, undisturbed: list[Tracked]) -> None:
+    def test_single_frame_of_noise(self, slam: Slam, undisturbed: list[FrameResult]) -> None:
         frames = clip().frames
         frames[20] = SPOILED["noise"](frames[20], frames[19])
         results = track(slam, frames)
@@ -147,7 +147,7 @@ class TestBadImages:
         assert results[5].T_world_cam == pytest.approx([1, 0, 0, 0, 0, 0, 0], abs=1e-6)
         assert len(slam.trajectory) == 10
 
-    def test_long_loss_ends_in_the_same_world(self, slam: Slam, undisturbed: list[Tracked]) -> None:
+    def test_long_loss_ends_in_the_same_world(self, slam: Slam, undisturbed: list[FrameResult]) -> None:
         """The tracker finds what it followed before again, or the map the place: in the dark nothing starts anew."""
         recording = clip()
         frames = recording.frames[:50]
@@ -158,7 +158,7 @@ class TestBadImages:
         assert {result.status for result in results[dark.stop :]} <= {
             TrackStatus.OK,
             TrackStatus.WEAK,
-            TrackStatus.RELOCALISED,
+            TrackStatus.RELOCALIZED,
         }
         np.testing.assert_allclose(results[-1].T_world_cam[4:], undisturbed[49].T_world_cam[4:], atol=0.02)  # of 20 cm
         assert {result.status for result in results[-5:]} == {TrackStatus.OK}
@@ -168,7 +168,7 @@ class TestRefusedFrames:
     """What does not fit raises, and leaves no trace: the next frames are tracked as if it had never come."""
 
     @pytest.mark.parametrize("kind", ["smaller", "repeated", "backward", "wrong type"])
-    def test_state_is_untouched(self, slam: Slam, undisturbed: list[Tracked], kind: str) -> None:
+    def test_state_is_untouched(self, slam: Slam, undisturbed: list[FrameResult], kind: str) -> None:
         slam.reset()
         for index, frame in enumerate(clip().frames[:12]):
             if index == 8:

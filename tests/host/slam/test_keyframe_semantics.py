@@ -20,22 +20,22 @@ from jaxslam.config.schema import Config, DynamicsConfig, RunConfig, SemanticsCo
 from jaxslam.datasets.synthetic import SceneDetector, SyntheticConfig, SyntheticDataset
 from jaxslam.features.orb import Features
 from jaxslam.loop_closing.place_index import PlaceIndex
-from jaxslam.map.dynamic_removal import Movers, under, without_movers
+from jaxslam.map.dynamic_removal import DynamicObservations, under, without_dynamic
 from jaxslam.map.edit import without_keyframe, without_points
 from jaxslam.map.types import NONE, Map, has
 from jaxslam.map.validate import problems
-from jaxslam.mapping.local_mapping import LocalMapping, NewKeyframe, Tracks, point_ids, recalled_id
+from jaxslam.mapping.local_mapping import LocalMapping, NewKeyframe, TrackedObservations, point_ids, reloaded_id
 from jaxslam.results.run_results import RunInfo, write_results
 from jaxslam.semantics import Detections, no_detections
 from jaxslam.sensors.frame import Frame
 from jaxslam.slam.back_end import _without_removed
-from jaxslam.slam.frame_result import Tracked
-from jaxslam.slam.keyframe_recall import recall
+from jaxslam.slam.frame_result import FrameResult
+from jaxslam.slam.keyframe_reload import reload_keyframe
 from jaxslam.slam.keyframe_semantics import KeyframeSemantics
 from jaxslam.slam.mask_pipeline import MaskSource
 from jaxslam.slam.slam import Slam
 from jaxslam.tracking.state import TrackPlan, TrackStatus
-from jaxslam.tracking.state_updates import forgotten
+from jaxslam.tracking.state_updates import drop_points
 from jaxslam.tracking.step import init_state
 
 WIDTH, HEIGHT, FRAMES = 320, 240, 60
@@ -49,7 +49,7 @@ def config(*, deterministic: bool = True, frames: Any = "keyframes", latency_fra
         track=PLAN,
         run=RunConfig(deterministic=deterministic),
         semantics=SemanticsConfig(model=None, frames=frames, latency_frames=latency_frames, dilate_px=DILATE_PX),
-        dynamics=DynamicsConfig(cues=(), even_votes=False),
+        dynamics=DynamicsConfig(cues=(), balance_regions=False),
     )
 
 
@@ -84,26 +84,26 @@ def everything(image: np.ndarray) -> Detections:
     return no_detections()._replace(class_mask=np.ones(image.shape[:2], bool))
 
 
-def track(slam: Slam, frames: int = FRAMES) -> list[Tracked]:
+def track(slam: Slam, frames: int = FRAMES) -> list[FrameResult]:
     return [slam.track(frame) for frame in rendered()[0].frames[:frames]]
 
 
-def keyframes(results: list[Tracked]) -> list[int]:
+def keyframes(results: list[FrameResult]) -> list[int]:
     return [index for index, result in enumerate(results) if result.is_keyframe]
 
 
-def on_people(map: Map) -> np.ndarray:
-    """Of every sighting, whether it was on a person."""
-    wrong = np.zeros(len(map.sightings.keyframe), bool)
-    for keyframe in map.keyframes:
-        here = np.flatnonzero(map.sightings.keyframe == keyframe.id)
-        wrong[here] = under(rendered()[1][keyframe.timestamp_ns], map.sightings.seen_uv[:, here])
+def on_people(slam_map: Map) -> np.ndarray:
+    """Of every observation, whether it was on a person."""
+    wrong = np.zeros(len(slam_map.observations.keyframe), bool)
+    for keyframe in slam_map.keyframes:
+        here = np.flatnonzero(slam_map.observations.keyframe == keyframe.id)
+        wrong[here] = under(rendered()[1][keyframe.timestamp_ns], slam_map.observations.uv_raw[:, here])
     return wrong
 
 
-def features_on_people(map: Map) -> int:
+def features_on_people(slam_map: Map) -> int:
     masks = rendered()[1]
-    return sum(int(under(masks[one.timestamp_ns], one.features.seen_uv).sum()) for one in map.keyframes)
+    return sum(int(under(masks[one.timestamp_ns], one.features.uv_raw).sum()) for one in slam_map.keyframes)
 
 
 @functools.cache
@@ -123,13 +123,13 @@ class TestRun:
         with Slam(source().camera, config(deterministic=deterministic), detector=looks) as slam:
             results = track(slam)
             slam.finish()
-            map, removed = slam.map, slam.removed_by_semantics
+            slam_map, removed = slam.map, slam.removed_by_semantics
         assert np.mean(on_people(blind_run())) > 0.2
         assert features_on_people(blind_run()) > 100
-        assert not on_people(map).any()
-        assert features_on_people(map) == 0
+        assert not on_people(slam_map).any()
+        assert features_on_people(slam_map) == 0
         assert removed > 100
-        assert problems(map) == []
+        assert problems(slam_map) == []
         assert looks.frames == keyframes(results)
         assert 2 <= len(looks.frames) < FRAMES / 4
         assert {result.mask_source for result in results} == {MaskSource.NONE}
@@ -141,15 +141,15 @@ class TestRun:
         with Slam(source().camera, config(), detector=Looks()) as slam:
             track(slam)
             slam.finish()
-            map = slam.map
+            slam_map = slam.map
         first = blind_run().keyframes[0].features
-        beside = ~under(dilated_truth(0), first.seen_uv)
+        beside = ~under(dilated_truth(0), first.uv_raw)
         assert 100 < beside.sum() < len(beside) - 100
-        np.testing.assert_array_equal(map.keyframes[0].features.descriptor, first.descriptor[beside])
-        seen, blind = (np.flatnonzero(m.sightings.keyframe == 0) for m in (map, blind_run()))
-        at_rest = ~under(dilated_truth(0), blind_run().sightings.seen_uv[:, blind])
+        np.testing.assert_array_equal(slam_map.keyframes[0].features.descriptor, first.descriptor[beside])
+        seen, blind = (np.flatnonzero(m.observations.keyframe == 0) for m in (slam_map, blind_run()))
+        at_rest = ~under(dilated_truth(0), blind_run().observations.uv_raw[:, blind])
         assert len(seen) > 0.8 * at_rest.sum()
-        views = np.bincount(np.searchsorted(map.points.ids, map.sightings.point))
+        views = np.bincount(np.searchsorted(slam_map.points.ids, slam_map.observations.point))
         assert np.count_nonzero(views >= 2) > 100
 
     def test_followed_points_on_people_are_forgotten(self) -> None:
@@ -175,21 +175,21 @@ class TestRun:
         assert ((hidden & (weight > 0)).sum(), (~hidden & (weight > 0)).sum()) == (0, before[1])
 
     def test_nothing_to_look_up_on_people(self) -> None:
-        """In no keyframe that the tracker holds at the end, its own or recalled, and no place is told by them."""
+        """In no keyframe that the tracker holds at the end, its own or reloaded, and no place is told by them."""
         with Slam(source().camera, config(), detector=Looks()) as slam:
             track(slam)
             slam.finish()
-            kept, map = jax.device_get(slam._state.keyframes), slam.map
+            kept, slam_map = jax.device_get(slam._state.keyframes), slam.map
             slots, index = list(slam._back._link._slots), slam._back._index
         held = [slot for slot, keyframe in enumerate(slots) if keyframe != NONE]
         assert len(held) >= 2
         for slot in held:
-            people = rendered()[1][map.keyframe(slots[slot]).timestamp_ns]
+            people = rendered()[1][slam_map.keyframe(slots[slot]).timestamp_ns]
             counts = kept.weight[slot] > 0
             assert counts.any()
             assert not (counts & under(people, kept.uv[slot])).any()
-        expected = PlaceIndex.from_map(map)
-        for keyframe in (*map.keyframes, *blind_run().keyframes):
+        expected = PlaceIndex.from_map(slam_map)
+        for keyframe in (*slam_map.keyframes, *blind_run().keyframes):
             assert index.query(keyframe.features) == expected.query(keyframe.features)
 
     def test_same_bytes_twice(self, tmp_path: Path) -> None:
@@ -226,12 +226,12 @@ class TestRun:
     def test_map_that_stays_as_it_is(self) -> None:
         """Points leave the tracker, none leaves the map."""
         looks = Looks()
-        with Slam(source().camera, config(), map=blind_run(), localize_only=True, detector=looks) as slam:
+        with Slam(source().camera, config(), slam_map=blind_run(), localize_only=True, detector=looks) as slam:
             results = track(slam, 30)
             slam.finish()
             assert slam.map is blind_run()
             assert slam.removed_by_semantics == 0
-        assert results[0].status is TrackStatus.RELOCALISED
+        assert results[0].status is TrackStatus.RELOCALIZED
         assert looks.frames == keyframes(results)
 
     def test_nothing_is_compiled_while_frames_come(self, compiled: list[str]) -> None:
@@ -298,7 +298,7 @@ class TestLate:
 
     def test_too_many_wait(self, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
         """The oldest ones that wait are passed over, the newest is not; it is counted and said once."""
-        monkeypatch.setattr("jaxslam.slam.keyframe_semantics._MOST_WAITING", 2)
+        monkeypatch.setattr("jaxslam.slam.keyframe_semantics._MAX_WAITING", 2)
         begun, release, seen = threading.Event(), threading.Event(), []
 
         def slow(image: np.ndarray) -> Detections:
@@ -313,10 +313,10 @@ class TestLate:
         for number in range(1, 7):
             show(semantics, number)
         release.set()
-        found, error = semantics.drain()
+        found, error = semantics.flush()
         for number in range(7, 9):
             show(semantics, number)
-        found += semantics.drain()[0]
+        found += semantics.flush()[0]
         semantics.worker.close()
         assert [movers.keyframe for movers in found] == seen == [0, 5, 6, 7, 8]
         assert semantics.num_passed_over == 4
@@ -327,7 +327,7 @@ class TestLate:
         semantics = semantics_of(lambda _: no_detections(), deterministic=True, latency_frames=3)
         show(semantics, 0, frame=5)
         show(semantics, 1, frame=6)
-        assert [len(semantics.take(frame)[0]) for frame in (5, 7, 8, 9, 10)] == [0, 0, 1, 1, 0]
+        assert [len(semantics.collect(frame)[0]) for frame in (5, 7, 8, 9, 10)] == [0, 0, 1, 1, 0]
 
     def test_points_under_the_mask(self) -> None:
         """The mask reaches beyond what was found; points of no weight are none."""
@@ -335,7 +335,7 @@ class TestLate:
         left[:, :10] = True
         semantics = semantics_of(lambda _: no_detections()._replace(class_mask=left), deterministic=True)
         show(semantics, 0, tracks_at([3, 11.4, 11.6, 40, 5, -4], weight=[1, 0.5, 1, 1, 0, 1]))
-        (movers,) = semantics.take(0)[0]
+        (movers,) = semantics.collect(0)[0]
         np.testing.assert_array_equal(movers.mask[7], np.arange(CAMERA.width) < 12)
         np.testing.assert_array_equal(movers.tracks, [0, 1, 5])
 
@@ -346,19 +346,19 @@ def semantics_of(
     return KeyframeSemantics(CAMERA, detector, deterministic=deterministic, latency_frames=latency_frames, dilate_px=2)
 
 
-def tracks_at(u: list[float], weight: list[float]) -> Tracks:
-    return Tracks(
+def tracks_at(u: list[float], weight: list[float]) -> TrackedObservations:
+    return TrackedObservations(
         id=np.arange(len(u)),
-        seen_uv=np.array([u, [10.0] * len(u)], np.float32),
+        uv_raw=np.array([u, [10.0] * len(u)], np.float32),
         X_cam=np.ones((3, len(u)), np.float32),
         weight=np.array(weight, np.float32),
     )
 
 
-def show(semantics: KeyframeSemantics, number: int, tracks: Tracks | None = None, frame: int = 0) -> None:
-    """A grey picture of one shade, the number of the keyframe."""
+def show(semantics: KeyframeSemantics, number: int, tracks: TrackedObservations | None = None, frame: int = 0) -> None:
+    """A gray picture of one shade, the number of the keyframe."""
     shade = np.full((CAMERA.height, CAMERA.width), number, np.uint8)
-    semantics.offer(number, shade, np.ones(shade.shape, np.float32), tracks or tracks_at([], []), frame)
+    semantics.submit(number, shade, np.ones(shade.shape, np.float32), tracks or tracks_at([], []), frame)
 
 
 class TestFailure:
@@ -395,7 +395,7 @@ class TestFailure:
         with Slam(source().camera, config(), detector=mostly) as slam:
             results = track(slam)
             slam.finish()
-            wrong = slam.map.sightings.keyframe[on_people(slam.map)]
+            wrong = slam.map.observations.keyframe[on_people(slam.map)]
         assert [bool(result.detector_error) for result in results].count(True) == 1
         assert set(wrong.tolist()) == {1}
 
@@ -403,7 +403,7 @@ class TestFailure:
     def test_removing_goes_wrong(self, monkeypatch: pytest.MonkeyPatch, deterministic: bool) -> None:
         """It reaches the caller, and the map goes on as it was."""
 
-        def wrong(self: LocalMapping, movers: Movers) -> Any:
+        def wrong(self: LocalMapping, movers: DynamicObservations) -> Any:
             raise RuntimeError(f"keyframe {movers.keyframe}")
 
         monkeypatch.setattr(LocalMapping, "remove", wrong)
@@ -436,18 +436,18 @@ class TestFailure:
         with Slam(source().camera, with_points_in(new_points), detector=once) as slam:
             results = track(slam)
             slam.finish()
-            map = slam.map
+            slam_map = slam.map
         statuses = [result.status for result in results]
         second = keyframes(results)[1]
         print(statuses[second:])
         assert set(statuses[1 : second + 1]) == {TrackStatus.OK}
-        assert (TrackStatus.RELOCALISED in statuses) == (new_points == "keyframes")
+        assert (TrackStatus.RELOCALIZED in statuses) == (new_points == "keyframes")
         assert statuses[-1] is TrackStatus.OK
-        assert len(map.keyframe(1).features.octave) == 0
-        assert not (map.sightings.keyframe == 1).any()
-        assert len(map.points.ids) > 100
-        assert problems(map) == []
-        assert len(np.unique(map.submap)) == 1
+        assert len(slam_map.keyframe(1).features.octave) == 0
+        assert not (slam_map.observations.keyframe == 1).any()
+        assert len(slam_map.points.ids) > 100
+        assert problems(slam_map) == []
+        assert len(np.unique(slam_map.submap)) == 1
 
     @pytest.mark.parametrize("new_points", ["always", "keyframes"])
     def test_all_is_always_masked(self, new_points: Any) -> None:
@@ -479,62 +479,66 @@ class TestMap:
         return mask
 
     def test_points_and_features_leave(self, mask: np.ndarray) -> None:
-        map = small_map(num_points=20)
-        map = aligned_features(map)
-        after = without_movers(map, 2, mask)
-        seen = map.sightings
+        slam_map = small_map(num_points=20)
+        slam_map = aligned_features(slam_map)
+        after = without_dynamic(slam_map, 2, mask)
+        seen = slam_map.observations
         here = seen.keyframe == 2
-        gone = seen.point[here][under(mask, seen.seen_uv[:, here])]
+        gone = seen.point[here][under(mask, seen.uv_raw[:, here])]
         assert 3 < len(gone) < 17
-        np.testing.assert_array_equal(after.points.ids, np.setdiff1d(map.points.ids, gone))
-        assert not np.isin(after.sightings.point, gone).any()
-        assert len(after.sightings.point) == len(seen.point) - np.isin(seen.point, gone).sum()
+        np.testing.assert_array_equal(after.points.ids, np.setdiff1d(slam_map.points.ids, gone))
+        assert not np.isin(after.observations.point, gone).any()
+        assert len(after.observations.point) == len(seen.point) - np.isin(seen.point, gone).sum()
         assert problems(after) == []
-        old, new = map.keyframe(2).features, after.keyframe(2).features
-        stays = ~under(mask, old.seen_uv)
+        old, new = slam_map.keyframe(2).features, after.keyframe(2).features
+        stays = ~under(mask, old.uv_raw)
         assert 0 < stays.sum() < len(stays)
         for name in Features._fields:
             kept = getattr(old, name)[stays] if name == "descriptor" else getattr(old, name)[..., stays]
             np.testing.assert_array_equal(getattr(new, name), kept)
 
     def test_others_are_the_same_features(self, mask: np.ndarray) -> None:
-        """A sighting of the keyframe is of the feature that it was of, with its new number."""
-        map = aligned_features(small_map(num_points=20))
-        after = without_movers(map, 2, mask)
-        old, new = map.keyframe(2).features, after.keyframe(2).features
-        stays = (after.sightings.keyframe == 2) & (after.sightings.feature != NONE)
+        """A observation of the keyframe is of the feature that it was of, with its new number."""
+        slam_map = aligned_features(small_map(num_points=20))
+        after = without_dynamic(slam_map, 2, mask)
+        old, new = slam_map.keyframe(2).features, after.keyframe(2).features
+        stays = (after.observations.keyframe == 2) & (after.observations.feature != NONE)
         assert stays.any()
-        for point, feature in zip(after.sightings.point[stays], after.sightings.feature[stays], strict=True):
-            before = map.sightings.feature[(map.sightings.keyframe == 2) & (map.sightings.point == point)][0]
+        for point, feature in zip(after.observations.point[stays], after.observations.feature[stays], strict=True):
+            before = slam_map.observations.feature[
+                (slam_map.observations.keyframe == 2) & (slam_map.observations.point == point)
+            ][0]
             np.testing.assert_array_equal(new.descriptor[feature], old.descriptor[before])
         for number in (0, 1, 3):
-            assert after.keyframe(number) is map.keyframe(number)
+            assert after.keyframe(number) is slam_map.keyframe(number)
             np.testing.assert_array_equal(
-                after.sightings.feature[after.sightings.keyframe == number],
-                map.sightings.feature[(map.sightings.keyframe == number) & has(after.points.ids, map.sightings.point)],
+                after.observations.feature[after.observations.keyframe == number],
+                slam_map.observations.feature[
+                    (slam_map.observations.keyframe == number) & has(after.points.ids, slam_map.observations.point)
+                ],
             )
 
     def test_empty_and_full_masks(self, mask: np.ndarray) -> None:
-        map = aligned_features(small_map())
-        assert same(without_movers(map, 1, np.zeros_like(mask)), map)
-        after = without_movers(map, 1, np.ones_like(mask))
-        assert len(after.points.ids) == len(after.sightings.point) == len(after.keyframe(1).features.octave) == 0
+        slam_map = aligned_features(small_map())
+        assert same(without_dynamic(slam_map, 1, np.zeros_like(mask)), slam_map)
+        after = without_dynamic(slam_map, 1, np.ones_like(mask))
+        assert len(after.points.ids) == len(after.observations.point) == len(after.keyframe(1).features.octave) == 0
         assert problems(after) == []
 
     def test_unknown_keyframe(self, mask: np.ndarray) -> None:
         with pytest.raises(KeyError, match="not in the map"):
-            without_movers(small_map(), 9, mask)
+            without_dynamic(small_map(), 9, mask)
 
 
-def aligned_features(map: Map) -> Map:
-    """The map with every feature where the sighting of it is."""
+def aligned_features(slam_map: Map) -> Map:
+    """The map with every feature where the observation of it is."""
     keyframes = []
-    for keyframe in map.keyframes:
-        here = np.flatnonzero((map.sightings.keyframe == keyframe.id) & (map.sightings.feature != NONE))
-        uv = keyframe.features.seen_uv.copy()
-        uv[:, map.sightings.feature[here]] = map.sightings.seen_uv[:, here]
-        keyframes.append(keyframe._replace(features=keyframe.features._replace(seen_uv=uv)))
-    return map._replace(keyframes=tuple(keyframes))
+    for keyframe in slam_map.keyframes:
+        here = np.flatnonzero((slam_map.observations.keyframe == keyframe.id) & (slam_map.observations.feature != NONE))
+        uv = keyframe.features.uv_raw.copy()
+        uv[:, slam_map.observations.feature[here]] = slam_map.observations.uv_raw[:, here]
+        keyframes.append(keyframe._replace(features=keyframe.features._replace(uv_raw=uv)))
+    return slam_map._replace(keyframes=tuple(keyframes))
 
 
 class TestMapping:
@@ -547,27 +551,27 @@ class TestMapping:
         return mask
 
     @staticmethod
-    def movers(keyframe: int, mask: np.ndarray) -> Movers:
+    def movers(keyframe: int, mask: np.ndarray) -> DynamicObservations:
         tracks = new_keyframe(keyframe, keyframe * STEP, None).tracks
-        there = (tracks.weight > 0) & under(mask, tracks.seen_uv)
-        return Movers(keyframe, mask, tracks.id[there])
+        there = (tracks.weight > 0) & under(mask, tracks.uv_raw)
+        return DynamicObservations(keyframe, mask, tracks.id[there])
 
     def test_nothing_comes_back(self, mask: np.ndarray) -> None:
         """Neither under the numbers of the tracker nor by features; what the tracker had of it is told."""
         mapping, maps = mapped(3, noisy=False)
         movers = self.movers(2, mask)
-        hidden = maps[-1].sightings.keyframe == 2
-        hidden[hidden] = under(mask, maps[-1].sightings.seen_uv[:, hidden])
-        removed = np.unique(maps[-1].sightings.point[hidden])
+        hidden = maps[-1].observations.keyframe == 2
+        hidden[hidden] = under(mask, maps[-1].observations.uv_raw[:, hidden])
+        removed = np.unique(maps[-1].observations.point[hidden])
         after, gone = mapping.remove(movers)
         assert after is mapping.map
         assert len(removed) > 100
         assert not has(after.points.ids, removed).any()
         assert problems(after) == []
-        assert set(recalled_id(removed).tolist()) <= set(gone.tolist())
+        assert set(reloaded_id(removed).tolist()) <= set(gone.tolist())
         assert set(movers.tracks.tolist()) <= set(gone.tolist())
         again = mapping.add(new_keyframe(3, 2 * STEP, 2 * STEP))
-        by_flow = again.sightings.point[(again.sightings.keyframe == 3) & (again.sightings.feature == NONE)]
+        by_flow = again.observations.point[(again.observations.keyframe == 3) & (again.observations.feature == NONE)]
         tracks = new_keyframe(3, 2 * STEP, None).tracks
         assert len(by_flow) == (tracks.weight > 0).sum() - len(movers.tracks)
         assert problems(again) == []
@@ -577,9 +581,9 @@ class TestMapping:
         new = new_keyframe(1, STEP, 0)
         fresh = np.setdiff1d(new.tracks.id[new.tracks.weight > 0], list(mapping._point_of))
         assert len(fresh) > 5
-        mapping.remove(Movers(0, np.zeros_like(mask), fresh))
+        mapping.remove(DynamicObservations(0, np.zeros_like(mask), fresh))
         after = mapping.add(new)
-        seen = after.sightings.point[(after.sightings.keyframe == 1) & (after.sightings.feature == NONE)]
+        seen = after.observations.point[(after.observations.keyframe == 1) & (after.observations.feature == NONE)]
         assert 0 < len(seen) <= (new.tracks.weight > 0).sum() - len(fresh)
         assert not set(fresh.tolist()) & {t for t, p in mapping._point_of.items() if p in after.points.ids.tolist()}
 
@@ -594,11 +598,11 @@ class TestMapping:
         before = mapping.map
         after, gone = mapping.remove(movers)
         assert same(after, without_points(before, np.unique(known)))
-        assert set(recalled_id(known).tolist()) <= set(gone.tolist())
+        assert set(reloaded_id(known).tolist()) <= set(gone.tolist())
 
     def test_a_keyframe_that_was_never_there(self, mask: np.ndarray) -> None:
         mapping, maps = mapped(2, noisy=False)
-        after, gone = mapping.remove(Movers(17, mask, np.array([10**6])))
+        after, gone = mapping.remove(DynamicObservations(17, mask, np.array([10**6])))
         assert same(after, maps[-1])
         assert len(gone) == 0
 
@@ -606,23 +610,23 @@ class TestMapping:
         """The tracker names points of the map by their own number."""
         mapping, maps = mapped(2, noisy=False)
         some = maps[-1].points.ids[5:15]
-        after, gone = mapping.remove(Movers(1, np.zeros_like(mask), recalled_id(some)))
+        after, gone = mapping.remove(DynamicObservations(1, np.zeros_like(mask), reloaded_id(some)))
         assert same(after, without_points(maps[-1], some))
-        assert set(recalled_id(some).tolist()) <= set(gone.tolist())
+        assert set(reloaded_id(some).tolist()) <= set(gone.tolist())
 
 
 class TestRecall:
     def test_points_that_have_left_since(self) -> None:
         """A keyframe was prepared for the tracker from a map that had them: they do not count."""
-        map = small_map()
-        keyframe = recall(map, 1, 16)
+        slam_map = small_map()
+        keyframe = reload_keyframe(slam_map, 1, 16)
         gone = point_ids(keyframe.id)[keyframe.weight > 0][::2]
-        left = _without_removed(keyframe, without_points(map, gone))
+        left = _without_removed(keyframe, without_points(slam_map, gone))
         assert len(gone) > 2
         stays = ~np.isin(point_ids(keyframe.id), gone)
         np.testing.assert_array_equal(left.weight, np.where(stays, keyframe.weight, 0))
         assert left.weight.dtype == np.float32
-        np.testing.assert_array_equal(_without_removed(keyframe, map).weight, keyframe.weight)
+        np.testing.assert_array_equal(_without_removed(keyframe, slam_map).weight, keyframe.weight)
 
 
 class TestPlaces:
@@ -664,7 +668,7 @@ def first_of(found: Features, count: int) -> Features:
 class TestState:
     @pytest.fixture
     def state(self) -> Any:
-        plan = TrackPlan(num_points=6, num_levels=2, num_keyframes=2, num_recalled=1, num_sources=1)
+        plan = TrackPlan(num_points=6, num_levels=2, num_keyframes=2, num_reloaded=1, num_sources=1)
         blank = init_state(24, 32, plan)
         ids = np.arange(18, dtype=np.int32).reshape(3, 6) - 6
         kept = blank.keyframes._replace(id=ids, weight=np.ones((3, 6), np.float32))  # type: ignore[arg-type]
@@ -672,7 +676,7 @@ class TestState:
         return blank._replace(keyframes=kept, points=points)
 
     def test_by_number(self, state: Any) -> None:
-        after = forgotten(state, np.array([-6, 1, 1, 4, 5, 99], np.int32))  # type: ignore[arg-type]
+        after = drop_points(state, np.array([-6, 1, 1, 4, 5, 99], np.int32))  # type: ignore[arg-type]
         np.testing.assert_array_equal(after.points.valid, [True, False, True, True, False, False])
         expected = ~np.isin(state.keyframes.id, [-6, 1, 4, 5])
         np.testing.assert_array_equal(after.keyframes.weight, expected.astype(np.float32))
@@ -680,6 +684,6 @@ class TestState:
         assert jax.tree.all(jax.tree.map(lambda a, b: a is b, unchanged, state))
 
     def test_others_only(self, state: Any) -> None:
-        after = forgotten(state, np.array([50], np.int32))  # type: ignore[arg-type]
+        after = drop_points(state, np.array([50], np.int32))  # type: ignore[arg-type]
         np.testing.assert_array_equal(after.points.valid, state.points.valid)
         np.testing.assert_array_equal(after.keyframes.weight, state.keyframes.weight)

@@ -17,8 +17,8 @@ from jaxslam.errors import ModelError
 from jaxslam.geometry.se3 import angle, between
 from jaxslam.semantics import Detections, no_detections
 from jaxslam.semantics.from_config import detector_of
-from jaxslam.sensors.frame import to_grey
-from jaxslam.slam.mask_pipeline import DynamicMasks, FrameMask, MaskSource
+from jaxslam.sensors.frame import to_gray
+from jaxslam.slam.mask_pipeline import FrameMask, MaskPipeline, MaskSource
 from jaxslam.slam.slam import Slam
 from jaxslam.tracking.state import TrackStatus
 from jaxslam.trajectory.evaluation import evaluate
@@ -53,17 +53,17 @@ def masks_of(
     *,
     deterministic: bool = True,
     propagate: bool = True,
-    newcomers: bool = False,
+    new_surfaces: bool = False,
     num: int = 12,
 ) -> list[FrameMask]:
     """The masks of the first frames, of a camera whose poses are known."""
-    made = DynamicMasks(
+    made = MaskPipeline(
         source().camera,
         detector,
         deterministic=deterministic,
         latency_frames=latency_frames,
         propagate=propagate,
-        newcomers=newcomers,
+        new_surfaces=new_surfaces,
         dilate_px=0,
     )
     try:
@@ -72,14 +72,14 @@ def masks_of(
         made.close()
 
 
-def mask_of(made: DynamicMasks, index: int, moved_to: np.ndarray | None = None) -> FrameMask:
+def mask_of(made: MaskPipeline, index: int, moved_to: np.ndarray | None = None) -> FrameMask:
     frame, time_s = rendered()[0].frames[index], float(1e-9 * source().timestamps_ns[index])
     pose: np.ndarray = source().T_world_cam[index] if moved_to is None else moved_to
     turn = float(turns()[index])
     assert frame.depth_m is not None
-    mask = made.of_frame(index, frame.image, to_grey(frame.image), frame.depth_m)
-    made.tracked(index, time_s, pose, turn)
-    made.look(index, frame.image)
+    mask = made.mask_frame(index, frame.image, to_gray(frame.image), frame.depth_m)
+    made.frame_tracked(index, time_s, pose, turn)
+    made.submit_for_detection(index, frame.image)
     return mask
 
 
@@ -148,11 +148,11 @@ class TestBlindDetector:
     def test_for_a_second(self) -> None:
         """People are followed on for thirty frames, a little better with what depth sees come."""
         last = {}
-        for newcomers in (False, True):
-            masks = masks_of(sees(6), 0, newcomers=newcomers, num=36)
+        for new_surfaces in (False, True):
+            masks = masks_of(sees(6), 0, new_surfaces=new_surfaces, num=36)
             overlap = overlaps(masks)
-            blind, last[newcomers] = overlap[6:], overlap[-1]
-            print(f"newcomers {newcomers}: overlap with the truth {np.round(overlap[[5, 10, 15, 25, 35]], 2)}")
+            blind, last[new_surfaces] = overlap[6:], overlap[-1]
+            print(f"new_surfaces {new_surfaces}: overlap with the truth {np.round(overlap[[5, 10, 15, 25, 35]], 2)}")
             assert overlap[5] > 0.9
             assert blind[:5].min() > 0.8
             assert np.median(blind) > 0.5
@@ -163,7 +163,7 @@ class TestBlindDetector:
 
     def test_newcomers_are_added(self) -> None:
         """Whom depth sees come is in the mask, also if no detector has ever found anything."""
-        masks = masks_of(lambda _: no_detections(), 0, newcomers=True, num=FRAMES)
+        masks = masks_of(lambda _: no_detections(), 0, new_surfaces=True, num=FRAMES)
         assert {mask.source for mask in masks} == {MaskSource.NONE, MaskSource.DEPTH}
         assert {mask.age for mask in masks} == {-1}
         truth = rendered()[1]
@@ -171,7 +171,7 @@ class TestBlindDetector:
         assert wrong <= 0.01 * sum(mask.mask.sum() for mask in masks)
 
     def test_same_as_without_a_detector(self) -> None:
-        blind, none = (masks_of(detector, 0, newcomers=True) for detector in (lambda _: no_detections(), None))
+        blind, none = (masks_of(detector, 0, new_surfaces=True) for detector in (lambda _: no_detections(), None))
         assert any(mask.mask.any() for mask in none)
         for a, b in zip(blind, none, strict=True):
             np.testing.assert_array_equal(a.mask, b.mask)
@@ -182,18 +182,18 @@ class TestWorld:
     """What is told of the camera's place."""
 
     @staticmethod
-    def made() -> DynamicMasks:
-        return DynamicMasks(source().camera, None, deterministic=True, latency_frames=2, dilate_px=0)
+    def made() -> MaskPipeline:
+        return MaskPipeline(source().camera, None, deterministic=True, latency_frames=2, dilate_px=0)
 
     def test_corrected(self) -> None:
-        """The world is moved by a metre between two frames: it is as if nothing had happened."""
+        """The world is moved by a meter between two frames: it is as if nothing had happened."""
         plain, corrected = self.made(), self.made()
         shift = np.array([1.0, 0, 0, 0, 0.8, 0.0, -0.6])
         here = np.concatenate([source().T_world_cam[:, :4], source().T_world_cam[:, 4:] + shift[4:]], axis=1)
         any_masked = []
         for index in range(FRAMES):
             if index == 8:
-                corrected.corrected(shift)
+                corrected.apply_map_correction(shift)
             one, other = mask_of(plain, index), mask_of(corrected, index, here[index] if index >= 8 else None)
             assert (one.mask != other.mask).mean() < 1e-3  # where depth is just at the edge of a threshold
             assert one.mask.any() == other.mask.any()
@@ -205,7 +205,7 @@ class TestWorld:
         made = self.made()
         for index in range(4):
             mask_of(made, index)
-        made.lost(3)
+        made.frame_lost(3)
         masks = [mask_of(made, index) for index in range(4, 16)]
         assert not any(mask.mask.any() for mask in masks[:4])
         assert masks[-1].mask.any()
@@ -321,9 +321,9 @@ class TestFailure:
         assert masks_of(lambda _: found, num=2)[0].mask.any()
 
 
-def config(*, newcomers: bool = True, **semantics: Any) -> Config:
+def config(*, new_surfaces: bool = True, **semantics: Any) -> Config:
     """Masks of every frame, and no cues."""
-    dynamics = DynamicsConfig(newcomers=newcomers, cues=(), even_votes=False)
+    dynamics = DynamicsConfig(new_surfaces=new_surfaces, cues=(), balance_regions=False)
     every = SemanticsConfig(model=None, frames="every", **semantics)
     return Config(track=PLAN, semantics=every, dynamics=dynamics)
 
@@ -355,8 +355,8 @@ class TestSlam:
 
     def test_callers_mask_where_there_is_no_other(self) -> None:
         clip, masks = rendered()
-        for newcomers in (True, False):
-            with Slam(clip.camera, config(newcomers=newcomers)) as slam:
+        for new_surfaces in (True, False):
+            with Slam(clip.camera, config(new_surfaces=new_surfaces)) as slam:
                 results = [slam.track(replace(clip[index], dynamic_mask=masks[index])) for index in range(3)]
             assert [(result.mask_source, result.mask_age) for result in results] == [(MaskSource.CALLER, -1)] * 3
             np.testing.assert_array_equal(results[-1].dynamic_mask, masks[2])
@@ -365,13 +365,13 @@ class TestSlam:
         """Masks are made nevertheless, unless the settings have none."""
         clip, truth = rendered()
         sources = {}
-        for newcomers in (True, False):
-            with Slam(clip.camera, config(newcomers=newcomers, dilate_px=0)) as slam:
+        for new_surfaces in (True, False):
+            with Slam(clip.camera, config(new_surfaces=new_surfaces, dilate_px=0)) as slam:
                 results = [slam.track(frame) for frame in clip.frames]
-            sources[newcomers] = {result.mask_source for result in results}
+            sources[new_surfaces] = {result.mask_source for result in results}
             masked = sum(result.dynamic_mask.sum() for result in results)
             wrong = sum((r.dynamic_mask & ~people).sum() for r, people in zip(results, truth, strict=True))
-            assert masked > 0 or not newcomers
+            assert masked > 0 or not new_surfaces
             assert wrong <= 0.02 * masked
             assert {result.mask_age for result in results} == {-1}
         assert sources == {True: {MaskSource.NONE, MaskSource.DEPTH}, False: {MaskSource.NONE}}

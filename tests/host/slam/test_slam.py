@@ -18,7 +18,7 @@ from jaxslam.trajectory.trajectory import write_tum
 
 HELPERS = str(Path(__file__).resolve().parents[2] / "helpers")
 
-MOST_PROGRAMS = 30
+MAX_PROGRAMS = 30
 """Measured: 28. The tracker is one, the changes to its state three, the map's kernels six, masks four; the first state,
 and what makes numbers of the settings, are the others."""
 
@@ -97,7 +97,7 @@ class TestCompiling:
     def test_everything_before_the_first_frame(self, slam: Slam, compiled: list[str]) -> None:
         """Making and warming up compile a known number of programs, as in a new process; tracking then none.
 
-        Not for a frame without a mask or with one, in colour or grey, late in time, dark or without depth, nor in a
+        Not for a frame without a mask or with one, in color or gray, late in time, dark or without depth, nor in a
         tracker reset or made anew.
         """
         frames = clip(2).frames
@@ -106,14 +106,14 @@ class TestCompiling:
         fresh = Slam(clip().camera, CONFIG)
         fresh.warm_up()
         assert [sum(part in name for name in compiled) for part in ("follow_points", "track_followed")] == [1, 1]
-        assert len(compiled) <= MOST_PROGRAMS
+        assert len(compiled) <= MAX_PROGRAMS
 
         compiled.clear()
         shape = frames[0].image.shape[:2]
         masked = {"dynamic_mask": np.ones(shape, bool), "depth_timestamp_ns": frames[20].timestamp_ns + 5_000_000}
-        grey, black = frames[21].image[..., 1].copy(), np.zeros_like(frames[22].image)
+        gray, black = frames[21].image[..., 1].copy(), np.zeros_like(frames[22].image)
         frames[20] = dataclasses.replace(frames[20], **masked)
-        frames[21] = dataclasses.replace(frames[21], image=grey)
+        frames[21] = dataclasses.replace(frames[21], image=gray)
         frames[22] = dataclasses.replace(frames[22], image=black, depth_m=np.zeros(shape, np.float32))
         statuses = [fresh.track(frame).status for frame in [*frames[:30], *frames[40:]]]
         assert statuses[22] is TrackStatus.LOST

@@ -10,7 +10,7 @@ from jaxlie import SE3
 from jaxslam import load_config
 from jaxslam.sensors.camera import Camera
 from jaxslam.tracking.from_config import track_params, track_plan
-from jaxslam.tracking.keyframe_decision import Candidate, keyframe_reason
+from jaxslam.tracking.keyframe_decision import KeyframeCandidate, keyframe_reason
 from jaxslam.tracking.state import KeyframeReason
 from jaxslam.tracking.step import init_state
 
@@ -19,8 +19,8 @@ CAMERA = Camera("test", 64, 48, 50.0, 50.0, 31.5, 23.5, depth_scale_per_m=5000.0
 CONFIG = load_config(overrides=(f"track.num_points={N}", "track.num_levels=2", "track.keyframe_points_below=0.5"))
 PARAMS = track_params(CAMERA, CONFIG.track)
 AS_NEEDED = track_plan(CONFIG.track)
-SPARING = AS_NEEDED._replace(keyframe_choice="sparing")
-DUE_S = CONFIG.track.keyframe_least_s
+SPARING = AS_NEEDED._replace(keyframe_policy="sparing")
+DUE_S = CONFIG.track.keyframe_min_s
 PATIENCE_S = CONFIG.track.keyframe_patience_s
 
 
@@ -44,7 +44,7 @@ def _reason(
     pose = jnp.array([1, 0, 0, 0, moved_m, 0, 0], jnp.float32)
     number = lambda value: jnp.asarray(value, jnp.float32)
     points = state.points._replace(X_world=X_world, age=jnp.full(N, 5, jnp.int32))
-    candidate = Candidate(
+    candidate = KeyframeCandidate(
         T_world_cam=SE3(pose),
         points=points,
         tracked=jnp.arange(N) < tracked,

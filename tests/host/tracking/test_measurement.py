@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxlie import SE3
-from jaxslam_kernels.se3 import moved, to_camera
+from jaxslam_kernels.se3 import retract, to_camera
 
 from jaxslam import Camera, track_params
 from jaxslam.config.schema import TrackConfig
-from jaxslam.tracking.measurement import observe, predict_pixels
+from jaxslam.tracking.measurement import measure, predict_pixels
 
 TWIST = np.array([0.2, -0.1, 0.15, 0.3, -0.6, 0.4])
 
@@ -31,11 +31,11 @@ def points():
 def test_observing_undoes_predicting(params, points):
     twist = jnp.asarray(TWIST, jnp.float32)
     uv = predict_pixels(points, twist, 480, params)
-    seen = observe(uv, points[2], twist, jnp.ones((480, 640), jnp.float32), jnp.float32(0), params)
+    seen = measure(uv, points[2], twist, jnp.ones((480, 640), jnp.float32), jnp.float32(0), params)
     error = np.abs(np.asarray(seen.xy) - np.asarray(points[:2] / points[2:3])) * 517
     # Second order in the readout time: the prediction looks up the row before the motion, the observation after it.
     assert error.max() < 0.3
-    still = observe(
+    still = measure(
         predict_pixels(points, 0 * twist, 480, params),
         points[2],
         0 * twist,
@@ -53,7 +53,7 @@ def test_a_late_depth_image_is_read_where_the_point_is_then(params):
         readout_s=jnp.float32(0), intrinsics=params.intrinsics._replace(distortion=jnp.zeros(5, jnp.float32))
     )
     X = jnp.asarray([[-0.02], [0.0], [2.0]], jnp.float32)  # left of the step, by 5 pixels
-    later = moved(SE3.identity(), turn * 0.02)
+    later = retract(SE3.identity(), turn * 0.02)
     edge = float(
         predict_pixels(
             to_camera(later, jnp.asarray([[0.0], [0.0], [2.0]], jnp.float32)), 0 * turn, 480, global_shutter
@@ -63,7 +63,7 @@ def test_a_late_depth_image_is_read_where_the_point_is_then(params):
     depth[:, int(np.ceil(edge)) :] = 4.0
     uv = predict_pixels(X, 0 * turn, 480, global_shutter)
     read = lambda delay: float(
-        observe(uv, X[2], turn, jnp.asarray(depth), jnp.float32(delay), global_shutter, reach=0).depth[0]
+        measure(uv, X[2], turn, jnp.asarray(depth), jnp.float32(delay), global_shutter, reach=0).depth[0]
     )
     assert edge > float(uv[0, 0]) + 10  # the scene moves right while the camera turns left
     assert read(0.02) == 2.0

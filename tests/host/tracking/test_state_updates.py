@@ -11,10 +11,10 @@ from small_map import pose
 
 from jaxslam.geometry.se3 import IDENTITY, between, compose, to_local, transform
 from jaxslam.tracking.state import TrackPlan, TrackState
-from jaxslam.tracking.state_updates import carried, recalled, relocated
+from jaxslam.tracking.state_updates import apply_map_correction, load_keyframe, reset_at_pose
 from jaxslam.tracking.step import init_state
 
-PLAN = TrackPlan(num_points=6, num_levels=2, num_keyframes=2, num_recalled=2, num_sources=1, points_per_source=4)
+PLAN = TrackPlan(num_points=6, num_levels=2, num_keyframes=2, num_reloaded=2, num_sources=1, points_per_source=4)
 HEIGHT, WIDTH, SLOTS = 24, 32, 4
 
 
@@ -54,7 +54,7 @@ def float32(pose: np.ndarray) -> Any:
 class TestCarried:
     def test_identity(self, state: Any) -> None:
         identity = float32(IDENTITY)
-        after = parts(carried(state, identity, jnp.tile(identity, (SLOTS, 1))))
+        after = parts(apply_map_correction(state, identity, jnp.tile(identity, (SLOTS, 1))))
         for name, array in parts(state).items():
             np.testing.assert_allclose(after[name], array, atol=2e-7, err_msg=name)
 
@@ -62,7 +62,7 @@ class TestCarried:
         """Against float64 on the host: the camera and its points by one transform, each keyframe by its own."""
         rng = np.random.default_rng(4)
         now, each = pose(rng), np.stack([pose(rng) for _ in range(SLOTS)])
-        after: Any = jax.jit(carried)(state, float32(now), float32(each))
+        after: Any = jax.jit(apply_map_correction)(state, float32(now), float32(each))
         assert changed(state, after) == {
             ".T_world_cam",
             ".points.X_world",
@@ -86,7 +86,7 @@ class TestCarried:
     def test_points_stay_where_they_are_seen(self, state: Any) -> None:
         """The same correction everywhere changes nothing that the camera can see."""
         change = pose(np.random.default_rng(5))
-        after: Any = carried(state, float32(change), jnp.tile(float32(change), (SLOTS, 1)))
+        after: Any = apply_map_correction(state, float32(change), jnp.tile(float32(change), (SLOTS, 1)))
         seen = lambda s: to_local(np.asarray(s.T_world_cam.wxyz_xyz, np.float64), np.asarray(s.points.X_world))
         np.testing.assert_allclose(seen(after), seen(state), atol=3e-6)
 
@@ -99,7 +99,7 @@ class TestRecalled:
         image = rng.integers(0, 256, (HEIGHT, WIDTH), np.uint8)
         uv, X_world, weight = (float32(rng.normal(size=shape)) for shape in ((2, n), (3, n), n))
         new = (jnp.asarray(image), float32(pose(rng)), uv, X_world, weight, -1 - jnp.arange(n))
-        after: Any = recalled(state, jnp.int32(slot), *new)
+        after: Any = load_keyframe(state, jnp.int32(slot), *new)
         names = ("images", "T_world_cam", "uv", "X_world", "weight", "id")
         assert changed(state, after) == {f".keyframes.{name}" for name in names}
         for name, array in zip(names, new, strict=True):
@@ -112,7 +112,7 @@ class TestRelocated:
     def test_forgets_what_is_tied_to_the_old_place(self, state: Any) -> None:
         """Points, keyframes and velocity; the numbers of points and the places in the ring go on."""
         there = pose(np.random.default_rng(7))
-        after: Any = relocated(state, float32(there))
+        after: Any = reset_at_pose(state, float32(there))
         assert changed(state, after) == {".T_world_cam", ".twist", ".points.valid", ".keyframes.weight", ".lost_frames"}
         np.testing.assert_allclose(after.T_world_cam.wxyz_xyz, there, atol=1e-7)
         assert not np.asarray(after.points.valid).any()

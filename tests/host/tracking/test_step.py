@@ -17,7 +17,7 @@ import pytest
 from jax import lax
 from jaxslam_kernels.flow.disparity import row_disparities
 from jaxslam_kernels.pose.pose_refine import PoseStatus
-from jaxslam_kernels.se3 import moved
+from jaxslam_kernels.se3 import retract
 from quick_compile import quick_compile
 from small_scene import HEIGHT, PLAN, TRACK, WIDTH, at, clip, new_state, params, stacked
 
@@ -25,15 +25,15 @@ from jaxslam import FlowPlan
 from jaxslam.config.schema import Config, DynamicsConfig, SemanticsConfig, load_config
 from jaxslam.semantics import Detections, no_detections
 from jaxslam.sensors.frame_arrays import FrameArrays
-from jaxslam.slam.frame_result import Tracked
+from jaxslam.slam.frame_result import FrameResult
 from jaxslam.slam.slam import Slam
 from jaxslam.tracking import measurement as observe
 from jaxslam.tracking import pose_estimation as frame_pose
-from jaxslam.tracking.measurement import View
+from jaxslam.tracking.measurement import PreparedFrame
 from jaxslam.tracking.pose_estimation import refined_pose, worse_status
 from jaxslam.tracking.state import (
+    KeyframeMatches,
     KeyframeReason,
-    LookedUp,
     TrackOutput,
     TrackParams,
     TrackPlan,
@@ -44,8 +44,8 @@ from jaxslam.tracking.state import (
 from jaxslam.tracking.step import init_state, track_step
 
 COUNT = 12
-SAME = {"twist": 1e-4 * 30, "covariance": 1e-7, "looked_up.uv": 1e-2}
-"""What is the same number in metres a second and square metres, where poses are the same to 1e-4.
+SAME = {"twist": 1e-4 * 30, "covariance": 1e-7, "keyframe_matches.uv": 1e-2}
+"""What is the same number in meters a second and square meters, where poses are the same to 1e-4.
 
 Rounding decides whether the refinement takes its last step: compiled in another way, poses differ by 0 or by 5e-6 m.
 So it does for the search of a point that is looked up, whose last step is up to 0.05 px long.
@@ -131,7 +131,7 @@ class TestCompiled:
         compiled = counted.step(before, at(frames, step), params())
         directly = track_step(before, at(frames, step), params(), PLAN)
         assert int(compiled[1].status) == TrackStatus.OK
-        assert int(compiled[1].num_looked_up) > 0
+        assert int(compiled[1].num_keyframe_matches) > 0
         assert jax.tree.structure(directly) == jax.tree.structure(compiled)
         for (path, one), other in zip(
             jax.tree_util.tree_leaves_with_path(jax.device_get(directly)),
@@ -141,7 +141,7 @@ class TestCompiled:
             name = jax.tree_util.keystr(path)
             assert one.dtype == other.dtype, name
             if np.issubdtype(one.dtype, np.floating):
-                field = "looked_up.uv" if name.endswith("looked_up.uv") else name.split(".")[-1]
+                field = "keyframe_matches.uv" if name.endswith("keyframe_matches.uv") else name.split(".")[-1]
                 np.testing.assert_allclose(one, other, rtol=1e-5, atol=SAME.get(field, 1e-4), err_msg=name)
             else:
                 np.testing.assert_array_equal(one, other, err_msg=name)
@@ -215,7 +215,7 @@ class TestReason:
 
     @pytest.mark.parametrize("image", [lambda image: image // 255, lambda image: jnp.full_like(image, 90)])
     def test_no_corners(self, counted: Counted, frames: FrameArrays, image: Callable[[Any], Any]) -> None:
-        """As of grey values from 0 to 1 in compiled code, and of a wall in one colour."""
+        """As of gray values from 0 to 1 in compiled code, and of a wall in one color."""
         frame = at(frames, 0)
         reason = self.reason(counted, frame._replace(image=image(frame.image)))
         assert reason is TrackReason.NO_CORNERS
@@ -233,14 +233,16 @@ class TestPoseStatus:
         assert statuses == [PoseStatus.TOO_FEW_POINTS] + [PoseStatus.OK] * (COUNT - 1)
 
     def test_steps_of_the_plan_run_out(self, counted: Counted, frames: FrameArrays) -> None:
-        """The refinement alone, from a pose some centimetres away."""
+        """The refinement alone, from a pose some centimeters away."""
         state, _ = counted.step(new_state(), at(frames, 0), params())
 
         @quick_compile
         def status(state: TrackState, frame: FrameArrays, given: TrackParams) -> Any:
-            view = View(frame, state.pyramid, frame.depth, state.elapsed_s)
-            none = LookedUp(jnp.zeros((3, 0)), jnp.zeros((2, 0)), jnp.zeros(0), jnp.zeros(0, jnp.int32), jnp.zeros(()))
-            away, trust = moved(state.T_world_cam, jnp.full(6, 0.02)), state.points.valid.astype(jnp.float32)
+            view = PreparedFrame(frame, state.pyramid, frame.depth, state.elapsed_s)
+            none = KeyframeMatches(
+                jnp.zeros((3, 0)), jnp.zeros((2, 0)), jnp.zeros(0), jnp.zeros(0, jnp.int32), jnp.zeros(())
+            )
+            away, trust = retract(state.T_world_cam, jnp.full(6, 0.02)), state.points.valid.astype(jnp.float32)
             refine = partial(refined_pose, state, view, state.points.uv, trust, none, away, state.twist, given)
             return [refine(PLAN._replace(pose_steps=steps))[0].status for steps in (2, 25)]
 
@@ -332,7 +334,9 @@ class TestFollowingAlone:
     def test_nothing_is_looked_up(self, step: Step) -> None:
         outputs = self.outputs(step, keyframe_points_below=0.5, keyframe_weak_after_s=0.0)
         assert [int(output.status) for output in outputs] == [TrackStatus.STARTED] + [TrackStatus.OK] * (LONGER - 1)
-        assert all(int(output.num_looked_up) == 0 and output.looked_up.uv.shape == (2, 0) for output in outputs)
+        assert all(
+            int(output.num_keyframe_matches) == 0 and output.keyframe_matches.uv.shape == (2, 0) for output in outputs
+        )
         off = np.linalg.norm(poses(outputs)[:, 4:] - poses(self.outputs(step))[:, 4:], axis=1)
         assert off.max() < 0.05
 
@@ -377,7 +381,7 @@ class TestFollowingAlone:
         assert soon.any() == sooner
 
 
-def slam_results(config: Config, num: int = LONGER, detector: Callable | None = None) -> list[Tracked]:
+def slam_results(config: Config, num: int = LONGER, detector: Callable | None = None) -> list[FrameResult]:
     recording = clip(0)
     with Slam(recording.camera, config, detector=detector) as slam:
         results = [slam.track(frame) for frame in recording.frames[:num]]
@@ -389,8 +393,8 @@ class TestHeldToMap:
     @pytest.mark.parametrize("which", ["weak", "keyframes", "always"])
     def test_which_frames(self, which: str) -> None:
         """Matching begins as soon as the map has a keyframe."""
-        track = replace(TRACK, hold_to_map=which, keyframe_after_s=0.3)
-        alone = {"semantics": SemanticsConfig(model=None), "dynamics": DynamicsConfig(cues=(), even_votes=False)}
+        track = replace(TRACK, match_map=which, keyframe_after_s=0.3)
+        alone = {"semantics": SemanticsConfig(model=None), "dynamics": DynamicsConfig(cues=(), balance_regions=False)}
         results = slam_results(Config(track=track, **alone))
         assert {result.status for result in results[1:]} == {TrackStatus.OK}
         matched = np.array([result.num_matched > 0 for result in results])
@@ -410,7 +414,7 @@ class TestPresets:
     )
 
     @pytest.mark.parametrize(
-        ("name", "hold_to_map", "looks_every"),
+        ("name", "match_map", "looks_every"),
         [
             ("static", "always", None),
             ("ngd-detector", "always", 1),
@@ -418,10 +422,10 @@ class TestPresets:
             ("ngd", "keyframes", 2),
         ],
     )
-    def test_run(self, name: str, hold_to_map: str, looks_every: int | None) -> None:
+    def test_run(self, name: str, match_map: str, looks_every: int | None) -> None:
         config = load_config(name, overrides=self.SMALL)
-        assert (config.track.hold_to_map, config.track.num_sources) == (hold_to_map, 0)
-        assert not config.dynamics.newcomers
+        assert (config.track.match_map, config.track.num_sources) == (match_map, 0)
+        assert not config.dynamics.new_surfaces
         assert (config.semantics.model is None) == (looks_every is None)
         looks = itertools.count()
 
@@ -432,8 +436,8 @@ class TestPresets:
         results = slam_results(config, LONGER, None if looks_every is None else detector)
         assert results[0].status is TrackStatus.STARTED
         assert all(result.status is TrackStatus.OK for result in results[1:])
-        assert not any(result.num_looked_up for result in results)
+        assert not any(result.num_keyframe_matches for result in results)
         assert not any(result.dynamic_mask.any() for result in results)
         assert next(looks) == (0 if looks_every is None else 1 + math.ceil((LONGER - 1) / looks_every))
         matched = [result.num_matched > 0 for result in results[6:]]
-        assert all(matched) if hold_to_map == "always" else sum(matched) < len(matched)
+        assert all(matched) if match_map == "always" else sum(matched) < len(matched)

@@ -13,15 +13,15 @@ from jax import lax
 from jaxlie import SE3
 from small_scene import HEIGHT, PLAN, TRACK, WIDTH, clip, new_state, params, stacked
 
-from jaxslam import FlowPlan, LevelPlan, TrackParams, Verdict, follow_points, init_state, track_clips, track_followed
+from jaxslam import CueResult, FlowPlan, LevelPlan, TrackParams, follow_points, init_state, track_clips, track_followed
 from jaxslam.config.schema import load_config
 from jaxslam.dynamics.object_motion import MotionPlan
 from jaxslam.errors import ConfigError, FrameError
-from jaxslam.sensors.frame_arrays import FrameArrays, check_grey_range
+from jaxslam.sensors.frame_arrays import FrameArrays, check_gray_range
 from jaxslam.tracking.cue_registry import with_cue_params, with_cues
 from jaxslam.tracking.from_config import track_params
 from jaxslam.tracking.state import TrackPlan, TrackState
-from jaxslam.tracking.state_updates import carried, forgotten, recalled, relocated
+from jaxslam.tracking.state_updates import apply_map_correction, drop_points, load_keyframe, reset_at_pose
 from jaxslam.tracking.step import track_step
 from jaxslam.tracking.step_checks import check_verdict
 
@@ -56,10 +56,10 @@ class TestFrame:
         other: Any = frame._replace(**{field: jnp.zeros((2 * HEIGHT, 2 * WIDTH), dtype)})
         refused(ValueError, f"frame.{field}: expected (120, 160) as frame.image, got (240, 320)", other)
 
-    @pytest.mark.parametrize("shape", [(HEIGHT, WIDTH, 3), (12, HEIGHT, WIDTH)], ids=["colour", "clip"])
-    def test_image_that_is_not_one_grey_one(self, frame: FrameArrays, shape: tuple[int, ...]) -> None:
+    @pytest.mark.parametrize("shape", [(HEIGHT, WIDTH, 3), (12, HEIGHT, WIDTH)], ids=["color", "clip"])
+    def test_image_that_is_not_one_gray_one(self, frame: FrameArrays, shape: tuple[int, ...]) -> None:
         other = frame._replace(image=jnp.zeros(shape, jnp.uint8))
-        refused(ValueError, f"frame.image: expected one grey image (h, w), got {shape}", other)
+        refused(ValueError, f"frame.image: expected one gray image (h, w), got {shape}", other)
 
     @pytest.mark.parametrize(
         ("field", "value", "message"),
@@ -92,23 +92,23 @@ class TestFrame:
         refused(TypeError, "frame: expected FrameArrays, got Frame", other)
 
 
-class TestGreyValues:
+class TestGrayValues:
     def test_from_0_to_1(self, frame: FrameArrays) -> None:
         """A tracer has no values: the step then says `NO_CORNERS`."""
         dim = frame._replace(image=frame.image.astype(jnp.float32) / 255)
         most = float(dim.image.max())
-        message = f"frame.image: expected grey values from 0 to 255, got {float(dim.image.min()):.3g} to {most:.3g}"
+        message = f"frame.image: expected gray values from 0 to 255, got {float(dim.image.min()):.3g} to {most:.3g}"
         refused(ValueError, message, dim, state=new_state(image_dtype=np.float32))
 
     @pytest.mark.parametrize("image", [np.zeros(SIZE), np.full(SIZE, 1.5), np.full(SIZE, np.nan), np.ones(SIZE, int)])
     def test_that_may_be_right(self, image: np.ndarray) -> None:
         """Black, dim, damaged, or whole numbers."""
-        check_grey_range("image", image)
+        check_gray_range("image", image)
 
     def test_clips(self) -> None:
         dim = stacked(clip().frames[:2], image_dtype=np.float32)
         arrays: Any = jax.device_get(dim._replace(image=dim.image / 255))
-        with pytest.raises(FrameError, match="clips: image of clip 1: expected grey values from 0 to 255, got"):
+        with pytest.raises(FrameError, match="clips: image of clip 1: expected gray values from 0 to 255, got"):
             track_clips([arrays._replace(image=arrays.image * 255), arrays], params(), PLAN)
 
 
@@ -120,7 +120,7 @@ class TestState:
             ({"num_levels": 2}, "pyramid.levels[2]: expected float32 (62, 72) for the plan, got nothing"),
             ({"num_levels": 4}, "pyramid.levels[3]: expected nothing there for the plan, got an array"),
             ({"num_keyframes": 12}, "keyframes.images: expected (7, 120, 160) for the plan and frame.image, got (16,"),
-            ({"num_recalled": 0}, "keyframes.images: expected (7, 120, 160) for the plan and frame.image, got (3,"),
+            ({"num_reloaded": 0}, "keyframes.images: expected (7, 120, 160) for the plan and frame.image, got (3,"),
             ({"regions": with_cues(PLAN, load_config().dynamics).regions}, "regions.centers: expected (3, 0) for"),
             ({"motion": with_cues(PLAN, USD).motion}, "motion.stillness: expected (0,) for the plan and the frame"),
         ],
@@ -177,9 +177,9 @@ class TestParams:
         refused(ValueError, message, frame, state=init_state(HEIGHT, WIDTH, plan), plan=plan)
 
     def test_motion_without_parameters(self, frame: FrameArrays) -> None:
-        plan, labelled = with_cues(PLAN, USD), frame._replace(movable=jnp.zeros(SIZE, jnp.uint8))
+        plan, labeled = with_cues(PLAN, USD), frame._replace(movable=jnp.zeros(SIZE, jnp.uint8))
         state = init_state(HEIGHT, WIDTH, plan)
-        refused(TypeError, "params.motion: expected MotionParams, got NoneType", labelled, state=state, plan=plan)
+        refused(TypeError, "params.motion: expected MotionParams, got NoneType", labeled, state=state, plan=plan)
 
     def test_another_class(self, frame: FrameArrays) -> None:
         refused(TypeError, "params: expected TrackParams, got TrackConfig", frame, given=TRACK)
@@ -232,9 +232,9 @@ class TestPlan:
         [
             ({"cell_px": 11}, "cell_px: expected an even number, at least 2, got 11"),
             ({"num_levels": 1}, "num_levels: expected at least 2, got 1"),
-            ({"num_sources": 8}, "num_sources: expected at most num_keyframes + num_recalled, 7, got 8"),
+            ({"num_sources": 8}, "num_sources: expected at most num_keyframes + num_reloaded, 7, got 8"),
             ({"new_points": "sometimes"}, "new_points: expected one of ('always', 'keyframes'), got 'sometimes'"),
-            ({"even_votes": True}, "regions: expected a RegionPlan for even_votes, got None"),
+            ({"balance_regions": True}, "regions: expected a RegionPlan for balance_regions, got None"),
             ({"look_up": LevelPlan(14, 8, 0.05)}, "look_up.window: expected an odd number, got 14"),
             ({"flow": FlowPlan(middle=LevelPlan(10, 5, 0.2))}, "flow.middle.window: expected an odd number, got 10"),
             ({"motion": MotionPlan(dense_cell_px=13)}, "motion.dense_cell_px: expected an even number"),
@@ -291,7 +291,7 @@ def test_points_followed_by_another_plan(frame: FrameArrays) -> None:
 
 
 def test_verdict_that_is_not_of_every_point() -> None:
-    good = Verdict(jnp.ones(5), jnp.ones(5), jnp.ones(5, bool))
+    good = CueResult(jnp.ones(5), jnp.ones(5), jnp.ones(5, bool))
     dtype = jnp.dtype(jnp.float32)
     check_verdict("plan.cues[0]", good, 5, dtype)
     with pytest.raises(ValueError, match=re.escape("plan.cues[0].weight: expected (5,) for every point, got ()")):
@@ -308,25 +308,25 @@ class TestEdits:
         state, n = new_state(), PLAN.num_points
         rest = (jnp.zeros(7), jnp.zeros((2, n)), jnp.zeros((3, n)), jnp.zeros(n), jnp.zeros(n, jnp.int32))
         with pytest.raises(TypeError, match="image: expected uint8 as the keyframes of the state, got float32"):
-            recalled(state, jnp.int32(3), jnp.zeros(SIZE), *rest)
+            load_keyframe(state, jnp.int32(3), jnp.zeros(SIZE), *rest)
         with pytest.raises(
             ValueError, match=re.escape("image: expected (120, 160) as the keyframes of the state, got")
         ):
-            recalled(state, jnp.int32(3), jnp.zeros((60, 80), jnp.uint8), *rest)
+            load_keyframe(state, jnp.int32(3), jnp.zeros((60, 80), jnp.uint8), *rest)
         few = (*rest[:1], jnp.zeros((2, 5)), *rest[2:])
         with pytest.raises(
             ValueError, match=re.escape("uv: expected (2, 128) as the keyframes of the state, got (2, 5)")
         ):
-            recalled(state, jnp.int32(3), jnp.zeros(SIZE, jnp.uint8), *few)
+            load_keyframe(state, jnp.int32(3), jnp.zeros(SIZE, jnp.uint8), *few)
 
     def test_poses_and_numbers(self) -> None:
         state = new_state()
         with pytest.raises(ValueError, match=re.escape("T_new_old_keyframes: expected (7, 7) as the keyframes")):
-            carried(state, jnp.zeros(7), jnp.zeros((3, 7)))
+            apply_map_correction(state, jnp.zeros(7), jnp.zeros((3, 7)))
         with pytest.raises(ValueError, match=re.escape("T_world_cam: expected (7,) as the state, got (4, 4)")):
-            relocated(state, jnp.eye(4))
+            reset_at_pose(state, jnp.eye(4))
         with pytest.raises(TypeError, match="ids: expected int32, got float32"):
-            forgotten(state, jnp.zeros(3))
+            drop_points(state, jnp.zeros(3))
 
     def test_first_pose_that_is_no_pose(self) -> None:
         matrix: Any = jnp.eye(4)

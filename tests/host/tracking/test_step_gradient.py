@@ -77,7 +77,7 @@ def _problem(recording: Clip) -> Problem:
     state = new_state(np.float64, np.float64)
     for index in range(BEFORE):
         state, _ = step(state, at(frames, index), given, EXACT)
-    given = given._replace(refill_below=jnp.zeros(()), keyframe_below=jnp.zeros(()))
+    given = given._replace(detect_below=jnp.zeros(()), keyframe_below=jnp.zeros(()))
     window = jax.tree.map(lambda array: array[BEFORE:], frames)
     change = jnp.asarray(np.random.default_rng(0).normal(size=window.image.shape))
     truth = jnp.asarray(truth_from_start(recording.source.ground_truth)[BEFORE : BEFORE + STEPS, :3, 3])

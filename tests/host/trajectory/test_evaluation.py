@@ -41,7 +41,7 @@ def on_a_line(n=50, noise=0.0):
 
 
 def straight_road(n):
-    """A metre a frame."""
+    """A meter a frame."""
     poses = np.zeros((n, 7))
     poses[:, 0], poses[:, 6] = 1, np.arange(n)
     return Trajectory(STEP_NS * np.arange(n), poses)

@@ -93,12 +93,12 @@ def one_second_apart(stamps_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.
 def figures_of_evo(estimate: Trajectory, reference: Trajectory, align: AlignmentKind) -> dict[str, float]:
     """Figures of matched poses under the names they have in an `Evaluation`."""
     evo = Evo(estimate, reference, align)
-    metres_per_s, degrees_per_s = evo.rpe_of(*one_second_apart(estimate.timestamps_ns))
+    meters_per_s, degrees_per_s = evo.rpe_of(*one_second_apart(estimate.timestamps_ns))
     ate = evo.ate()
     return {
         **{f"ate_{name}_m": ate[name] for name in ("rmse", "mean", "median", "max", "std")},
         "scale": evo.scale,
-        "rpe_trans_m_per_s": metres_per_s,
+        "rpe_trans_m_per_s": meters_per_s,
         "rpe_rot_deg_per_s": degrees_per_s,
         "rpe_trans_m_per_frame": evo.rpe("translation_part"),
         "rpe_rot_deg_per_frame": evo.rpe("rotation_angle_deg"),

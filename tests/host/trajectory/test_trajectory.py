@@ -41,7 +41,7 @@ def assert_same_poses(actual, expected, atol=1e-9):
 
 
 class TestTrajectory:
-    def test_normalises_copies_and_protects(self):
+    def test_normalizes_copies_and_protects(self):
         stamps, poses = np.array([0, 1]), np.array([IDENTITY, (0.99, 0, 0, 0.01, 1, 2, 3)])
         trajectory = Trajectory(stamps, poses)
         poses[:] = 7

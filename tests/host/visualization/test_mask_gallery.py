@@ -8,7 +8,7 @@ from PIL import Image
 
 from jaxslam.errors import JaxSlamError
 from jaxslam.sensors.frame import Frame
-from jaxslam.slam.frame_result import Rejected, Tracked
+from jaxslam.slam.frame_result import FrameResult, Rejected
 from jaxslam.slam.mask_pipeline import MaskSource
 from jaxslam.tracking.state import KeyframeReason, TrackStatus
 from jaxslam.visualization.mask_gallery import MASK_RGB, MaskPictures, draw_mask, write_mask_pictures
@@ -18,16 +18,16 @@ BAR = 20
 """Height of the line of words, pixels."""
 
 
-def frame_of(level: int, *, grey: bool = False) -> Frame:
-    shape = (HEIGHT, WIDTH) if grey else (HEIGHT, WIDTH, 3)
+def frame_of(level: int, *, gray: bool = False) -> Frame:
+    shape = (HEIGHT, WIDTH) if gray else (HEIGHT, WIDTH, 3)
     return Frame(0, np.full(shape, level, np.uint8), np.ones((HEIGHT, WIDTH), np.float32))
 
 
-def tracked(mask: np.ndarray, source: MaskSource = MaskSource.DETECTOR, age: int = 2) -> Tracked:
+def tracked(mask: np.ndarray, source: MaskSource = MaskSource.DETECTOR, age: int = 2) -> FrameResult:
     """A result of which only the mask matters."""
     nothing, pose = np.zeros(0, np.float32), np.array([1.0, 0, 0, 0, 0, 0, 0])
-    return Tracked(
-        **dict.fromkeys(("timestamp_ns", "num_inliers", "inlier_ratio", "num_looked_up", "num_matched"), 0),
+    return FrameResult(
+        **dict.fromkeys(("timestamp_ns", "num_inliers", "inlier_ratio", "num_keyframe_matches", "num_matched"), 0),
         **{"T_world_cam": pose, "correction": pose, "covariance": np.eye(6), "twist": np.zeros(6)},
         **{"uv": np.zeros((2, 0), np.float32), "weights": nothing, "followed": nothing.astype(bool)},
         **{"status": TrackStatus.OK, "reason": "", "keyframe": KeyframeReason.NONE, "residual_px": 0.0},
@@ -45,7 +45,7 @@ def left_half() -> np.ndarray:
 
 
 def levels(pictures: list[np.ndarray]) -> list[int]:
-    """The grey level outside the mask, by which a test knows a frame again."""
+    """The gray level outside the mask, by which a test knows a frame again."""
     return [int(picture[-1, -1, 0]) for picture in pictures]
 
 
@@ -85,7 +85,7 @@ class TestWhichAreKept:
 
 class TestPicture:
     @pytest.mark.parametrize("source", list(MaskSource))
-    def test_mask_has_the_colour_of_its_source(self, source: MaskSource) -> None:
+    def test_mask_has_the_color_of_its_source(self, source: MaskSource) -> None:
         picture = draw_mask(frame_of(100).image, tracked(left_half(), source), "frame 3")
         assert (picture.shape, picture.dtype) == ((240 + BAR, 320, 3), np.uint8)
         color = np.array(MASK_RGB[source])
@@ -94,7 +94,7 @@ class TestPicture:
         np.testing.assert_array_equal(picture[1, 318], color)
         assert (picture[:BAR] == 0).all(axis=2).sum() > 50  # words
 
-    def test_colours_are_told_apart(self) -> None:
+    def test_colors_are_told_apart(self) -> None:
         colors = np.array(list(MASK_RGB.values()), float)
         apart = np.linalg.norm(colors[:, None] - colors[None], axis=2)
         assert apart[~np.eye(len(colors), dtype=bool)].min() > 60
@@ -105,8 +105,8 @@ class TestPicture:
         assert (draw(2, "frame 3") != draw(2, "frame 4")).any()
         assert (draw(-1, "frame 3") != draw(1, "frame 3")).any()
 
-    def test_grey_and_source_untouched(self) -> None:
-        frame = frame_of(100, grey=True)
+    def test_gray_and_source_untouched(self) -> None:
+        frame = frame_of(100, gray=True)
         picture = draw_mask(frame.image, tracked(left_half()), "frame 0")
         np.testing.assert_array_equal(picture, draw_mask(frame_of(100).image, tracked(left_half()), "frame 0"))
         assert (frame.image == 100).all()

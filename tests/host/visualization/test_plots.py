@@ -48,8 +48,8 @@ def test_draws_the_evaluated_path_and_its_errors(tmp_path, figures):
     assert (path.get_xlabel(), path.get_ylabel(), path.get_aspect()) == ("x [m]", "z [m]", 1.0)
     (segments,) = [c for c in path.collections if isinstance(c, LineCollection)]
     assert len(segments.get_segments()) == len(estimate) - 2  # one step bridges the loss
-    coloured = np.asarray(segments.get_array())
-    np.testing.assert_allclose(coloured[:19], (evaluation.errors_m[:19] + evaluation.errors_m[1:20]) / 2)
+    colored = np.asarray(segments.get_array())
+    np.testing.assert_allclose(colored[:19], (evaluation.errors_m[:19] + evaluation.errors_m[1:20]) / 2)
     assert path.get_legend().get_texts()[0].get_text() == "ground truth"
     assert len(errors.patches) == len(evaluation.lost_spans_ns) == 1
     assert errors.patches[0].get_x() == pytest.approx(1.9)
@@ -103,16 +103,18 @@ HALF = 0.5**0.5
 )
 def test_map_stands_upright(tmp_path, figures, wxyz, views):
     """Up is where the first keyframe has it, and what is ahead of it is at the top of a picture from above."""
-    map = small_map()
-    map = map._replace(T_world_cam=np.concatenate([np.tile(wxyz, (len(map.ids), 1)), map.T_world_cam[:, 4:]], axis=1))
-    plot_map(map, Trajectory(STEP_NS * np.arange(len(map.ids)), map.T_world_cam), tmp_path / "map.svg")
+    slam_map = small_map()
+    slam_map = slam_map._replace(
+        T_world_cam=np.concatenate([np.tile(wxyz, (len(slam_map.ids), 1)), slam_map.T_world_cam[:, 4:]], axis=1)
+    )
+    plot_map(slam_map, Trajectory(STEP_NS * np.arange(len(slam_map.ids)), slam_map.T_world_cam), tmp_path / "map.svg")
     assert (tmp_path / "map.svg").read_bytes().startswith(b"<?xml")
     drawn = [
         (axes.get_title(), axes.get_xlabel()[0], axes.get_ylabel()[0], axes.xaxis_inverted(), axes.yaxis_inverted())
         for axes in figures[0].axes[:2]
     ]
     assert drawn == views
-    seen = np.concatenate([map.points.X_world.T, map.T_world_cam[:, 4:]])
+    seen = np.concatenate([slam_map.points.X_world.T, slam_map.T_world_cam[:, 4:]])
     for axes in figures[0].axes[:2]:
         low, high = sorted(axes.get_ylim())
         values = seen[:, "xyz".index(axes.get_ylabel()[0])]

@@ -18,7 +18,7 @@ import jaxslam.visualization.rerun_viewer
 from jaxslam.errors import JaxSlamError
 from jaxslam.map.types import Map
 from jaxslam.sensors.frame import Frame
-from jaxslam.slam.frame_result import Rejected, Tracked
+from jaxslam.slam.frame_result import FrameResult, Rejected
 from jaxslam.slam.mask_pipeline import MaskSource
 from jaxslam.slam.slam import Slam
 from jaxslam.trajectory.trajectory import Trajectory
@@ -38,7 +38,7 @@ LOGGED_EVERY_FRAME = [
 
 class Run(NamedTuple):
     frames: list[Frame]
-    results: list[Tracked | Rejected]
+    results: list[FrameResult | Rejected]
     map: Map
     trajectory: Trajectory
     rows: dict[str, list[dict[str, Any]]]
@@ -48,9 +48,9 @@ class Run(NamedTuple):
         (row,) = [row for row in self.rows[entity] if row.get("frame") == frame]
         return row
 
-    def tracked(self, frame: int) -> Tracked:
+    def tracked(self, frame: int) -> FrameResult:
         result = self.results[frame]
-        assert isinstance(result, Tracked)
+        assert isinstance(result, FrameResult)
         return result
 
 
@@ -75,7 +75,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
         frames[index] = Frame(frames[index].timestamp_ns, frames[index].image, frames[index].depth_m, mask)
     small = np.zeros((HEIGHT // 2, WIDTH // 2), np.float32)
     frames[REJECTED] = Frame(frames[REJECTED].timestamp_ns, small.astype(np.uint8), small)
-    results: list[Tracked | Rejected] = []
+    results: list[FrameResult | Rejected] = []
     with Slam(recording.camera, CONFIG) as slam, Viewer(slam, recording.ground_truth, path=path) as viewer:
         slam.run(recording, lambda frame, result: (viewer(frame, result), results.append(result))[0])
     return Run(frames, results, slam.map, slam.trajectory, *read(path))

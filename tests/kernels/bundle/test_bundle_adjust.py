@@ -23,7 +23,7 @@ from jaxslam.benchmark.kernels.scenes.single_view import pose_error, to_wxyz_xyz
 
 K, N = 4, 25
 SPARE = 5  # slots without an observation
-FOCAL, CENTRE = 500.0, np.array([[320.0], [240.0]])
+FOCAL, CENTER = 500.0, np.array([[320.0], [240.0]])
 SIGMA_PX, SIGMA_DEPTH = 1.3, 0.03
 
 
@@ -65,7 +65,7 @@ def make_window(seed: int, *, noise: float = 1.0, outliers: float = 0.1, baselin
     positions = [np.array([baseline * i, 0, 0]) + 0.2 * baseline * rng.normal(size=3) for i in range(K)]
     camera, point = np.nonzero((np.arange(K)[:, None] + np.arange(N)) % K != rng.integers(0, K, N))
     X_cam = np.stack([_into(rotations[i], positions[i], X_world[:, j]) for i, j in zip(camera, point, strict=True)], 1)
-    uv = FOCAL * X_cam[:2] / X_cam[2] + CENTRE + noise * SIGMA_PX * rng.normal(size=(2, camera.size))
+    uv = FOCAL * X_cam[:2] / X_cam[2] + CENTER + noise * SIGMA_PX * rng.normal(size=(2, camera.size))
     uv[:, rng.random(camera.size) < outliers] += 30.0
     depth = X_cam[2] + noise * SIGMA_DEPTH * rng.normal(size=camera.size)
     depth[::7] = 0.0
@@ -102,7 +102,7 @@ def _observations(inputs: Inputs, links: Links) -> Observations:
         links.camera,
         links.point,
         inputs.uv,
-        make_intrinsics(FOCAL, FOCAL, *CENTRE[:, 0], dtype=inputs.uv.dtype),
+        make_intrinsics(FOCAL, FOCAL, *CENTER[:, 0], dtype=inputs.uv.dtype),
         depth=inputs.depth,
         sigma_px=SIGMA_PX,
         sigma_depth=SIGMA_DEPTH,
@@ -198,7 +198,7 @@ def _scipy_optimum(window: Window, loss: Loss) -> tuple[np.ndarray, np.ndarray, 
     def residuals(x):
         rotations, positions, X_world = unpack(x)
         X, Y, Z = rotations[camera].inv().apply(X_world[:, point].T - positions[camera]).T
-        pixel = (FOCAL * np.stack([X / Z, Y / Z]) + CENTRE - uv) / SIGMA_PX
+        pixel = (FOCAL * np.stack([X / Z, Y / Z]) + CENTER - uv) / SIGMA_PX
         r = np.stack([*pixel, np.where(depth > 0, (Z - depth) / SIGMA_DEPTH, 0.0)])
         s = (r**2).sum(0)
         return (r * np.sqrt(weights * rho(s) / s)).ravel()
@@ -211,7 +211,7 @@ def _scipy_optimum(window: Window, loss: Loss) -> tuple[np.ndarray, np.ndarray, 
 
 
 def _pose_errors(poses, others) -> float:
-    """The largest difference in metres or radians."""
+    """The largest difference in meters or radians."""
     return max(max(pose_error(a, b)) for a, b in zip(poses, others, strict=True))
 
 

@@ -35,14 +35,14 @@ def _clusters(points, radius, min_points, mask=None) -> Clusters:
 def _blobs(seed=0, n=N, d=2, dtype: Any = np.float64):
     """Three blobs of unit deviation, noise between them, in random order."""
     rng = np.random.default_rng(seed)
-    centres = rng.uniform(-8, 8, (d, 3))
-    points = centres[:, rng.integers(0, 3, n)] + rng.normal(size=(d, n))
+    centers = rng.uniform(-8, 8, (d, 3))
+    points = centers[:, rng.integers(0, 3, n)] + rng.normal(size=(d, n))
     noise = rng.uniform(size=n) < 0.25
     return np.where(noise, rng.uniform(-10, 10, (d, n)), points).astype(dtype)
 
 
 def _rings(seed=0, n=100):
-    """Three around one centre, 4 apart; 1.5 from point to point of one, in random order."""
+    """Three around one center, 4 apart; 1.5 from point to point of one, in random order."""
     rng = np.random.default_rng(seed)
     place = rng.permutation(n) * 6 / n
     ring = np.searchsorted([1, 3], place, side="right") + 1

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from jaxlie import SE3
 from jaxslam_kernels.camera import MIN_DEPTH, Intrinsics, make_intrinsics
 from jaxslam_kernels.depth.depth_change import DepthChange, depth_change
-from jaxslam_kernels.se3 import between, composed, moved
+from jaxslam_kernels.se3 import between, compose, retract
 from scipy.spatial.transform import Rotation
 
 H, W, F = 24, 32, 40.0
@@ -36,7 +36,7 @@ def _camera(dtype: Any = np.float32, fx=F, fy=F, cx=CX, cy=CY, distortion=()) ->
 
 
 def _pose(rotation=(0, 0, 0), translation=(0, 0, 0), dtype: Any = np.float32) -> SE3:
-    """A rotation vector in radians, and metres."""
+    """A rotation vector in radians, and meters."""
     quaternion = Rotation.from_rotvec(rotation).as_quat(scalar_first=True)
     return SE3(jnp.asarray(np.concatenate([quaternion, translation]), dtype))
 
@@ -200,7 +200,7 @@ class TestScenes:
 
     @pytest.mark.parametrize("box", [False, True])
     def test_along_the_wall(self, box):
-        """By half a metre to the right, 5 pixels of the wall and 10 of the box."""
+        """By half a meter to the right, 5 pixels of the wall and 10 of the box."""
         change = _compare(_scene((0.5, 0, 0), box=box), _scene(box=box), _pose(translation=(0.5, 0, 0)))
         columns = np.broadcast_to(np.arange(W), (H, W))
         moved_box = np.roll(_box_pixels(), -10, axis=1) & box
@@ -218,7 +218,7 @@ class TestScenes:
         np.testing.assert_array_equal(change.same, ~moved_box & (np.mgrid[:H, :W][0] < H - 3))
 
     def test_towards_the_wall(self):
-        """A metre nearer than before, and every depth a metre less."""
+        """A meter nearer than before, and every depth a meter less."""
         change = _compare(_scene((0, 0, 1), box=False), _scene(box=False), _pose(translation=(0, 0, 1)))
         assert change.same.all()
         assert change.then.min() == (H // 2 - 9) * W + W // 2 - 12  # three quarters of the 11.5 rows and 15.5 columns
@@ -284,7 +284,7 @@ class TestScenes:
 
 
 @pytest.mark.parametrize(
-    ("limits", "metres", "alike", "beyond"),
+    ("limits", "meters", "alike", "beyond"),
     [
         ({}, 2, 0.08, 0.25),
         ({}, 6, 0.20, 0.45),
@@ -292,10 +292,10 @@ class TestScenes:
         ({"same_m": 0.1, "new_m": 0.3}, 4, 0.22, 0.5),
     ],
 )
-def test_limits(limits, metres, alike, beyond):
-    """They grow with the distance from the earlier camera, from where the wall is a metre nearer or farther."""
+def test_limits(limits, meters, alike, beyond):
+    """They grow with the distance from the earlier camera, from where the wall is a meter nearer or farther."""
     for ahead in (-1, 0, 1):
-        depth, T = np.full((H, W), metres - ahead, np.float32), _pose(translation=(0, 0, ahead))
+        depth, T = np.full((H, W), meters - ahead, np.float32), _pose(translation=(0, 0, ahead))
         for difference, same, new in (
             (alike - 0.001, True, False),
             (0.001 - alike, True, False),
@@ -305,9 +305,9 @@ def test_limits(limits, metres, alike, beyond):
             (beyond + 0.001, False, True),
             (-beyond - 0.001, False, False),
         ):
-            change = _compare(depth, np.full((H, W), metres + difference, np.float32), T, **limits)
-            centre = H // 2, W // 2
-            assert (change.same[centre], change.new[centre]) == (same, new), (ahead, difference)
+            change = _compare(depth, np.full((H, W), meters + difference, np.float32), T, **limits)
+            center = H // 2, W // 2
+            assert (change.same[center], change.new[center]) == (same, new), (ahead, difference)
 
 
 def _sum_of(images, change: DepthChange):
@@ -322,7 +322,7 @@ def _sum_of(images, change: DepthChange):
 
 def _loss(images, T_then_now, tangent, camera, limits):
     depth, depth_then = images
-    return _sum_of(images, depth_change(depth, depth_then, moved(T_then_now, tangent), camera, **limits))
+    return _sum_of(images, depth_change(depth, depth_then, retract(T_then_now, tangent), camera, **limits))
 
 
 _gradient_at_change = jax.jit(jax.grad(_sum_of))
@@ -417,7 +417,7 @@ DEGENERATE: dict[str, dict[str, Any]] = {  # changes of a wall in front of a cam
     "focal length 0": {"camera": _camera(fx=0.0, fy=0.0)},
     "focal length NaN": {"camera": _camera(fx=np.nan)},
     "focal length infinite": {"camera": _camera(fy=np.inf)},
-    "centre infinite": {"camera": _camera(cx=np.inf)},
+    "center infinite": {"camera": _camera(cx=np.inf)},
     "limits 0": {"limits": dict.fromkeys(LIMITS, 0.0)},
     "limits NaN": {"limits": dict.fromkeys(LIMITS, np.nan)},
     "limits negative": {"then": 1.9, "limits": {"same_share": -1.0, "same_m": -1.0}},
@@ -470,14 +470,14 @@ def _wild(seed, holes=0.2):
     return np.where(rng.uniform(size=images.shape) < holes, filling, images).astype(np.float32)
 
 
-_SHARES, _METRES = st.floats(0, 0.5, width=32), st.floats(0, 1, width=32)
+_SHARES, _METERS = st.floats(0, 0.5, width=32), st.floats(0, 1, width=32)
 
 
 @settings(max_examples=30, deadline=None, derandomize=True)
-@given(seed=SEEDS, angle=st.floats(0, 4), shares=st.tuples(_SHARES, _SHARES), metres=st.tuples(_METRES, _METRES))
-def test_nothing_is_both_same_and_new(seed, angle, shares, metres):
+@given(seed=SEEDS, angle=st.floats(0, 4), shares=st.tuples(_SHARES, _SHARES), meters=st.tuples(_METERS, _METERS))
+def test_nothing_is_both_same_and_new(seed, angle, shares, meters):
     """Whatever the depths, the pose, and limits of which those of what is new are the greater ones."""
-    (same_share, new_share), (same_m, new_m) = sorted(shares), sorted(metres)
+    (same_share, new_share), (same_m, new_m) = sorted(shares), sorted(meters)
     now, then = _wild(seed)
     T = _random_pose(seed, np.float32, rotation=angle, translation=3)
     limits = {"same_share": same_share, "same_m": same_m, "new_share": new_share, "new_m": new_m}
@@ -495,10 +495,10 @@ def test_rigid_motion_of_the_world_does_not_matter(seed, angle, offset):
     """Nor does the sign of the quaternion."""
     with jax.enable_x64(True):
         images, T_world_then, T_then_now = _images(seed), _random_pose(seed + 1), _random_pose(seed)
-        T_world_now = composed(T_world_then, T_then_now)
+        T_world_now = compose(T_world_then, T_then_now)
         change = _compare(*images, between(T_world_then, T_world_now))
         W_new_old = _pose(angle * np.array([0.6, 0, 0.8]), (offset, 2 * offset, -offset), np.float64)
-        again = between(composed(W_new_old, T_world_then), composed(W_new_old, T_world_now))
+        again = between(compose(W_new_old, T_world_then), compose(W_new_old, T_world_now))
         sign = jnp.where(jnp.arange(7) < 4, -1.0, 1.0)
         clear = ~_by_loop(*images, T_then_now, _camera(np.float64), 1e-9).tie
         assert clear.mean() > 0.99
@@ -509,7 +509,7 @@ def test_rigid_motion_of_the_world_does_not_matter(seed, angle, offset):
 @settings(max_examples=20, deadline=None, derandomize=True)
 @given(seed=SEEDS, power=st.integers(-3, 5))
 def test_scale_does_not_matter(seed, power):
-    """Of all lengths together, the limits in metres included; by powers of two, so that nothing is rounded anew."""
+    """Of all lengths together, the limits in meters included; by powers of two, so that nothing is rounded anew."""
     scale = np.float32(2.0**power)
     now, then = _images(seed, np.float32)
     T = _random_pose(seed, np.float32)

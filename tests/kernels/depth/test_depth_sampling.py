@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.test_util import check_grads
-from jaxslam_kernels.depth.sampling import believable, sample_depth
+from jaxslam_kernels.depth.sampling import sample_depth, valid_depth
 
 H, W, N = 12, 16, 60
 
@@ -17,8 +17,8 @@ _sample = {reach: jax.jit(lambda d, uv, r=reach: sample_depth(d, uv, reach=r, ma
 
 @jax.jit
 def _pipeline(depth, uv):
-    """Samples of what is believable, and the derivative of their sum."""
-    samples = lambda depth, uv: sample_depth(believable(depth, 0.3, 8.0), uv)
+    """Samples of what is valid_depth, and the derivative of their sum."""
+    samples = lambda depth, uv: sample_depth(valid_depth(depth, 0.3, 8.0), uv)
     return samples(depth, uv), jax.grad(lambda *a: jnp.sum(samples(*a)), argnums=(0, 1))(depth, uv)
 
 
@@ -148,11 +148,11 @@ class TestBelievable:
     def test_matches_reference(self):
         depth = np.array([[0.2, 0.3, 0.31, 7.9, 8.0, 9.0], [0.0, -1.0, np.nan, np.inf, -np.inf, 5.0]], np.float32)
         expected = np.array([[0, 0, 0.31, 7.9, 0, 0], [0, 0, 0, 0, 0, 5.0]], np.float32)
-        result = believable(jnp.asarray(depth), jnp.float32(0.3), 8.0)
+        result = valid_depth(jnp.asarray(depth), jnp.float32(0.3), 8.0)
         assert result.dtype == np.float32
         np.testing.assert_array_equal(result, expected)
 
     def test_gradient(self):
         depth = jnp.array([[1.0, jnp.nan, jnp.inf, 0.1]])
-        gradient = jax.grad(lambda depth: jnp.sum(jnp.square(believable(depth, 0.3, 8.0))))(depth)
+        gradient = jax.grad(lambda depth: jnp.sum(jnp.square(valid_depth(depth, 0.3, 8.0))))(depth)
         np.testing.assert_array_equal(gradient, [[2, 0, 0, 0]])

@@ -8,7 +8,7 @@ from equinox.debug import assert_max_traces
 from flow_cases import all_finite
 from jaxlie import SE3
 from jaxslam_kernels.camera import make_intrinsics
-from jaxslam_kernels.depth.free_space import seen_from
+from jaxslam_kernels.depth.free_space import classify_visibility
 
 HEIGHT, WIDTH, N = 40, 60, 900
 INTRINSICS = make_intrinsics(50.0, 50.0, 30.0, 20.0)
@@ -17,7 +17,9 @@ POSE[:4] /= np.linalg.norm(POSE[:4])
 
 
 def _run(X, pose, depth, least):
-    return seen_from(X, SE3(pose), depth, least, INTRINSICS, same_share=jnp.float32(0.03), same_m=jnp.float32(0.03))
+    return classify_visibility(
+        X, SE3(pose), depth, least, INTRINSICS, same_share=jnp.float32(0.03), same_m=jnp.float32(0.03)
+    )
 
 
 _see = jax.jit(assert_max_traces(_run, max_traces=1))

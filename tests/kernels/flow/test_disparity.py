@@ -46,10 +46,10 @@ _gradient = quick_compile(lambda weights, *inputs: jax.grad(_loss, (2, 3, 4), ha
 
 @functools.cache
 def _motorcycle():
-    """Grey left and right image (Middlebury 2014), and the disparity of each pixel of the left one, 0 where unknown."""
+    """Gray left and right image (Middlebury 2014), and the disparity of each pixel of the left one, 0 where unknown."""
     left, right, disparity = stereo_motorcycle()
-    grey = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (left, right))
-    return *grey, np.where(np.isfinite(disparity), disparity, 0)
+    gray = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (left, right))
+    return *gray, np.where(np.isfinite(disparity), disparity, 0)
 
 
 def _pair(dtype: type = np.float32, seed=0):

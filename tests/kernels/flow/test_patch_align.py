@@ -21,13 +21,13 @@ H, W, FOCAL, N = 96, 128, 140.0, 24
 K = np.array([[FOCAL, 0, (W - 1) / 2], [0, FOCAL, (H - 1) / 2], [0, 0, 1]])
 EXACT = LevelPlan(7, 200, 1e-13)
 """A small window, searched until nothing moves, for derivatives."""
-DIFFERENTIATED = ("pictures", "centre", "warp", "current", "guess")
+DIFFERENTIATED = ("pictures", "center", "warp", "current", "guess")
 
 
 class _Scene(NamedTuple):
     pictures: np.ndarray
     picture: np.ndarray
-    centre: np.ndarray
+    center: np.ndarray
     warp: np.ndarray
     current: np.ndarray
     guess: np.ndarray
@@ -36,18 +36,18 @@ class _Scene(NamedTuple):
 
 
 @partial(jax.jit, static_argnames=("plan", "chunk"))
-def _align(pictures, picture, centre, warp, current, guess, mask, *, plan=DEFAULT_PLAN, chunk=32, min_texture=1.0):
+def _align(pictures, picture, center, warp, current, guess, mask, *, plan=DEFAULT_PLAN, chunk=32, min_texture=1.0):
     pyramid = build_pyramid(current, num_levels=1)
     settings = {"plan": plan, "chunk": chunk, "min_texture": min_texture}
-    return align_patches(pictures, picture, centre, warp, pyramid, guess, mask, **settings)
+    return align_patches(pictures, picture, center, warp, pyramid, guess, mask, **settings)
 
 
 @jax.jit
 def _derivatives(inputs, tangents, picture, mask):
     """The match with a small window; the change of points and correlation, and the gradient of their sum."""
 
-    def place(pictures, centre, warp, current, guess):
-        match = _align(pictures, picture, centre, warp, current, guess, mask, plan=EXACT, min_texture=1e-3)
+    def place(pictures, center, warp, current, guess):
+        match = _align(pictures, picture, center, warp, current, guess, mask, plan=EXACT, min_texture=1e-3)
         return match[:2], match
 
     out, pushforward, match = jax.linearize(place, *inputs, has_aux=True)
@@ -104,16 +104,16 @@ def _scene(
     truth = rng.uniform([[14], [14]], [[W / 2 - 14], [H - 14]], (2, N))
     picture = np.arange(N) % 2
     truth[0] += picture * W / 2
-    centre, step = _apply(homography, truth), 1e-4
+    center, step = _apply(homography, truth), 1e-4
     shift = lambda du, dv: _apply(homography, truth + step * np.array([[du], [dv]]))
     warp = np.stack([shift(1, 0) - shift(-1, 0), shift(0, 1) - shift(0, -1)], axis=1) / (2 * step)
     current = gain * current + offset
     if image_dtype == np.uint8:
         pictures, current = (np.clip(images, 0, 255).round() for images in (pictures, current))
     guess = truth + rng.uniform(-1.5, 1.5, (2, N))
-    centre, warp, current, guess = (array.astype(dtype) for array in (centre, warp, current, guess))
+    center, warp, current, guess = (array.astype(dtype) for array in (center, warp, current, guess))
     pictures, picture = pictures.astype(image_dtype), picture.astype(np.int32)
-    return _Scene(pictures, picture, centre, warp, current, guess, np.ones(N, bool), truth)
+    return _Scene(pictures, picture, center, warp, current, guess, np.ones(N, bool), truth)
 
 
 def _error(match, scene):
@@ -123,13 +123,13 @@ def _error(match, scene):
 def _small():
     """What derivatives are taken of: 5 points, one of them masked, pictures of floating point."""
     scene = _scene(15, 1.1, 5, 0.8, 10, 0, np.float64, np.float64)
-    arrays = {name: getattr(scene, name)[..., :5] for name in ("picture", "centre", "warp", "guess", "mask", "truth")}
+    arrays = {name: getattr(scene, name)[..., :5] for name in ("picture", "center", "warp", "guess", "mask", "truth")}
     arrays["mask"][4] = False
     return scene._replace(**arrays)
 
 
 DEGENERATE = (
-    *("all masked", "centre NaN", "warp infinite", "guess NaN", "picture NaN", "current NaN"),
+    *("all masked", "center NaN", "warp infinite", "guess NaN", "picture NaN", "current NaN"),
     *("flat picture", "flat current", "warp zero", "far outside"),
 )
 
@@ -138,8 +138,8 @@ def _spoil(scene, case):
     match case:
         case "all masked":
             scene.mask[:] = False
-        case "centre NaN":
-            scene.centre[1] = np.nan
+        case "center NaN":
+            scene.center[1] = np.nan
         case "warp infinite":
             scene.warp[0, 1] = np.inf
         case "guess NaN":
@@ -182,7 +182,7 @@ class TestAlignPatches:
         scene = jax.tree.map(jnp.asarray, _scene())
         pyramid = build_pyramid(scene.current, num_levels=1, border=15)
         with pytest.raises(ValueError, match="at least 16 pixels needed, got 15"):
-            align_patches(scene.pictures, scene.picture, scene.centre, scene.warp, pyramid, scene.guess, scene.mask)
+            align_patches(scene.pictures, scene.picture, scene.center, scene.warp, pyramid, scene.guess, scene.mask)
 
     @pytest.mark.parametrize(
         ("turn_deg", "scale", "tilt_deg", "gain", "offset"),
@@ -199,7 +199,7 @@ class TestAlignPatches:
     def test_finds_the_truth(self, turn_deg, scale, tilt_deg, gain, offset):
         scene = _scene(turn_deg, scale, tilt_deg, gain, offset)
         match = _align(*scene[:-1])
-        u, v = scene.centre
+        u, v = scene.center
         expected = (u > 2) & (v > 2) & (u < W - 3) & (v < H - 3)
         assert expected.sum() > 0.9 * N
         assert match.converged[expected].all()
@@ -218,11 +218,11 @@ class TestAlignPatches:
         """What lies outside does not count: at the edge a point is still found, without half of its patch not."""
         scene = _scene(10, 0.8)
         shifted = np.linspace(-4, 8, N)
-        moved = np.array(scene.centre, float)
+        moved = np.array(scene.center, float)
         moved[0] = shifted + (W - 1 - 2 * shifted) * scene.picture
         truth = _apply(np.linalg.inv(_homography(10, 0.8, 0)), moved)
         in_view = (truth > 11).all(axis=0) & (truth < [[W - 12], [H - 12]]).all(axis=0)
-        match = _align(*scene._replace(centre=np.float32(moved), guess=np.float32(truth + 1))[:-1])
+        match = _align(*scene._replace(center=np.float32(moved), guess=np.float32(truth + 1))[:-1])
         found = in_view & (shifted > 0.5)
         assert found.sum() > N / 3
         assert match.converged[found].all()
@@ -239,7 +239,7 @@ class TestAlignPatches:
         expected, status, _ = cv2.calcOpticalFlowPyrLK(
             scene.pictures[0],
             scene.current.astype(np.uint8),
-            scene.centre.T[both].reshape(-1, 1, 2),
+            scene.center.T[both].reshape(-1, 1, 2),
             scene.guess.T[both].reshape(-1, 1, 2),
             winSize=(21, 21),
             maxLevel=0,
@@ -304,7 +304,7 @@ class TestAlignPatches:
         scene, order = _scene(20, 1.1), np.random.default_rng(0).permutation(N)
         whole = _align(*scene[:-1])
         in_parts = _align(*scene[:-1], chunk=7)
-        shuffled = {name: getattr(scene, name)[..., order] for name in ("picture", "centre", "warp", "guess")}
+        shuffled = {name: getattr(scene, name)[..., order] for name in ("picture", "center", "warp", "guess")}
         mixed = _align(*scene._replace(**shuffled)[:-1])
         np.testing.assert_allclose(in_parts.points, whole.points, atol=1e-4)
         np.testing.assert_allclose(mixed.points, whole.points[:, order], atol=1e-4)
@@ -372,12 +372,12 @@ class TestWarpedPatches:
     def test_matches_reference(self, x64):
         """SciPy's bilinear sampling, also past the edges, which repeat."""
         scene, side, stride = _scene(30, 1.1, image_dtype=np.float64, dtype=np.float64), 9, 11
-        scene.centre[:, :4] = [[0, W - 1, -5, W + 3], [0, H - 1, 40, 40]]
+        scene.center[:, :4] = [[0, W - 1, -5, W + 3], [0, H - 1, 40, 40]]
         sample = jax.jit(partial(warped_patches, side=side, stride=stride))
         patches, inside = (np.asarray(a).reshape(N, side, stride) for a in sample(*scene[:4]))
         dv, du = np.mgrid[:side, :stride] - side // 2
         for n in range(N):
-            u, v = scene.centre[:, n, None, None] + np.tensordot(scene.warp[:, :, n], np.stack([du, dv]), (1, 0))
+            u, v = scene.center[:, n, None, None] + np.tensordot(scene.warp[:, :, n], np.stack([du, dv]), (1, 0))
             # Held a thousandth inside the picture.
             at = np.stack([np.clip(v, 0, H - 1.001), np.clip(u, 0, W - 1.001)])
             expected = map_coordinates(scene.pictures[scene.picture[n]], at, order=1)
@@ -386,13 +386,13 @@ class TestWarpedPatches:
 
     def test_degenerate(self):
         scene = _scene()
-        scene.centre[0, 0], scene.warp[1, 0, 1], scene.centre[:, 2] = np.nan, np.inf, 1e30
-        sample = lambda centre, warp: warped_patches(
-            jnp.asarray(scene.pictures), jnp.asarray(scene.picture), centre, warp, side=5, stride=5
+        scene.center[0, 0], scene.warp[1, 0, 1], scene.center[:, 2] = np.nan, np.inf, 1e30
+        sample = lambda center, warp: warped_patches(
+            jnp.asarray(scene.pictures), jnp.asarray(scene.picture), center, warp, side=5, stride=5
         )
-        centre, warp = jnp.asarray(scene.centre), jnp.asarray(scene.warp)
+        center, warp = jnp.asarray(scene.center), jnp.asarray(scene.warp)
         both = lambda *a: (sample(*a), jax.grad(lambda *a: jnp.sum(sample(*a)[0]), (0, 1))(*a))
-        (patches, inside), gradients = jax.jit(both)(centre, warp)
+        (patches, inside), gradients = jax.jit(both)(center, warp)
         assert _finite((patches, gradients))
         assert not inside[:3].any()
         assert inside[3:].all()

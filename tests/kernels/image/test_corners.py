@@ -112,12 +112,12 @@ class TestCornerScore:
         check_grads(jax.jit(corner_score), (_image(1, (13, 12)),), order=1, modes=("fwd", "rev"), eps=1e-4, rtol=1e-6)
 
     def test_gradient_where_eigenvalues_are_equal(self, x64):
-        """The centre of a symmetric blob of whole numbers: the smaller eigenvalue has a kink there."""
+        """The center of a symmetric blob of whole numbers: the smaller eigenvalue has a kink there."""
         distance = np.abs(np.arange(9) - 4)
         blob = np.float64(100 - 4 * np.add.outer(distance**2, distance**2))
-        centre = jax.jit(lambda image: corner_score(image)[4, 4])
-        assert centre(blob) > 1
-        check_grads(centre, (blob,), order=1, modes=("fwd", "rev"), eps=1e-5, rtol=1e-6)
+        center = jax.jit(lambda image: corner_score(image)[4, 4])
+        assert center(blob) > 1
+        check_grads(center, (blob,), order=1, modes=("fwd", "rev"), eps=1e-5, rtol=1e-6)
 
     def test_gradient_of_a_flat_image_is_zero(self, x64):
         np.testing.assert_array_equal(_pipeline(np.full((H, W), 7.0), _allowed())[2], 0)

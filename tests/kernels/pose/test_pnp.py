@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from jaxslam.benchmark.kernels.scenes.single_view import (
     DISTORTION,
     MATRIX,
-    Scene,
+    PosedPoints,
     camera,
     make_scene,
     pose_error,
@@ -190,7 +190,7 @@ class Inputs(NamedTuple):
     threshold_depth: Any
 
 
-def _inputs(scene: Scene) -> Inputs:
+def _inputs(scene: PosedPoints) -> Inputs:
     X_world, uv, depth, sigma = scene.arrays()
     ones = jnp.ones(uv.shape[1], uv.dtype)
     return Inputs(X_world, uv, camera(), ones, depth, jnp.asarray(THRESHOLD_PX, uv.dtype), 3.0 * sigma)
@@ -241,7 +241,7 @@ def _run(seed: int, inputs: Inputs, initial: SE3 | None = None, direction: Input
     return jax.tree.map(np.asarray, _differentiated(jax.random.key(seed), initial, inputs, direction))
 
 
-def _opencv(scene: Scene) -> np.ndarray | None:
+def _opencv(scene: PosedPoints) -> np.ndarray | None:
     """EPnP in RANSAC, then Levenberg-Marquardt on the inliers: `wxyz_xyz`, `None` if it fails."""
     X, uv = scene.X_world.T.copy(), scene.uv.T.copy()
     found, rvec, tvec, inliers = cv2.solvePnPRansac(
@@ -447,7 +447,7 @@ class TestInvariance:
     """One scene whose inliers are clear, changed in a way that must not change the answer."""
 
     @staticmethod
-    def _scene(seed: int) -> Scene:
+    def _scene(seed: int) -> PosedPoints:
         return make_scene(seed % 1000, N, noise_px=0.3, noise_depth=0.3, outliers=0.4)
 
     @few_examples

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from jaxslam.benchmark.kernels.scenes.single_view import (
     DISTORTION,
     MATRIX,
-    Scene,
+    PosedPoints,
     camera,
     make_scene,
     pose_error,
@@ -51,7 +51,7 @@ class Inputs(NamedTuple):
     prior: PosePrior
 
 
-def _inputs(scene: Scene, seed: int = 0) -> Inputs:
+def _inputs(scene: PosedPoints, seed: int = 0) -> Inputs:
     """The inputs for a scene in JAX's default precision, with weights of all sizes, some of them zero."""
     X_world, uv, depth, sigma_depth = scene.arrays()
     weights = np.random.default_rng(seed).uniform(0.2, 1.0, uv.shape[1])
@@ -144,7 +144,7 @@ def _pairs(a, b):
     return zip(*map(jax.tree.leaves, (a, b)), strict=True)
 
 
-def _scipy_optimum(scene: Scene, inputs: Inputs, loss: Loss, with_prior: bool) -> np.ndarray:
+def _scipy_optimum(scene: PosedPoints, inputs: Inputs, loss: Loss, with_prior: bool) -> np.ndarray:
     """`wxyz_xyz` from `scipy.optimize.least_squares` on whitened residuals scaled to give the robust cost."""
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 1000, 1e-15)
     undistort = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)  # OpenCV 4 and 5
@@ -216,16 +216,16 @@ class TestReference:
 
     def test_covariance_matches_the_spread_of_estimates(self):
         """Over many scenes the squared error in units of the covariance averages to its six degrees of freedom."""
-        normalised = []
+        normalized = []
         for seed in range(60):
             scene = make_scene(100 + seed, N, noise_px=SIGMA_PX, outliers=0.0)
             inputs = _inputs(scene)
             inputs = inputs._replace(weights=jnp.ones(N), scale=25.0 * inputs.scale, prior=_no_prior(inputs))
             result, *_ = _run(pose_of(scene.initial), inputs)
             error = _tangent(np.asarray(result.T_world_cam.wxyz_xyz), scene.pose)
-            normalised.append(error @ np.linalg.solve(np.asarray(result.covariance, np.float64), error))
+            normalized.append(error @ np.linalg.solve(np.asarray(result.covariance, np.float64), error))
             assert 0.7 < float(result.residual_scale) < 1.3
-        assert np.mean(normalised) == pytest.approx(6.0, abs=3 * np.sqrt(12 / 60))
+        assert np.mean(normalized) == pytest.approx(6.0, abs=3 * np.sqrt(12 / 60))
 
     def test_float32_is_within_a_hundredth_of_a_deviation(self):
         scene = make_scene(3, N)
@@ -328,7 +328,7 @@ class TestGradient:
         np.testing.assert_allclose(through, changes, rtol=1e-6)
 
 
-def _squeezed(scene: Scene, width: float = 0.02) -> Scene:
+def _squeezed(scene: PosedPoints, width: float = 0.02) -> PosedPoints:
     """The scene with its points drawn together around a line, to a hundredth of the distances by default."""
     rotation = Rotation.from_quat(np.roll(scene.pose[:4], -1))
     X_cam = rotation.inv().apply((scene.X_world - scene.pose[4:, None]).T).T
@@ -337,7 +337,9 @@ def _squeezed(scene: Scene, width: float = 0.02) -> Scene:
     uv = cv2.projectPoints(X_cam.T.copy(), np.zeros(3), np.zeros(3), MATRIX, DISTORTION)[0][:, 0].T
     X_world = rotation.apply(X_cam.T).T + scene.pose[4:, None]
     noise = np.random.default_rng(0).normal(size=uv.shape)
-    return Scene(scene.pose, scene.initial, X_world, uv + noise, X_cam[2], np.full(X_cam.shape[1], 0.05), scene.outlier)
+    return PosedPoints(
+        scene.pose, scene.initial, X_world, uv + noise, X_cam[2], np.full(X_cam.shape[1], 0.05), scene.outlier
+    )
 
 
 def test_vmap_equals_loop():
@@ -398,10 +400,10 @@ def _degenerate(change: str) -> tuple[SE3, Inputs]:
     return T, jax.tree.map(lambda new, old: jnp.asarray(new, old.dtype), changed, inputs)  # no weak types: no new trace
 
 
-def _behind(scene: Scene) -> jax.Array:
-    """Every point mirrored in the camera's centre."""
-    centre = scene.initial[4:, None]
-    return jnp.asarray(2.0 * centre - scene.X_world, jnp.float32)
+def _behind(scene: PosedPoints) -> jax.Array:
+    """Every point mirrored in the camera's center."""
+    center = scene.initial[4:, None]
+    return jnp.asarray(2.0 * center - scene.X_world, jnp.float32)
 
 
 class TestDegenerate:

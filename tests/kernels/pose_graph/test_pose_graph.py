@@ -18,7 +18,7 @@ from jaxlie import SE3
 from jaxslam_kernels.pose_graph.block_tridiagonal_cg import (
     GraphMatrix,
     conjugate_gradients,
-    factorise,
+    factorize,
     multiply,
     solve_factor,
 )
@@ -35,7 +35,7 @@ from jaxslam_kernels.pose_graph.pose_graph import (
     PoseGraph,
     PoseGraphStatus,
     band_rank,
-    optimise_pose_graph,
+    optimize_pose_graph,
     suitable_group_size,
 )
 from jaxslam_kernels.pose_graph.sparse_solve import solve_on_host
@@ -72,10 +72,10 @@ def _inputs(graph: Graph, dtype: Any = jnp.float32, *, sim3: bool = False) -> In
     return Inputs(poses, scales if sim3 else None, edges, jnp.zeros(len(poses), bool).at[0].set(True))
 
 
-def _optimise(
+def _optimize(
     inputs: Inputs, loss: Loss = "squared", max_steps: int = 50, elimination: Elimination = "band"
 ) -> PoseGraph:
-    return optimise_pose_graph(
+    return optimize_pose_graph(
         SE3(inputs.poses),
         inputs.edges,
         inputs.fixed,
@@ -101,7 +101,7 @@ def _summary(result: PoseGraph) -> jax.Array:
 
 def _differentiate(inputs: Inputs, loss: Loss):
     def f(edges, poses):
-        result = _optimise(inputs._replace(edges=edges, poses=poses), loss)
+        result = _optimize(inputs._replace(edges=edges, poses=poses), loss)
         return _summary(result), result
 
     by_inputs = jax.value_and_grad(f, argnums=(0, 1), has_aux=True, allow_int=True)
@@ -111,11 +111,11 @@ def _differentiate(inputs: Inputs, loss: Loss):
 
 
 _differentiated = quick_compile(_differentiate, static_argnums=1)
-_optimised = quick_compile(_optimise, static_argnums=(1, 2, 3))
+_optimized = quick_compile(_optimize, static_argnums=(1, 2, 3))
 
 
 def _largest_difference(a: Any, b: Any) -> float:
-    """Over all nodes, of positions in metres and of rotations as twice the sine of half the angle."""
+    """Over all nodes, of positions in meters and of rotations as twice the sine of half the angle."""
     e = between(np.asarray(a, float), np.asarray(b, float))
     return max(np.abs(e[:, 4:]).max(), 2 * np.abs(e[:, 1:4]).max())
 
@@ -123,7 +123,7 @@ def _largest_difference(a: Any, b: Any) -> float:
 def test_shapes():
     graph = loop_graph(0, 12)
     for sim3 in (False, True):
-        result = jax.eval_shape(_optimise, _inputs(graph, sim3=sim3))
+        result = jax.eval_shape(_optimize, _inputs(graph, sim3=sim3))
         assert result.T_world_cam.wxyz_xyz.shape == (12, 7)
         assert result.scales.shape == result.anchored.shape == (12,)
         assert result.chi2.shape == result.robust_weights.shape == graph.source.shape
@@ -139,7 +139,7 @@ class TestMatchesReference:
         graph = loop_graph(1, 14, sim3=sim3)
         with jax.enable_x64(True):
             inputs = _inputs(graph, jnp.float64, sim3=sim3)
-            result = _optimised(inputs, loss)
+            result = _optimized(inputs, loss)
             nodes, cost, chi2 = scipy_optimum(graph, np.asarray(inputs.edges.weights), loss, 2.0, sim3=sim3)
         assert PoseGraphStatus(int(result.status)) == PoseGraphStatus.OK
         assert float(result.cost_before) > 10 * float(result.cost)
@@ -150,9 +150,9 @@ class TestMatchesReference:
 
     def test_single_precision(self):
         graph = loop_graph(2, 14)
-        single = _optimised(_inputs(graph), "squared")
+        single = _optimized(_inputs(graph), "squared")
         with jax.enable_x64(True):
-            double = _optimised(_inputs(graph, jnp.float64), "squared")
+            double = _optimized(_inputs(graph, jnp.float64), "squared")
         assert int(single.status) == int(double.status) == PoseGraphStatus.OK
         np.testing.assert_allclose(single.cost, double.cost, rtol=1e-4)
         assert _largest_difference(single.T_world_cam.wxyz_xyz, double.T_world_cam.wxyz_xyz) < 1e-3
@@ -182,8 +182,8 @@ class TestMatchesReference:
         with jax.enable_x64(True):
             inputs = _inputs(graph, jnp.float64)
             edges = inputs.edges._replace(weights=jnp.ones_like(inputs.edges.weights))
-            optimise = jax.jit(partial(optimise_pose_graph, elimination="host"))
-            result = optimise(SE3(inputs.poses), edges, inputs.fixed)
+            optimize = jax.jit(partial(optimize_pose_graph, elimination="host"))
+            result = optimize(SE3(inputs.poses), edges, inputs.fixed)
         assert PoseGraphStatus(int(result.status)) == PoseGraphStatus.OK
         np.testing.assert_allclose(2.0 * float(result.cost), published, rtol=tolerance)
 
@@ -202,7 +202,7 @@ def posegraph_case(request):
 
 
 def _value(values, inputs, loss):
-    return _summary(_optimise(inputs._replace(edges=inputs.edges._replace(**values)), loss))
+    return _summary(_optimize(inputs._replace(edges=inputs.edges._replace(**values)), loss))
 
 
 def _forward(values, direction, inputs, loss):
@@ -251,9 +251,9 @@ class TestGradient:
 def test_vmap_equals_loop():
     several = [_inputs(loop_graph(seed, 10)) for seed in range(3)]
     batch = jax.tree.map(lambda *x: jnp.stack(x), *several)
-    together = quick_compile(jax.vmap(_optimise))(batch)
+    together = quick_compile(jax.vmap(_optimize))(batch)
     for i, inputs in enumerate(several):
-        alone = _optimised(inputs, "squared")
+        alone = _optimized(inputs, "squared")
         assert int(alone.status) == int(together.status[i]) == PoseGraphStatus.OK
         assert _largest_difference(together.T_world_cam.wxyz_xyz[i], alone.T_world_cam.wxyz_xyz) < 1e-3
         np.testing.assert_allclose(together.cost[i], alone.cost, rtol=1e-4)
@@ -263,7 +263,7 @@ def test_single_trace():
     """Values, masks, weights, fixed nodes and the order change; nothing is traced again."""
 
     def solve(inputs, mask, rank, loss_scale):
-        return optimise_pose_graph(
+        return optimize_pose_graph(
             SE3(inputs.poses), inputs.edges, inputs.fixed, mask=mask, rank=rank, loss_scale=loss_scale, group_size=GROUP
         )
 
@@ -345,7 +345,7 @@ class TestDegenerate:
         assert all(np.isfinite(x).all() for x in jax.tree.leaves((result, gradient)))
         np.testing.assert_array_equal(result.anchored, np.arange(10) < 6)
         np.testing.assert_allclose(result.T_world_cam.wxyz_xyz[6:], inputs.poses[6:], atol=1e-6)
-        expected = _optimised(alone, "squared").T_world_cam.wxyz_xyz
+        expected = _optimized(alone, "squared").T_world_cam.wxyz_xyz
         assert _largest_difference(result.T_world_cam.wxyz_xyz, expected) < 1e-3
 
     @pytest.mark.parametrize("what", ["pose", "information", "weight"])
@@ -360,7 +360,7 @@ class TestDegenerate:
             "weight": edges._replace(weights=edges.weights.at[last].set(nan)),
         }[what]
         result, gradient = _differentiated(inputs._replace(edges=bad), "squared")
-        without = _optimised(inputs._replace(edges=edges._replace(mask=edges.mask.at[last].set(False))), "squared")
+        without = _optimized(inputs._replace(edges=edges._replace(mask=edges.mask.at[last].set(False))), "squared")
         assert int(result.status) == PoseGraphStatus.OK
         assert all(np.isfinite(x).all() for x in jax.tree.leaves((result, gradient)))
         np.testing.assert_allclose(result.T_world_cam.wxyz_xyz, without.T_world_cam.wxyz_xyz, atol=1e-5)
@@ -376,20 +376,20 @@ class TestDegenerate:
         assert _largest_difference(result.T_world_cam.wxyz_xyz, graph.truth[:, :7]) < 1e-4
 
     def test_steps_run_out(self):
-        result = _optimised(_inputs(loop_graph(10, 14)), "squared", 1)
+        result = _optimized(_inputs(loop_graph(10, 14)), "squared", 1)
         assert PoseGraphStatus(int(result.status)) == PoseGraphStatus.NOT_CONVERGED
         assert float(result.cost) < float(result.cost_before)
 
 
 def test_wrong_loop_is_rejected_by_a_robust_loss():
-    """An edge that is metres off pulls in least squares and not under Geman and McClure's loss."""
+    """An edge that is meters off pulls in least squares and not under Geman and McClure's loss."""
     graph = loop_graph(11, 14)
     wrong = graph.measured.copy()
     wrong[-1, 4:7] += 3.0
     truth = graph.truth[:, :7]
     errors = {}
     for loss in ("squared", "geman_mcclure"):
-        result = _optimised(_inputs(graph._replace(measured=wrong)), loss)
+        result = _optimized(_inputs(graph._replace(measured=wrong)), loss)
         errors[loss] = _largest_difference(result.T_world_cam.wxyz_xyz, truth)
         weight = float(result.robust_weights[-1])
         assert (weight == 1.0) if loss == "squared" else (weight < 1e-3)
@@ -403,7 +403,7 @@ class TestHostElimination:
     def test_matches_reference(self, sim3):
         with jax.enable_x64(True):
             inputs = _inputs(loop_graph(1, 14, sim3=sim3), jnp.float64, sim3=sim3)
-            band, host = (_optimised(inputs, "cauchy", 50, way) for way in ("band", "host"))
+            band, host = (_optimized(inputs, "cauchy", 50, way) for way in ("band", "host"))
         assert int(host.status) == PoseGraphStatus.OK
         np.testing.assert_allclose(host.cost, band.cost, rtol=1e-10)
         assert _largest_difference(host.T_world_cam.wxyz_xyz, band.T_world_cam.wxyz_xyz) < 1e-6
@@ -416,7 +416,7 @@ class TestHostElimination:
             def gradient(way):
                 def f(information, measured):
                     edges = inputs.edges._replace(information=information, T_source_target=SE3(measured))
-                    return _summary(_optimise(inputs._replace(edges=edges), "cauchy", 50, way))
+                    return _summary(_optimize(inputs._replace(edges=edges), "cauchy", 50, way))
 
                 by = quick_compile(jax.grad(f, argnums=(0, 1)))
                 return by(inputs.edges.information, inputs.edges.T_source_target.wxyz_xyz)
@@ -428,14 +428,14 @@ class TestHostElimination:
     def test_vmap_equals_loop(self):
         several = [_inputs(loop_graph(seed, 10)) for seed in range(2)]
         batch = jax.tree.map(lambda *x: jnp.stack(x), *several)
-        together = quick_compile(jax.vmap(partial(_optimise, elimination="host")))(batch)
+        together = quick_compile(jax.vmap(partial(_optimize, elimination="host")))(batch)
         for i, inputs in enumerate(several):
-            alone = _optimised(inputs, "squared", 50, "host")
+            alone = _optimized(inputs, "squared", 50, "host")
             assert _largest_difference(together.T_world_cam.wxyz_xyz[i], alone.T_world_cam.wxyz_xyz) < 1e-4
 
     @pytest.mark.parametrize("change", ["no edges", "measured NaN", "all fixed", "none fixed", "initial NaN"])
     def test_degenerate(self, change):
-        result = _optimised(_degenerate(change), "squared", 50, "host")
+        result = _optimized(_degenerate(change), "squared", 50, "host")
         expected = PoseGraphStatus.BAD_INITIAL if change == "initial NaN" else PoseGraphStatus.NOTHING_TO_DO
         assert PoseGraphStatus(int(result.status)) == expected
         assert all(np.isfinite(x).all() for x in jax.tree.leaves(result))
@@ -483,13 +483,13 @@ class TestBlockBand:
             2 * k, 2 * k
         )
 
-    def test_exact_within_neighbouring_groups(self):
+    def test_exact_within_neighboring_groups(self):
         """Seven nodes in groups of three, in an order of their own: the factor alone solves."""
         with jax.enable_x64(True):
             rank = jnp.asarray([3, 1, 0, 2, 6, 5, 4])
             matrix, dense = self._matrix(7, [(2, 1), (0, 2), (3, 5), (6, 4), (4, 0)])
             right = jnp.asarray(np.random.default_rng(1).normal(size=(7, 2)))
-            found = solve_factor(factorise(matrix, rank, 3), right)
+            found = solve_factor(factorize(matrix, rank, 3), right)
             np.testing.assert_allclose(multiply(matrix, right).ravel(), dense @ right.ravel(), rtol=1e-12)
             np.testing.assert_allclose(found.ravel(), np.linalg.solve(dense, right.ravel()), rtol=1e-10)
 
@@ -497,7 +497,7 @@ class TestBlockBand:
         with jax.enable_x64(True):
             matrix, dense = self._matrix(9, [(i, i + 1) for i in range(8)] + [(0, 8), (7, 1)])
             right = jnp.asarray(np.random.default_rng(1).normal(size=(9, 2)))
-            factor = factorise(matrix, jnp.arange(9), 2)
+            factor = factorize(matrix, jnp.arange(9), 2)
             exact = np.linalg.solve(dense, right.ravel())
             found, steps = conjugate_gradients(
                 partial(multiply, matrix), partial(solve_factor, factor), right, tolerance=1e-12, max_steps=50
@@ -510,7 +510,7 @@ class TestBlockBand:
         """A matrix that is not positive definite ends the search with something finite."""
         with jax.enable_x64(True):
             matrix, _ = self._matrix(4, [(0, 1), (2, 3)])
-            factor = factorise(matrix, jnp.arange(4), 2)
+            factor = factorize(matrix, jnp.arange(4), 2)
             found, _ = conjugate_gradients(
                 lambda x: -multiply(matrix, x),
                 partial(solve_factor, factor),
@@ -536,8 +536,8 @@ class TestInvariance:
         motion = np.concatenate([rng.normal(size=4), rng.normal(size=3), [1.0]])
         motion[:4] /= np.linalg.norm(motion[:4])
         with jax.enable_x64(True):
-            before = _optimised(_inputs(graph, jnp.float64), "squared")
-            after = _optimised(_inputs(graph._replace(nodes=move(motion, graph.nodes)), jnp.float64), "squared")
+            before = _optimized(_inputs(graph, jnp.float64), "squared")
+            after = _optimized(_inputs(graph._replace(nodes=move(motion, graph.nodes)), jnp.float64), "squared")
         ones = np.ones((10, 1))
         expected = move(motion, np.concatenate([before.T_world_cam.wxyz_xyz, ones], axis=1))[:, :7]
         np.testing.assert_allclose(after.cost, before.cost, rtol=1e-8)
@@ -550,12 +550,12 @@ class TestInvariance:
         rng = np.random.default_rng(seed)
         with jax.enable_x64(True):
             inputs = _inputs(graph, jnp.float64)
-            before = _optimised(inputs, "squared")
+            before = _optimized(inputs, "squared")
             order = rng.permutation(len(graph.source))
             edges = jax.tree.map(lambda x: x[order], inputs.edges)
             rank = jnp.asarray(rng.permutation(10))
             ordered = quick_compile(
-                lambda edges, rank: optimise_pose_graph(
+                lambda edges, rank: optimize_pose_graph(
                     SE3(inputs.poses), edges, inputs.fixed, rank=rank, group_size=GROUP
                 )
             )

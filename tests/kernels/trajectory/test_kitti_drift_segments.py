@@ -40,7 +40,7 @@ def x64():
 
 
 def _drive(seed, n=N):
-    """Poses along a winding road, about half a metre apart."""
+    """Poses along a winding road, about half a meter apart."""
     rng = np.random.default_rng(seed)
     turned = Rotation.from_rotvec(np.cumsum(rng.normal(size=(n, 3)) * [0.02, 0.1, 0.02], axis=0))
     steps = turned.apply(np.array([0, 0, 0.5]) + 0.05 * rng.normal(size=(n, 3)))
@@ -96,7 +96,7 @@ class TestSegmentErrors:
         np.testing.assert_allclose(errors.rotation, rotations.sum() / count, rtol=1e-8)
 
     def test_as_long_as_kittis(self, x64):
-        """The benchmark's own lengths and step, on a path of a kilometre and a half."""
+        """The benchmark's own lengths and step, on a path of a kilometer and a half."""
         Q = _drive(5, 1500)
         Q[:, 4:] *= 2
         P, lengths = _drifting(Q, 6, 0.001), np.arange(1, 9) * 100.0
@@ -221,7 +221,7 @@ class TestSegmentErrors:
         np.testing.assert_allclose(errors.rotations, 0, atol=1e-12)
 
     def test_two_percent(self, x64):
-        """Steps of half a metre on a straight road: segments of 2 m end at 2.5 m, of 5 m at 5.5 m, of 9 m at 9.5 m."""
+        """Steps of half a meter on a straight road: segments of 2 m end at 2.5 m, of 5 m at 5.5 m, of 9 m at 9.5 m."""
         Q = np.tile([1.0, 0, 0, 0, 0, 0, 0], (N, 1))
         Q[:, 6] = 0.5 * np.arange(N)
         P = Q.copy()

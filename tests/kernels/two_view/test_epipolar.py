@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jaxlie import SE3
 from jaxslam_kernels.camera import Intrinsics, project
-from jaxslam_kernels.se3 import moved, to_camera, to_world
+from jaxslam_kernels.se3 import retract, to_camera, to_world
 from jaxslam_kernels.two_view.epipolar import (
     epipolar_distances,
     fundamental_of_poses,
@@ -103,8 +103,8 @@ def _camera() -> Intrinsics:
 
 def _poses(seed: int) -> tuple[SE3, SE3]:
     rng = np.random.default_rng(seed)
-    first = moved(SE3(jnp.asarray([1.0, 0, 0, 0, 0, 0, 0])), jnp.asarray(rng.normal(size=6)))
-    return first, moved(first, jnp.asarray(0.1 * rng.normal(size=6)))
+    first = retract(SE3(jnp.asarray([1.0, 0, 0, 0, 0, 0, 0])), jnp.asarray(rng.normal(size=6)))
+    return first, retract(first, jnp.asarray(0.1 * rng.normal(size=6)))
 
 
 class TestOfPoses:
@@ -142,7 +142,7 @@ class TestOfPoses:
         with jax.enable_x64(True):
             before, after = _poses(1)
             weights = jnp.asarray(np.random.default_rng(2).normal(size=(3, 3)))
-            f = lambda tangent: jnp.vdot(weights, fundamental_of_poses(before, moved(after, tangent), _camera()))
+            f = lambda tangent: jnp.vdot(weights, fundamental_of_poses(before, retract(after, tangent), _camera()))
             zero, direction = jnp.zeros(6), jnp.asarray(np.random.default_rng(3).normal(size=6))
             _, forward = jax.jvp(f, (zero,), (direction,))
             h = 1e-6
@@ -154,7 +154,7 @@ class TestOfPoses:
         """A camera that only turns or stands has no lines."""
         with jax.enable_x64(True):
             pose, _ = _poses(4)
-            turned = moved(pose, jnp.asarray([0.0, 0, 0, 0.1, -0.2, 0.05]))
+            turned = retract(pose, jnp.asarray([0.0, 0, 0, 0.1, -0.2, 0.05]))
             for after in (pose, turned):
                 np.testing.assert_allclose(fundamental_of_poses(pose, after, _camera()), 0, atol=1e-15)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pyceres
 import pycolmap
 
-from jaxslam.benchmark.kernels.scenes.bundle_window import CENTRE_PX, FOCAL_PX, Window
+from jaxslam.benchmark.kernels.scenes.bundle_window import CENTER_PX, FOCAL_PX, Window
 
 
 def ceres_problem(window: Window, num_fixed: int) -> tuple[pycolmap.CeresBundleAdjuster, pycolmap.Reconstruction]:
@@ -15,12 +15,12 @@ def ceres_problem(window: Window, num_fixed: int) -> tuple[pycolmap.CeresBundleA
     """
     seen, valid = window.observations, np.asarray(window.observations.valid)
     camera, point = np.asarray(seen.camera)[valid], np.asarray(seen.point)[valid]
-    uv = FOCAL_PX * np.asarray(seen.xy, np.float64)[:, valid] + np.array(CENTRE_PX)[:, None]
+    uv = FOCAL_PX * np.asarray(seen.xy, np.float64)[:, valid] + np.array(CENTER_PX)[:, None]
     poses, X_world = (np.asarray(a, np.float64) for a in (window.poses, window.X_world))
     poses = np.concatenate([poses[:, :4] / np.linalg.norm(poses[:, :4], axis=1)[:, None], poses[:, 4:]], axis=1)
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(
-        pycolmap.Camera(model="PINHOLE", width=640, height=480, params=[FOCAL_PX, FOCAL_PX, *CENTRE_PX], camera_id=1)
+        pycolmap.Camera(model="PINHOLE", width=640, height=480, params=[FOCAL_PX, FOCAL_PX, *CENTER_PX], camera_id=1)
     )
     slot = np.zeros(len(camera), int)
     for i, pose in enumerate(poses):

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxslam.benchmark.kernels.scenes.single_view import to_wxyz_xyz
 
-FOCAL_PX, CENTRE_PX = 500.0, (320.0, 240.0)
+FOCAL_PX, CENTER_PX = 500.0, (320.0, 240.0)
 """Of the camera, which has no distortion."""
 
 
@@ -32,7 +32,7 @@ class Window(NamedTuple):
 
 
 def make_window(k: int, n: int, m: int) -> Window:
-    """A camera that moves a metre sideways sees n points m times in k pictures, which points by chance."""
+    """A camera that moves a meter sideways sees n points m times in k pictures, which points by chance."""
     rng = np.random.default_rng(0)
     X_world = rng.uniform([[-2.0], [-1.5], [2.0]], [[2.0], [1.5], [5.0]], (3, n))
     rotations = [Rotation.from_rotvec(0.05 * rng.normal(size=3)) for _ in range(k)]
@@ -40,7 +40,7 @@ def make_window(k: int, n: int, m: int) -> Window:
     X_cam = np.stack([r.inv().apply(X_world.T - t).T for r, t in zip(rotations, positions, strict=True)])
     camera, point = np.divmod(np.sort(rng.choice(k * n, m, replace=False)), n)
     X, Y, Z = X_cam[camera, :, point].T
-    uv = FOCAL_PX * np.stack([X / Z, Y / Z]) + np.array(CENTRE_PX)[:, None] + rng.normal(size=(2, m))
+    uv = FOCAL_PX * np.stack([X / Z, Y / Z]) + np.array(CENTER_PX)[:, None] + rng.normal(size=(2, m))
     sigma_depth = 0.005 * Z**2
     depth = Z + sigma_depth * rng.normal(size=m)
     truth = np.stack([to_wxyz_xyz(r, t) for r, t in zip(rotations, positions, strict=True)])
@@ -51,7 +51,7 @@ def make_window(k: int, n: int, m: int) -> Window:
         jnp.asarray(camera, jnp.int32),
         jnp.asarray(point, jnp.int32),
         single(uv),
-        make_intrinsics(FOCAL_PX, FOCAL_PX, *CENTRE_PX),
+        make_intrinsics(FOCAL_PX, FOCAL_PX, *CENTER_PX),
         depth=single(depth),
         sigma_depth=single(sigma_depth),
     )

@@ -8,7 +8,7 @@ from skimage.data import camera, stereo_motorcycle
 
 
 class Warp(NamedTuple):
-    """Two grey images and the homography from pixels of the first to pixels of the second."""
+    """Two gray images and the homography from pixels of the first to pixels of the second."""
 
     previous: np.ndarray
     current: np.ndarray
@@ -42,9 +42,9 @@ def homography(rng: np.random.Generator, width: int, height: int, shift_px: floa
     cos, sin = scale * np.cos(angle), scale * np.sin(angle)
     direction = rng.uniform(0, 2 * np.pi)
     shift = shift_px * np.array([np.cos(direction), np.sin(direction)])
-    about_centre = np.array([[cos, -sin, shift[0]], [sin, cos, shift[1]], [*rng.uniform(-3e-5, 3e-5, 2), 1]])
-    to_centre = np.array([[1, 0, -width / 2], [0, 1, -height / 2], [0, 0, 1]])
-    return np.linalg.inv(to_centre) @ about_centre @ to_centre
+    about_center = np.array([[cos, -sin, shift[0]], [sin, cos, shift[1]], [*rng.uniform(-3e-5, 3e-5, 2), 1]])
+    to_center = np.array([[1, 0, -width / 2], [0, 1, -height / 2], [0, 0, 1]])
+    return np.linalg.inv(to_center) @ about_center @ to_center
 
 
 def warp(image: np.ndarray, shift_px: float, seed: int, noise: float = 2.0) -> Warp:

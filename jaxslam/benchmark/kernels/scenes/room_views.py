@@ -9,7 +9,7 @@ import numpy as np
 from jaxlie import SE3
 
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset, SyntheticFrame
-from jaxslam.dynamics.cue import Scene
+from jaxslam.dynamics.cue import CueInput
 from jaxslam.geometry.se3 import compose, inverse, to_local, transform
 from jaxslam.sensors.camera import Camera
 
@@ -39,7 +39,7 @@ def room_views() -> RoomViews:
         )
 
 
-def followed_points(views: RoomViews, num_points: int) -> tuple[Scene, np.ndarray]:
+def followed_points(views: RoomViews, num_points: int) -> tuple[CueInput, np.ndarray]:
     """Points all over the first picture that are seen in the second, and `(num_points,)` which of them move.
 
     Poses are the true ones. A person who walks is carried on as a whole: limbs swing little meanwhile.
@@ -66,11 +66,11 @@ def followed_points(views: RoomViews, num_points: int) -> tuple[Scene, np.ndarra
         "size": np.array([views.camera.width, views.camera.height]),
         "key": jax.random.key(0),
     }
-    return jax.tree.map(_for_jax, Scene(**fields)), moves
+    return jax.tree.map(_for_jax, CueInput(**fields)), moves
 
 
 def back_projected(camera: Camera, uv: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """`(3, n)` in the axes of a camera without lens distortion, of pixels `(2, n)` and depths `(n,)` in metres."""
+    """`(3, n)` in the axes of a camera without lens distortion, of pixels `(2, n)` and depths `(n,)` in meters."""
     return np.stack([(uv[0] - camera.cx) / camera.fx, (uv[1] - camera.cy) / camera.fy, np.ones_like(depth)]) * depth
 
 

@@ -17,7 +17,7 @@ DISTORTION = np.array(TUM_FR1[4])
 
 
 @dataclass(frozen=True)
-class Scene:
+class PosedPoints:
     """All float64. Poses are `wxyz_xyz` of T_world_cam; `outlier` marks wrong pixels and depths."""
 
     pose: np.ndarray
@@ -35,7 +35,7 @@ class Scene:
 
 def make_scene(
     seed: int, n: int = 60, *, noise_px: float = 1.0, noise_depth: float = 1.0, outliers: float = 0.2
-) -> Scene:
+) -> PosedPoints:
     """A view of `n` points 1 to 5 m away, the depth noise growing with the square of the depth."""
     rng = np.random.default_rng(seed)
     depth = rng.uniform(1.0, 5.0, n)
@@ -51,7 +51,7 @@ def make_scene(
     uv[:, outlier] = rng.uniform([[0.0], [0.0]], [[639.0], [479.0]], (2, outlier.sum()))
     depth[outlier] = rng.uniform(1.0, 5.0, outlier.sum())
     start = rotation * Rotation.from_rotvec(0.03 * rng.normal(size=3))
-    return Scene(
+    return PosedPoints(
         pose=to_wxyz_xyz(rotation, position),
         initial=to_wxyz_xyz(start, position + 0.03 * rng.normal(size=3)),
         X_world=X_world,
@@ -63,7 +63,7 @@ def make_scene(
 
 
 def camera(dtype: DTypeLike | None = None) -> Intrinsics:
-    """The colour camera of TUM's fr1 recordings, lens distortion included."""
+    """The color camera of TUM's fr1 recordings, lens distortion included."""
     return make_intrinsics(*TUM_FR1, dtype=jnp.zeros(()).dtype if dtype is None else dtype)
 
 
@@ -78,7 +78,7 @@ def pose_of(wxyz_xyz: ArrayLike) -> SE3:
 
 
 def pose_error(estimate: ArrayLike, truth: ArrayLike) -> tuple[float, float]:
-    """Distance in metres and angle in radians between two `wxyz_xyz`."""
+    """Distance in meters and angle in radians between two `wxyz_xyz`."""
     a, b = (np.asarray(p, np.float64) for p in (estimate, truth))
     turn = Rotation.from_quat(np.roll(a[:4], -1)).inv() * Rotation.from_quat(np.roll(b[:4], -1))
     return float(np.linalg.norm(a[4:] - b[4:])), float(turn.magnitude())

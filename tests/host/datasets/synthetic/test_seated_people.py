@@ -12,7 +12,7 @@ from jaxslam.errors import ConfigError
 
 SMALL = SyntheticConfig(width=160, height=120, frames=120, people=0, seated=2)
 ONE_RAY = dataclasses.replace(PERFECT_SENSOR, exposure_samples=1)
-"""A pixel is what its centre sees at one moment, so that it changes only where that does."""
+"""A pixel is what its center sees at one moment, so that it changes only where that does."""
 PATHS: list[CameraPathKind] = ["xyz", "rpy", "halfsphere", "static"]
 HEAD, FOREARMS, LEGS = [3, 4], [9, 14], [5, 6, 7, 10, 11, 12]
 FACE_M = 0.095
@@ -20,7 +20,7 @@ STEP_S = 0.01
 
 
 def joints(dataset: SyntheticDataset, actor: int) -> np.ndarray:
-    """Both ends of the axes of an actor's solids over half a minute: `(t, 15, 2, 3)` metres."""
+    """Both ends of the axes of an actor's solids over half a minute: `(t, 15, 2, 3)` meters."""
     one = dataset.actors[actor]
     parts = one.parts(np.arange(0.0, 30.0, STEP_S))
     half = np.array([solid.size[2] * (solid.stem or 0.0) for solid in one.solids])
@@ -29,14 +29,14 @@ def joints(dataset: SyntheticDataset, actor: int) -> np.ndarray:
 
 
 def speeds(points: np.ndarray) -> np.ndarray:
-    """`(t - 1, ...)` metres a second of `(t, ..., 3)` points."""
+    """`(t - 1, ...)` meters a second of `(t, ..., 3)` points."""
     return np.linalg.norm(np.diff(points, axis=0), axis=-1) / STEP_S
 
 
 class TestMotion:
     @pytest.mark.parametrize("seed", [0, 1, 2, 2**31 - 1])
     @pytest.mark.parametrize("actor", [0, 1])
-    def test_of_a_few_centimetres(self, seed: int, actor: int) -> None:
+    def test_of_a_few_centimeters(self, seed: int, actor: int) -> None:
         dataset = SyntheticDataset(dataclasses.replace(SMALL, seed=seed))
         places, speed = joints(dataset, actor), speeds(joints(dataset, actor))
         others = [part for part in range(15) if part not in FOREARMS]
@@ -138,9 +138,9 @@ class TestRoomWithoutThem:
     )
     def test_solids(self, seed: int, people: int, boxes: int, surfaces: int, sizes: int) -> None:
         room = SyntheticDataset(SyntheticConfig(seed=seed, people=people, boxes=boxes, width=64, height=48, frames=1))
-        micrometres = [np.round(1e6 * np.asarray(part, np.float64)).astype(np.int64) for part in room._scene[:2]]
+        micrometers = [np.round(1e6 * np.asarray(part, np.float64)).astype(np.int64) for part in room._scene[:2]]
         assert zlib.crc32(np.asarray(room._scene.surface).tobytes()) == surfaces
-        assert zlib.crc32(b"".join(part.tobytes() for part in micrometres)) == sizes
+        assert zlib.crc32(b"".join(part.tobytes() for part in micrometers)) == sizes
 
     def test_ways(self) -> None:
         room = SyntheticDataset(SyntheticConfig(people=2, boxes=1, width=64, height=48, frames=1))

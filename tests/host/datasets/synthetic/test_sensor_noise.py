@@ -11,14 +11,14 @@ from jaxslam.datasets.synthetic import PERFECT_SENSOR, SensorConfig, SyntheticCo
 from jaxslam.datasets.synthetic.sensor_noise import measure, sensor_params
 
 SHAPE = (120, 160)
-GREY = np.uint32(400 | 400 << 10 | 400 << 20)
+GRAY = np.uint32(400 | 400 << 10 | 400 << 20)
 
 
 def measured(
     depth: np.ndarray, config: SensorConfig, *, incidence: float = 1.0, gain: float = 1.0, key: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Channels and depth of a grey picture."""
-    exposures = (np.full(SHAPE, GREY),)
+    """Channels and depth of a gray picture."""
+    exposures = (np.full(SHAPE, GRAY),)
     cosines = np.full(SHAPE, incidence, np.float32)
     params = sensor_params(config)
     channels, result = measure(exposures, depth.astype(np.float32), cosines, 525.0, gain, params, jax.random.key(key))
@@ -99,7 +99,7 @@ class TestDepth:
             assert not np.array_equal(first, third)
 
 
-class TestColour:
+class TestColor:
     def test_noise(self):
         channels = measured(wall(2.0), with_fault(image_noise=3.0))[0].astype(float)
         assert channels.std() == pytest.approx(3.0, rel=0.05)
@@ -135,7 +135,7 @@ class TestInARecording:
         assert np.abs(error[~missing]).max() < 0.02
         assert 0.5 * 1.425e-3 < error[~missing].std() < 3.0 * 1.425e-3
 
-    def test_blur_is_of_the_colour_alone_and_comes_from_motion(self):
+    def test_blur_is_of_the_color_alone_and_comes_from_motion(self):
         detail = {}
         for path in ("rpy", "static"):
             config = dataclasses.replace(self.CONFIG, path=path, people=0)

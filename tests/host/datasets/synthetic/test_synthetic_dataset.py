@@ -271,9 +271,9 @@ class TestHardness:
         pose, frame, errors = truth[0], dataset[0], []
         for index in range(1, len(dataset)):
             last, frame = frame, dataset[index]
-            grey, last_grey = (cv2.cvtColor(f.image, cv2.COLOR_RGB2GRAY) for f in (frame, last))
-            corners = cv2.goodFeaturesToTrack(last_grey, 400, 0.01, 6)
-            moved, found, _ = cv2.calcOpticalFlowPyrLK(last_grey, grey, corners, corners.copy(), winSize=(15, 15))
+            gray, last_gray = (cv2.cvtColor(f.image, cv2.COLOR_RGB2GRAY) for f in (frame, last))
+            corners = cv2.goodFeaturesToTrack(last_gray, 400, 0.01, 6)
+            moved, found, _ = cv2.calcOpticalFlowPyrLK(last_gray, gray, corners, corners.copy(), winSize=(15, 15))
             start, end = corners[:, 0], moved[:, 0]
             inside = np.all((end >= 0) & (end <= [dataset.width - 1, dataset.height - 1]), axis=1)
             kept = (found[:, 0] == 1) & inside
@@ -295,8 +295,8 @@ class TestHardness:
     @pytest.mark.parametrize("path", CAMERA_PATHS)
     def test_corners_everywhere(self, path):
         image = SyntheticDataset(SyntheticConfig(path=path, people=0)).render(60).rgb
-        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        corners = cv2.goodFeaturesToTrack(grey, 2000, 0.01, 7)[:, 0]
+        gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        corners = cv2.goodFeaturesToTrack(gray, 2000, 0.01, 7)[:, 0]
         assert len(corners) > 500
         cell, _, _ = np.histogram2d(corners[:, 0], corners[:, 1], bins=(4, 3), range=((0, 640), (0, 480)))
         assert np.count_nonzero(cell >= 5) >= 10

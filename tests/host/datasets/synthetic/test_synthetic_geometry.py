@@ -1,4 +1,4 @@
-"""The synthetic recording against its own ground truth: depth, masks, motions and colours agree to the digit."""
+"""The synthetic recording against its own ground truth: depth, masks, motions and colors agree to the digit."""
 
 import dataclasses
 
@@ -160,9 +160,9 @@ class TestMovers:
         assert checked > 1000
 
 
-class TestColour:
+class TestColor:
     @pytest.mark.parametrize("path", ["xyz", "halfsphere", "rpy"])
-    def test_static_points_keep_their_colour(self, path):
+    def test_static_points_keep_their_color(self, path):
         dataset = dataset_with(path=path, width=320, height=240)
         first, second = dataset.render(5), dataset.render(12)
         pixels, depth, inside = seen_by(dataset, points_in_world(dataset, first), second)
@@ -170,12 +170,12 @@ class TestColour:
         pixels, depth = pixels[:, inside], depth[inside]
         visible = np.abs(1.0 / sampled(1.0 / second.exact_depth_m.astype(np.float64), pixels) - depth) < 2e-3
         assert np.count_nonzero(visible) > 0.3 * depth.size
-        colour = first.rgb.reshape(-1, 3)[inside][visible].astype(np.float64)
-        error = np.abs(sampled(second.rgb, pixels[:, visible]) - colour).mean(axis=1)
+        color = first.rgb.reshape(-1, 3)[inside][visible].astype(np.float64)
+        error = np.abs(sampled(second.rgb, pixels[:, visible]) - color).mean(axis=1)
         assert np.median(error) < 2.0
         assert np.mean(error < 10.0) > 0.95
-        shuffled = np.random.default_rng(0).permutation(colour)
-        assert np.median(np.abs(shuffled - colour).mean(axis=1)) > 8.0 * np.median(error)
+        shuffled = np.random.default_rng(0).permutation(color)
+        assert np.median(np.abs(shuffled - color).mean(axis=1)) > 8.0 * np.median(error)
 
     def test_texture_at_all_scales_without_shimmer(self):
         """Detail is there in the large picture, and a small one looks like the large one averaged."""
@@ -183,8 +183,8 @@ class TestColour:
         small = dataset_with().render(0).rgb
         averaged = cv2.resize(large, (160, 120), interpolation=cv2.INTER_AREA)
         assert np.median(np.abs(averaged.astype(int) - small)) <= 5.0
-        grey = cv2.cvtColor(large, cv2.COLOR_RGB2GRAY).astype(np.float32)
+        gray = cv2.cvtColor(large, cv2.COLOR_RGB2GRAY).astype(np.float32)
         for _ in range(3):
-            detail = grey - cv2.GaussianBlur(grey, (0, 0), 1.5)
+            detail = gray - cv2.GaussianBlur(gray, (0, 0), 1.5)
             assert detail.std() > 4.0
-            grey = cv2.pyrDown(grey)
+            gray = cv2.pyrDown(gray)

@@ -16,7 +16,7 @@ from jaxslam.cli.entry_point import main
 from jaxslam.config.schema import Config, RunConfig, TrackConfig
 from jaxslam.datasets import open_dataset
 from jaxslam.datasets.synthetic import SyntheticDataset, write_tum
-from jaxslam.geometry.se3 import IDENTITY, angle, between, moved
+from jaxslam.geometry.se3 import IDENTITY, angle, between, retract
 from jaxslam.map.npz_file import load_map, save_map
 from jaxslam.map.types import empty_map
 from jaxslam.map.validate import problems
@@ -47,21 +47,21 @@ class TestKidnap:
         played = play([*BEFORE, *[BLACK] * 60, *AFTER], config)
         assert set(played.statuses[1:60]) == {TrackStatus.OK}
         assert set(played.statuses[60:120]) == {TrackStatus.LOST}
-        found = played.first(TrackStatus.RELOCALISED)
+        found = played.first(TrackStatus.RELOCALIZED)
         assert found < 120 + 15
         assert set(played.statuses[found + 1 :]) == {TrackStatus.OK}
         errors = played.errors_m(range(found, len(played.order)))
-        print(f"recognised after {found - 119} frames; largest error after it {errors.max() * 1e3:.1f} mm")
+        print(f"recognized after {found - 119} frames; largest error after it {errors.max() * 1e3:.1f} mm")
         assert errors.max() < 0.03
         assert np.unique(played.slam.map.submap).tolist() == [0]
 
     def test_cut(self) -> None:
         """A jump in time and place without any black frame."""
         played = play([*BEFORE, *AFTER], gap_s=2.0)
-        found = played.first(TrackStatus.RELOCALISED)
+        found = played.first(TrackStatus.RELOCALIZED)
         assert 60 <= found < 60 + 15
         errors = played.errors_m(range(found, len(played.order)))
-        print(f"recognised after {found - 59} frames; largest error after it {errors.max() * 1e3:.1f} mm")
+        print(f"recognized after {found - 59} frames; largest error after it {errors.max() * 1e3:.1f} mm")
         assert errors.max() < 0.03
         assert 0 < np.sqrt(np.diag(played.results[found].covariance)).max() < 0.03
 
@@ -71,9 +71,9 @@ class TestKidnap:
         frames.frames[41] = replace(frames[41], depth_m=np.zeros_like(frames[41].depth_m))
         with Slam(frames.camera, CONFIG) as slam:
             before = Played(slam, frames, range(41), FPS)
-            slam._state = slam._back.restarted(slam._state, before.results[-1].T_world_cam)
+            slam._state = slam._back.start_submap(slam._state, before.results[-1].T_world_cam)
             after = Played(slam, frames, range(41, 46), FPS)
-        assert after.statuses == [*[TrackStatus.RELOCALISED] * 2, *[TrackStatus.OK] * 3]
+        assert after.statuses == [*[TrackStatus.RELOCALIZED] * 2, *[TrackStatus.OK] * 3]
         found = after.results[0]
         assert found.reason == TrackReason.NO_DEPTH.text  # why flow had lost it
         assert found.num_matched >= 30
@@ -85,10 +85,10 @@ class TestKidnap:
         assert max(apart) < 0.03
 
     def test_keyframes_are_at_hand_at_once(self) -> None:
-        """Those that show the place are recalled with the relocalisation: their points are found again."""
+        """Those that show the place are reloaded with the relocalization: their points are found again."""
         played = play([*BEFORE, *[BLACK] * 3, *AFTER])
-        found = played.first(TrackStatus.RELOCALISED)
-        assert played.results[found + 1].num_looked_up > 60
+        found = played.first(TrackStatus.RELOCALIZED)
+        assert played.results[found + 1].num_keyframe_matches > 60
 
     def test_real(self, data_dir: Path) -> None:
         """The first frame has a rolling shutter and no motion yet to correct it by: 14 to 38 mm in 24 runs."""
@@ -98,13 +98,13 @@ class TestKidnap:
             with Slam(dataset.camera, Config(run=RunConfig(seed=seed))) as slam:
                 order = [*range(100), *[BLACK] * black, *range(30, 90)]
                 played = Played(slam, dataset, order, dataset.camera.fps, gap_s)
-            found = played.first(TrackStatus.RELOCALISED)
+            found = played.first(TrackStatus.RELOCALIZED)
             assert 100 + black <= found < 115 + black
             errors = played.aligned_errors_m(range(100), range(found, len(order)))
             first.append(errors[0])
             largest.append(errors[1:].max())
             ate = evaluate(slam.trajectory, played.truth).ate_rmse_m
-            print(f"{black} black: recognised in {found - 99 - black} frames, {1e3 * errors[0]:.1f} mm off there,")
+            print(f"{black} black: recognized in {found - 99 - black} frames, {1e3 * errors[0]:.1f} mm off there,")
             print(f"then up to {1e3 * errors[1:].max():.1f} mm, ATE of all {ate * 1e3:.1f} mm")
             assert ate < 0.0215
         assert np.median(first) < 0.03
@@ -129,7 +129,7 @@ class TestPolicies:
         played = play([*range(40), *[BLACK] * 30], PREDICT)
         last = played.results[39]
         for number, result in enumerate(played.results[40:], 1):
-            expected = moved(last.T_world_cam, last.twist * min(number / FPS, 1.0))
+            expected = retract(last.T_world_cam, last.twist * min(number / FPS, 1.0))
             apart = between(expected, result.T_world_cam)
             assert np.linalg.norm(apart[4:]) < 1e-6
             assert angle(apart) < 1e-6
@@ -159,12 +159,12 @@ class TestPolicies:
         assert errors.max() < 0.05
         assert problems(slam.map) == []
 
-    def test_localising_begins_no_submap(self) -> None:
+    def test_localizing_begins_no_submap(self) -> None:
         """A place that is not in the map stays unknown, whatever the policy."""
         start = play(range(120, 140)).slam.map
-        with Slam(room().camera, SUBMAP, map=start, localize_only=True) as slam:
+        with Slam(room().camera, SUBMAP, slam_map=start, localize_only=True) as slam:
             played = Played(slam, room(), [*range(120, 130), *range(40)], FPS, 2.0)
-        assert played.statuses[0] is TrackStatus.RELOCALISED
+        assert played.statuses[0] is TrackStatus.RELOCALIZED
         assert TrackStatus.STARTED not in played.statuses
         assert same(slam.map, start)
 
@@ -178,8 +178,8 @@ def mapped(tmp_path_factory: pytest.TempPathFactory) -> tuple[Slam, Path]:
     return slam, path
 
 
-def localise(path: Path, out: Path) -> None:
-    """Localise the same frames with a map from a file, and write poses, statuses and the map."""
+def localize(path: Path, out: Path) -> None:
+    """Localize the same frames with a map from a file, and write poses, statuses and the map."""
     slam = Slam.load(path, config=CONFIG, localize_only=True)
     played = Played(slam, room(), BEFORE, FPS)
     np.save(out / "poses.npy", np.array([result.T_world_cam for result in played.results]))
@@ -188,7 +188,7 @@ def localise(path: Path, out: Path) -> None:
 
 
 class TestFile:
-    def test_localise_in_another_process(self, mapped: tuple[Slam, Path], tmp_path: Path) -> None:
+    def test_localize_in_another_process(self, mapped: tuple[Slam, Path], tmp_path: Path) -> None:
         """The poses of a run in memory, and a map that is the same to the bit."""
         slam, path = mapped
         assert same(load_map(path), slam.map)
@@ -196,21 +196,21 @@ class TestFile:
             "import sys; sys.path[:0] = sys.argv[1].split(',')\n"
             "import jax; jax.config.update('jax_numpy_dtype_promotion', 'strict')\n"
             "jax.config.update('jax_numpy_rank_promotion', 'raise')\n"
-            "from pathlib import Path; import test_relocalisation\n"
-            "test_relocalisation.localise(Path(sys.argv[2]), Path(sys.argv[3]))\n"
+            "from pathlib import Path; import test_relocalization\n"
+            "test_relocalization.localize(Path(sys.argv[2]), Path(sys.argv[3]))\n"
         )
         subprocess.run([sys.executable, "-c", script, FOLDERS, str(path), str(tmp_path)], check=True, timeout=300)
-        here = Slam(room().camera, CONFIG, map=slam.map, localize_only=True)
+        here = Slam(room().camera, CONFIG, slam_map=slam.map, localize_only=True)
         played = Played(here, room(), BEFORE, FPS)
         poses = np.array([result.T_world_cam for result in played.results])
         np.testing.assert_allclose(np.load(tmp_path / "poses.npy"), poses, rtol=0, atol=1e-6)
         assert np.load(tmp_path / "statuses.npy").tolist() == played.statuses
-        assert played.statuses[0] is TrackStatus.RELOCALISED
+        assert played.statuses[0] is TrackStatus.RELOCALIZED
         assert set(played.statuses[1:]) == {TrackStatus.OK}
         assert (tmp_path / "again.npz").read_bytes() == path.read_bytes()
         assert here.map is slam.map
         errors = played.errors_m(range(len(BEFORE)))
-        print(f"localised to {errors.max() * 1e3:.1f} mm at most, mean {errors.mean() * 1e3:.1f}")
+        print(f"localized to {errors.max() * 1e3:.1f} mm at most, mean {errors.mean() * 1e3:.1f}")
         assert errors.max() < 0.03
 
     def test_second_clip_goes_on(self, mapped: tuple[Slam, Path]) -> None:
@@ -218,7 +218,7 @@ class TestFile:
         before = load_map(mapped[1])
         with Slam.load(mapped[1], config=CONFIG) as slam:
             played = Played(slam, room(), range(30, 110), FPS)
-        assert played.statuses[0] is TrackStatus.RELOCALISED
+        assert played.statuses[0] is TrackStatus.RELOCALIZED
         assert slam.map.next_keyframe > before.next_keyframe
         assert np.unique(slam.map.submap).tolist() == [0]
         assert slam.map.parent[slam.map.row(before.next_keyframe)] < before.next_keyframe
@@ -235,7 +235,7 @@ class TestFile:
             Played(slam, room(), range(40, 60), FPS)
             slam.reset()
             assert slam.map is start
-            assert slam.track(room()[20]).status is TrackStatus.RELOCALISED
+            assert slam.track(room()[20]).status is TrackStatus.RELOCALIZED
 
 
 SETTINGS = [
@@ -254,14 +254,14 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class TestCommandLine:
-    def test_run_localise_export(self, written: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def test_run_localize_export(self, written: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         map_file, settings = tmp_path / "m.npz", ["--set", *SETTINGS]
         main(["run", str(written), "--save-map", str(map_file), "--out", str(tmp_path / "one"), *settings])
         assert f"Map in {map_file}" in capsys.readouterr().out
         before = map_file.read_bytes()
         out = tmp_path / "two"
         main(["run", str(written), "--map", str(map_file), "--localize-only", "--out", str(out), *settings])
-        assert "RELOCALISED 1" in capsys.readouterr().out
+        assert "RELOCALIZED 1" in capsys.readouterr().out
         assert map_file.read_bytes() == before
         one, two = (read_trajectory(tmp_path / name / "trajectory.txt") for name in ("one", "two"))
         assert len(one) == len(two) == 40
@@ -284,7 +284,7 @@ class TestCommandLine:
             (["--map", str(damaged)], "damaged.npz"),
             (["--map", missing], "missing.npz"),
             (["--map", str(other)], "expected one of a camera of 320x240 pixels, got 64x48"),
-            (["--localize-only"], "--localize-only: needs the map to localise in: --map FILE"),
+            (["--localize-only"], "--localize-only: needs the map to localize in: --map FILE"),
         ):
             assert expected in fails(capsys, "run", str(written), *arguments)
         assert "damaged.npz" in fails(capsys, "export", str(damaged), "--ply", str(tmp_path / "x.ply"))

@@ -13,11 +13,11 @@ from wall_map import POINTS, at, seen_from
 from jaxslam.config.schema import Config
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.geometry.se3 import between, to_local
-from jaxslam.mapping.local_mapping import recalled_id
+from jaxslam.mapping.local_mapping import reloaded_id
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame
-from jaxslam.slam.frame_result import Tracked
-from jaxslam.slam.keyframe_recall import recall
+from jaxslam.slam.frame_result import FrameResult
+from jaxslam.slam.keyframe_reload import reload_keyframe
 from jaxslam.slam.slam import Slam
 
 
@@ -25,30 +25,30 @@ class TestRecall:
     def test_points(self) -> None:
         """As the map has them, in the keyframe's axes; those that were followed by flow first."""
         made = seen_from([at(), at(x=0.3)], [POINTS, POINTS])
-        keyframe = recall(made, 1, 120)
+        keyframe = reload_keyframe(made, 1, 120)
         assert keyframe.keyframe == 1
         np.testing.assert_array_equal(keyframe.image, cv2.imdecode(np.frombuffer(png(1), np.uint8), 0))
         ids = -1 - keyframe.id[:POINTS]
-        np.testing.assert_array_equal(recalled_id(ids), keyframe.id[:POINTS])
+        np.testing.assert_array_equal(reloaded_id(ids), keyframe.id[:POINTS])
         np.testing.assert_array_equal(ids, [*range(1, POINTS, 2), *range(0, POINTS, 2)])
         np.testing.assert_allclose(
             keyframe.X_cam[:, :POINTS], to_local(at(x=0.3), made.points.X_world[:, ids]), atol=1e-6
         )
-        mine = made.sightings.keyframe == 1
-        np.testing.assert_array_equal(keyframe.seen_uv[:, :POINTS], made.sightings.seen_uv[:, mine][:, ids])
-        np.testing.assert_array_equal(keyframe.weight[:POINTS], made.sightings.weight[mine][ids])
+        mine = made.observations.keyframe == 1
+        np.testing.assert_array_equal(keyframe.uv_raw[:, :POINTS], made.observations.uv_raw[:, mine][:, ids])
+        np.testing.assert_array_equal(keyframe.weight[:POINTS], made.observations.weight[mine][ids])
         assert not keyframe.weight[POINTS:].any()
 
     def test_no_more_than_there_is_room_for(self) -> None:
-        keyframe = recall(seen_from([at()], [POINTS]), 0, 30)
-        assert keyframe.seen_uv.shape == (2, 30)
+        keyframe = reload_keyframe(seen_from([at()], [POINTS]), 0, 30)
+        assert keyframe.uv_raw.shape == (2, 30)
         np.testing.assert_array_equal(-1 - keyframe.id, range(1, 61, 2))
 
     def test_damaged_image(self) -> None:
         made = seen_from([at()], [POINTS])
         damaged = made._replace(keyframes=(made.keyframes[0]._replace(image_png=b"no picture"),))
         with pytest.raises(RuntimeError, match="image of keyframe 0 cannot be decoded"):
-            recall(damaged, 0, 30)
+            reload_keyframe(damaged, 0, 30)
 
 
 OUT = 72
@@ -73,15 +73,15 @@ class TestTracking:
         """Back where the ring of keyframes has moved on from, the tracker finds more, and is no less right."""
         frames, truth = _there_and_back()
         late = slice(len(frames) - 40, len(frames))
-        looked_up, errors = {}, {}
-        for num_recalled in (0, 4):
-            with Slam(_camera(), Config(track=replace(SMALL_RING, num_recalled=num_recalled))) as slam:
-                results: list[Tracked] = [slam.track(frame) for frame in frames]
+        keyframe_matches, errors = {}, {}
+        for num_reloaded in (0, 4):
+            with Slam(_camera(), Config(track=replace(SMALL_RING, num_reloaded=num_reloaded))) as slam:
+                results: list[FrameResult] = [slam.track(frame) for frame in frames]
             poses = np.array([result.T_world_cam for result in results])
-            looked_up[num_recalled] = np.mean([result.num_looked_up for result in results[late]])
-            errors[num_recalled] = np.sqrt(np.square(poses[late, 4:] - truth[late, 4:]).sum(axis=1).mean())
-        print(f"points found again {looked_up}, errors {errors}")
-        assert looked_up[4] > 1.1 * looked_up[0]
+            keyframe_matches[num_reloaded] = np.mean([result.num_keyframe_matches for result in results[late]])
+            errors[num_reloaded] = np.sqrt(np.square(poses[late, 4:] - truth[late, 4:]).sum(axis=1).mean())
+        print(f"points found again {keyframe_matches}, errors {errors}")
+        assert keyframe_matches[4] > 1.1 * keyframe_matches[0]
         assert errors[4] < 1.1 * errors[0]
 
 
