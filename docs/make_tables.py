@@ -1,0 +1,144 @@
+"""Rewrite the tables of README.md and docs/measured-results.md from stored results.
+
+Run `python docs/make_tables.py` after a file in `configs/benchmarks/baselines` or `configs/benchmarks/published` has
+changed.
+A table stands between the comments `<!-- NAME: begin ... -->` and `<!-- NAME: end -->`; nothing else is touched.
+"""
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from jaxslam.benchmark.reports.markdown import table
+from jaxslam.benchmark.suites.accuracy_ruler import AccuracyBaseline, load_accuracy_baseline
+from jaxslam.benchmark.suites.published import Figure, published_for
+from jaxslam.config.schema import configs_dir
+from jaxslam.datasets.synthetic import SyntheticConfig
+
+DOCS = Path(__file__).resolve().parent
+PAGES = (DOCS.parent / "README.md", DOCS / "measured-results.md")
+_SYSTEMS_IN_README = ("DROID-W", "DynaSLAM", "Occlusion SLAM", "RTS-SLAM", "NGD-SLAM", "ORB-SLAM2")
+
+
+def tables() -> dict[str, str]:
+    """Make every generated block as Markdown, by the name in its comments."""
+    files = sorted((configs_dir() / "benchmarks" / "baselines").glob("accuracy-*.json"))
+    baselines = [load_accuracy_baseline(file) for file in files]
+    return {
+        "accuracy": "\n".join(map(accuracy_table, baselines)),
+        "published": "\n".join(published_tables(baselines)),
+        "results": results_table(baselines[0]),
+    }
+
+
+def accuracy_table(baseline: AccuracyBaseline) -> str:
+    """Make the table of one accuracy baseline, under a line that says where it was measured."""
+    rows = []
+    for name, runs in baseline.recordings.items():
+        low, high = 1e3 * min(runs.ates_m), 1e3 * max(runs.ates_m)
+        rows.append(
+            [
+                f"`{name}`",
+                described(baseline.sequences[name]),
+                str(runs.frames),
+                str(len(runs.ates_m)),
+                f"{runs.tracked_percent:.4g} %",
+                f"{1e3 * runs.median_m:.2f} mm",
+                f"{low:.2f}-{high:.2f} mm",
+            ]
+        )
+    columns = ("name", "recording", "frames", "seeds", "tracked", "ATE, median", "ATE, range")
+    measured = f"Commit {baseline.commit}, preset `{baseline.preset}`, on {baseline.machine}; {baseline.versions}:\n"
+    return f"{measured}\n{table(columns, rows)}"
+
+
+def published_tables(baselines: list[AccuracyBaseline]) -> list[str]:
+    """Make, for every recording that was run whole and has published figures, a table of those figures."""
+    parts = []
+    for recording in dict.fromkeys(whole for baseline in baselines for whole in whole_recordings(baseline).values()):
+        figures = published_for(recording)
+        rows = [
+            [
+                figure.system,
+                f"{figure.value:g} m",
+                figure.sensor,
+                figure.alignment + ("" if figure.alignment_stated else ", not stated"),
+                figure.source + (f" (reported by {figure.reported_by})" if figure.reported_by else ""),
+            ]
+            for figure in figures
+        ]
+        if rows:
+            parts.append(f"`{recording}`:\n\n" + table(("system", "ATE", "sensor", "alignment", "source"), rows))
+    return parts
+
+
+def results_table(baseline: AccuracyBaseline) -> str:
+    """Make the short table of README.md: the recordings of a baseline, and published figures where they compare."""
+    whole = whole_recordings(baseline)
+    rows = []
+    for name, runs in baseline.recordings.items():
+        best_of_each: dict[str, Figure] = {}
+        for figure in published_for(whole[name]) if name in whole else []:  # best first
+            best_of_each.setdefault(figure.system, figure)
+        others = [
+            f"{figure.system}{'' if figure.sensor == 'rgbd' else f' ({figure.sensor})'} {figure.value:g} m"
+            for figure in best_of_each.values()
+            if figure.system in _SYSTEMS_IN_README
+        ]
+        rows.append(
+            [
+                described(baseline.sequences[name]),
+                f"{runs.tracked_percent:.4g} %",
+                f"{runs.median_m:.4f} m",
+                ", ".join(others) or "-",
+            ]
+        )
+    return table(("recording", "tracked", "ATE", "published"), rows)
+
+
+def whole_recordings(baseline: AccuracyBaseline) -> dict[str, str]:
+    """List the sequences that are whole recordings, with the name of the recording."""
+    return {
+        name: sequence["recording"]
+        for name, sequence in baseline.sequences.items()
+        if "recording" in sequence and "stop" not in sequence
+    }
+
+
+def described(sequence: Mapping[str, Any]) -> str:
+    """Say in words what a sequence of a suite is."""
+    if "recording" in sequence:
+        part = f", first {sequence['stop']} frames" if "stop" in sequence else ""
+        return f"`{sequence['recording']}`{part}"
+    room = SyntheticConfig(**sequence["room"])
+    moving = [f"{number} {what}" for number, what in ((room.people, "people"), (room.boxes, "boxes")) if number]
+    sensor = ["stereo"] if room.baseline_m is not None else []
+    return ", ".join([f"rendered room, path {room.path}", *(moving or ["nothing moves"]), *sensor])
+
+
+def with_tables(text: str, blocks: Mapping[str, str]) -> str:
+    """Put the blocks between their comments in the text of a page.
+
+    Raises:
+        ValueError: If the text has comments for a block that is unknown.
+    """
+
+    def filled(match: re.Match[str]) -> str:
+        if match["name"] not in blocks:
+            raise ValueError(f"{match['name']}: expected one of {', '.join(blocks)}")
+        return f"{match['begin']}\n{blocks[match['name']].strip()}\n{match['end']}"
+
+    pattern = r"(?P<begin><!-- (?P<name>\w+): begin[^>]*-->)\n.*?(?P<end><!-- (?P=name): end -->)"
+    return re.sub(pattern, filled, text, flags=re.DOTALL)
+
+
+def main() -> None:
+    """Rewrite the tables of every page."""
+    blocks = tables()
+    for page in PAGES:
+        page.write_text(with_tables(page.read_text(encoding="utf-8"), blocks), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
