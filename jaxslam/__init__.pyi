@@ -1,12 +1,14 @@
 from .config.schema import Config as Config
 from .config.schema import load_config as load_config
 from .datasets import open_dataset as open_dataset
-from .dynamics.cue import CueInput as CueInput
-from .dynamics.cue import CueResult as CueResult
-from .dynamics.cue import threshold_evidence as threshold_evidence
+from .datasets.protocol import Dataset as Dataset
+from .dense.point_cloud import DenseCloud as DenseCloud
 from .errors import JaxSlamError as JaxSlamError
+from .map.types import Map as Map
 from .runtime.compile_cache import enable_compile_cache as enable_compile_cache
 from .runtime.compile_cache import prefer_one_thread as prefer_one_thread
+from .semantics.detections import Detections as Detections
+from .semantics.detections import Detector as Detector
 from .sensors.camera import Camera as Camera
 from .sensors.camera import Intrinsics as Intrinsics
 from .sensors.camera import known_cameras as known_cameras
@@ -17,7 +19,10 @@ from .sensors.frame_arrays import stack_frames as stack_frames
 from .sensors.rectification import RectifiedPair as RectifiedPair
 from .sensors.stereo_rig import Lens as Lens
 from .sensors.stereo_rig import Rig as Rig
+from .slam.frame_result import FrameRecord as FrameRecord
 from .slam.frame_result import FrameResult as FrameResult
+from .slam.frame_result import Rejected as Rejected
+from .slam.mask_pipeline import MaskSource as MaskSource
 from .slam.slam import Slam as Slam
 from .tracking.batch import track_clips as track_clips
 from .tracking.cue_registry import with_cue_params as with_cue_params
@@ -40,6 +45,7 @@ from .tracking.step import follow_points as follow_points
 from .tracking.step import init_state as init_state
 from .tracking.step import track_followed as track_followed
 from .tracking.step import track_step as track_step
+from .trajectory.coverage import Coverage as Coverage
 from .trajectory.evaluation import Evaluation as Evaluation
 from .trajectory.evaluation import evaluate as evaluate
 from .trajectory.trajectory import Trajectory as Trajectory

@@ -344,7 +344,8 @@ class TestOthers:
 
 
 _RUN = """
-from jaxslam import Slam, load_config, trace_cache
+from jaxslam import Slam, load_config
+from jaxslam.runtime import trace_cache
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 
 made, make = [], trace_cache._traced

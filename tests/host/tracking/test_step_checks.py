@@ -13,7 +13,8 @@ from jax import lax
 from jaxlie import SE3
 from small_scene import HEIGHT, PLAN, TRACK, WIDTH, clip, new_state, params, stacked
 
-from jaxslam import CueResult, FlowPlan, LevelPlan, TrackParams, follow_points, init_state, track_clips, track_followed
+from jaxslam import FlowPlan, LevelPlan, TrackParams, follow_points, init_state, track_clips, track_followed
+from jaxslam.dynamics import CueResult
 from jaxslam.config.schema import load_config
 from jaxslam.dynamics.object_motion import MotionPlan
 from jaxslam.errors import ConfigError, FrameError
