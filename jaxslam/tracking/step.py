@@ -297,7 +297,7 @@ def track_followed(
     witnesses = judged.monitor_points(uv, state.points.anchor_age, followed & ~inliers)
     kept = _update_points(state, view, uv, inliers, witnesses, refined.T_world_cam, params)
     new_state, output = _conclude(state, view, kept, refined, keyframe_matches, verdict, judged, params, plan)
-    said = {"verdicts": judged.verdicts, "regions": judged.regions, "moving": judged.moving, "motion": judged.motion}
+    said = {"cue_results": judged.verdicts, "regions": judged.regions, "moving": judged.moving, "motion": judged.motion}
     if plan.pose_steps > DEFAULT_PLAN.pose_steps:
         # Not always: one more use of the coarse pose's status has XLA round the pose itself in another way.
         said["pose_status"] = worse_status(coarse_status, refined.status)
