@@ -1,4 +1,4 @@
-"""Cues to what moves: pure functions from what a frame shows of the points to how much each of them counts."""
+"""Dynamic cues: pure functions from the measurements of tracked points to a weight for each point."""
 
 import lazy_loader
 

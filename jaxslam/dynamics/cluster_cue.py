@@ -1,8 +1,8 @@
-"""Clusters: whether the points on one surface are, on average, where the map has them.
+"""Cluster cue: compare the mean reprojection error of each depth region with that of all points.
 
 Source: TRS-SLAM (Ji, Wang and Xie, ICRA 2021), equation 1 and section IV: the mean robust reprojection error of each
-region of the depth image against a threshold that depends on the mean over all of them. It is low on purpose: a mover
-that is missed costs more than a surface at rest that is left out.
+region of the depth image against a threshold derived from the mean over all regions. The threshold is low on purpose: a
+missed moving object costs more than a static surface that is left out.
 """
 
 from collections.abc import Callable
@@ -20,17 +20,18 @@ from jaxslam.dynamics.regions import RegionCueResult, Regions, mean_of_regions, 
 
 
 class ClusterParams(NamedTuple):
-    """Of the cluster cue; scalars.
+    """Parameters of the cluster cue; all scalars.
 
     Attributes:
-        times_mean: A region moves if its mean error is beyond so many times that of all points. The paper gives no
-            number.
-        least_px: A region whose root mean error is below is at rest, pixels; 0 as published. With
-            1.75 at `robust_px` of 2.45 half of its points are wrong; 1.4, a third, gave surfaces at rest away.
-        robust_px: Errors beyond count hardly more, however large, pixels (the loss of Geman and McClure; the paper has
-            a robust one and does not name it). With Huber's, one wrong match in five gives a region at rest away.
-        fewest: Least number of points of which a mean is worth anything.
-        temperature: See `cue.judge`.
+        times_mean: A region moves if its mean error exceeds this multiple of the mean error of all points. The paper
+            gives no number.
+        least_px: A region whose root mean error is below this is static, in pixels; 0 as published. With 1.75 at a
+            `robust_px` of 2.45, half of the region's points are wrong; with 1.4 a third are, which rejected static
+            surfaces.
+        robust_px: Scale beyond which a larger error hardly counts more, in pixels (Geman-McClure loss; the paper uses a
+            robust loss without naming it). With Huber's loss, one wrong match in five rejects a static region.
+        fewest: Minimum number of points for a mean to be used.
+        temperature: Softness of the comparison, as in `cue.threshold_evidence`.
     """
 
     times_mean: Scalar
@@ -43,24 +44,24 @@ class ClusterParams(NamedTuple):
 ClusterCue: TypeAlias = Callable[[CueInput, ClusterParams], CueResult]
 
 
-@lru_cache  # the same function for the same choice: another one would be compiled anew
+@lru_cache  # the same function for the same choice: a new function would be compiled again
 def make_cluster_cue(as_published: bool = False) -> ClusterCue:
-    """The cue that judges regions of the depth image.
+    """Make the cue that classifies regions of the depth image.
 
     Args:
-        as_published: Whether the mean over all points is taken over all of them, or over those that agree with the
-            pose, which a large mover does not raise.
+        as_published: Whether the overall mean is taken over all points. Otherwise it is taken over those that agree
+            with the pose, so that a large moving object does not raise it.
     """
 
     def cluster_cue(scene: CueInput, params: ClusterParams) -> CueResult:
-        """How large the mean error of each point's region is, in thresholds.
+        """Return the mean error of each point's region in units of the threshold.
 
         Args:
-            scene: What is known of the points; its `regions` must be there.
+            scene: Measurements of the points; its `regions` must be set.
             params: Thresholds.
 
         Raises:
-            ValueError: If the scene has no regions.
+            ValueError: If `scene.regions` is `None`.
         """
         if scene.regions is None:
             raise ValueError("scene.regions: expected regions for the cluster cue, got None; set TrackPlan.regions")
@@ -87,10 +88,10 @@ def _verdict(scene: CueInput, regions: Regions, params: ClusterParams, as_publis
 
 
 def _robust_errors(scene: CueInput, params: ClusterParams) -> tuple[Weights, Mask]:
-    """Robust squared reprojection errors of the points at the pose, pixels squared, and which are known.
+    """Compute the robust squared reprojection errors of the points at the pose, in pixels squared, and their validity.
 
-    Of where they were a while ago, as the points of a keyframe in the paper: the places of followed points are measured
-    anew in every frame, and go along with what moves slowly.
+    The errors are those of the points' earlier positions (`X_anchor`), like the keyframe points in the paper: positions
+    of tracked points are measured again in every frame, so they drift along with a slowly moving surface.
     """
     X_cam = to_camera(scene.T_world_cam, scene.X_anchor)
     known = scene.followed & jnp.isfinite(scene.uv).all(axis=0) & (X_cam[2] > 0)

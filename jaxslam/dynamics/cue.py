@@ -1,7 +1,8 @@
-"""What a cue is given and what it says, the same for all of them, and how several become one weight a point.
+"""Common interface of the dynamic cues: their input, their result, and how several results become one weight per point.
 
-A cue measures something that points at rest do not show, in units in which 1 is the limit. Published systems compare
-with the limit and drop what is beyond; with a temperature the same comparison is smooth, and has a derivative.
+A cue measures something that static points do not show, scaled so that the threshold is 1. Published systems compare
+with the threshold and drop what exceeds it; with a temperature above 0 the same comparison is smooth and
+differentiable.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,25 +19,26 @@ from jaxslam.dynamics.regions import RegionCueResult, Regions
 
 
 class CueInput(NamedTuple):
-    """What is known of `n` points between two frames, before the pose of the second is refined.
+    """Measurements of `n` points in two frames, before the pose of the second frame is refined.
 
     Attributes:
-        uv_before: `(2, n)` where they are in the frame before, pixels of the camera of `intrinsics`.
-        uv: `(2, n)` where they are now.
-        followed: `(n,)` which are there in both and under no mask.
-        masked: `(n,)` which are there in both and under a mask: they do not count, whatever is said of them.
-        agrees: `(n,)` which of those that are followed agree with `T_world_cam`.
-        weight: `(n,)` how much each counts before anything is said of it.
-        depth_before: `(n,)` meters in the frame before, 0 where not measured.
-        depth: `(n,)` meters now, 0 where not measured.
-        X_world: `(3, n)` where they are in the world, meters, as measured over the last few frames.
-        X_anchor: `(3, n)` where they were up to half a second ago, meters.
-        T_world_before: Pose of the camera in the frame before.
-        T_world_cam: Its pose now, as most points have it.
-        intrinsics: The camera. The tracker's is one without lens distortion and with a global shutter.
-        size: `(2,)` columns and rows of the picture.
-        key: Of the random choices of this frame.
-        regions: Parts of the depth image; `None` without `TrackPlan.regions`.
+        uv_before: `(2, n)` pixel positions in the previous frame, for the camera of `intrinsics`.
+        uv: `(2, n)` pixel positions in the current frame.
+        followed: `(n,)` whether each point is tracked in both frames and outside every mask.
+        masked: `(n,)` whether each point is tracked in both frames and under a mask. These points have no weight,
+            whatever a cue returns for them.
+        agrees: `(n,)` which of the `followed` points are inliers of `T_world_cam`.
+        weight: `(n,)` weight of each point before any cue is applied.
+        depth_before: `(n,)` depth in the previous frame, in meters; 0 where not measured.
+        depth: `(n,)` depth in the current frame, in meters; 0 where not measured.
+        X_world: `(3, n)` world positions measured over the last few frames, in meters.
+        X_anchor: `(3, n)` world positions measured up to half a second ago, in meters.
+        T_world_before: Camera pose of the previous frame.
+        T_world_cam: Current camera pose, as most points agree on it.
+        intrinsics: Camera intrinsics. The tracker passes a camera without lens distortion and with a global shutter.
+        size: `(2,)` columns and rows of the image.
+        key: Key of this frame's random choices.
+        regions: Regions of the depth image; `None` without `TrackPlan.regions`.
     """
 
     uv_before: Pixels
@@ -58,13 +60,13 @@ class CueInput(NamedTuple):
 
 
 class CueResult(NamedTuple):
-    """What a cue says of each point.
+    """Result of a cue for `n` points.
 
     Attributes:
-        weight: `(n,)` 0 for what moves to 1 for what is at rest; 1 where nothing is known.
-        evidence: `(n,)` what was measured, in units of its limit; 0 where nothing is known.
-        known: `(n,)` where something is.
-        regions: The same of each of `Scene.regions`, if it is said of them as a whole.
+        weight: `(n,)` from 0 for a moving point to 1 for a static one; 1 where nothing is known.
+        evidence: `(n,)` measured value in units of the threshold; 0 where nothing is known.
+        known: `(n,)` whether the point could be classified.
+        regions: The same result per region of `CueInput.regions`, if the cue classifies whole regions.
     """
 
     weight: Weights
@@ -74,17 +76,18 @@ class CueResult(NamedTuple):
 
 
 Cue: TypeAlias = Callable[[CueInput, Any], CueResult]
-"""A pure function of what is known and of its own parameters, a pytree. `TrackPlan.cues` takes any of them."""
+"""A pure function of the measurements and of its own parameters, a pytree. `TrackPlan.cues` accepts any of them."""
 
 
 def threshold_evidence(evidence: Weights, known: Mask, temperature: Scalar) -> CueResult:
-    """A verdict by the limit, which is 1.
+    """Classify points by comparing their evidence with the threshold, which is 1.
 
     Args:
-        evidence: `(n,)` not negative; beyond 1 a point moves.
-        known: `(n,)` where it is worth anything. Where it is not finite it is not.
-        temperature: 0 compares, as published. Above, the weight is `1 / (1 + exp((evidence - 1) / temperature))`:
-            one half at the limit, and what comparing gives as the temperature goes to 0.
+        evidence: `(n,)` non-negative measurements; above 1 a point moves.
+        known: `(n,)` whether the evidence is usable. Evidence that is not finite never is.
+        temperature: At 0 the comparison is hard, as published. Above 0 the weight is
+            `1 / (1 + exp((evidence - 1) / temperature))`: one half at the threshold, and equal to the hard comparison
+            in the limit of temperature 0.
     """
     known = known & jnp.isfinite(evidence)
     measured = jnp.where(known, evidence, 0)
@@ -95,11 +98,14 @@ def threshold_evidence(evidence: Weights, known: Mask, temperature: Scalar) -> C
 
 
 def combine_cues(verdicts: Sequence[CueResult], weight: Weights) -> Weights:
-    """`(n,)` the weights times those of all verdicts: every cue has a veto, as every layer has in RTS-SLAM.
+    """Multiply the weights by those of all cue results: every cue has a veto, like every layer of RTS-SLAM.
 
     Args:
-        verdicts: Of the same points, any number.
-        weight: `(n,)` how much each counts without them.
+        verdicts: Any number of results for the same points.
+        weight: `(n,)` weights before the cues.
+
+    Returns:
+        The combined weights, `(n,)`.
     """
     for verdict in verdicts:
         weight = weight * verdict.weight

@@ -1,8 +1,8 @@
-"""Epipolar consistency: whether a point is on the line on which one at rest would be.
+"""Epipolar cue: measure how far a point is from the epipolar line on which a static point would lie.
 
-Source: RTS-SLAM (Sensors 2026), algorithm 1, lines 1 to 16: the fundamental matrix of two adjacent frames by RANSAC of
-seven points, from points outside semantic regions if there are enough of them, else from all; and the distance of each
-point from its line. It needs neither depth nor map.
+Source: RTS-SLAM (Sensors 2026), algorithm 1, lines 1 to 16: the fundamental matrix of two adjacent frames by 7-point
+RANSAC, from points outside semantic regions if there are enough of them, else from all points; then the distance of
+each point from its epipolar line. The cue needs neither depth nor a map.
 """
 
 from collections.abc import Callable
@@ -18,14 +18,15 @@ from jaxslam.dynamics.cue import CueInput, CueResult, threshold_evidence
 
 
 class EpipolarParams(NamedTuple):
-    """Of the epipolar cue; scalars.
+    """Parameters of the epipolar cue; all scalars.
 
     Attributes:
-        limit_px: Distance from the line beyond which a point moves: the paper's xi.
-        fewest_outside: With no more points outside masks, those under masks vote too: the paper's N_th.
-        border_px: Points closer to the border of the picture are not judged; flow is worse there.
-        ransac_px: Sampson distance up to which a point supports a matrix.
-        temperature: See `cue.judge`.
+        limit_px: Distance from the epipolar line above which a point moves, in pixels: the paper's xi.
+        fewest_outside: If no more points than this lie outside masks, points under masks vote too: the paper's N_th.
+        border_px: Points closer to the image border than this are not classified, in pixels; optical flow is worse
+            there.
+        ransac_px: Sampson distance up to which a point supports a matrix, in pixels.
+        temperature: Softness of the comparison, as in `cue.threshold_evidence`.
     """
 
     limit_px: Scalar
@@ -38,20 +39,20 @@ class EpipolarParams(NamedTuple):
 EpipolarCue: TypeAlias = Callable[[CueInput, EpipolarParams], CueResult]
 
 
-@lru_cache  # the same function for the same number: another one would be compiled anew
+@lru_cache  # the same function for the same number: a new function would be compiled again
 def make_epipolar_cue(num_hypotheses: int = 32) -> EpipolarCue:
-    """The cue with so many hypotheses of the matrix a frame.
+    """Make the cue with this number of RANSAC hypotheses per frame.
 
-    Most points that move are under masks: of 80 % good ones seven are good in one sample of five, and 32 samples miss
-    once in 1,800 frames; of 60 %, once in 2.5. Not in the paper: the matrix of the coarse motion of the camera is tried
-    besides. With it a quarter of the hypotheses do, and a third of the steps.
+    Most moving points are under masks: with 80 % inliers, one sample of seven in five is all inliers, and 32 samples
+    miss once in 1,800 frames; with 60 %, once in 2.5 frames. Beyond the paper, the matrix of the coarse camera motion
+    is tried as well. With it, a quarter of the hypotheses and a third of the steps are enough.
     """
 
     def epipolar_cue(scene: CueInput, params: EpipolarParams) -> CueResult:
-        """How far each point is from its line, in limits.
+        """Return the distance of each point from its epipolar line in units of the threshold.
 
-        Nothing is said in a frame whose motion does not determine the matrix: a camera that stands or turns on the
-        spot, or points on one plane; one of many matrices that fit would be no evidence.
+        Nothing is classified in a frame whose motion does not determine the matrix: a camera that stands still or
+        rotates in place, or points on one plane. One of many matrices that fit would be no evidence.
         """
         judged = (scene.followed | scene.masked) & _clear_of_border(scene, params.border_px)
         found = _matrix(scene, judged, params, num_hypotheses)

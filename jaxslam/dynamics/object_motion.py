@@ -1,7 +1,7 @@
-"""3-D motion state: which of the things that may move do so now, and which stand still and are as good as a wall.
+"""3-D motion state: classify movable objects as moving or static; static ones are as good as background.
 
-Source: USD-SLAM (Wang et al., RA-L 2024), section III-B: the motion of points in space, beyond that of the camera,
-against what points at rest show; a thing stands still while 70 % of its points are below that limit.
+Source: USD-SLAM (Wang et al., RA-L 2024), section III-B: the 3-D motion of points beyond that of the camera, compared
+with what static points show; an object is static while 70 % of its points are below that threshold.
 """
 
 from typing import NamedTuple
@@ -17,19 +17,19 @@ from jaxslam.dynamics.cue import threshold_evidence
 from jaxslam.dynamics.regions import RegionCueResult
 
 Labels = UInt8[Array, "h w"]
-"""Number of the thing that may move at each pixel, from 1; 0 where there is none."""
+"""Number of the movable object at each pixel, from 1; 0 where there is none."""
 
 
 class MotionPlan(NamedTuple):
-    """Static.
+    """Static settings of the motion state.
 
     Attributes:
-        num_objects: Things in one frame at most; a frame's labels are 1 to this.
-        reserved: Slots of points that are kept free for points on them.
-        dense_cell_px: Side of the cells that each get at most one new corner where things take up over half of the
-            picture, even: more points from what is left of it.
-        as_published: Whether motion is measured in meters from frame to frame, its limit from mean and standard
-            deviation, and the points of a thing are counted alone.
+        num_objects: Maximum number of objects in a frame; the labels of a frame are 1 to this.
+        reserved: Point slots kept free for points on movable objects.
+        dense_cell_px: Side of the grid cells that each get at most one new corner where movable objects cover over half
+            of the image, in pixels (an even number). It gives more points from the remaining background.
+        as_published: Whether to follow the paper: motion in meters from frame to frame, a threshold from mean and
+            standard deviation, and an object classified by counting its points alone.
     """
 
     num_objects: int = 16
@@ -39,16 +39,17 @@ class MotionPlan(NamedTuple):
 
 
 class MotionParams(NamedTuple):
-    """Of `classify_motion`; scalars.
+    """Parameters of `classify_motion`; all scalars.
 
     Attributes:
-        sigmas: A point moves if it moves more than points at rest do by so many standard deviations.
-        share: A thing is at rest while this share of its points does not move.
-        least: Motion of a thing, in standard deviations of a point, that is none in any case: people who sit breathe.
-        fewest: Least number of points that say anything of a thing.
-        still_frames: Frames in which it must be at rest to be taken to stand still,
-        moving_frames: and in which it must move to be taken to move again.
-        temperature: See `cue.judge`; of the verdict on a thing.
+        sigmas: A point moves if its motion exceeds that of static points by this many standard deviations.
+        share: An object is static while this share of its points does not move.
+        least: Mean motion of an object below which it never counts as moving, in standard deviations of a point: seated
+            people breathe.
+        fewest: Minimum number of points for an object to be classified.
+        still_frames: Number of frames in which an object must be static before it is treated as static.
+        moving_frames: Number of frames in which a static object must move before it is treated as moving again.
+        temperature: Softness of an object's classification, as in `cue.threshold_evidence`.
     """
 
     sigmas: Scalar
@@ -61,12 +62,12 @@ class MotionParams(NamedTuple):
 
 
 class MotionMemory(NamedTuple):
-    """What the next frame has of the things in this one; they are known again by the points on them.
+    """Motion state carried to the next frame; objects are re-identified by the points on them.
 
     Attributes:
-        of_point: `(n,)` number of the thing that each point is on, 0 for none.
-        stillness: `(k,)` 0 for what moves to 1 for what has been at rest for some frames.
-        at_rest: `(k,)` which are taken to stand still.
+        of_point: `(n,)` number of the object that each point is on; 0 for none.
+        stillness: `(k,)` from 0 for a moving object to 1 for one that has been static for some frames.
+        at_rest: `(k,)` whether each object is treated as static.
     """
 
     of_point: Int[Array, " n"]
@@ -75,12 +76,12 @@ class MotionMemory(NamedTuple):
 
 
 class MotionState(NamedTuple):
-    """What is known of the things in a frame that may move; entry 0 is of thing 1.
+    """Motion state of the movable objects in a frame; entry 0 belongs to object 1.
 
     Attributes:
-        there: `(n,)` which points are known in the frame.
-        verdict: Of this frame alone, `(k,)`; evidence is in units of the limit.
-        memory: For the next frame.
+        there: `(n,)` which points are measured in this frame.
+        verdict: Classification from this frame alone, `(k,)`; its evidence is in units of the threshold.
+        memory: State for the next frame.
     """
 
     there: Mask
@@ -89,28 +90,28 @@ class MotionState(NamedTuple):
 
     @property
     def of_point(self) -> Int[Array, " n"]:
-        """`(n,)` number of the thing that each point is on, from 1; 0 for none."""
+        """`(n,)` number of the object that each point is on, from 1; 0 for none."""
         return self.memory.of_point
 
     @property
     def at_rest(self) -> Bool[Array, " k"]:
-        """`(k,)` which are taken to stand still."""
+        """`(k,)` whether each object is treated as static."""
         return self.memory.at_rest
 
     def moves(self) -> Bool[Array, " k1"]:
-        """`(k + 1,)` by label; false for 0, what cannot move."""
+        """Return `(k + 1,)` whether each label moves; false for label 0, the background."""
         return jnp.concatenate([jnp.zeros(1, bool), ~self.at_rest])
 
     def moving_pixels(self, labels: Labels) -> Bool[Array, "h w"]:
-        """Pixels of things that move, or of which nothing is known."""
+        """Return the pixels of objects that move or could not be classified."""
         return self.moves()[labels.astype(jnp.int32)]
 
     def joining(self) -> Mask:
-        """`(n,)` points on things that stand still."""
+        """Return `(n,)` which points are on static objects."""
         return self.there & (self.of_point > 0) & ~self.moves()[self.of_point]
 
     def monitored(self) -> Mask:
-        """`(n,)` points on things that move."""
+        """Return `(n,)` which points are on moving objects."""
         return self.there & self.moves()[self.of_point]
 
 
@@ -118,10 +119,10 @@ class MeasuredPoints(NamedTuple):
     """Points in the world and in a frame.
 
     Attributes:
-        X_world: `(3, n)` meters, where they were.
-        X_cam: `(3, n)` meters, where they are in the axes of the camera.
-        sigma: `(3, n)` standard deviation of that, meters.
-        there: `(n,)` which are known in both.
+        X_world: `(3, n)` earlier world positions, in meters.
+        X_cam: `(3, n)` current positions in camera axes, in meters.
+        sigma: `(3, n)` standard deviations of `X_cam`, in meters.
+        there: `(n,)` which points are measured in both.
     """
 
     X_world: Points
@@ -131,13 +132,13 @@ class MeasuredPoints(NamedTuple):
 
 
 def no_motion(plan: MotionPlan | None, num_points: int, dtype: jnp.dtype) -> MotionMemory:
-    """Before anything is seen."""
+    """Return the memory before the first frame."""
     num = 0 if plan is None else plan.num_objects
     return MotionMemory(jnp.zeros(num_points, jnp.int32), jnp.zeros(num, dtype), jnp.zeros(num, bool))
 
 
 def labels_at(labels: Labels, uv: Pixels) -> Int[Array, " n"]:
-    """`(n,)` what is at pixels `(2, n)`; 0 outside of the picture."""
+    """Return `(n,)` the labels at pixels `(2, n)`; 0 outside the image."""
     column, row = jnp.round(lax.stop_gradient(uv)).astype(jnp.int32)
     there = labels.at[row, column].get(mode="fill", fill_value=0).astype(jnp.int32)
     return jnp.where((row >= 0) & (column >= 0), there, 0)  # negative indices count from the end
@@ -153,21 +154,21 @@ def classify_motion(
     *,
     as_published: bool = False,
 ) -> MotionState:
-    """Which things stand still, given the pose that what cannot move has.
+    """Classify the movable objects as moving or static, given the pose estimated from the background.
 
-    Lengths are in standard deviations of where a point is measured, not in meters as published: pixels are worth
-    millimeters across the line of sight and depth is worth centimeters along it, so that in meters a limit of what
-    depth shows hides what goes by. And a thing whose points have gone the same way on average moves though no single
-    one does by the limit: noise of the mean of `n` points is `1 / sqrt(n)` of theirs.
+    Lengths are in standard deviations of a point's measured position, not in meters as published. Pixels are accurate
+    to millimeters across the line of sight and depth to centimeters along it, so a threshold in meters wide enough for
+    depth noise hides sideways motion. Also, an object whose points have all gone the same way on average moves although
+    no single point exceeds the threshold: the noise of the mean of `n` points is `1 / sqrt(n)` of theirs.
 
     Args:
-        points: All points that are followed.
-        of_point: `(n,)` number of the thing that each is on, from 1; 0 for none.
-        background: `(n,)` how much each counts for the limit: those that agree with the pose and are on no thing.
-        T_world_cam: Pose of the camera.
-        before: From the frame before.
-        params: Limits.
-        as_published: As of `MotionPlan`, static.
+        points: All tracked points.
+        of_point: `(n,)` number of the object that each point is on, from 1; 0 for none.
+        background: `(n,)` weight of each point in the threshold: inliers of the pose that are on no object.
+        T_world_cam: Camera pose.
+        before: Memory of the previous frame.
+        params: Thresholds.
+        as_published: As in `MotionPlan`; static.
     """
     flow = scene_flow(points.X_world, points.X_cam, T_world_cam)
     flow = jnp.where(points.there[None, :], flow, 0)
@@ -189,9 +190,9 @@ def classify_motion(
 def _remembered(
     verdict: RegionCueResult, of_point: Int[Array, " n"], before: MotionMemory, params: MotionParams
 ) -> MotionMemory:
-    """The memory of each thing after this frame; that of a new one is of what moves.
+    """Update the memory of each object after this frame; a new object starts as moving.
 
-    A thing is the one of the frame before that most of its points were on.
+    An object is matched to the object of the previous frame that most of its points were on.
     """
     num = before.at_rest.shape[0]
     was, now = before.of_point, of_point
@@ -201,6 +202,6 @@ def _remembered(
     at_rest = known_before & before.at_rest[parent]
     step = jnp.where(verdict.weight >= 0.5, 1 / params.still_frames, -1 / params.moving_frames)
     stillness = jnp.clip(stillness + jnp.where(verdict.known, step, 0), 0, 1)
-    nearly = 1e-3  # of a sum of thirds
+    nearly = 1e-3  # tolerance for a sum of thirds
     at_rest = (at_rest | (stillness > 1 - nearly)) & (stillness > nearly)
     return MotionMemory(of_point, lax.stop_gradient(stillness), at_rest)

@@ -1,8 +1,9 @@
-"""Occluded points: map points that something passed in front of and that were there again afterwards.
+"""Occluded points: map points that something passed in front of and that were visible again afterwards.
 
-What stays where it was while something moves before it belongs to the background, and counts more in every adjustment.
+A point that stays in place while something moves in front of it belongs to the background, and gets more weight in
+every adjustment.
 
-Source: Occlusion SLAM, algorithm 1 and formula 3; weights 1 and 3 there.
+Source: Occlusion SLAM, algorithm 1 and equation 3, with weights 1 and 3.
 """
 
 import enum
@@ -17,29 +18,30 @@ States = Int[Array, " n"]
 
 
 class PointState(enum.IntEnum):
-    """What is known of a map point from masks that passed over it."""
+    """State of a map point, from the masks that passed over it."""
 
     STATIC = 0
-    """Nothing has passed before it."""
+    """Nothing has passed in front of it."""
     BLOCKED = 1
-    """A mask was over it when last it was in the picture."""
+    """A mask covered it when it was last inside the image."""
     OCCLUDED = 2
-    """It was seen again after it had been blocked."""
+    """It was visible again after having been blocked."""
 
 
 def next_states(states: States, inside: Mask, masked: Mask, displaced: Mask) -> States:
-    """States after a frame.
+    """Advance the states by one frame.
 
-    A point that is STATIC and under the mask becomes BLOCKED; one that is BLOCKED, in the picture and not under the
-    mask becomes OCCLUDED, and stays so. That is the paper's state machine, and all of it where nothing is
-    `displaced`. A box that stands still, is passed, and is carried away later would keep its weight for good; the
-    guard, which the paper does not have, takes a point that is seen, but not where it should be, back to STATIC.
+    A STATIC point under the mask becomes BLOCKED; a BLOCKED point inside the image and outside the mask becomes
+    OCCLUDED, and stays so. This is the paper's state machine, and all of it if nothing is `displaced`. A box that
+    stands still, is passed, and is carried away later would keep its weight forever; the guard, which the paper does
+    not have, resets a point that is visible but not where it should be to STATIC.
 
     Args:
-        states: Before it.
-        inside: `(n,)` which points the pose puts into the picture, in front of the camera.
-        masked: `(n,)` which of them are under the mask.
-        displaced: `(n,)` which of them were found elsewhere than the pose puts them; all false without the guard.
+        states: `(n,)` states before the frame.
+        inside: `(n,)` which points the pose projects into the image, in front of the camera.
+        masked: `(n,)` which of those are under the mask.
+        displaced: `(n,)` which of those were found at a different place than the pose predicts; all false without the
+            guard.
     """
     static, blocked = (jnp.full_like(states, state) for state in (PointState.STATIC, PointState.BLOCKED))
     occluded = jnp.full_like(states, PointState.OCCLUDED)
@@ -50,16 +52,19 @@ def next_states(states: States, inside: Mask, masked: Mask, displaced: Mask) -> 
 
 
 def occlusion_weights(states: States, occluded_weight: Scalar) -> Weights:
-    """`(n,)` how much each point counts: `occluded_weight` if it is OCCLUDED, 1 otherwise."""
+    """Return `(n,)` the weight of each point: `occluded_weight` if it is OCCLUDED, 1 otherwise."""
     return jnp.where(states == PointState.OCCLUDED, occluded_weight, jnp.ones_like(occluded_weight))
 
 
 def state_weights(states: np.ndarray, occluded_weight: float) -> Float32[np.ndarray, " n"]:
-    """`occlusion_weights` of any number of points of a map, nothing compiled."""
+    """Compute `occlusion_weights` in NumPy, for any number of map points and without compilation."""
     return np.where(states == PointState.OCCLUDED, np.float32(occluded_weight), np.float32(1))
 
 
 def occluded_share(states: States, counts: Mask) -> Scalar:
-    """Share of the points that count which are OCCLUDED; the paper finds its effect from a fifth on. 0 of none."""
+    """Return the share of the counted points that are OCCLUDED; 0 if none counts.
+
+    The paper finds an effect from a share of a fifth on.
+    """
     occluded = jnp.sum(counts & (states == PointState.OCCLUDED), dtype=jnp.float32)
     return occluded / jnp.maximum(jnp.sum(counts, dtype=jnp.float32), 1)

@@ -1,6 +1,6 @@
-"""From points that move to pixels: what is near such a point and as far away moves with it.
+"""Grow moving points into a mask: pixels near such a point at a similar depth move with it.
 
-Cues judge the points that are followed. The map is made of other features, and people look at pictures.
+Cues classify tracked points only. The map is made of other features, and people look at images.
 """
 
 from collections.abc import Sequence
@@ -11,11 +11,11 @@ from jaxtyping import Bool, Float
 from jaxslam.dynamics.cue import CueResult
 
 _DEPTH_STEP, _DEPTH_STEP_M = 0.05, 0.05
-"""Largest difference of depth on one surface: a share of depth, and meters besides."""
+"""Largest depth difference within one surface: a share of the depth, plus meters."""
 
 
 def moving_points(verdicts: Sequence[CueResult]) -> Bool[np.ndarray, " n"]:
-    """`(n,)` the points of which cues know that they rather move, by the product of their weights."""
+    """Return `(n,)` the points that the cues classify as more likely moving, by the product of their weights."""
     weight, known = 1.0, np.zeros((), bool)
     for verdict in verdicts:
         weight, known = weight * np.asarray(verdict.weight), known | np.asarray(verdict.known)
@@ -25,12 +25,12 @@ def moving_points(verdicts: Sequence[CueResult]) -> Bool[np.ndarray, " n"]:
 def mask_around(
     uv: Float[np.ndarray, "2 n"], depth: Float[np.ndarray, "h w"], reach_px: int
 ) -> Bool[np.ndarray, "h w"]:
-    """Pixels around some points that are as far away as they are, or whose depth is missing.
+    """Return the pixels around some points that have a similar depth, or whose depth is missing.
 
     Args:
-        uv: Pixels; what is outside the image is left out.
-        depth: Meters, 0 where missing.
-        reach_px: How far around, in rows and in columns.
+        uv: Pixel positions; those outside the image are ignored.
+        depth: Depth image in meters, 0 where missing.
+        reach_px: Half the side of the square around each point, in pixels.
     """
     height, width = depth.shape
     mask = np.zeros(depth.shape, bool)

@@ -1,7 +1,7 @@
-"""Regions: parts of a depth image whose points are near each other, each a surface that moves as one.
+"""Depth regions: clusters of nearby points in a depth image, each a surface that moves as one.
 
 Source: TRS-SLAM (Ji, Wang and Xie, ICRA 2021), section III-B: K-means on the points of the depth image. An object may
-be several regions, and need not be rigid.
+consist of several regions and need not be rigid.
 """
 
 from collections.abc import Sequence
@@ -16,19 +16,20 @@ from jaxslam_kernels.types import DepthImage, Mask, Points, Weights
 from jaxtyping import Array, Bool, Float, Int, Key
 
 _PER_LIMIT = 0.25
+"""Loss of weight for evidence that exceeds the threshold by one threshold."""
 Centers = Float[Array, "3 k"]
-"""Of regions, in the axes of the camera, meters; not finite where none is known."""
+"""Region centers in camera axes, in meters; not finite where none is known."""
 
 
 class RegionPlan(NamedTuple):
-    """How a depth image is divided; static.
+    """Settings of the division of a depth image into regions; static.
 
     Attributes:
-        num_regions: How many regions.
-        step_px: One pixel of so many is looked at, in rows and in columns.
-        num_steps: Steps of K-means a frame, from where the last frame left off.
-        recover_frames: Frames without motion after which a region that moved counts again, if it moved for long: what
-            is carried pauses.
+        num_regions: Number of regions.
+        step_px: Spacing of the sampled pixels, in rows and in columns.
+        num_steps: K-means steps per frame, starting from the centers of the previous frame.
+        recover_frames: Number of frames without motion after which a region that moved for long counts again. A carried
+            object pauses.
     """
 
     num_regions: int = 24
@@ -38,13 +39,13 @@ class RegionPlan(NamedTuple):
 
 
 class Regions(NamedTuple):
-    """A depth image, divided.
+    """Regions of a depth image.
 
     Attributes:
-        of_pixel: `(h', w')` region of one pixel in each block of `step_px` by `step_px`; -1 for none, without depth.
+        of_pixel: `(h', w')` region of one pixel in each block of `step_px` by `step_px`; -1 where depth is missing.
         of_point: `(n,)` region of each point; -1 for none.
-        centers: `(3, k)` meters, in the axes of the camera; not finite for a region without pixels.
-        num_pixels: `(k,)` pixels looked at that are in each.
+        centers: `(3, k)` region centers in camera axes, in meters; not finite for a region without pixels.
+        num_pixels: `(k,)` number of sampled pixels in each region.
     """
 
     of_pixel: Int[Array, "h w"]
@@ -54,12 +55,12 @@ class Regions(NamedTuple):
 
 
 class RegionCueResult(NamedTuple):
-    """What a cue says of each region; as `CueResult`, `(k,)` each.
+    """Result of a cue per region, each `(k,)`; see `CueResult`.
 
     Attributes:
-        weight: 0 for what moves to 1 for what is at rest; 1 where nothing is known.
-        evidence: What was measured, in units of its limit; 0 where nothing is known.
-        known: Where something is.
+        weight: From 0 for a moving region to 1 for a static one; 1 where nothing is known.
+        evidence: Measured value in units of the threshold; 0 where nothing is known.
+        known: Whether the region could be classified.
     """
 
     weight: Float[Array, " k"]
@@ -68,11 +69,12 @@ class RegionCueResult(NamedTuple):
 
 
 class RegionMemory(NamedTuple):
-    """What the next frame has of the regions of this one.
+    """Region state carried to the next frame.
 
     Attributes:
-        centers: `(3, k)` see `Regions`.
-        weight: `(k,)` 0 for what has moved much, 1 for what has been at rest for long; below one half it moves.
+        centers: `(3, k)` region centers, as in `Regions`.
+        weight: `(k,)` from 0 for a region that has moved much to 1 for one that has long been static; below one half
+            the region is treated as moving.
     """
 
     centers: Centers
@@ -80,7 +82,7 @@ class RegionMemory(NamedTuple):
 
 
 def no_regions(plan: RegionPlan | None, dtype: jnp.dtype) -> RegionMemory:
-    """Before anything is seen."""
+    """Return the memory before the first frame."""
     num = 0 if plan is None else plan.num_regions
     return RegionMemory(jnp.full((3, num), jnp.inf, dtype), jnp.ones(num, dtype))
 
@@ -88,15 +90,15 @@ def no_regions(plan: RegionPlan | None, dtype: jnp.dtype) -> RegionMemory:
 def find_regions(
     key: Key[Array, ""], depth: DepthImage, before: Centers, X_cam: Points, intrinsics: Intrinsics, plan: RegionPlan
 ) -> Regions:
-    """Divide a depth image. Regions are choices, constant for a derivative.
+    """Divide a depth image into regions. The division is a discrete choice, constant for differentiation.
 
     Args:
-        key: Of random choices: where regions begin of which nothing is known.
-        depth: `(h, w)` meters, 0 where missing.
-        before: Centers in the last frame.
-        X_cam: `(3, n)` points whose regions are asked for, in the axes of the camera, at its center where not known.
-        intrinsics: The camera; lens distortion, which moves a whole region alike, may be left out.
-        plan: Static.
+        key: Key of the random choices: the starting centers of regions without a known center.
+        depth: `(h, w)` depth image in meters, 0 where missing.
+        before: Centers in the previous frame.
+        X_cam: `(3, n)` points whose regions are requested, in camera axes; at the camera center where unknown.
+        intrinsics: Camera intrinsics; lens distortion shifts a whole region alike and may be left out.
+        plan: Static settings.
     """
     step = plan.step_px
     rows, columns = (np.minimum(np.arange(0, size, step) + step // 2, size - 1) for size in depth.shape)
@@ -111,7 +113,7 @@ def find_regions(
 
 
 def region_weights(verdicts: Sequence[RegionCueResult]) -> Float[Array, " k"]:
-    """`(k,)` the product of the weights of verdicts on the same regions, at least one."""
+    """Return `(k,)` the product of the weights of at least one result for the same regions."""
     weight = verdicts[0].weight
     for verdict in verdicts[1:]:
         weight = weight * verdict.weight
@@ -121,23 +123,24 @@ def region_weights(verdicts: Sequence[RegionCueResult]) -> Float[Array, " k"]:
 def remembered_weights(
     regions: Regions, verdicts: Sequence[RegionCueResult], before: Float[Array, " k"], plan: RegionPlan
 ) -> Float[Array, " k"]:
-    """`(k,)` what is remembered of regions: below one half, one moves whatever is said of it now.
+    """Update the remembered weight of each region, `(k,)`; below one half a region moves whatever the cues say now.
 
-    What is carried stops now and then, and a box before the camera that is taken for a wall while it does takes the
-    pose with it when it goes on. So evidence is summed up (the cumulative sum of Page, "Continuous inspection
-    schemes", Biometrika 1954): what is beyond the limit, in limits, takes a quarter of that away, and a frame without
-    motion gives little back. Where no verdict is known the weight stays: nobody has seen the region stop. A region
-    without pixels is gone.
+    A carried object stops now and then. A box in front of the camera that is taken for a wall while it pauses takes the
+    pose with it when it moves again. So evidence is accumulated (the cumulative sum of Page, "Continuous inspection
+    schemes", Biometrika 1954): each threshold of evidence beyond the threshold takes a quarter of the weight away, and
+    a frame without motion gives a little back. Where no cue has a result the weight stays: nothing has shown that the
+    region stopped. A region without pixels is forgotten.
 
-    With one verdict enough, a region at rest that is beyond the limit in one frame of ten, where the pose is not that
-    precise, was left out for good: 41 % of what is at rest in a kitchen with people, now 17 %, and 11 % of a rendered
-    room with boxes, now 2 %. What moves is missed as rarely in the room, and in 8 % of the kitchen instead of 1 %.
+    When a single result was enough, a static region beyond the threshold in one frame of ten, where the pose is not
+    that precise, was left out forever: 41 % of the static surfaces in a kitchen with people, now 17 %, and 11 % of a
+    rendered room with boxes, now 2 %. Moving surfaces are missed as rarely as before in the room, and in 8 % of the
+    kitchen instead of 1 %.
 
     Args:
-        regions: Of the frame.
-        verdicts: On them, at least one.
-        before: What was remembered in the last frame.
-        plan: Static.
+        regions: Regions of the frame.
+        verdicts: At least one result for these regions.
+        before: `(k,)` remembered weights of the previous frame.
+        plan: Static settings.
     """
     evidence, known = jnp.zeros_like(before), jnp.zeros(before.shape, bool)
     for verdict in verdicts:
@@ -155,17 +158,17 @@ def lasting_weights(
     agreeing: Mask,
     plan: RegionPlan,
 ) -> Float[Array, " k"]:
-    """`remembered_weights`, all before this frame forgotten where it has proved wrong.
+    """Update the remembered weights, but drop the memory in frames in which it has proved wrong.
 
-    It has where it speaks against most of the points that agree on a pose now: somebody has carried the pose with him
-    for a moment, and the room would be left out until nothing is left to track by.
+    The memory has proved wrong if it rejects most of the points that now agree on a pose: someone has dragged the pose
+    along for a moment, and the background would be left out until nothing remains to track.
 
     Args:
-        regions: Of the frame.
-        verdicts: On them, at least one.
-        before: What was remembered in the last frame.
-        agreeing: `(n,)` which points agree on a pose now.
-        plan: Static.
+        regions: Regions of the frame.
+        verdicts: At least one result for these regions.
+        before: `(k,)` remembered weights of the previous frame.
+        agreeing: `(n,)` which points are inliers of the current pose.
+        plan: Static settings.
     """
     fresh, lasting = (remembered_weights(regions, verdicts, old, plan) for old in (jnp.ones_like(before), before))
     now, one = region_weights(verdicts), jnp.ones_like(before[0])
@@ -176,14 +179,14 @@ def lasting_weights(
 def moving_pixels(
     regions: Regions, weight: Float[Array, " k"], height: int, width: int, plan: RegionPlan
 ) -> Bool[Array, "h w"]:
-    """`(height, width)` true in regions that rather move."""
+    """Return `(height, width)` the pixels of regions that are more likely moving."""
     moving = (weight < 0.5)[jnp.maximum(regions.of_pixel, 0)] & (regions.of_pixel >= 0)
     whole = jnp.repeat(jnp.repeat(moving, plan.step_px, axis=0), plan.step_px, axis=1)
     return whole[:height, :width]
 
 
 def mean_of_regions(values: Weights, counts: Mask, regions: Regions) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
-    """`(k,)` mean of the values of the points in each region that count, 0 for none, and how many those are."""
+    """Return `(k,)` the mean value of the counted points in each region, 0 for none, and how many count."""
     num = regions.centers.shape[1]
     counted = counts & (regions.of_point >= 0)
     to = jnp.where(counted, regions.of_point, num)
@@ -193,9 +196,9 @@ def mean_of_regions(values: Weights, counts: Mask, regions: Regions) -> tuple[Fl
 
 
 def balance_regions(weights: Weights, regions: Regions) -> Weights:
-    """`(n,)` weights with which no region has more of a say than an even share; what is in none keeps its own.
+    """Return `(n,)` weights with which no region exceeds an even share; points in no region keep their weight.
 
-    A textured box before the camera has most of the points, and a room behind it most of the surfaces.
+    A textured box in front of the camera has most of the points, and the room behind it most of the surfaces.
     """
     num = regions.centers.shape[1]
     to = jnp.where(regions.of_point >= 0, regions.of_point, num)
@@ -206,7 +209,7 @@ def balance_regions(weights: Weights, regions: Regions) -> Weights:
 
 
 def of_points(per_region: Array, regions: Regions, otherwise: Array) -> Array:
-    """`(n,)` what each point's region has; `otherwise` for points in none."""
+    """Return `(n,)` the value of each point's region; `otherwise` for points in none."""
     return jnp.where(regions.of_point >= 0, per_region[jnp.maximum(regions.of_point, 0)], otherwise)
 
 

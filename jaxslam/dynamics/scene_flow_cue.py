@@ -1,6 +1,6 @@
-"""Trajectory consistency: whether a point's way from frame to frame is that of something at rest.
+"""Trajectory cue: compare a point's displacement between frames with that of a static point.
 
-Source: RTS-SLAM (Sensors 2026), trajectory consistency, up to formula 14: the displacement of the point in camera axes
+Source: RTS-SLAM (Sensors 2026), trajectory consistency, up to equation 14: the displacement of the point in camera axes
 against that of the camera, with a tolerance that grows with depth.
 """
 
@@ -15,14 +15,15 @@ from jaxslam.dynamics.cue import CueInput, CueResult, threshold_evidence
 
 
 class TrajectoryParams(NamedTuple):
-    """Of `trajectory_cue`; scalars.
+    """Parameters of `trajectory_cue`; all scalars.
 
     Attributes:
-        tolerance_m: Difference of ways that says nothing, close to the camera: the paper's alpha.
-        tolerance_per_m: Its growth with the smaller of both depths: the paper's beta.
-        as_published: 1 compares the lengths of the ways, as in the paper; 0 the ways themselves. A choice without a
-            derivative; a number, not a flag, so that `jax.grad` takes it. One program serves both.
-        temperature: See `cue.judge`.
+        tolerance_m: Tolerated difference of displacement close to the camera, in meters: the paper's alpha.
+        tolerance_per_m: Growth of the tolerance per meter of the smaller of both depths: the paper's beta.
+        as_published: 1 compares the lengths of the displacements, as in the paper; 0 the displacements themselves. The
+            choice has no derivative; it is a number and not a flag so that `jax.grad` accepts it. One compiled program
+            serves both.
+        temperature: Softness of the comparison, as in `cue.threshold_evidence`.
     """
 
     tolerance_m: Scalar
@@ -32,15 +33,15 @@ class TrajectoryParams(NamedTuple):
 
 
 def trajectory_cue(scene: CueInput, params: TrajectoryParams) -> CueResult:
-    """How far each point is from where it would be at rest, in tolerances.
+    """Return the distance of each point from where a static point would be, in units of the tolerance.
 
-    The paper compares the lengths of two ways: that of the point in the axes of the camera, and that of the camera.
-    A point far from the axis about which the camera turns is then taken to move, and one that moves along with the
-    camera is not. Corrected, the point is carried to the second frame by the motion of the camera, and the distance to
-    where it is found is what counts: `|P_t - T P_{t-1}|`.
+    The paper compares two lengths: the displacement of the point in camera axes and that of the camera. A point far
+    from the camera's axis of rotation is then taken to move, and one that moves along with the camera is not. The
+    corrected form transforms the point to the second frame by the camera motion and measures the distance to where it
+    is found: `|P_t - T P_{t-1}|`.
 
     Args:
-        scene: What is known of the points; those without depth in one frame are not judged.
+        scene: Measurements of the points; those without depth in either frame are not classified.
         params: Tolerances.
     """
     seen = jnp.isfinite(scene.uv_before).all(axis=0) & jnp.isfinite(scene.uv).all(axis=0)
@@ -58,13 +59,13 @@ def trajectory_cue(scene: CueInput, params: TrajectoryParams) -> CueResult:
 
 
 def _in_camera(uv: Pixels, depth: Weights, known: Mask, intrinsics: Intrinsics) -> Points:
-    """Points in camera axes; those that are not known on the optical axis, a meter away."""
+    """Back-project points into camera axes; unknown ones are put on the optical axis, a meter away."""
     center = jnp.stack([intrinsics.cx, intrinsics.cy])[:, None]
     return back_project(intrinsics, jnp.where(known, uv, center), jnp.where(known, depth, 1))
 
 
 def _length(way: Points) -> Weights:
-    """With derivative 0 where there is no way."""
+    """Compute lengths with derivative 0 where the displacement is 0."""
     squared = jnp.sum(jnp.square(way), axis=0)
     some = squared > 0
     return jnp.where(some, jnp.sqrt(jnp.where(some, squared, 1)), 0)

@@ -1,4 +1,4 @@
-"""ORB features of an image: what can be recognized from other places and later."""
+"""ORB features of an image, which can be recognized later and from other places."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -21,24 +21,24 @@ from jaxslam.tracking.state import TrackParams
 DESCRIPTOR_BYTES = 32
 _PATCH_PX = 31
 _BORDER_PX = 19
-"""Room that a turned patch and its blur need, pixels of its level (`EDGE_THRESHOLD` of ORB-SLAM)."""
+"""Margin that a rotated patch and its blur need, in pixels of its level (`EDGE_THRESHOLD` of ORB-SLAM)."""
 _CLEARANCE_PX = 8
-"""How far from what is to be ignored the middle of a patch must be, pixels of its level: most comparisons of a
-descriptor lie within it."""
+"""Minimum distance of a patch center from ignored pixels, in pixels of its level: most comparisons of a descriptor lie
+within it."""
 _MAX_CANDIDATES = 12
-"""Corners a level looked at for every feature wanted; it bounds the time that noise and gravel take."""
+"""Corners considered per level for every feature wanted; it bounds the time spent on noise and gravel."""
 
 
 class Features(NamedTuple):
     """ORB features of one image, `n` of them.
 
     Attributes:
-        uv_raw: Where they are, pixels of the distorted image.
-        uv: Where an ideal pinhole camera without distortion and rolling shutter would have seen them, pixels.
-        depth: Meters, 0 where there is none to believe.
-        octave: Level of the scale pyramid, 0 the finest.
-        angle: Direction of the patch, radians, from u towards v.
-        descriptor: 256 bits each.
+        uv_raw: Positions in the distorted image, in pixels.
+        uv: Positions as an ideal pinhole camera without distortion and rolling shutter would see them, in pixels.
+        depth: Depths in meters; 0 where no valid depth was measured.
+        octave: Level of the scale pyramid; 0 is the finest.
+        angle: Direction of the patch in radians, from u towards v.
+        descriptor: Descriptors of 256 bits each.
     """
 
     uv_raw: Float32[np.ndarray, "2 n"]
@@ -50,14 +50,14 @@ class Features(NamedTuple):
 
 
 class FeaturePlan(NamedTuple):
-    """How features are found.
+    """Settings of feature extraction.
 
     Attributes:
-        num_features: At most so many.
-        num_levels: Levels of the scale pyramid.
-        scale_factor: From one level to the next.
-        fast_threshold: Contrast of a corner, gray values.
-        min_fast_threshold: The same in cells that have no such corner.
+        num_features: Maximum number of features.
+        num_levels: Number of levels of the scale pyramid.
+        scale_factor: Scale from one level to the next.
+        fast_threshold: Minimum contrast of a corner, in gray values.
+        min_fast_threshold: Minimum contrast in cells without a corner at `fast_threshold`, in gray values.
     """
 
     num_features: int = 1000
@@ -67,18 +67,18 @@ class FeaturePlan(NamedTuple):
     min_fast_threshold: int = 7
 
     def quotas(self) -> np.ndarray:
-        """`(num_levels,)` features a level: fewer where it is smaller, by its scale (Mur-Artal et al. 2015)."""
+        """Return `(num_levels,)` features per level, in proportion to its scale (Mur-Artal et al. 2015)."""
         shares = self.scale_factor ** -np.arange(self.num_levels, dtype=np.float64)
         ends = np.round(np.cumsum(shares) / shares.sum() * self.num_features).astype(np.int64)
         return np.diff(ends, prepend=0)
 
     def scale(self, octave: np.ndarray) -> np.ndarray:
-        """Size of the features of some octaves in the image, octave 0 being 1."""
+        """Return the size of features of these octaves in the image, relative to octave 0."""
         return np.float32(self.scale_factor) ** octave.astype(np.float32)
 
 
 class Patches(NamedTuple):
-    """Features as found in the image, without geometry; as in `Features`."""
+    """Features as detected in the image, without geometry; fields as in `Features`."""
 
     uv_raw: Float32[np.ndarray, "2 n"]
     octave: UInt8[np.ndarray, " n"]
@@ -92,34 +92,34 @@ DEFAULT_PLAN = FeaturePlan()
 def features_of(
     frame: FrameArrays, twist: np.ndarray, params: TrackParams, plan: FeaturePlan = DEFAULT_PLAN
 ) -> Features:
-    """The features of a frame, with distortion and rolling shutter removed and depth read.
+    """Extract the features of a frame, remove distortion and rolling shutter, and read their depth.
 
     Args:
-        frame: Its image is uint8; nothing is taken where it says `ignore`.
-        twist: `(6,)` velocity of the camera in its own axes, meters a second then radians a second.
-        params: Camera, readout time, and the depths that are believed.
-        plan: How features are found.
+        frame: Frame with a uint8 image; no feature is taken where it says `ignore`.
+        twist: `(6,)` velocity of the camera in its own axes, in meters per second, then radians per second.
+        params: Camera, readout time, and the range of valid depths.
+        plan: Settings of feature extraction.
     """
     patches = extract(np.asarray(frame.image), np.asarray(frame.ignore), plan)
     num = len(patches.octave)
-    fixed_size = padded(patches.uv_raw, plan.num_features, axis=1)  # compiled once
+    fixed_size = padded(patches.uv_raw, plan.num_features, axis=1)  # so that it is compiled once
     uv, depth = jax.device_get(_ideal(fixed_size, twist.astype(np.float32), frame, params))
     return Features(patches.uv_raw, uv[:, :num], depth[:num], *patches[1:])
 
 
 def extract(gray: np.ndarray, ignore: np.ndarray | None = None, plan: FeaturePlan = DEFAULT_PLAN) -> Patches:
-    """ORB features, well spread over the image.
+    """Extract ORB features that are well spread over the image.
 
     Every level of the pyramid has its quota and a grid of as many cells. The best corner of every cell comes first,
-    then the second best, and so on until the quota is spent, so that what texture there is fills it.
+    then the second best, and so on until the quota is filled, so that the available texture fills it.
 
     Source: Rublee et al., ORB: an efficient alternative to SIFT or SURF, 2011; the two thresholds and the quotas are
     ORB-SLAM's (Mur-Artal et al. 2015).
 
     Args:
-        gray: `(h, w)` uint8.
-        ignore: `(h, w)` bool, true where no feature may be.
-        plan: How many, and where.
+        gray: `(h, w)` uint8 image.
+        ignore: `(h, w)` bool, true where no feature may be taken.
+        plan: Settings of feature extraction.
     """
     clearance = None if ignore is None or not ignore.any() else _distance_to(ignore)
     levels = zip(_pyramid(gray, plan), plan.quotas(), strict=True)
@@ -132,14 +132,14 @@ def extract(gray: np.ndarray, ignore: np.ndarray | None = None, plan: FeaturePla
 
 
 def _distance_to(ignore: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    """Distance of every pixel from the nearest one to be ignored."""
+    """Compute the distance of every pixel from the nearest ignored one."""
     return cv2.distanceTransform((~ignore).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3)
 
 
 def _extract_level(
     gray: np.ndarray, picture: np.ndarray, clearance: np.ndarray | None, quota: int, plan: FeaturePlan
 ) -> Patches:
-    """Features of one level, called octave 0."""
+    """Extract the features of one pyramid level; their octave is 0."""
     if min(picture.shape) <= 2 * _BORDER_PX or quota == 0:
         return _no_patches()
     orb = cv2.ORB.create(
@@ -167,7 +167,7 @@ def _extract_level(
 
 
 def _pyramid(gray: np.ndarray, plan: FeaturePlan) -> list[np.ndarray]:
-    """Every level made from the one before, so that fine texture is smoothed away and not sampled."""
+    """Build the scale pyramid, each level from the previous one, so that fine texture is smoothed and not aliased."""
     pictures = [np.ascontiguousarray(gray)]
     for scale in plan.scale(np.arange(1, plan.num_levels)):
         height, width = (max(round(side / float(scale)), 1) for side in gray.shape)
@@ -180,7 +180,7 @@ def _positions(corners: Sequence[cv2.KeyPoint]) -> Float32[np.ndarray, "2 n"]:
 
 
 def _in_image(uv: np.ndarray, picture: np.ndarray, gray: np.ndarray) -> Float32[np.ndarray, "2 n"]:
-    """Where pixels of a shrunk picture are in the image: the outer edges of both coincide, not their first pixels."""
+    """Map pixels of a pyramid level to the image: the outer edges of both coincide, not their first pixels."""
     ratio = np.array([[gray.shape[1] / picture.shape[1]], [gray.shape[0] / picture.shape[0]]], np.float32)
     return (uv + np.float32(0.5)) * ratio - np.float32(0.5)
 
@@ -188,10 +188,10 @@ def _in_image(uv: np.ndarray, picture: np.ndarray, gray: np.ndarray) -> Float32[
 def _spread(
     uv: np.ndarray, response: np.ndarray, shape: tuple[int, ...], quota: int, fast_threshold: int
 ) -> np.ndarray:
-    """Indices of at most `quota` corners, round by round the best one left in every cell.
+    """Return the indices of at most `quota` corners: in each round, the best remaining one of every cell.
 
-    The response of a corner is the highest threshold at which it is one. A cell with a corner at `fast_threshold`
-    gives no weaker ones.
+    The response of a corner is the highest threshold at which it is detected. A cell with a corner at `fast_threshold`
+    contributes no weaker ones.
     """
     side = np.sqrt(shape[0] * shape[1] / quota)
     column, row = (uv / side).astype(np.int64)
@@ -208,7 +208,7 @@ def _spread(
 
 
 def no_features() -> Features:
-    """Features of an image that has none."""
+    """Return an empty set of features."""
     uv_raw, *rest = _no_patches()
     return Features(uv_raw, uv_raw, np.zeros(0, np.float32), *rest)
 
@@ -225,7 +225,7 @@ def _no_patches() -> Patches:
 @jax.jit
 @cached_trace
 def _ideal(uv_raw: Pixels, twist: Float[Array, "6"], frame: FrameArrays, params: TrackParams) -> tuple[Pixels, Weights]:
-    """Pixels of the ideal camera, and depth; of a pair by matching."""
+    """Convert pixels to those of the ideal camera and read depth; of a stereo pair by matching."""
     believed = valid_depth(frame.depth, params.min_depth_m, params.max_depth_m)
     rough, matched = sample_depth(believed, uv_raw), None
     if frame.right is not None:

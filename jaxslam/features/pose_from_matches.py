@@ -1,4 +1,4 @@
-"""The pose of an image from points found among its features, if enough of them agree on one."""
+"""Pose of an image from map points matched with its features, if enough matches agree."""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -20,32 +20,32 @@ from jaxslam.tracking.measurement import depth_sigma
 from jaxslam.tracking.state import TrackParams
 
 MIN_INLIERS = 30
-"""Fewest features that agree in the end."""
+"""Minimum number of features that agree with the final pose."""
 MIN_SHARE = 0.5
-"""Their least share of the features that were matched where the pose puts them."""
+"""Their minimum share of the features matched at the predicted positions."""
 MIN_CELLS = 12
-"""Fewest cells of the image they must lie in. With 8, one of 900 pairs of images of one room came out 0.5 m wrong:
-what is seen in a small part of the image may be a thing that is there twice."""
+"""Minimum number of image cells they must cover. With 8, one of 900 pairs of images of one room came out 0.5 m wrong: a
+small part of the image may show an object that exists twice."""
 _CELL = 0.15
-"""Side of such a cell in focal lengths, 9 degrees: 48 of them in an image of 640 x 480 pixels and 525 focal length."""
+"""Side of such a cell in focal lengths, 9 degrees: 48 cells in an image of 640 x 480 pixels and focal length 525."""
 MAX_SIGMA_M = 0.03
-"""Largest standard deviation of the position in any direction, meters."""
+"""Largest standard deviation of the position in any direction, in meters."""
 _SIGMA_PX = 1.0
-"""Standard deviation of a feature of octave 0, each coordinate."""
+"""Standard deviation of each coordinate of a feature of octave 0."""
 _CHI2_GATES = (9.21, 11.34)
-"""99 % quantiles of chi squared with two degrees of freedom and, where depth was measured, three."""
+"""99 % quantiles of chi squared with two degrees of freedom and, where depth was measured, with three."""
 
 
 class Matches(NamedTuple):
-    """Points found among the features of an image; padded with weight 0 to a fixed size.
+    """Points matched with features of an image, padded with weight 0 to a fixed size.
 
     Attributes:
-        X: `(3, n)` where the points are, in the axes the pose is sought in, meters.
-        depth_then: `(n,)` depth from which that was measured, whose error counts too; 0 for a point better known.
-        uv: `(2, n)` the features, pixels of the ideal camera.
-        depth: `(n,)` measured there, 0 for none.
-        sigma_px: `(n,)` standard deviation of the features, each coordinate.
-        weight: `(n,)` how much each counts, 0 for not at all.
+        X: `(3, n)` points in the axes in which the pose is wanted, in meters.
+        depth_then: `(n,)` depth from which each point was measured, whose error counts too; 0 for a point known better.
+        uv: `(2, n)` matched features, in pixels of the ideal camera.
+        depth: `(n,)` depth measured at the features, in meters; 0 for none.
+        sigma_px: `(n,)` standard deviation of each coordinate of the features, in pixels.
+        weight: `(n,)` weight of each match; 0 to ignore it.
     """
 
     X: Points
@@ -57,14 +57,14 @@ class Matches(NamedTuple):
 
 
 class FeaturePose(NamedTuple):
-    """A pose that enough features agree on.
+    """Pose that enough matches agree with.
 
     Attributes:
-        T_origin_cam: `wxyz_xyz`, in the axes of the points.
-        covariance: Of it in the tangent space at the camera: translation (m), then rotation (rad). Errors that
-            features have in common are not in it.
-        agree: Index of each match that agrees.
-        share: Their share of the matches.
+        T_origin_cam: `wxyz_xyz` pose of the camera in the axes of the points.
+        covariance: Covariance of the pose in the tangent space at the camera: translation (m), then rotation (rad). It
+            does not include errors that the features have in common.
+        agree: Indices of the inlier matches.
+        share: Share of the matches that are inliers.
     """
 
     T_origin_cam: Float64[np.ndarray, "7"]
@@ -83,16 +83,16 @@ def matches_of(
     weight: np.ndarray | None = None,
     capacity: int | None = None,
 ) -> Matches:
-    """Points found among features, as `Matches`.
+    """Collect points matched with features as padded `Matches`.
 
     Args:
-        X: `(3, k)` as there.
-        depth_then: `(k,)` as there.
-        features: Of the image.
-        which: `(k,)` index of the feature that each point was found at.
-        plan: How features were found.
-        weight: `(k,)` how much each counts; all alike by default.
-        capacity: Size to pad to; the most features there can be by default.
+        X: `(3, k)` points, as in `Matches`.
+        depth_then: `(k,)` depths, as in `Matches`.
+        features: Features of the image.
+        which: `(k,)` index of the feature matched with each point.
+        plan: Settings of feature extraction.
+        weight: `(k,)` weight of each match; 1 by default.
+        capacity: Size to pad to; by default the maximum number of features.
     """
     capacity = plan.num_features if capacity is None else capacity
     columns = (
@@ -115,14 +115,14 @@ def fit_pose(
     min_inliers: int | None = None,
     min_cells: int | None = None,
 ) -> FeaturePose | None:
-    """The pose that most matches agree on; `None` where too few do, or in too small a part of the image.
+    """Fit a pose to matches; `None` if too few agree, or if the inliers cover too small a part of the image.
 
     Args:
-        T_origin_cam: `(7,)` a pose near it.
-        matches: What was found.
-        params: Camera, of which ideal pixels leave the pinhole, and the errors of its depth.
-        min_inliers: Fewest matches that agree in the end, `MIN_INLIERS` by default,
-        min_cells: and fewest cells of the image they lie in, `MIN_CELLS`.
+        T_origin_cam: `(7,)` approximate pose to start from.
+        matches: Points matched with features.
+        params: Camera, of which ideal pixels leave the pinhole, and the error model of its depth.
+        min_inliers: Minimum number of inlier matches; `MIN_INLIERS` by default.
+        min_cells: Minimum number of image cells the inliers cover; `MIN_CELLS` by default.
     """
     min_inliers = MIN_INLIERS if min_inliers is None else min_inliers
     min_cells = MIN_CELLS if min_cells is None else min_cells
@@ -135,7 +135,7 @@ def fit_pose(
         return None
     pose = np.asarray(refined.T_world_cam.wxyz_xyz, np.float64)
     pose[:4] /= np.linalg.norm(pose[:4])
-    # Residuals larger than expected make the pose less certain, smaller ones no more certain.
+    # Residuals larger than expected make the pose less certain; smaller ones do not make it more certain.
     covariance = np.asarray(refined.covariance, np.float64) * max(float(refined.residual_scale), 1.0) ** 2
     covariance = 0.5 * (covariance + covariance.T)
     sigma_m = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
@@ -145,18 +145,18 @@ def fit_pose(
 
 
 def matches_depth_sigma(matches: Matches, params: TrackParams) -> Weights:
-    """Of the difference of depth measured then and in the image."""
+    """Compute the standard deviation of the difference between the earlier depth and the depth in the image."""
     return jnp.hypot(depth_sigma(matches.depth_then, params), depth_sigma(matches.depth, params))
 
 
 def pinhole(params: TrackParams) -> tuple[np.ndarray, np.ndarray]:
-    """Focal length and principal point, `(2, 1)` each."""
+    """Return the focal lengths and the principal point, `(2, 1)` each."""
     fx, fy, cx, cy = (float(value) for value in params.intrinsics[:4])
     return np.array([[fx], [fy]]), np.array([[cx], [cy]])
 
 
 def _cells(uv: np.ndarray, params: TrackParams) -> int:
-    """How many cells of the image hold one of the pixels."""
+    """Count the image cells that contain at least one of the pixels."""
     focal, center = pinhole(params)
     return np.unique(np.floor((uv - center) / (_CELL * focal)), axis=1).shape[1]
 
