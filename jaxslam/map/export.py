@@ -236,8 +236,7 @@ def _pixel_errors(slam_map: Map) -> np.ndarray:
     """`(s,)` pixels between where a point was seen and where it should have been."""
     T_cam_world = inverse(slam_map.T_world_cam)[rows(slam_map.ids, slam_map.observations.keyframe)]
     X_world = slam_map.points.X_world[:, rows(slam_map.points.ids, slam_map.observations.point)]
-    x, y, z = (rotate(T_cam_world, X_world.T) + T_cam_world[:, 4:]).T
-    u, v = slam_map.camera.fx * x / z + slam_map.camera.cx, slam_map.camera.fy * y / z + slam_map.camera.cy
+    u, v = slam_map.camera.project((rotate(T_cam_world, X_world.T) + T_cam_world[:, 4:]).T)
     return np.hypot(u - slam_map.observations.uv[0], v - slam_map.observations.uv[1])
 
 

@@ -81,7 +81,7 @@ def find_points(
     X = to_local(T_world_cam, points.X_world)
     front = X[2] > _NEAREST_M
     z = np.where(front, X[2], 1.0)
-    uv = np.stack([camera.fx * X[0] / z + camera.cx, camera.fy * X[1] / z + camera.cy])
+    uv = camera.project(np.stack([X[0], X[1], z]))
     inside = front & (uv > -_MARGIN_PX).all(axis=0) & (uv < [[camera.width], [camera.height]]).all(axis=0)
     octave = np.log(points.size / np.linalg.norm(X, axis=0).clip(_NEAREST_M)) / np.log(plan.scale_factor)
     octave = np.clip(np.round(octave), 0, plan.num_levels - 1).astype(np.int64)

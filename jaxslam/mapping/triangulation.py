@@ -75,8 +75,7 @@ def triangulate(
 
 def _rays(camera: Camera, features: Features) -> np.ndarray:
     """`(3, n)` directions, third coordinate 1."""
-    u, v = features.uv.astype(np.float64)
-    return np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)])
+    return camera.back_project(features.uv.astype(np.float64), np.ones(features.uv.shape[1]))
 
 
 def _near_lines(first: np.ndarray, second: np.ndarray, sigmas: list[np.ndarray], T: np.ndarray) -> np.ndarray:

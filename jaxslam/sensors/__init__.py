@@ -1,4 +1,4 @@
-"""Cameras, stereo rigs, rectification, stereo depth, image files, and frames as the tracker takes them."""
+"""Cameras, stereo rigs, rectification, stereo depth, image files, and the frames that the tracker takes."""
 
 import lazy_loader
 

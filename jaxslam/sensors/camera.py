@@ -1,4 +1,4 @@
-"""A calibrated camera: one frozen record, its checks, and the files it comes from."""
+"""A calibrated camera: its immutable record, its checks and its files."""
 
 import dataclasses
 import json
@@ -10,14 +10,14 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxslam_kernels.camera import Intrinsics, make_intrinsics
 
-from jaxslam.config.schema import configs_dir
+from jaxslam.config.loading import configs_dir
 from jaxslam.config.validation import Range, ValidatedConfig
 from jaxslam.errors import CameraError, JaxSlamError, nearest
 from jaxslam.io.atomic_files import write_atomically
 from jaxslam.sensors.camera_formats import read_camera_fields
 
 MAX_BASELINE_M = 10.0
-"""Longest baseline of a pair; more is rather millimeters."""
+"""Longest baseline of a stereo pair in meters; a larger number is probably in millimeters."""
 
 _UNITS = {
     "width": "pixels",
@@ -27,12 +27,12 @@ _UNITS = {
     "cx": "pixels, from the center of the top-left pixel",
     "cy": "pixels",
     "distortion": "k1 k2 p1 p2 k3, as in OpenCV",
-    "depth_scale_per_m": "counts of the depth image a meter",
-    "fps": "frames a second",
+    "depth_scale_per_m": "counts of the depth image per meter",
+    "fps": "frames per second",
     "baseline_m": "meters between left and right camera",
     "far_depth_m": "meters; depth beyond it is not trusted on its own",
     "readout_s": "seconds from the first row to the last; 0 for a global shutter",
-    "color_order": "of a live stream; image files are always read right",
+    "color_order": "of live images only; image files carry their own order",
 }
 
 
@@ -41,23 +41,24 @@ class Camera(ValidatedConfig):
     """A pinhole camera with OpenCV's radial-tangential distortion.
 
     Attributes:
-        name: What to call it in messages.
+        name: Name of the camera in messages.
         width: Image width in pixels.
         height: Image height in pixels.
-        fx: Focal length along a row in pixels.
-        fy: Focal length along a column in pixels.
-        cx: Principal point along a row in pixels, from the center of the top-left pixel.
-        cy: Principal point along a column in pixels.
-        distortion: `(k1, k2, p1, p2, k3)` as in OpenCV; zeros for rectified images.
-        depth_scale_per_m: Counts of the integer depth image a meter: 5000.0 for TUM and Bonn, 1000.0 for
+        fx: Horizontal focal length in pixels.
+        fy: Vertical focal length in pixels.
+        cx: Horizontal coordinate of the principal point in pixels, from the center of the top-left pixel.
+        cy: Vertical coordinate of the principal point in pixels, from the center of the top-left pixel.
+        distortion: Coefficients `(k1, k2, p1, p2, k3)` as in OpenCV; zeros for rectified images.
+        depth_scale_per_m: Counts of the integer depth image per meter: 5000.0 for TUM and Bonn, 1000.0 for
             millimeters; `None` for a camera whose depth comes in meters or from stereo.
-        fps: Nominal frames a second. Motion models use timestamps; this only where those fit no rate, and at first.
+        fps: Nominal frames per second. Motion models use timestamps; they use this rate only at the start, and where
+            the timestamps fit no rate.
         baseline_m: Distance between left and right camera in meters, at most 10; `None` if not stereo.
         far_depth_m: Depth in meters beyond which a measured depth is not trusted on its own (in ORB-SLAM,
-            `ThDepth` times the baseline); `None` if not known.
+            `ThDepth` times the baseline); `None` if unknown.
         readout_s: Time in seconds a rolling shutter takes from the first row of a color image to the last; 0 for a
             global shutter. `jaxslam.Slam` corrects for it.
-        color_order: Order of the channels in which the camera's driver hands over a color image.
+        color_order: Channel order of the color images that the camera's driver delivers.
 
     Raises:
         CameraError: If a value has the wrong type or is impossible.
@@ -120,16 +121,44 @@ class Camera(ValidatedConfig):
 
     @property
     def is_stereo(self) -> bool:
-        """Whether it takes rectified pairs: it has a baseline and no depth images. ORB-SLAM's RGB-D files have both."""
+        """Whether the camera takes rectified stereo pairs.
+
+        That is so if it has a baseline and no depth images. ORB-SLAM's RGB-D files have both.
+        """
         return self.baseline_m is not None and self.depth_scale_per_m is None
 
     def intrinsics(self, dtype: DTypeLike = np.float32) -> Intrinsics:
-        """The part of the calibration that the kernels compute with, as arrays of `dtype`."""
+        """Return the calibration that the kernels compute with, as arrays of `dtype`."""
         return make_intrinsics(self.fx, self.fy, self.cx, self.cy, self.distortion, dtype)
+
+    def project(self, X_cam: np.ndarray) -> np.ndarray:
+        """Project points of the camera frame with an ideal pinhole, without distortion.
+
+        Args:
+            X_cam: `(3, n)` points in camera axes, in meters; their depth `X_cam[2]` must not be 0.
+
+        Returns:
+            `(2, n)` pixels `(u, v)`, outside the image too.
+        """
+        x, y, z = X_cam
+        return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy])
+
+    def back_project(self, uv: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """Return the points that an ideal pinhole, without distortion, projects to given pixels: `project` inverted.
+
+        Args:
+            uv: `(2, n)` pixels.
+            depth: `(n,)` depth along the optical axis in meters.
+
+        Returns:
+            `(3, n)` points in camera axes, in meters. A depth of 1 gives the rays through the pixels.
+        """
+        u, v = uv
+        return np.stack([(u - self.cx) / self.fx * depth, (v - self.cy) / self.fy * depth, depth])
 
 
 def known_cameras() -> list[str]:
-    """The names of the cameras that come with jaxslam."""
+    """Return the names of the cameras that come with jaxslam."""
     return sorted(path.stem for path in _cameras_dir().glob("*.yaml"))
 
 
@@ -140,10 +169,17 @@ def _cameras_dir() -> Path:
 def check_axis(whose: str, axis: str, focal: float, center: float, extent: int) -> None:
     """Refuse a focal length that does not suit the image, or a principal point outside it.
 
+    Args:
+        whose: Prefix of the field name in the message.
+        axis: `x` or `y`.
+        focal: Focal length along that axis in pixels.
+        center: Coordinate of the principal point along that axis in pixels.
+        extent: Size of the image along that axis in pixels.
+
     Raises:
-        CameraError: If so.
+        CameraError: If either value is out of range.
     """
-    shortest, longest = extent / 20, extent * 50  # 169 and 1.1 degrees of view
+    shortest, longest = extent / 20, extent * 50  # a field of view of 169 and 1.1 degrees
     if not shortest <= focal <= longest:
         raise CameraError(
             f"{whose}.f{axis}: expected pixels that suit an image of {extent}, {shortest:g} to {longest:g},"
@@ -154,10 +190,14 @@ def check_axis(whose: str, axis: str, focal: float, center: float, extent: int) 
 
 
 def check_baseline(field: str, baseline_m: float) -> None:
-    """Refuse a distance between two cameras that is rather in millimeters.
+    """Refuse a distance between two cameras that is probably in millimeters.
+
+    Args:
+        field: Name of the field in the message.
+        baseline_m: Distance in meters.
 
     Raises:
-        CameraError: If so.
+        CameraError: If the distance is larger than `MAX_BASELINE_M`.
     """
     if baseline_m > MAX_BASELINE_M:
         raise CameraError(

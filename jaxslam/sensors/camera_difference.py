@@ -1,4 +1,4 @@
-"""How far apart two calibrations are, in pixels of the image."""
+"""Difference between two calibrations, in pixels of the image."""
 
 import cv2
 import numpy as np
@@ -6,18 +6,18 @@ import numpy as np
 from jaxslam.sensors.camera import Camera
 
 _MIN_PX, _MIN_SHARE = 1.0, 0.003
-"""Mean distance, pixels and as a share of the image's width, below which two calibrations may be of one camera."""
+"""Mean distance below which two calibrations may be of one camera, in pixels and as a share of the image width."""
 _MIN_BASELINE = 0.02
-"""The same for the baseline of a pair, as a share of it."""
+"""Difference of two baselines below which they may be of one stereo pair, as a share of the longer one."""
 _STEPS = 9
 
 
 def difference_of_cameras(first: Camera, second: Camera) -> str:
-    """What differs between two cameras by more than calibrating one camera twice would; empty if nothing does.
+    """Describe what differs between two cameras by more than calibrating one camera twice would; empty if nothing does.
 
     Args:
         first: One camera.
-        second: Another one, or the same.
+        second: The camera to compare with it.
     """
     sizes = [f"{camera.width}x{camera.height}" for camera in (first, second)]
     if sizes[0] != sizes[1]:
@@ -36,11 +36,11 @@ def difference_of_cameras(first: Camera, second: Camera) -> str:
 
 
 def distance_of_projections_px(first: Camera, second: Camera) -> float:
-    """Mean distance, in pixels, between where two cameras of one image size see the same directions.
+    """Return the mean distance, in pixels, between the projections of the same directions into two cameras.
 
     Args:
-        first: The camera whose pixels, on a grid over the image, give the directions.
-        second: The camera into which they are projected.
+        first: The camera whose pixels, on a grid over the image, define the directions.
+        second: The camera into which the directions are projected, of the same image size.
     """
     u, v = np.meshgrid(np.linspace(0, first.width - 1, _STEPS), np.linspace(0, first.height - 1, _STEPS))
     pixels = np.stack([u.ravel(), v.ravel()], axis=1)

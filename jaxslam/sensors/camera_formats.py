@@ -1,7 +1,7 @@
-"""Camera files: jaxslam's own flat YAML, ORB-SLAM2's and ORB-SLAM3's, read into the fields of `Camera`.
+"""Camera files of jaxslam (flat YAML), ORB-SLAM2 and ORB-SLAM3, read into the fields of `Camera`.
 
-The foreign formats hold settings of other modules too (`ORBextractor.*`, `Viewer.*`); those are passed over.
-In our own format every key must be a field of `Camera`.
+The files of ORB-SLAM also hold settings of other modules (`ORBextractor.*`, `Viewer.*`); those are ignored.
+In jaxslam's own format every key must be a field of `Camera`.
 """
 
 from collections.abc import Mapping
@@ -32,19 +32,19 @@ _FISHEYE = "KannalaBrandt8"
 
 
 def is_pair(raw: Mapping[str, Any]) -> bool:
-    """Whether a camera file describes two cameras as they are, of a pair that is not rectified."""
+    """Whether a camera file describes a stereo pair that is not rectified."""
     return any(key in ("left", "right", "cam0", "cam1") or key.startswith("Camera2.") for key in raw)
 
 
 def read_camera_fields(path: Path, fields: list[str]) -> dict[str, Any]:
-    """The values a camera file holds, under the names of `Camera`'s fields; `Camera` checks their types.
+    """Read the values of a camera file, under the names of `Camera`'s fields; `Camera` checks their types.
 
     Args:
-        path: The file; its format is recognized by its keys.
+        path: The file. Its keys tell its format.
         fields: The names of `Camera`'s fields.
 
     Raises:
-        CameraError: If the file is unreadable, lacks a needed key, or (our format) has an unknown one.
+        CameraError: If the file is unreadable, lacks a required key, or has an unknown one (jaxslam's format only).
     """
     raw = read_mapping(path, CameraError)
     if is_pair(raw):
@@ -75,13 +75,13 @@ def _orb_slam(raw: Mapping[str, Any], keys: Mapping[str, str], path: Path) -> di
     values["distortion"] = [given.get(term, 0.0) for term in _DISTORTION]
     if "Camera.RGB" in raw:
         values["color_order"] = "rgb" if raw["Camera.RGB"] else "bgr"
-    if "depth_scale_per_m" in given:  # both systems take a factor of 0 for "the depth is in meters"
+    if "depth_scale_per_m" in given:  # in both systems a factor of 0 means that depth is in meters
         values["depth_scale_per_m"] = given["depth_scale_per_m"] or 1.0
     return values | _lengths(given, keys, path)
 
 
 def _lengths(given: Mapping[str, Any], keys: Mapping[str, str], path: Path) -> dict[str, float]:
-    """Baseline and far depth in meters: `Camera.bf` is baseline times fx, `ThDepth` counts baselines."""
+    """Return baseline and far depth in meters: `Camera.bf` is baseline times fx, `ThDepth` counts baselines."""
     numbers = {
         field: _number(given[field], keys[field], path)
         for field in ("fx", "baseline_px_m", "baseline_m", "far_depth_baselines")

@@ -1,38 +1,39 @@
-"""Checks of depth images against what sensors measure: the unit, the scale, the steps of structured light."""
+"""Checks of depth images against what sensors measure: unit, scale, and the depth steps of structured light."""
 
 import numpy as np
 from jaxtyping import Float32
 
 _FEWEST, _SAMPLES = 100, 80
-"""Fewest pixels with depth that say something, and rows and columns that are looked at."""
+"""Fewest valid pixels for a decision, and the approximate number of rows and columns sampled."""
 _FARTHEST_M, _NEAREST_M = 200.0, 0.01
-"""Medians beyond are of another unit, whatever the scene."""
+"""A median depth outside this range is in another unit, whatever the scene."""
 _MIN_COUNT = 100.0
 _FACTOR = 5.0
-"""Between the usual scales, 1000 and 5000 counts a meter."""
+"""Ratio of the usual depth scales, 1000 and 5000 counts per meter."""
 _STEP_PER_M = 2.89e-3
-"""Steps of the disparity of structured light (Kinect v1, Xtion, Astra), an eighth of a pixel at a focal length of 576
-pixels and a baseline of 75 mm: so many meters at one meter, and with the square of the distance. Source: Khoshelham and
-Elberink, "Accuracy and Resolution of Kinect Depth Data", 2012. Medians of images of TUM fr1 and Bonn: 2.87 to 2.93 mm;
-of rendered rooms: 2.85 mm."""
+"""Depth step of structured light (Kinect v1, Xtion, Astra) at a depth of 1 m, in meters; it grows with depth squared.
+
+It corresponds to a disparity step of an eighth of a pixel at a focal length of 576 pixels and a baseline of 75 mm.
+Source: Khoshelham and Elberink, "Accuracy and Resolution of Kinect Depth Data", 2012. Medians measured on images of TUM
+fr1 and Bonn: 2.87 to 2.93 mm; on rendered rooms: 2.85 mm."""
 _STEP_TOLERANCE, _MAX_SPREAD = 0.06, 0.25
 _FEWEST_STEPS, _MIN_RANGE = 40, 1.3
 _USUAL_M = (0.9, 4.0)
-"""Medians of depth between which a scale five times off is not looked for."""
+"""Usual median depths indoors, in meters; the check for a scale off by a factor of 5 runs outside this range only."""
 
 
 def is_plausible(near: float, median: float, far: float) -> bool:
-    """Whether depth, its 2nd, 50th and 98th percentile in meters, is usual for an RGB-D camera in a room."""
+    """Whether the 2nd, 50th and 98th percentile of depth, in meters, are usual for an RGB-D camera in a room."""
     return near >= 0.25 and 0.2 <= median <= 10 and far <= 12
 
 
 def contradiction_of_depth(depth_m: Float32[np.ndarray, "h w"]) -> str:
-    """What shows that depth is not in meters, as a part of a sentence; empty if nothing does.
+    """Describe the evidence that depth is not in meters, as a part of a sentence; empty if there is none.
 
-    Large and small scenes are fine: only what no sensor measures is named.
+    Large and small scenes pass: only values that no sensor measures are reported.
 
     Args:
-        depth_m: Depth; 0 or not finite where missing.
+        depth_m: `(h, w)` depth in meters; 0 or not finite where missing.
     """
     rows, columns = (max(1, size // _SAMPLES) for size in depth_m.shape)
     measured = _measured(depth_m[::rows, ::columns])
@@ -53,7 +54,7 @@ def _measured(depth_m: np.ndarray) -> np.ndarray:
 
 
 def _contradiction_of_steps(measured: np.ndarray, median: float) -> str:
-    """Structured light whose steps are five times too coarse or too fine for its distances."""
+    """Describe structured light whose depth steps are five times too coarse or too fine for its depth."""
     levels = np.unique(measured).astype(np.float64)
     if levels.size <= _FEWEST_STEPS or levels[-1] < _MIN_RANGE * levels[0]:
         return ""

@@ -1,4 +1,4 @@
-"""Smaller images: a mask needs no outline to the pixel, and half the width is a quarter of the work."""
+"""Smaller images for masks: a mask need not be exact to the pixel, and half the width is a quarter of the work."""
 
 from typing import NamedTuple
 
@@ -12,11 +12,11 @@ from jaxslam.sensors.camera import Camera
 
 
 class ImageGrid(NamedTuple):
-    """Where the pixels of an image lie.
+    """The pixel grid of an image.
 
     Attributes:
-        shape: Its height and width.
-        intrinsics: Of the camera, in its pixels.
+        shape: Height and width in pixels.
+        intrinsics: Intrinsics of the camera in pixels of this grid.
     """
 
     shape: tuple[int, int]
@@ -24,20 +24,25 @@ class ImageGrid(NamedTuple):
 
     @classmethod
     def of(cls, camera: Camera) -> "ImageGrid":
-        """The pixels of a camera's images."""
+        """Return the pixel grid of a camera's images."""
         return cls((camera.height, camera.width), camera.intrinsics(np.float32))
 
 
 class Downscaler:
-    """Every few pixels of larger images: their middle ones, counted from the top left corner.
+    """Subsampling of images by an integer step: each small pixel is the middle one of its block.
 
     Attributes:
-        step: A pixel of it in larger ones.
-        raster: Its own pixels. Rows and columns of the larger image that make no whole pixel are left out.
+        step: Side of a block, in pixels of the large image.
+        raster: The pixel grid of the small image. Rows and columns of the large image that fill no block are left out.
     """
 
     def __init__(self, fine: ImageGrid, width: int) -> None:
-        """Of about so many columns; never of more pixels than the larger images have."""
+        """Choose the step for a small image of about `width` columns; a small image is never the larger one.
+
+        Args:
+            fine: The pixel grid of the large images.
+            width: Desired width of the small image in pixels.
+        """
         self.step = max(1, round(fine.shape[1] / width))
         self._fine, self._offset = fine.shape, self.step // 2
         height, width = (max(1, side // self.step) for side in fine.shape)
@@ -54,19 +59,19 @@ class Downscaler:
         )
 
     def every(self, images: Shaped[np.ndarray, "... h w"]) -> Shaped[np.ndarray, "... _h _w"]:
-        """Of images of the larger size, the pixels that are in it; a view of them."""
+        """Return a view of the pixels of large images that are in the small one."""
         (height, width), first = self.raster.shape, self._offset
         return images[..., first :: self.step, first :: self.step][..., :height, :width]
 
     def mean(self, gray: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "_h _w"]:
-        """A smaller picture, each pixel the mean of those it stands for; a copy, aligned."""
+        """Return a smaller image, each pixel the mean of its block; an aligned copy."""
         small = aligned_array(self.raster.shape, np.uint8)
         height, width = (side * self.step for side in self.raster.shape)
         cv2.resize(gray[:height, :width], self.raster.shape[::-1], dst=small, interpolation=cv2.INTER_AREA)
         return small
 
     def whole(self, mask: Bool[np.ndarray, "_h _w"]) -> Bool[np.ndarray, "h w"]:
-        """A mask at the larger size; a copy."""
+        """Return a small mask enlarged to the size of the large image; a copy."""
         if self.step == 1:
             return mask.copy()
         return cv2.resize(mask.view(np.uint8), self._fine[::-1], interpolation=cv2.INTER_NEAREST).view(bool)

@@ -1,4 +1,4 @@
-"""One frame as it enters jaxslam, checked once, here."""
+"""One input frame, and its checks."""
 
 import numbers
 from dataclasses import dataclass
@@ -13,23 +13,23 @@ _INT64 = np.iinfo(np.int64)
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A color or gray image with depth, or a rectified pair of images, taken at one time.
+    """A color or gray image with depth, or a rectified stereo pair, taken at one time.
 
-    Only the structure is checked: a black image, a frozen one or a depth of NaN is a frame like any other,
-    and the tracker reports what it makes of it. Arrays are kept as they are, not copied: do not write to them
-    while jaxslam works on the frame.
+    Only the structure is checked: an image that is black or frozen, or depth that is all NaN, makes a valid frame,
+    and the tracker reports how it handles it. Arrays are kept without a copy: do not write to them while jaxslam works
+    on the frame.
 
     Attributes:
-        timestamp_ns: Time of exposure, int nanoseconds on any clock that goes forward. Stamps of arrival will do: where
-            they fit no frame rate, the tracker counts frames instead.
+        timestamp_ns: Time of exposure, int nanoseconds on any clock that never goes back. Times of arrival will do:
+            where they fit no frame rate, the tracker counts frames instead.
         image: `(height, width, 3)` RGB or `(height, width)` gray, uint8.
         depth_m: `(height, width)` float32 depth along the optical axis in meters; 0 or NaN where missing. `None` for
-            a pair.
-        dynamic_mask: `(height, width)` bool, true where something moves or may move; `None` if unknown.
-        depth_timestamp_ns: Time of the depth image where the sensor takes it apart from the color image, within a
-            second of it; `None` if both are of one time.
-        right: What the right camera of a rectified pair saw, as `image`, the left one, of the same size; `None` for a
-            camera that measures depth. With it `depth_m` is no more than where matching begins.
+            a stereo pair.
+        dynamic_mask: `(height, width)` bool, true where objects move or may move; `None` if unknown.
+        depth_timestamp_ns: Time of the depth image, int nanoseconds, for a sensor that takes it apart from the color
+            image but within a second of it; `None` if both have the same time.
+        right: Image of the right camera of a rectified pair, with the shape and type of `image`, the left one; `None`
+            for a camera that measures depth. With a right image, `depth_m` is only the start value of stereo matching.
 
     Raises:
         FrameError: If a field has the wrong type or shape, the images differ in size, or there is neither depth nor a
@@ -75,13 +75,13 @@ def check_frame(frame: Frame, width: int, height: int, *, pair: bool = False) ->
 
     Args:
         frame: The frame to check.
-        width: The camera's width in pixels.
-        height: The camera's height in pixels.
+        width: The camera's image width in pixels.
+        height: The camera's image height in pixels.
         pair: Whether the camera takes stereo pairs.
 
     Raises:
-        FrameError: If it is no `Frame`, the size differs from the camera's, it is a pair and should not be, or the
-            other way round.
+        FrameError: If it is not a `Frame`, its size differs from the camera's, or one of depth image and stereo pair
+            is given where the other is expected.
     """
     if not isinstance(frame, Frame):
         got = f"{type(frame).__name__}; make one: Frame(timestamp_ns, image, depth_m)"
@@ -97,11 +97,11 @@ def check_frame(frame: Frame, width: int, height: int, *, pair: bool = False) ->
 
 
 def to_gray(image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-    """`(height, width)` uint8 gray of an RGB image (ITU-R BT.601 weights); a gray image stays as it is.
+    """Convert an RGB image to `(height, width)` uint8 gray (ITU-R BT.601 weights); return a gray image unchanged.
 
     Args:
-        image: `(height, width, 3)` or `(height, width)`.
-        out: `(height, width)` uint8, where to put it; then that comes back.
+        image: `(height, width, 3)` RGB or `(height, width)` gray, uint8.
+        out: `(height, width)` uint8 array to write to and return; `None` to allocate one where needed.
     """
     if image.ndim == 3:
         return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY, dst=out)
@@ -112,7 +112,7 @@ def to_gray(image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
 
 
 def _timestamp(field: str, timestamp_ns: object) -> int:
-    """A time as Python's `int`, whose differences do not overflow as NumPy's do."""
+    """Return a time as Python's `int`, whose differences do not overflow as NumPy's do."""
     if isinstance(timestamp_ns, bool) or not isinstance(timestamp_ns, numbers.Integral):
         hint = " seconds? (use round(seconds * 1e9))" if isinstance(timestamp_ns, float) else ""
         raise FrameError(f"{field}: expected an int in nanoseconds, got {brief_repr(timestamp_ns)}{hint}")

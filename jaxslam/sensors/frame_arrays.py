@@ -1,4 +1,4 @@
-"""Frames as the compiled step takes them: one, or a clip of them with time as the first axis."""
+"""The arrays of a frame that the compiled step takes: one frame, or a clip with time as the first axis."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -13,18 +13,18 @@ from jaxslam.sensors.frame import Frame, to_gray
 
 
 class FrameArrays(NamedTuple):
-    """One frame as the compiled step takes it; NumPy arrays will do.
+    """The arrays of one frame, as the compiled step takes them; NumPy arrays will do.
 
     Attributes:
-        image: `(h, w)` gray, 0 to 255; `uint8`, or floating point to differentiate with respect to it.
-        depth: `(h, w)` meters, floating point; 0 or not finite where missing.
-        ignore: `(h, w)` true where nothing is to be trusted (people, the robot itself).
-        dt_s: Seconds since the frame before.
-        depth_delay_s: Seconds from the time of the image to the time of the depth.
-        right: `(h, w)` the right image of a rectified pair, as `image`; `None` where depth is measured. With it `depth`
-            is where matching begins.
-        movable: `(h, w)` number of the thing that may move at each pixel, from 1, 0 for none; for a plan with `motion`,
-            which finds out whether it does. `None` without.
+        image: `(h, w)` gray values, 0 to 255: `uint8`, or floating point to differentiate with respect to them.
+        depth: `(h, w)` floating-point depth in meters; 0 or not finite where missing.
+        ignore: `(h, w)` mask, true where no pixel is to be trusted (people, the robot itself).
+        dt_s: Time since the previous frame in seconds.
+        depth_delay_s: Time from the image to the depth image in seconds.
+        right: `(h, w)` right image of a rectified pair, of the type of `image`; `None` where depth is measured. With a
+            right image, `depth` is only the start value of stereo matching.
+        movable: `(h, w)` number of the movable object at each pixel, from 1; 0 where there is none. Needed by a plan
+            with `motion`, which finds out which objects do move; `None` without.
     """
 
     image: Num[Array, "*time h w"]
@@ -37,13 +37,14 @@ class FrameArrays(NamedTuple):
 
 
 def frame_arrays(frame: Frame, dt_s: float, dtype: DTypeLike = np.float32) -> FrameArrays:
-    """A frame for `track_step`, as NumPy arrays; nothing that has the right type is copied.
+    """Return the arrays of a frame for `track_step`, in NumPy; arrays of the right type are not copied.
 
     Args:
-        frame: The frame; color becomes gray. A stereo pair needs rough depth, see `stereo.RoughDepth`.
-        dt_s: Seconds since the frame before; for the first one any number.
-        dtype: Floating-point type of everything but the image, that of state and parameters; float32 if not given,
-            also with `jax_enable_x64`.
+        frame: The frame; color is converted to gray. A stereo pair needs rough depth: see
+            `jaxslam.sensors.stereo_depth.RoughDepth`.
+        dt_s: Time since the previous frame in seconds; any number for the first frame.
+        dtype: Floating-point type of all arrays but the image, equal to that of state and parameters. The default is
+            float32, with `jax_enable_x64` too.
     """
     ignore = np.zeros(frame.size[::-1], bool) if frame.dynamic_mask is None else frame.dynamic_mask
     depth = _depth(frame).astype(dtype, copy=False)
@@ -53,14 +54,14 @@ def frame_arrays(frame: Frame, dt_s: float, dtype: DTypeLike = np.float32) -> Fr
 
 
 def check_gray_range(name: str, image: ArrayLike, error: type[Exception] = ValueError) -> None:
-    """Refuse an image in floating point whose gray values are from 0 to 1 where 0 to 255 is expected.
+    """Refuse a floating-point image whose gray values are from 0 to 1 where 0 to 255 is expected.
 
-    A black one passes: it is a frame in which nothing is seen.
+    A black image passes: it is a valid frame without any points.
 
     Args:
-        name: What to call it in the message.
-        image: Of any shape, no tracer.
-        error: The class of error to raise.
+        name: Name of the image in the message.
+        image: Image of any shape, not a tracer.
+        error: Class of the error to raise.
     """
     values = np.asarray(image)
     if np.issubdtype(values.dtype, np.integer) or not values.size:
@@ -71,13 +72,20 @@ def check_gray_range(name: str, image: ArrayLike, error: type[Exception] = Value
 
 
 class FrameMemory:
-    """Room for the arrays of one frame, filled anew with each.
+    """Reusable buffers for the arrays of one frame, overwritten by each frame.
 
-    XLA computes on it in place: see `aligned_array`.
+    XLA computes on them without a copy: see `aligned_array`.
     """
 
     def __init__(self, height: int, width: int, *, pairs: bool = False, movable: bool = False) -> None:
-        """Make room for frames of one size, or for pairs; with what may move in them, or without."""
+        """Allocate buffers for frames of one size.
+
+        Args:
+            height: Image height in pixels.
+            width: Image width in pixels.
+            pairs: Whether to hold right images.
+            movable: Whether to hold the numbers of movable objects.
+        """
         self._movable = aligned_array((height, width), np.uint8) if movable else None
         self._right = aligned_array((height, width), np.uint8) if pairs else None
         self._image, self._depth = aligned_array((height, width), np.uint8), aligned_array((height, width), np.float32)
@@ -85,12 +93,12 @@ class FrameMemory:
         self._nothing[:] = False
 
     def hold(self, frame: Frame, dt_s: float, *, depth_follows: bool = False) -> FrameArrays:
-        """The arrays of a frame, as of `frame_arrays`, until the next one is held.
+        """Return the arrays of a frame as `frame_arrays` does; they are valid until the next call.
 
         Args:
             frame: The frame.
-            dt_s: Seconds since the frame before.
-            depth_follows: Whether its depth is given to `hold_depth`, before anything looks at it.
+            dt_s: Time since the previous frame in seconds.
+            depth_follows: Whether the caller passes the depth to `hold_depth` before anything reads it.
         """
         to_gray(frame.image, out=self._image)
         if not depth_follows:
@@ -106,31 +114,31 @@ class FrameMemory:
         return FrameArrays(*arrays)
 
     def hold_depth(self, depth_m: np.ndarray) -> None:
-        """Depth `(h, w)` of the frame held, meters."""
+        """Set the depth `(h, w)` of the current frame, in meters."""
         np.copyto(self._depth, depth_m)
 
     def with_movable(self, arrays: FrameArrays, labels: np.ndarray) -> FrameArrays:
-        """The arrays held, with the numbers `(h, w)` of things that may move."""
+        """Return the current arrays with the numbers `(h, w)` of movable objects."""
         assert self._movable is not None
         np.copyto(self._movable, labels)
         movable: Any = self._movable
         return arrays._replace(movable=movable)
 
     def ignoring(self, arrays: FrameArrays, mask: np.ndarray) -> FrameArrays:
-        """The arrays held, with nothing trusted where `mask` `(h, w)` is true."""
+        """Return the current arrays with pixels ignored where `mask` `(h, w)` is true."""
         np.copyto(self._ignore, mask)
         ignore: Any = self._ignore
         return arrays._replace(ignore=ignore)
 
 
 def stack_frames(frames: Sequence[Frame], previous_ns: int | None = None, dtype: DTypeLike = np.float32) -> FrameArrays:
-    """A clip for `lax.scan` over `track_step`: the arrays of all frames, with time as their first axis.
+    """Return a clip for `lax.scan` over `track_step`: the arrays of all frames, with time as their first axis.
 
     Args:
-        frames: At least one frame, all of one size.
-        previous_ns: Time of the frame before the first of them; where there is none, it counts as if it had come as
-            long before as the second comes after.
-        dtype: As for `frame_arrays`.
+        frames: The frames, at least one, all of one size.
+        previous_ns: Time of the frame before the first one, in nanoseconds. If `None`, the step before the first frame
+            is taken to be as long as the step after it.
+        dtype: Floating-point type, as for `frame_arrays`.
 
     Raises:
         FrameError: If there is no frame, their sizes differ, or only some are stereo pairs.

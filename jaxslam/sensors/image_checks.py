@@ -9,7 +9,7 @@ _MIN_AGREEMENT = 0.5
 
 
 def image_fault(gray: UInt8[np.ndarray, "h w"]) -> str | None:
-    """What gives the tracker few points or none, in words; `None` if the image is sharp and well lit."""
+    """Describe why the tracker would find few points or none; `None` if the image is sharp and well lit."""
     if scaled_to_one(gray):
         return "with values of 0 and 1 only (an image scaled to 0 to 1?)"
     if gray.mean() < 25:
@@ -20,10 +20,10 @@ def image_fault(gray: UInt8[np.ndarray, "h w"]) -> str | None:
 
 
 def scaled_to_one(gray: UInt8[np.ndarray, "h w"]) -> bool:
-    """Whether a picture was scaled to 0 to 1 before it became uint8.
+    """Whether an image was scaled to 0 to 1 before it became uint8.
 
-    In the noise of a covered lens, which may have values of 0 and 1 too, one pixel says nothing of the next; in a
-    picture neighbors agree.
+    The noise of a covered lens may have values of 0 and 1 too, but there one pixel says nothing about the next; in an
+    image of a scene, neighboring pixels agree.
     """
     if gray.max() != 1:
         return False

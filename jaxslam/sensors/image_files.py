@@ -1,4 +1,4 @@
-"""Decoding the images of a recording, with errors that name the file."""
+"""Reading of a recording's image files, with errors that name the file."""
 
 from pathlib import Path
 
@@ -9,32 +9,36 @@ from jaxslam.errors import DatasetError
 from jaxslam.sensors.camera import Camera
 
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
-_AS_STORED = cv2.IMREAD_IGNORE_ORIENTATION  # a calibration speaks of the pixels before any EXIF rotation
+_AS_STORED = cv2.IMREAD_IGNORE_ORIENTATION  # calibrations refer to the pixels before any EXIF rotation
 
 
 def read_color(path: Path) -> np.ndarray:
-    """`(height, width, 3)` uint8 RGB; a gray file gives three equal channels.
+    """Read a `(height, width, 3)` uint8 RGB image; a gray file gives three equal channels.
 
     Raises:
-        DatasetError: If the file is missing, cut short or no image.
+        DatasetError: If the file is missing, truncated or not an image.
     """
     return cv2.cvtColor(_decode(path, cv2.IMREAD_COLOR | _AS_STORED), cv2.COLOR_BGR2RGB)
 
 
 def read_gray(path: Path) -> np.ndarray:
-    """`(height, width)` uint8; a color file becomes gray.
+    """Read a `(height, width)` uint8 gray image; a color file is converted to gray.
 
     Raises:
-        DatasetError: If the file is missing, cut short or no image.
+        DatasetError: If the file is missing, truncated or not an image.
     """
     return _decode(path, cv2.IMREAD_GRAYSCALE | _AS_STORED)
 
 
 def read_depth(path: Path, scale_per_m: float) -> np.ndarray:
-    """`(height, width)` float32 meters from a uint16 file with `scale_per_m` counts a meter; 0 where missing.
+    """Read `(height, width)` float32 depth in meters from a uint16 file; 0 where missing.
+
+    Args:
+        path: The image file.
+        scale_per_m: Counts per meter.
 
     Raises:
-        DatasetError: If the file is missing, cut short, no image, or its pixels are not one uint16 each.
+        DatasetError: If the file is missing, truncated or not an image, or its pixels are not single uint16 values.
     """
     counts = _decode(path, cv2.IMREAD_UNCHANGED)
     if counts.dtype != np.uint16 or counts.ndim != 2:
@@ -44,10 +48,10 @@ def read_depth(path: Path, scale_per_m: float) -> np.ndarray:
 
 
 def read_depth_meters(path: Path) -> np.ndarray:
-    """`(height, width)` float32 meters from a NumPy file of floats; 0 where it is not finite or not positive.
+    """Read `(height, width)` float32 depth in meters from a NumPy file; 0 where it is not finite or not positive.
 
     Raises:
-        DatasetError: If the file is missing or damaged, or holds no plane of floats.
+        DatasetError: If the file is missing or damaged, or does not hold a two-dimensional array of floats.
     """
     try:
         depth_m = np.load(path, allow_pickle=False)
@@ -60,10 +64,10 @@ def read_depth_meters(path: Path) -> np.ndarray:
 
 
 def check_size(path: Path, image: np.ndarray, camera: Camera) -> None:
-    """Refuse an image that is not of the camera's size.
+    """Refuse an image whose size is not the camera's.
 
     Raises:
-        DatasetError: If it is not.
+        DatasetError: If the sizes differ.
     """
     height, width = image.shape[:2]
     if (height, width) != (camera.height, camera.width):
@@ -78,7 +82,7 @@ def _decode(path: Path, flags: int) -> np.ndarray:
         content = path.read_bytes()
     except OSError as problem:
         raise DatasetError(f"{path}: cannot be read: {problem.strerror}") from None
-    # libjpeg fills the missing part of a cut file with gray instead of failing
+    # libjpeg fills the missing part of a truncated file with gray instead of failing
     is_cut = content.startswith(_JPEG_START) and _JPEG_END not in content[-64:]
     image = None if is_cut or not content else cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     if image is None:

@@ -1,6 +1,6 @@
-"""Rectification of stereo pairs: two cameras as they are, turned and straightened into one `Camera` with a baseline.
+"""Rectification of stereo pairs: the images of a `Rig` become those of one `Camera` with a baseline.
 
-Source: Bouguet's method as in OpenCV's `stereoRectify`; what is seen of both images fills the rectified ones.
+Source: Bouguet's method as in OpenCV's `stereoRectify`. The area that both images show fills the rectified ones.
 """
 
 from pathlib import Path
@@ -19,19 +19,19 @@ from jaxslam.sensors.stereo_rig_formats import read_rig
 
 
 class RectifiedPair:
-    """Makes rectified frames of the images of a rig; what is needed for that is computed once.
+    """Rectify the images of a rig; the pixel maps are computed once.
 
     Attributes:
-        rig: The two cameras as they are.
-        camera: What the frames are taken with: no distortion, rows that match, and a baseline.
-        T_left_camera: `(7,)` float64 wxyz_xyz, `camera` in the axes of the rig's left camera: a rotation alone.
+        rig: The two cameras before rectification.
+        camera: The camera of the rectified frames: no distortion, matching rows, and a baseline.
+        T_left_camera: `(7,)` float64 wxyz_xyz pose of `camera` in the axes of the rig's left camera: a pure rotation.
     """
 
     def __init__(self, rig: Rig) -> None:
         """Compute the maps from rectified to raw pixels.
 
         Raises:
-            CameraError: If the two views share too little to be rectified.
+            CameraError: If the two views overlap too little to be rectified.
         """
         self.rig = rig
         (R_left, R_right), projection = _planes(rig)
@@ -58,10 +58,10 @@ class RectifiedPair:
         return cls(read_rig(Path(path)))
 
     def images(self, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The two images rectified, of the same shape and type.
+        """Return the two images rectified, of the same shape and type.
 
         Raises:
-            FrameError: If an image is none, or not of the size of the rig's cameras.
+            FrameError: If an argument is not a uint8 image, or does not have the size of the rig's cameras.
         """
         for side, image in (("left", left), ("right", right)):
             _check(side, image, self.rig)
@@ -69,25 +69,26 @@ class RectifiedPair:
         return cv2.remap(left, *of_left, cv2.INTER_LINEAR), cv2.remap(right, *of_right, cv2.INTER_LINEAR)
 
     def of(self, timestamp_ns: int, left: np.ndarray, right: np.ndarray) -> Frame:
-        """The rectified frame of two images as the cameras take them, at one time.
+        """Return the rectified frame of two raw images taken at one time.
 
         Args:
             timestamp_ns: Time of exposure, int nanoseconds.
-            left: `(height, width, 3)` RGB or `(height, width)` gray, uint8.
-            right: As `left`.
+            left: `(height, width, 3)` RGB or `(height, width)` gray image of the left camera, uint8.
+            right: Image of the right camera, of the same shape and type.
 
         Raises:
-            FrameError: If an image is none, not of the size of the rig's cameras, or the two are of different kinds.
+            FrameError: If an argument is not a uint8 image, does not have the size of the rig's cameras, or one image
+                is in color and the other one gray.
         """
         image, other = self.images(left, right)
         return Frame(timestamp_ns, image, right=other)
 
 
 def load_camera(source: str | Path) -> Camera | RectifiedPair:
-    """A camera by its known name or from a file, or the rectified pair if the file describes two cameras.
+    """Load a camera by its known name or from a file; a rectified pair if the file describes two cameras.
 
     Raises:
-        CameraError: If there is no such name or file, or the file is incomplete, misspelt or impossible.
+        CameraError: If there is no such name or file, or the file is incomplete, misspelled or impossible.
     """
     path = Path(source)
     if str(source) not in known_cameras() and path.is_file() and is_pair(read_mapping(path, CameraError)):
@@ -96,13 +97,11 @@ def load_camera(source: str | Path) -> Camera | RectifiedPair:
 
 
 def _planes(rig: Rig) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """Rotations from each camera to the rectified one, and the `(3, 4)` projection that both share."""
+    """Return the rotations from each camera to the rectified one, and the `(3, 4)` projection that both share."""
     rotation, shift = np.array(rig.T_left_right[:4]), np.array(rig.T_left_right[4:])
     R_left_right = matrices(rotation / np.linalg.norm(rotation))
-    R, t = (
-        R_left_right.T,
-        -(R_left_right.T @ shift)[:, None],
-    )  # OpenCV's carry the left camera's points to the right one
+    # OpenCV takes the transform of the left camera's points to the right camera
+    R, t = R_left_right.T, -(R_left_right.T @ shift)[:, None]
     cameras = (rig.left.matrix, rig.left.terms, rig.right.matrix, rig.right.terms)
     size = (rig.left.width, rig.left.height)
     if rig.left.model == "equidistant":
@@ -115,7 +114,7 @@ def _planes(rig: Rig) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
 
 
 def _maps(lens: Lens, R: np.ndarray, projection: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where in the raw image each rectified pixel lies, in the fixed point of `cv2.remap`."""
+    """Return the raw position of each rectified pixel, in the fixed-point form of `cv2.remap`."""
     make = cv2.fisheye.initUndistortRectifyMap if lens.model == "equidistant" else cv2.initUndistortRectifyMap
     whole, parts = make(lens.matrix, lens.terms, R, projection[:, :3], (lens.width, lens.height), cv2.CV_16SC2)
     return np.asarray(whole), np.asarray(parts)

@@ -1,4 +1,4 @@
-"""Checks of stereo pairs without depth: whether rows match, which side is which, how far away things are."""
+"""Checks of stereo pairs without depth: matching rows, swapped sides, and the range of disparities."""
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -16,12 +16,19 @@ _MAX_OFF_ROW_PX = 1.0
 _MAX_BRIGHTER = 0.25
 _NEAR_ZERO_PX = 0.5
 _SURELY_OFF_ROW_PX = 2.0
-"""Median distance from the row that no rectified pair has: 0.6 pixels with quick matches in KITTI 06, 0 in rooms."""
+"""Median row error in pixels that no rectified pair reaches; quick matches give 0.6 in KITTI 06 and 0 in rooms."""
 _SURELY_NEGATIVE_PX, _NEARLY_ALL, _ENOUGH_MATCHES = -1.0, 0.8, 60
 
 
 class PairFinding(NamedTuple):
-    """One thing looked at: its topic, whether it is odd, what was found, and what that would do."""
+    """The result of one check on stereo pairs.
+
+    Attributes:
+        topic: The topic in a word.
+        odd: Whether the result is unusual.
+        text: What was found.
+        consequence: What an unusual result would do to tracking.
+    """
 
     topic: str
     odd: bool
@@ -30,7 +37,7 @@ class PairFinding(NamedTuple):
 
 
 def look_over(frames: Sequence[Frame], camera: Camera) -> Iterator[PairFinding]:
-    """Findings about the pairs among some frames of a camera; nothing if there is none."""
+    """Check the stereo pairs among some frames of a camera; yields nothing if there are none."""
     pairs = [(to_gray(frame.image), to_gray(frame.right)) for frame in frames if frame.right is not None]
     if not pairs or camera.baseline_m is None:
         return
@@ -68,10 +75,11 @@ def look_over(frames: Sequence[Frame], camera: Camera) -> Iterator[PairFinding]:
 
 
 def contradiction_of_pairs(shifts: Float[np.ndarray, "n 2"]) -> tuple[str, str]:
-    """What matches say is certainly wrong about pairs, as a topic and a sentence; both empty if nothing is.
+    """Describe what is certainly wrong with stereo pairs, as a topic and a sentence; both empty if nothing is.
 
     Args:
-        shifts: Of matches in one or more pairs, as `matched_shifts` gives them. Few say nothing.
+        shifts: `(n, 2)` shifts of matches in one or more pairs, as `matched_shifts` returns them. Too few matches give
+            no result.
     """
     if len(shifts) < _ENOUGH_MATCHES:
         return "", ""
@@ -95,7 +103,7 @@ def contradiction_of_pairs(shifts: Float[np.ndarray, "n 2"]) -> tuple[str, str]:
 
 
 def _rows(shifts: Float[np.ndarray, "n 2"]) -> tuple[float, Float[np.ndarray, " m"]]:
-    """Median distance of matches from their rows, and the disparities of those near theirs, pixels."""
+    """Return the median row error of matches, and the disparities of those near their rows, both in pixels."""
     off = float(np.median(np.abs(shifts[:, 1])))
     return off, shifts[np.abs(shifts[:, 1]) < max(3 * off, _MAX_OFF_ROW_PX), 0]
 
@@ -103,12 +111,14 @@ def _rows(shifts: Float[np.ndarray, "n 2"]) -> tuple[float, Float[np.ndarray, " 
 def matched_shifts(
     left: UInt8[np.ndarray, "h w"], right: UInt8[np.ndarray, "h w"], *, quick: bool = False
 ) -> Float[np.ndarray, "n 2"]:
-    """`(n, 2)` how much further right and down features lie in the left image than in the right one, pixels.
+    """Return `(n, 2)` shifts of matches: how far right and down features are in the left image from the right one.
+
+    Shifts are in pixels.
 
     Args:
         left: The gray left image.
         right: The gray right image.
-        quick: Whether to match ORB features, to a pixel, instead of SIFT features, to a tenth of one.
+        quick: Whether to match ORB features, accurate to a pixel, instead of SIFT features, accurate to a tenth.
     """
     finder = cv2.ORB.create(_QUICK_FEATURES, nlevels=_QUICK_LEVELS) if quick else cv2.SIFT.create(_FEATURES)
     (at_left, of_left), (at_right, of_right) = (finder.detectAndCompute(image, None) for image in (left, right))

@@ -1,4 +1,4 @@
-"""Rough dense depth of a rectified pair of images: where matching of points begins, and what masks and regions see."""
+"""Rough dense depth of a rectified pair: the start value of point matching, and the depth of masks and regions."""
 
 import cv2
 import numpy as np
@@ -15,13 +15,17 @@ _UNIT = 16
 
 
 class DenseDepth:
-    """Depth of pairs by semi-global matching at half the size: slower than `RoughDepth`, denser and smoother.
+    """Depth of stereo pairs by semi-global matching at half the size: slower than `RoughDepth`, denser and smoother.
 
-    On a pair of KITTI (1226x370) it takes 20 ms on one core; matching alone, at the full size, 118.
+    On a pair of KITTI (1226x370) it takes 20 ms on one core; the matching alone at full size takes 118 ms.
     """
 
     def __init__(self, camera: Camera) -> None:
-        """Prepare for pairs of a camera; raises as `RoughDepth` does."""
+        """Prepare for the stereo pairs of a camera.
+
+        Raises:
+            CameraError: If the camera has no baseline, or its images are not rectified.
+        """
         self._focal_baseline, most = _prepared(camera, _DENSE_HALVINGS)
         block = 5
         self._matcher = cv2.StereoSGBM.create(
@@ -37,23 +41,23 @@ class DenseDepth:
         )
 
     def of(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-        """`(height, width)` float32 meters, 0 where nothing is found."""
+        """Return `(height, width)` float32 depth in meters, 0 where no match is found."""
         return _small_depth(self._matcher, left, right, self._focal_baseline, _DENSE_HALVINGS)
 
 
 class RoughDepth:
-    """Depth of pairs by block matching at a quarter of the size.
+    """Depth of stereo pairs by block matching at a quarter of the size.
 
-    On a pair of KITTI (1226x370) it has depth at 82 % of corners, half of them within 0.7 pixels of disparity of
-    semi-global matching and 92 % within the four that `match_depth` makes good, in 1.1 ms. At half the size: 77 %, 0.3
-    pixels, 95 %, 5.5 ms, which is more than the flow of all points that it would be done beside.
+    On a pair of KITTI (1226x370) it gives depth at 82 % of the corners in 1.1 ms: half of them are within 0.7 pixels of
+    disparity of semi-global matching, and 92 % within the four pixels that `match_depth` can correct. At half the size:
+    77 %, 0.3 pixels and 95 % in 5.5 ms, which is longer than the flow of all points that runs at the same time.
     """
 
     def __init__(self, camera: Camera) -> None:
-        """Prepare for pairs of a camera.
+        """Prepare for the stereo pairs of a camera.
 
         Raises:
-            CameraError: If it has no baseline, or its images are not rectified.
+            CameraError: If the camera has no baseline, or its images are not rectified.
         """
         self._focal_baseline, most = _prepared(camera, _ROUGH_HALVINGS)
         self._matcher = cv2.StereoBM.create(most, _BLOCK_PX)
@@ -62,12 +66,12 @@ class RoughDepth:
         self._matcher.setTextureThreshold(5)
 
     def of(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-        """`(height, width)` float32 meters, 0 where nothing is found."""
+        """Return `(height, width)` float32 depth in meters, 0 where no match is found."""
         return _small_depth(self._matcher, left, right, self._focal_baseline, _ROUGH_HALVINGS)
 
 
 def _prepared(camera: Camera, halvings: int) -> tuple[float, int]:
-    """Focal length times baseline, and the disparities sought at a size halved so often.
+    """Return focal length times baseline, and the number of disparities to search after `halvings` of the size.
 
     Raises:
         CameraError: If the camera has no baseline, or its images are not rectified.
@@ -76,14 +80,14 @@ def _prepared(camera: Camera, halvings: int) -> tuple[float, int]:
         raise CameraError(f"camera '{camera.name}': baseline_m: expected meters for a stereo pair, got none")
     if any(camera.distortion):
         raise CameraError(f"camera '{camera.name}': distortion: expected zeros, as of rectified images")
-    # As far as a tenth of the width, and in steps of 16 at the smaller size.
+    # Search up to a tenth of the width; OpenCV needs a multiple of 16 at the smaller size.
     return camera.fx * camera.baseline_m, 16 * max(1, round(camera.width / (10 * 2**halvings) / 16))
 
 
 def _small_depth(
     matcher: cv2.StereoMatcher, left: np.ndarray, right: np.ndarray, focal_baseline: float, halvings: int
 ) -> np.ndarray:
-    """Depth at a size halved so often, brought to the whole one."""
+    """Return depth computed after `halvings` of the size, enlarged to full size."""
     small = [to_gray(image) for image in (left, right)]
     for _ in range(halvings):
         small = [cv2.pyrDown(image) for image in small]

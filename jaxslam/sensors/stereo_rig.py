@@ -1,4 +1,4 @@
-"""Two cameras side by side as they are, before rectification: one frozen record, and its checks."""
+"""Two cameras side by side before rectification: an immutable record and its checks."""
 
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal, TypeAlias
@@ -21,18 +21,19 @@ _Pose: TypeAlias = tuple[float, float, float, float, float, float, float]
 
 @dataclass(frozen=True)
 class Lens(ValidatedConfig):
-    """One camera of a pair as it is.
+    """One camera of a pair before rectification.
 
     Attributes:
         width: Image width in pixels.
         height: Image height in pixels.
-        fx: Focal length along a row in pixels.
-        fy: Focal length along a column in pixels.
-        cx: Principal point along a row in pixels, from the center of the top-left pixel.
-        cy: Principal point along a column in pixels.
-        distortion: `(k1, k2, p1, p2)` or `(k1, k2, p1, p2, k3)` of `radtan`, `(k1, k2, k3, k4)` of `equidistant`; none
-            if the lens does not distort.
-        model: `radtan`, OpenCV's radial-tangential distortion, or `equidistant`, its fisheye (Kannala and Brandt).
+        fx: Horizontal focal length in pixels.
+        fy: Vertical focal length in pixels.
+        cx: Horizontal coordinate of the principal point in pixels, from the center of the top-left pixel.
+        cy: Vertical coordinate of the principal point in pixels, from the center of the top-left pixel.
+        distortion: Coefficients `(k1, k2, p1, p2)` or `(k1, k2, p1, p2, k3)` of `radtan`, `(k1, k2, k3, k4)` of
+            `equidistant`; empty if the lens does not distort.
+        model: Distortion model: `radtan`, OpenCV's radial-tangential one, or `equidistant`, its fisheye model (Kannala
+            and Brandt).
 
     Raises:
         CameraError: If a value has the wrong type or is impossible.
@@ -66,27 +67,27 @@ class Lens(ValidatedConfig):
 
     @property
     def terms(self) -> np.ndarray:
-        """`(5,)` or, of a fisheye, `(4,)` float64 distortion."""
+        """Distortion coefficients, `(5,)` or for a fisheye `(4,)` float64, padded with zeros."""
         count = _TERMS[self.model][-1]
         return np.array([*self.distortion, *[0.0] * (count - len(self.distortion))])
 
 
 @dataclass(frozen=True)
 class Rig(ValidatedConfig):
-    """Two cameras side by side, as a calibration finds them.
+    """Two cameras side by side, as calibration describes them.
 
     Attributes:
-        name: What to call the pair in messages.
+        name: Name of the pair in messages.
         left: The left camera.
         right: The right camera, of the same image size and lens model.
-        T_left_right: `qw qx qy qz x y z`, the right camera in the axes of the left one, meters: x is the baseline, and
-            positive. In ORB-SLAM3 `Stereo.T_c1_c2`.
-        fps: Nominal pairs a second.
-        far_depth_baselines: Depth beyond which it is not trusted on its own, in baselines (`ThDepth` of ORB-SLAM);
-            `None` if not known.
+        T_left_right: Pose `qw qx qy qz x y z` of the right camera in the axes of the left one, in meters; x is the
+            baseline and must be positive. In ORB-SLAM3 it is `Stereo.T_c1_c2`.
+        fps: Nominal pairs per second.
+        far_depth_baselines: Depth beyond which a measured depth is not trusted on its own, in baselines (`ThDepth` of
+            ORB-SLAM); `None` if unknown.
 
     Raises:
-        CameraError: If a value has the wrong type, or the two cameras are no pair side by side.
+        CameraError: If a value has the wrong type, or the two cameras are not side by side.
     """
 
     name: str

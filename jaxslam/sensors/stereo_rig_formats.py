@@ -1,6 +1,6 @@
-"""Files that describe two cameras as they are: jaxslam's own, ORB-SLAM3's and Kalibr's, read into a `Rig`.
+"""Files that describe two cameras before rectification, read into a `Rig`: formats of jaxslam, ORB-SLAM3 and Kalibr.
 
-jaxslam's own:
+An example of jaxslam's own format:
 
 left: {width: 752, height: 480, fx: 458.7, fy: 457.3, cx: 367.2, cy: 248.4, distortion: [-0.28, 0.07, 0.0002, 0.00002]}
 right: {width: 752, height: 480, fx: 457.6, fy: 456.1, cx: 379.999, cy: 255.2}
@@ -42,11 +42,11 @@ def read_rig(path: Path) -> Rig:
     """Read two cameras and the transform between them.
 
     Args:
-        path: The file; its format is recognized by its keys.
+        path: The file. Its keys tell its format.
 
     Raises:
-        CameraError: If the file is unreadable, lacks a needed key, has an unknown one (our format), or the calibration
-            is impossible.
+        CameraError: If the file is unreadable, lacks a required key, has an unknown one (jaxslam's format only), or
+            the calibration is impossible.
     """
     raw = read_mapping(path, CameraError)
     if any(key.startswith("Camera2.") for key in raw):
@@ -63,10 +63,14 @@ def read_rig(path: Path) -> Rig:
 
 
 def lens_of_kalibr(raw: Mapping[str, Any], place: str) -> Lens:
-    """A camera as Kalibr and EuRoC's `sensor.yaml` write it: `intrinsics`, `distortion_model`, `resolution`.
+    """Read a camera as Kalibr and EuRoC's `sensor.yaml` write it: `intrinsics`, `distortion_model`, `resolution`.
+
+    Args:
+        raw: The keys and values of the camera.
+        place: Prefix of the key in messages.
 
     Raises:
-        CameraError: If a key is missing, or the camera is no pinhole or its distortion of another kind.
+        CameraError: If a key is missing, the camera is not a pinhole, or its distortion model is unknown.
     """
     intrinsics = numbers(raw, "intrinsics", place, 4)
     width, height = numbers(raw, "resolution", place, 2)
@@ -82,17 +86,21 @@ def lens_of_kalibr(raw: Mapping[str, Any], place: str) -> Lens:
 
 
 def transform_of(value: object, place: str) -> np.ndarray:
-    """`(7,)` wxyz_xyz of a 4 x 4 matrix, as rows, 16 numbers or OpenCV's `data`, or of 7 numbers.
+    """Convert a pose to `(7,)` wxyz_xyz.
+
+    Args:
+        value: A 4 x 4 matrix, as rows, 16 numbers or OpenCV's `data`, or 7 numbers `qw qx qy qz x y z`.
+        place: Name of the value in messages.
 
     Raises:
-        CameraError: If it is none of these, or no rigid transform.
+        CameraError: If the value has none of these forms, or is not a rigid transform.
     """
     content = value.get("data") if isinstance(value, Mapping) else value
     try:
         given = np.asarray(content, np.float64).ravel()
     except (TypeError, ValueError):
         given = np.zeros(0)
-    usable = bool((np.abs(given) < _FARTHEST_M).all())  # nor is NaN
+    usable = bool((np.abs(given) < _FARTHEST_M).all())  # false for NaN too
     if given.size == 7 and usable:
         return given
     if given.size != 16 or not usable:
@@ -106,10 +114,16 @@ def transform_of(value: object, place: str) -> np.ndarray:
 
 
 def numbers(raw: Mapping[str, Any], key: str, place: str, count: int | None = None) -> list[float]:
-    """The list of numbers under a key.
+    """Return the list of numbers under a key.
+
+    Args:
+        raw: The keys and values to read from.
+        key: The key of the list.
+        place: Prefix of the key in messages.
+        count: The required length; `None` for any.
 
     Raises:
-        CameraError: If there is none, or it is of another length.
+        CameraError: If there is no such list, or it has another length.
     """
     value = raw.get(key)
     is_number = lambda x: isinstance(x, int | float) and not isinstance(x, bool) and math.isfinite(x)
