@@ -13,7 +13,7 @@ from typing import Any
 from jaxslam.benchmark.reports.markdown import table
 from jaxslam.benchmark.suites.accuracy_ruler import AccuracyBaseline, load_accuracy_baseline
 from jaxslam.benchmark.suites.published import Figure, published_for
-from jaxslam.config.schema import configs_dir
+from jaxslam.config.loading import configs_dir
 from jaxslam.datasets.synthetic import SyntheticConfig
 
 DOCS = Path(__file__).resolve().parent

@@ -22,7 +22,7 @@ from jaxslam.benchmark.suites.suite import Suite, check_masks, checked_presets, 
 from jaxslam.cli.command_table import COMMANDS
 from jaxslam.cli.console import console, make_table, plain_console, print_json, text_column
 from jaxslam.cli.shared_options import ALLOW_MISSING_MODEL, Settings, WithJson, flat
-from jaxslam.config.schema import load_config
+from jaxslam.config.loading import load_config
 from jaxslam.errors import BenchmarkError, nearest
 from jaxslam.io.atomic_files import make_folder, write_atomically
 from jaxslam.semantics.from_config import network_files

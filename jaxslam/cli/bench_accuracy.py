@@ -26,7 +26,7 @@ from jaxslam.benchmark.suites.gate import check_reason
 from jaxslam.benchmark.suites.plan import fingerprint
 from jaxslam.cli.bench import RunsOfSuite
 from jaxslam.cli.console import make_table, plain_console, print_json
-from jaxslam.config.schema import configs_dir
+from jaxslam.config.loading import configs_dir
 from jaxslam.errors import BenchmarkError
 from jaxslam.io.atomic_files import write_atomically
 from jaxslam.runtime.compile_cache import usable_cores

@@ -11,7 +11,7 @@ from jaxslam.benchmark.suites.aggregate import shown_label
 from jaxslam.cli.console import console, make_table, plain_console, print_json
 from jaxslam.cli.run import OfRecording
 from jaxslam.cli.tracking_run import number, track
-from jaxslam.config.schema import presets
+from jaxslam.config.loading import presets
 from jaxslam.errors import ConfigError, nearest
 from jaxslam.io.atomic_files import write_atomically
 from jaxslam.runtime.compile_cache import prefer_one_thread

@@ -50,7 +50,7 @@ class Demo(WithJson):
     def main(self) -> None:
         """Run the command."""
         from jaxslam.cli.tracking_run import make_viewer, track  # noqa: PLC0415
-        from jaxslam.config.schema import load_config  # noqa: PLC0415
+        from jaxslam.config.loading import load_config  # noqa: PLC0415
         from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset, with_true_masks  # noqa: PLC0415
         from jaxslam.slam.slam import Slam  # noqa: PLC0415
 
@@ -107,7 +107,7 @@ class OfRecording(WithJson):
 
     def settings(self, preset: str, *overrides: str) -> "Config":
         """The settings of a run, with more overrides if there are any."""
-        from jaxslam.config.schema import load_config  # noqa: PLC0415
+        from jaxslam.config.loading import load_config  # noqa: PLC0415
 
         chosen = ["run.deterministic=false"] if not self.deterministic else []
         chosen += ["run.realtime=true"] if self.realtime else []

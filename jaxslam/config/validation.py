@@ -1,4 +1,4 @@
-"""Frozen dataclasses whose fields are checked against their annotations, ranges included."""
+"""Frozen dataclasses that check the type and range of every field when they are built."""
 
 import dataclasses
 import functools
@@ -18,13 +18,18 @@ _PLAIN: dict[Any, str] = {int: "an integer", float: "a finite number", bool: "tr
 
 @dataclass(frozen=True)
 class Range:
-    """The numbers a field accepts, as in `Annotated[float, Range(above=0, at_most=1)]`."""
+    """Range of numbers that a field accepts, as in `Annotated[float, Range(above=0, at_most=1)]`."""
 
     at_least: float | None = None
+    """Smallest accepted number."""
     at_most: float | None = None
+    """Largest accepted number."""
     above: float | None = None
+    """Exclusive lower bound."""
     below: float | None = None
+    """Exclusive upper bound."""
     multiple_of: int | None = None
+    """Divisor of every accepted number."""
 
     def __contains__(self, value: float) -> bool:
         return (
@@ -41,16 +46,21 @@ class Range:
         return " and ".join(parts if self.multiple_of is None else [*parts, f"a multiple of {self.multiple_of}"])
 
 
+Positive = Range(above=0)
+Share = Range(at_least=0, at_most=1)
+
+
 @dataclass(frozen=True)
 class ValidatedConfig:
-    """Base of dataclasses that refuse a field of the wrong type or out of range, however they are built.
+    """Base class of dataclasses that refuse a field of the wrong type or out of range, however they are built.
 
     Annotations may be `int`, `float`, `bool`, `str`, `Literal`, `tuple`, another dataclass, a union of these
-    or `None`, each optionally `Annotated` with a `Range`. Lists become tuples and whole numbers floats where
-    the annotation says so: equal settings compare and hash equal.
+    or `None`, each optionally `Annotated` with a `Range`. Where the annotation says so, lists become tuples and
+    integers become floats, so that equal settings compare and hash equal.
     """
 
     _error: ClassVar[type[JaxSlamError]] = ConfigError
+    """Class of the error raised for a wrong field; derived classes may replace it."""
 
     def __post_init__(self) -> None:
         for name, hint in field_hints(type(self)).items():
@@ -59,24 +69,27 @@ class ValidatedConfig:
 
 
 class _MismatchError(ValueError):
-    """A value that does not fit its annotation; never leaves this file."""
+    """A value does not fit its annotation. This error never leaves the module."""
 
 
 @functools.cache
 def field_hints(cls: type) -> dict[str, Any]:
-    """The annotations of a dataclass's fields, in order, with their `Annotated` metadata."""
+    """List the annotations of a dataclass's fields, in order, with their `Annotated` metadata."""
     hints = get_type_hints(cls, include_extras=True)
     return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
 
 
 def checked_value(hint: Any, value: object, key: str, error: type[JaxSlamError] = ConfigError) -> Any:
-    """`value` as its annotation wants it.
+    """Check a value against its annotation and convert it.
 
     Args:
         hint: The field's annotation.
-        value: What came, from a file, a command line or code.
-        key: What to call the field in the message, such as `track.num_points`.
-        error: The class of error to raise.
+        value: The value given in a file, on a command line or in code.
+        key: Name of the field for the message, such as `track.num_points`.
+        error: Class of the error to raise.
+
+    Returns:
+        The value, with lists converted to tuples and integers to floats where the annotation says so.
 
     Raises:
         JaxSlamError: Of class `error`, if the value has the wrong type or is out of range.
@@ -88,7 +101,7 @@ def checked_value(hint: Any, value: object, key: str, error: type[JaxSlamError] 
 
 
 def section_of(hint: Any) -> type[Any] | None:
-    """The dataclass that an annotation such as `X` or `X | None` holds, if it holds one."""
+    """Find the dataclass in an annotation such as `X` or `X | None`; `None` if there is none."""
     choices = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
     return next((c for c in choices if isinstance(c, type) and dataclasses.is_dataclass(c)), None)
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import platformdirs
 
-from jaxslam.config.schema import configs_dir
+from jaxslam.config.loading import configs_dir
 from jaxslam.config.validation import Range, ValidatedConfig, field_hints
 from jaxslam.errors import DatasetError, JaxSlamError
 from jaxslam.io.yaml_files import check_keys, read_yaml

@@ -20,7 +20,7 @@ from jaxslam_kernels.se3 import to_camera
 from jaxslam_kernels.types import DepthImage, Mask, Pixels, Points, Scalar, Weights
 from jaxtyping import Array, Bool, Float, Float32, Float64, Int8, Int64
 
-from jaxslam.config.schema import OcclusionConfig
+from jaxslam.config.cue_sections import OcclusionConfig
 from jaxslam.dynamics.occlusion import PointState, States, next_states, occluded_share, state_weights
 from jaxslam.geometry.se3 import IDENTITY, to_local
 from jaxslam.map.edit import with_states

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxslam.config.schema import to_yaml
+from jaxslam.config.loading import to_yaml
 from jaxslam.datasets import Dataset
 from jaxslam.errors import TrajectoryError
 from jaxslam.io.atomic_files import write_atomically

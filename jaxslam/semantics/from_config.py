@@ -5,7 +5,8 @@ import logging
 from collections.abc import Sequence
 from pathlib import Path
 
-from jaxslam.config.schema import Config, SemanticsConfig, load_config
+from jaxslam.config.loading import load_config
+from jaxslam.config.schema import Config, SemanticsConfig
 from jaxslam.errors import ConfigError, MissingModelError, ModelError
 from jaxslam.semantics import Detector, OnnxDetector, load_detector
 from jaxslam.semantics.adapters.class_map import ClassMap

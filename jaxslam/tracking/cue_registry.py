@@ -6,7 +6,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
-from jaxslam.config.schema import DynamicsConfig, MotionConfig
+from jaxslam.config.cue_sections import MotionConfig
+from jaxslam.config.schema import DynamicsConfig
 from jaxslam.dynamics.cluster_cue import ClusterParams, make_cluster_cue
 from jaxslam.dynamics.cue import Cue
 from jaxslam.dynamics.epipolar_cue import EpipolarParams, make_epipolar_cue

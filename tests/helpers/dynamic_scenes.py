@@ -6,7 +6,7 @@ from typing import NamedTuple, get_args
 import numpy as np
 from small_scene import Clip
 
-from jaxslam.config.schema import load_config
+from jaxslam.config.loading import load_config
 from jaxslam.datasets.synthetic import SceneDetector, SyntheticConfig, SyntheticDataset
 from jaxslam.datasets.synthetic.camera_path_kind import CameraPathKind
 from jaxslam.sensors.frame import Frame

@@ -18,7 +18,8 @@ from jaxslam.benchmark.kernels.scenes.room_views import (
     room_views,
 )
 from jaxslam.benchmark.reference_flow import NUM_CORNERS, opencv_flow
-from jaxslam.config.schema import DynamicsConfig, OcclusionConfig, TrackConfig
+from jaxslam.config.cue_sections import OcclusionConfig
+from jaxslam.config.schema import DynamicsConfig, TrackConfig
 from jaxslam.dynamics.cue import CueInput, combine_cues
 from jaxslam.dynamics.occlusion import PointState
 from jaxslam.dynamics.regions import RegionMemory, RegionPlan, find_regions, moving_pixels, no_regions

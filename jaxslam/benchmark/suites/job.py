@@ -24,7 +24,8 @@ from jaxslam.benchmark.reference_flow import flow_time_ms
 from jaxslam.benchmark.suites.provenance import camera_sha256, data_sha256, networks_sha256, sources_sha256
 from jaxslam.benchmark.suites.run_names import flattened, run_folder
 from jaxslam.benchmark.suites.suite import Sequence as Clip
-from jaxslam.config.schema import Config, load_config, to_yaml
+from jaxslam.config.loading import load_config, to_yaml
+from jaxslam.config.schema import Config
 from jaxslam.datasets import Associated, Dataset, Subset, open_dataset
 from jaxslam.datasets.catalog import find_recording
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset, with_true_masks

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from jaxslam.benchmark.suites.suite import Sequence as Clip
-from jaxslam.config.schema import Config, SemanticsConfig, configs_dir
+from jaxslam.config.loading import configs_dir
+from jaxslam.config.schema import Config, SemanticsConfig
 from jaxslam.datasets.catalog import find_recording
 from jaxslam.errors import BenchmarkError, ModelError
 from jaxslam.io.download import sha256_of

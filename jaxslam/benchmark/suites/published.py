@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias, get_args
 
-from jaxslam.config.schema import configs_dir
+from jaxslam.config.loading import configs_dir
 from jaxslam.config.validation import Range, ValidatedConfig, checked_value, field_hints
 from jaxslam.errors import ConfigError, nearest
 from jaxslam.io.yaml_files import check_keys, read_mapping

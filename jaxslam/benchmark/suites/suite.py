@@ -25,7 +25,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from jaxslam.config.schema import Config, configs_dir, load_config, presets, updated
+from jaxslam.config.loading import configs_dir, load_config, presets, updated
+from jaxslam.config.schema import Config
 from jaxslam.config.validation import Range, ValidatedConfig
 from jaxslam.datasets.catalog import name_of
 from jaxslam.datasets.synthetic import SyntheticConfig

@@ -22,7 +22,7 @@ from jaxslam.benchmark.suites.accuracy_ruler import (
 from jaxslam.benchmark.suites.plan import fingerprint, plan
 from jaxslam.benchmark.suites.suite import load_suite
 from jaxslam.cli.entry_point import main
-from jaxslam.config.schema import configs_dir
+from jaxslam.config.loading import configs_dir
 from jaxslam.errors import BenchmarkError
 
 fails = failing("bench", "accuracy")

@@ -18,7 +18,7 @@ from jaxslam.benchmark.suites.published import (
 )
 from jaxslam.benchmark.suites.published_comparison import published_of
 from jaxslam.benchmark.suites.suite import load_suite, suites
-from jaxslam.config.schema import configs_dir
+from jaxslam.config.loading import configs_dir
 from jaxslam.datasets.loaders import bonn, tum
 from jaxslam.datasets.protocol import Fit
 from jaxslam.errors import ConfigError

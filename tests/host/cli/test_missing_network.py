@@ -9,7 +9,7 @@ from command_line import failing
 from small_scene import HEIGHT, SETTINGS, WIDTH
 
 from jaxslam.cli.entry_point import main
-from jaxslam.config.schema import load_config, presets
+from jaxslam.config.loading import load_config, presets
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset, write_tum
 from jaxslam.errors import MissingModelError
 from jaxslam.semantics import no_detections

@@ -13,8 +13,9 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxslam.config import schema as config_module
-from jaxslam.config.schema import Config, RunConfig, TrackConfig, configs_dir, load_config, presets, to_yaml, updated
+from jaxslam.config import loading as config_module
+from jaxslam.config.loading import configs_dir, load_config, presets, to_yaml, updated
+from jaxslam.config.schema import Config, RunConfig, TrackConfig
 from jaxslam.config.validation import Range, ValidatedConfig, checked_value
 from jaxslam.errors import ConfigError
 
@@ -311,10 +312,10 @@ class TestConfigsFolder:
         installed = tmp_path / "site-packages" / "jaxslam" / "_configs"
         installed.mkdir(parents=True)
         (tmp_path / "site-packages" / "configs").mkdir()
-        monkeypatch.setattr(config_module, "__file__", str(installed.parent / "config" / "schema.py"))
+        monkeypatch.setattr(config_module, "__file__", str(installed.parent / "config" / "loading.py"))
         assert configs_dir() == installed
 
     def test_no_folder(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(config_module, "__file__", str(tmp_path / "jaxslam" / "config" / "schema.py"))
+        monkeypatch.setattr(config_module, "__file__", str(tmp_path / "jaxslam" / "config" / "loading.py"))
         with pytest.raises(ConfigError, match="configs: expected the folder _configs"):
             configs_dir()

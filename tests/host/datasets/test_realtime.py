@@ -9,7 +9,7 @@ import pytest
 from jaxslam.results.run_results import RunInfo, write_results
 from small_scene import CONFIG, Clip, clip
 
-from jaxslam.config.schema import load_config
+from jaxslam.config.loading import load_config
 from jaxslam.datasets.realtime import in_real_time
 from jaxslam.sensors.frame import Frame
 from jaxslam.slam.slam import Slam

@@ -13,7 +13,8 @@ from scipy.spatial import KDTree
 from small_scene import CONFIG, clip
 from true_surface import accuracy, true_surface
 
-from jaxslam.config.schema import Config, DenseConfig, load_config
+from jaxslam.config.loading import load_config
+from jaxslam.config.schema import Config, DenseConfig
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.datasets.synthetic.camera_path_kind import CameraPathKind
 from jaxslam.datasets.synthetic.dataset import SyntheticFrame

@@ -11,7 +11,7 @@ from npz_members import array_of, npy, packed, unpacked
 from rig_texts import KALIBR, ORB_SLAM3, OWN
 from small_map import small_map
 
-from jaxslam.config.schema import load_config
+from jaxslam.config.loading import load_config
 from jaxslam.datasets.catalog import known_recordings
 from jaxslam.errors import JaxSlamError
 from jaxslam.map.npz_file import load_map, save_map

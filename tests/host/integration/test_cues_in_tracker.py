@@ -13,7 +13,8 @@ from jaxslam_kernels.pose.pose_refine import PoseStatus
 from quick_compile import quick_compile
 from small_scene import HEIGHT, PLAN, TRACK, WIDTH, at, clip, new_state, params, stacked
 
-from jaxslam.config.schema import Config, DynamicsConfig, load_config, presets
+from jaxslam.config.loading import load_config, presets
+from jaxslam.config.schema import Config, DynamicsConfig
 from jaxslam.dynamics.cue import CueInput, CueResult, threshold_evidence
 from jaxslam.dynamics.regions import Regions
 from jaxslam.errors import ConfigError

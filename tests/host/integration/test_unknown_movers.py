@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from small_scene import Clip
 
-from jaxslam.config.schema import load_config
+from jaxslam.config.loading import load_config
 from jaxslam.datasets.synthetic import SceneDetector, SyntheticConfig, SyntheticDataset
 from jaxslam.sensors.frame import Frame
 from jaxslam.slam.slam import Slam

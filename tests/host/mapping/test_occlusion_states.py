@@ -19,7 +19,9 @@ from small_map import CAMERA, same, small_map
 from small_scene import Clip
 from wall_map import POINTS, at, seen_from
 
-from jaxslam.config.schema import Config, DynamicsConfig, OcclusionConfig, TrackConfig, load_config
+from jaxslam.config.cue_sections import OcclusionConfig
+from jaxslam.config.loading import load_config
+from jaxslam.config.schema import Config, DynamicsConfig, TrackConfig
 from jaxslam.datasets.synthetic import SceneDetector, SyntheticConfig, SyntheticDataset
 from jaxslam.dynamics.occlusion import PointState, state_weights
 from jaxslam.errors import MapFileError

@@ -12,7 +12,8 @@ from result_files import FILES, MASK_FILES
 
 from jaxslam import Camera, TrackParams, TrackPlan, TrackReason, TrackStatus
 from jaxslam.cli.command_table import ExitCode, find_command
-from jaxslam.config.schema import Config, presets
+from jaxslam.config.loading import presets
+from jaxslam.config.schema import Config
 from jaxslam.results.dense_results import DENSE_FILES
 from jaxslam.semantics.prompted import read_examples
 

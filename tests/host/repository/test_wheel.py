@@ -63,8 +63,8 @@ def test_wheel_holds_what_is_needed_and_no_more(wheel: Path) -> None:
 
 def test_imports_from_anywhere(environment: Path) -> None:
     code = (
-        "import json, jaxslam, jaxslam_kernels, jaxslam.config.schema, jaxslam.sensors.camera\n"
-        "places = [jaxslam.__file__, jaxslam_kernels.__file__, str(jaxslam.config.schema.configs_dir())]\n"
+        "import json, jaxslam, jaxslam_kernels, jaxslam.config.loading, jaxslam.sensors.camera\n"
+        "places = [jaxslam.__file__, jaxslam_kernels.__file__, str(jaxslam.config.loading.configs_dir())]\n"
         "print(json.dumps([places, jaxslam.sensors.camera.known_cameras()]))"
     )
     places, cameras = json.loads(_run([environment / "bin" / "python", "-W", "error", "-c", code], "/"))

@@ -15,7 +15,7 @@ from result_files import ALWAYS, FILES, MASK_FILES
 from small_scene import CONFIG, clip
 
 from jaxslam.cli.entry_point import main
-from jaxslam.config.schema import load_config
+from jaxslam.config.loading import load_config
 from jaxslam.errors import TrajectoryError
 from jaxslam.results.dense_results import DENSE_FILES
 from jaxslam.results.frame_table import read_errors, read_track_ms

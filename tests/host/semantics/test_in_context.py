@@ -19,7 +19,8 @@ from tiny_segmenters import SURE
 
 from jaxslam.benchmark.suites.job import networks_sha256
 from jaxslam.cli.entry_point import main
-from jaxslam.config.schema import SemanticsConfig, load_config
+from jaxslam.config.loading import load_config
+from jaxslam.config.schema import SemanticsConfig
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.errors import ConfigError, FrameError, JaxSlamError, MissingModelError, ModelError
 from jaxslam.io.download import sha256_of

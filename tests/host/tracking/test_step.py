@@ -22,7 +22,8 @@ from quick_compile import quick_compile
 from small_scene import HEIGHT, PLAN, TRACK, WIDTH, at, clip, new_state, params, stacked
 
 from jaxslam import FlowPlan
-from jaxslam.config.schema import Config, DynamicsConfig, SemanticsConfig, load_config
+from jaxslam.config.loading import load_config
+from jaxslam.config.schema import Config, DynamicsConfig, SemanticsConfig
 from jaxslam.semantics import Detections, no_detections
 from jaxslam.sensors.frame_arrays import FrameArrays
 from jaxslam.slam.frame_result import FrameResult

@@ -15,7 +15,7 @@ from small_scene import HEIGHT, PLAN, TRACK, WIDTH, clip, new_state, params, sta
 
 from jaxslam import FlowPlan, LevelPlan, TrackParams, follow_points, init_state, track_clips, track_followed
 from jaxslam.dynamics import CueResult
-from jaxslam.config.schema import load_config
+from jaxslam.config.loading import load_config
 from jaxslam.dynamics.object_motion import MotionPlan
 from jaxslam.errors import ConfigError, FrameError
 from jaxslam.sensors.frame_arrays import FrameArrays, check_gray_range

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from evo_figures import Evo
 
-from jaxslam.config.schema import load_config
+from jaxslam.config.loading import load_config
 from jaxslam.datasets import Subset, open_dataset
 from jaxslam.sensors.camera import Camera
 from jaxslam.slam.slam import Slam
