@@ -49,7 +49,7 @@ def accuracy_table(baseline: AccuracyBaseline) -> str:
             ]
         )
     columns = ("name", "recording", "frames", "seeds", "tracked", "ATE, median", "ATE, range")
-    measured = f"Commit {baseline.commit}, preset `{baseline.preset}`, on {baseline.machine}; {baseline.versions}:\n"
+    measured = f"Commit {baseline.commit}, preset `{baseline.preset}`, on {baseline.machine};\n{baseline.versions}:\n"
     return f"{measured}\n{table(columns, rows)}"
 
 

@@ -1,4 +1,4 @@
-"""Looking over a recording before it is tracked: what is there, what is odd, and what that would do."""
+"""Sanity checks on a recording before tracking."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -19,11 +19,11 @@ from jaxslam.sensors.stereo_checks import look_over
 from jaxslam.trajectory.trajectory import associate
 
 _SAMPLED_PAIRS = 8
-_USUAL_DEPTH_SCALES = (1000.0, 5000.0)  # millimeters; TUM and Bonn
+_USUAL_DEPTH_SCALES = (1000.0, 5000.0)  # counts per meter: millimeters; TUM and Bonn
 
 
 class Level(StrEnum):
-    """What a finding means for tracking."""
+    """Severity of a finding."""
 
     OK = "ok"
     WARNING = "warning"
@@ -32,7 +32,13 @@ class Level(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing looked at: its topic in a word, what was found, and what that would do."""
+    """The result of one check.
+
+    Attributes:
+        level: Its severity.
+        topic: Its topic in a word.
+        text: What was found and, if it is unusual, what that would do to tracking.
+    """
 
     level: Level
     topic: str
@@ -44,17 +50,21 @@ class Finding:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Everything found; as text, one line a finding and a last line that counts them."""
+    """The results of all checks; as text, one line per finding and a last line with their counts.
+
+    Attributes:
+        findings: The findings in the order of the checks.
+    """
 
     findings: tuple[Finding, ...]
 
     def at(self, level: Level) -> list[Finding]:
-        """The findings of one level."""
+        """Return the findings of one level."""
         return [finding for finding in self.findings if finding.level is level]
 
     @property
     def ok(self) -> bool:
-        """Whether nothing stands in the way of tracking; warnings may remain."""
+        """Whether no finding prevents tracking; there may be warnings."""
         return not self.at(Level.ERROR)
 
     def __str__(self) -> str:
@@ -63,7 +73,7 @@ class Diagnosis:
 
 
 def diagnose(path: str | Path, kind: str = "auto", camera: Camera | str | Path | None = None) -> Diagnosis:
-    """Look over a recording, decoding a few frames of it; whatever is wrong inside the folder becomes a finding.
+    """Check a recording, decoding a few frames of it; whatever is wrong inside the folder becomes a finding.
 
     Args:
         path: The folder, as for `open_dataset`.
@@ -71,7 +81,7 @@ def diagnose(path: str | Path, kind: str = "auto", camera: Camera | str | Path |
         camera: The camera, as for `open_dataset`.
 
     Raises:
-        DatasetError: If there is no such folder, and so nothing to look over.
+        DatasetError: If there is no such folder, and so nothing to check.
     """
     try:
         dataset = open_dataset(path, kind, camera)
@@ -153,7 +163,7 @@ def _calibration(camera: Camera) -> Iterator[Finding]:
 
 
 def _is_monotonic(camera: Camera) -> bool:
-    """Whether radial distortion keeps growing with the radius, out to the farthest corner."""
+    """Whether the distorted radius grows with the undistorted one, out to the farthest corner."""
     k1, k2, _, _, k3 = camera.distortion
     x = max(camera.cx, camera.width - camera.cx) / camera.fx
     y = max(camera.cy, camera.height - camera.cy) / camera.fy
@@ -162,7 +172,7 @@ def _is_monotonic(camera: Camera) -> bool:
 
 
 def _sample(dataset: Dataset) -> tuple[list[Frame], list[Finding]]:
-    """Neighboring frames at a few places, and a finding for each that cannot be read."""
+    """Decode neighboring frames at a few places; each unreadable frame gives a finding."""
     starts = np.linspace(0, max(len(dataset) - 2, 0), _SAMPLED_PAIRS).astype(int)
     frames, findings = [], []
     for index in sorted({int(i) for start in starts for i in (start, start + 1) if i < len(dataset)}):

@@ -1,4 +1,4 @@
-"""Read the files of an estimate and of a reference, with the stamps and frames that they do not hold themselves."""
+"""Files of an estimated and a reference trajectory, with the timestamps and frames that they do not contain."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,18 +14,18 @@ from jaxslam.trajectory.formats import PoseRows, read_rows, read_times, text_row
 from jaxslam.trajectory.trajectory import Trajectory, of_rows
 
 _FRAME_LISTS = ("rgb.txt", "times.txt")
-"""Files beside the ground truth that list the frames of a recording, in the layouts of TUM and KITTI."""
+"""Files next to the ground truth that list the frames of a recording, in the layouts of TUM and KITTI."""
 _HOW = "--times FILE gives stamps, one a row, to rows of KITTI"
 
 
 class TrajectoryPair(NamedTuple):
-    """An estimate and a reference from files.
+    """An estimated and a reference trajectory read from files.
 
     Attributes:
         estimate: The estimated poses.
         reference: The true poses.
-        frames_ns: `(f,)` int64 stamps of the frames of the recording, nanoseconds; `None` if they are not known.
-        notes: What was taken for granted, in words.
+        frames_ns: `(f,)` int64 timestamps of the recording's frames in nanoseconds; `None` if unknown.
+        notes: Assumptions made while reading, as sentences.
     """
 
     estimate: Trajectory
@@ -39,19 +39,19 @@ def read_pair(
 ) -> TrajectoryPair:
     """Read an estimate and a reference; rows that are not in the order of time are sorted.
 
-    Rows of KITTI have no stamps. They get those of `times` or, if that is not given, of a list of frames that is as
-    long. Two files of KITTI of equal length are matched by row without any.
+    Rows of KITTI have no timestamps. They get those of `times` or, without it, of a list of frames of the same length.
+    Two files of KITTI of equal length are matched by row without any timestamps.
 
     Args:
         estimate: File of the estimated poses.
         reference: File of the true poses.
-        times: Files of one stamp a line for rows of KITTI: one file for either or both sides, or one for the estimate
-            and one for the reference.
-        frames: Stamps of the frames of the recording, as `read_frames` reads them. By default those of `rgb.txt` or
-            `times.txt` beside the reference, if there is one.
+        times: Files of one timestamp per line for rows of KITTI: one file for either or both sides, or one for the
+            estimate and one for the reference.
+        frames: File with the timestamps of the recording's frames, as `read_frames` reads it. The default is `rgb.txt`
+            or `times.txt` next to the reference, if it exists.
 
     Raises:
-        TrajectoryError: If a file is missing, unreadable or malformed, or stamps are missing or do not fit.
+        TrajectoryError: If a file is missing, unreadable or malformed, or timestamps are missing or do not fit.
         DatasetError: If a list of images given as `frames` is malformed.
     """
     rows = [read_rows(estimate), read_rows(reference)]
@@ -68,18 +68,24 @@ def read_pair(
 
 
 def read_frames(path: Path) -> Int[np.ndarray, " f"]:
-    """Stamps of frames: a list of images such as `rgb.txt`, or one stamp in seconds a line as KITTI's `times.txt`.
+    """Read the timestamps of frames from a list of images (`rgb.txt`) or of one time per line (KITTI's `times.txt`).
 
     Raises:
         TrajectoryError: If the file is missing, unreadable or empty, or a line is not one number.
-        DatasetError: If it is a list of images and malformed.
+        DatasetError: If it is a malformed list of images.
     """
     rows = text_rows(path, TrajectoryError)
     return read_file_list(path).timestamps_ns if rows and len(rows[0][1]) > 1 else read_times(path)
 
 
 class _Frames(NamedTuple):
-    """A list of frames, and whether it was asked for."""
+    """A list of frames.
+
+    Attributes:
+        path: The file it was read from.
+        timestamps_ns: `(f,)` timestamps of the frames in nanoseconds.
+        asked_for: Whether the caller named the file.
+    """
 
     path: Path
     timestamps_ns: Int[np.ndarray, " f"]
@@ -87,7 +93,7 @@ class _Frames(NamedTuple):
 
 
 def _listed_frames(reference: Path, frames: Path | None) -> tuple[_Frames | None, tuple[str, ...]]:
-    """The list of frames that was asked for or lies beside the reference."""
+    """Read the list of frames that the caller named, or else the one next to the reference."""
     if frames is not None:
         return _Frames(frames, read_frames(frames), asked_for=True), ()
     found = next((path for name in _FRAME_LISTS if (path := reference.parent / name).is_file()), None)
@@ -101,7 +107,7 @@ def _listed_frames(reference: Path, frames: Path | None) -> tuple[_Frames | None
 
 
 def _with_times(rows: Sequence[PoseRows], times: Sequence[Path]) -> list[PoseRows]:
-    """The rows of both sides, those of KITTI with the stamps of these files."""
+    """Return the rows of both sides, those of KITTI with the timestamps of these files."""
     bare = [side for side in rows if side.timestamps_ns is None]
     if not 0 < len(times) <= len(bare):
         have = " and ".join(f"{side.path} ({side.kind})" for side in rows)
@@ -125,10 +131,10 @@ def _stamped(side: PoseRows, times: Path) -> PoseRows:
 def _with_frames(
     rows: Sequence[PoseRows], frames: _Frames | None
 ) -> tuple[list[PoseRows], _Frames | None, tuple[str, ...]]:
-    """The rows of both sides, those of KITTI with the stamps of as many frames, or matched by row.
+    """Return the rows of both sides, those of KITTI with the timestamps of as many frames, or matched by row.
 
     Returns:
-        The rows, the frames if their stamps go with those of the rows, and notes.
+        The rows, the frames if their timestamps fit those of the rows, and notes.
     """
     bare = [side for side in rows if side.timestamps_ns is None]
     if frames is not None and all(len(side) == len(frames.timestamps_ns) for side in bare):
@@ -149,7 +155,7 @@ def _with_frames(
 
 
 def _in_order(name: str, side: PoseRows) -> tuple[Trajectory, tuple[str, ...]]:
-    """The trajectory of these rows, sorted by time, and a note if they had to be."""
+    """Return the trajectory of these rows, sorted by time, and a note if the order changed."""
     if side.timestamps_ns is None:
         return of_rows(side), ()
     back = int((np.diff(side.timestamps_ns) < 0).sum())

@@ -1,4 +1,4 @@
-"""Images of a folder, in order, and the times that their names or a list beside them give."""
+"""The images of a folder in order, and their times from file names or a list."""
 
 import re
 from pathlib import Path
@@ -14,10 +14,10 @@ _SECONDS = re.compile(r"\d+\.\d{1,9}\Z")
 
 
 def files_in(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
-    """The files of a folder with one of these endings, sorted by name, numbers by their value.
+    """Return the files of a folder with one of the suffixes, sorted by name; numbers are sorted by value.
 
     Raises:
-        DatasetError: If there is none.
+        DatasetError: If there is no such file.
     """
     found = [path for path in folder.iterdir() if path.suffix.lower() in suffixes and not path.name.startswith(".")]
     if not found:
@@ -26,17 +26,17 @@ def files_in(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
 
 
 def times_of(files: list[Path], times: Path, fps: float) -> np.ndarray:
-    """`(n,)` int64 nanoseconds of images, strictly increasing.
+    """Return the `(n,)` int64 timestamps of images in nanoseconds, strictly increasing.
 
     Args:
         files: The images in order.
-        times: A file of one stamp in seconds a line, taken if it is there. Without it names of 16 to 19 digits are
-            nanoseconds, and decimal numbers seconds.
-        fps: Frames a second, for names that are neither.
+        times: A file of one timestamp in seconds per line, used if it exists. Otherwise names of 16 to 19 digits are
+            read as nanoseconds, and decimal numbers as seconds.
+        fps: Frames per second, used for names that are neither.
 
     Raises:
-        DatasetError: If times are malformed, do not increase, or are not as many as images; or if only some names
-            are times.
+        DatasetError: If timestamps are malformed, do not increase, or do not match the number of images, or if only
+            some of the names are timestamps.
     """
     if times.is_file():
         stamps, source = _read(times, len(files)), str(times)

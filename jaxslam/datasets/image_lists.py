@@ -1,4 +1,4 @@
-"""Lists of images with their times, such as `rgb.txt`: one `timestamp file` a line, seconds, `#` comments."""
+"""Lists of images with timestamps, such as `rgb.txt`: one `timestamp file` per line, in seconds, `#` for comments."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +8,7 @@ import numpy as np
 from jaxslam.errors import DatasetError
 from jaxslam.io.timestamps import nanoseconds
 
-_LONGEST_PAUSE_STEPS = 10**6  # nine hours at 30 frames a second; a longer one is a change of unit
+_LONGEST_PAUSE_STEPS = 10**6  # nine hours at 30 frames per second; a longer pause is a change of unit
 
 
 @dataclass(frozen=True)
@@ -16,9 +16,9 @@ class FileList:
     """Images in the order of time.
 
     Attributes:
-        source: The file the list was read from.
-        timestamps_ns: `(n,)` int64 nanoseconds, strictly increasing.
-        files: One path an image.
+        source: The file that the list was read from.
+        timestamps_ns: `(n,)` int64 timestamps in nanoseconds, strictly increasing.
+        files: The path of each image.
     """
 
     source: Path
@@ -27,7 +27,7 @@ class FileList:
 
 
 def read_file_list(path: Path) -> FileList:
-    """Read a list; the files it names are relative to its folder, and are not opened.
+    """Read a list of images. The files it names are relative to its folder, and are not opened.
 
     Raises:
         DatasetError: If the list is missing, empty or unreadable, or a line is malformed, not in seconds or

@@ -1,4 +1,4 @@
-"""What recordings of two image files a frame have in common: color and depth, or left and right."""
+"""Base class of recordings with two image files per frame: color and depth, or left and right."""
 
 import functools
 from abc import ABC, abstractmethod
@@ -19,14 +19,14 @@ Files = list[tuple[Path, Path]]
 
 
 class ImagePairs(ABC):
-    """A recording that knows its files from the start and decodes those of a frame when it is asked for.
+    """A recording that lists its files at the start and decodes those of a frame on access.
 
-    A kind of recording sets the attributes, and says how files and ground truth are read.
+    A subclass sets the attributes and defines how images and ground truth are read.
 
     Attributes:
-        name: What to call it in results.
-        camera: The camera that took the frames, that of the rectified pair if two cameras as they are were given.
-        timestamps_ns: `(n,)` int64 nanoseconds, strictly increasing.
+        name: Name of the recording in results.
+        camera: The camera that took the frames, or the rectified camera of a stereo pair that is not rectified.
+        timestamps_ns: `(n,)` int64 timestamps in nanoseconds, strictly increasing.
     """
 
     name: str
@@ -34,7 +34,7 @@ class ImagePairs(ABC):
     timestamps_ns: np.ndarray
     _files: Files
     _pair: RectifiedPair | None = None
-    """What rectifies the images of two cameras as they are."""
+    """Rectifies the images of a stereo pair; `None` if they are already rectified or there is no pair."""
 
     def _taken_with(self, camera: Camera | RectifiedPair) -> None:
         self._pair = camera if isinstance(camera, RectifiedPair) else None
@@ -42,7 +42,11 @@ class ImagePairs(ABC):
 
     @property
     def ground_truth(self) -> Trajectory | None:
-        """Poses of `camera`, read when first asked for; `TrajectoryError` if malformed, `None` if there are none."""
+        """The poses of `camera`, read on first access; `None` if there are none.
+
+        Raises:
+            TrajectoryError: If the file is malformed.
+        """
         return self._ground_truth
 
     @functools.cached_property
@@ -55,17 +59,17 @@ class ImagePairs(ABC):
     @property
     @abstractmethod
     def _readers(self) -> tuple[Callable[[Path], np.ndarray], Callable[[Path], np.ndarray]]:
-        """How the first and the second file of a frame are read."""
+        """The functions that read the first and the second file of a frame."""
 
     def __len__(self) -> int:
         return len(self._files)
 
     def __getitem__(self, index: int) -> Frame:
-        """Decode one frame, and rectify it where that is needed.
+        """Decode one frame, and rectify it where needed.
 
         Raises:
             IndexError: If there is no such frame.
-            DatasetError: If an image is unreadable, or of another size than the camera's.
+            DatasetError: If an image is unreadable, or its size is not the camera's.
         """
         files = self._files[index]
         first, second = (read(file) for read, file in zip(self._readers, files, strict=True))
@@ -81,20 +85,20 @@ class ImagePairs(ABC):
 
 
 def check_stereo(camera: Camera) -> None:
-    """Refuse a camera that is no stereo pair.
+    """Refuse a camera that is not a stereo pair.
 
     Raises:
-        CameraError: If it is none.
+        CameraError: If the camera has no baseline, or has depth images.
     """
     if not camera.is_stereo:
         raise CameraError(f"camera '{camera.name}': baseline_m: expected meters for a stereo pair, got none")
 
 
 def check_present(files: Sequence[tuple[Path, Path]]) -> None:
-    """Refuse lists of files that are not all there.
+    """Refuse a list of files of which some do not exist.
 
     Raises:
-        DatasetError: If one is missing.
+        DatasetError: If a file is missing.
     """
     missing = [file for pair in files for file in pair if not file.is_file()]
     if missing:
@@ -102,5 +106,10 @@ def check_present(files: Sequence[tuple[Path, Path]]) -> None:
 
 
 def moved(bodies: Trajectory, T_body_camera: np.ndarray) -> Trajectory:
-    """The trajectory of a camera that is fixed to another body, by its pose `(7,)` there, wxyz_xyz."""
+    """Return the trajectory of a camera fixed to a body, from the body's trajectory.
+
+    Args:
+        bodies: The trajectory of the body.
+        T_body_camera: `(7,)` wxyz_xyz pose of the camera in the axes of the body.
+    """
     return Trajectory(bodies.timestamps_ns, compose(bodies.T_world_cam, T_body_camera[None]))

@@ -1,4 +1,4 @@
-"""Parts of a recording, and reading ahead of whoever consumes it."""
+"""Parts of a recording, and decoding of frames ahead of their use."""
 
 from collections import deque
 from collections.abc import Generator
@@ -22,11 +22,18 @@ class Subset:
 
     Attributes:
         whole: The other recording.
-        indices: Of the frames in it.
+        indices: Indices of the chosen frames in the other recording.
+        name: Name of the part in results, such as `fr1_xyz[0:100]`.
     """
 
     def __init__(self, dataset: Dataset, start: int = 0, stop: int | None = None, step: int = 1) -> None:
-        """Choose the frames as a slice does: negative numbers of frames count from the end.
+        """Choose frames as a slice does: negative indices count from the end.
+
+        Args:
+            dataset: The recording to choose from.
+            start: Index of the first frame.
+            stop: Index after the last frame; `None` for the end.
+            step: Step between chosen frames.
 
         Raises:
             DatasetError: If no frame is left.
@@ -45,7 +52,7 @@ class Subset:
 
     @property
     def timestamps_ns(self) -> np.ndarray:
-        """`(n,)` int64 nanoseconds of the chosen frames."""
+        """`(n,)` int64 timestamps of the chosen frames in nanoseconds."""
         return self.whole.timestamps_ns[self.indices.start : self.indices.stop : self.indices.step]
 
     @property
@@ -61,7 +68,7 @@ class Subset:
 
 
 class Indexed(Protocol[_Item_co]):
-    """What `prefetch` reads: a recording, or anything with a length and items."""
+    """A sequence that `prefetch` can read: a recording, or anything with a length and items."""
 
     def __len__(self) -> int: ...
 
@@ -69,16 +76,16 @@ class Indexed(Protocol[_Item_co]):
 
 
 def prefetch(dataset: Indexed[_Item_co], ahead: int = 4) -> Generator[_Item_co]:
-    """Every frame in order, decoded in one background thread while the caller works on earlier ones.
+    """Yield every frame in order, decoded in one background thread while the caller works on earlier ones.
 
-    The thread ends with the iterator: when it is exhausted, closed, or thrown away half-way.
+    The thread ends with the iterator: when it is exhausted, closed, or discarded half-way.
 
     Args:
         dataset: The recording.
-        ahead: Frames to decode ahead, at least 1; as many are held in memory.
+        ahead: Number of frames to decode ahead, at least 1; as many are held in memory.
 
     Raises:
-        JaxSlamError: Whatever decoding a frame raised, when that frame's turn comes.
+        JaxSlamError: Whatever decoding a frame raised, when that frame is due.
     """
     indices = iter(range(len(dataset)))
     pool = ThreadPoolExecutor(1, thread_name_prefix="jaxslam-prefetch")

@@ -1,4 +1,4 @@
-"""What a recording is to the rest of jaxslam, and what a loader of one kind of recording provides."""
+"""The protocol of a recording, and of the loader of one kind of recording."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,11 +15,11 @@ from jaxslam.trajectory.trajectory import Trajectory
 
 
 class Dataset(Protocol):
-    """A finite recording: frames in the order of time, one camera, and ground truth if there is any."""
+    """A finite recording: frames in the order of time, one camera, and ground truth if available."""
 
     @property
     def name(self) -> str:
-        """What to call the recording in results."""
+        """Name of the recording in results."""
         ...
 
     @property
@@ -29,12 +29,12 @@ class Dataset(Protocol):
 
     @property
     def timestamps_ns(self) -> np.ndarray:
-        """`(n,)` int64 times of the frames in nanoseconds, strictly increasing."""
+        """`(n,)` int64 timestamps of the frames in nanoseconds, strictly increasing."""
         ...
 
     @property
     def ground_truth(self) -> Trajectory | None:
-        """The true trajectory, on the frames' clock but at its own times; `None` if there is none."""
+        """The true trajectory, on the clock of the frames but at its own times; `None` if unknown."""
         ...
 
     def __len__(self) -> int: ...
@@ -45,9 +45,11 @@ class Dataset(Protocol):
 
 
 class Unmatched(NamedTuple):
-    """Images left out because no image of the other kind was taken at nearly the same time.
+    """Counts of images left out because no image of the other kind was taken at nearly the same time.
 
-    Of a pair `color` counts those of the left camera, and `depth` those of the right one, which stand in for depth.
+    Attributes:
+        color: Number of color images left out, or of images of the left camera.
+        depth: Number of depth images left out, or of images of the right camera.
     """
 
     color: int
@@ -56,36 +58,37 @@ class Unmatched(NamedTuple):
 
 @runtime_checkable
 class Associated(Protocol):
-    """A recording whose two images of a frame were taken apart and have been matched by time."""
+    """A recording whose frames consist of two images taken separately and matched by time."""
 
     @property
     def unmatched(self) -> Unmatched:
-        """How many images found no partner."""
+        """The number of images without a partner."""
         ...
 
 
 class Fit(IntEnum):
-    """How surely a loader recognizes a folder; the surest loader opens it."""
+    """How surely a loader recognizes a folder; the loader with the highest value opens it."""
 
     NO = 0
     FOLDERS = 1
-    """Folders of images are there."""
+    """The folder contains folders of images."""
     LAYOUT = 2
-    """The files are there."""
+    """The folder contains the files of the layout."""
     NAME = 3
-    """The files are there and the folder's name says so too."""
+    """The folder contains the files of the layout, and its name confirms it."""
 
 
 @dataclass(frozen=True)
 class Loader:
-    """One kind of recording. A module of this package that holds a `LOADER` is found by itself.
+    """One kind of recording. Each module of `jaxslam.datasets.loaders` that defines a `LOADER` is registered.
 
     Attributes:
-        kind: The name by which it is chosen.
-        fit: How surely a folder is of this kind.
-        camera: What a folder was taken with, as its name or a calibration in it tells; `None` if neither does.
-        open: Opens a folder with its camera.
-        rectifies: Whether `open` also takes a pair that is not rectified.
+        kind: The name that selects this kind of recording.
+        fit: Function that tells how surely a folder is of this kind.
+        camera: Function that finds the camera of a folder from its name or a calibration in it; it returns `None` if
+            neither tells.
+        open: Function that opens a folder with its camera.
+        rectifies: Whether `open` also takes a stereo pair that is not rectified.
     """
 
     kind: str

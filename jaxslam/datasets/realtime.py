@@ -1,4 +1,4 @@
-"""A recording at the rate it was taken at: who is slower than the camera misses frames, as on a robot."""
+"""Playback of a recording at its own rate: a consumer slower than the camera misses frames, as on a robot."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -16,15 +16,15 @@ def in_real_time(
     clock: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
 ) -> Iterator[_Item | None]:
-    """Each frame when it is due; `None` for one that is late, because the next one is there when it is asked for.
+    """Yield each frame when it is due; `None` for a late frame: its successor is due by the time it is requested.
 
-    The first frame is due when it is asked for. The last one is never late.
+    The first frame is due when it is requested. The last frame is never late.
 
     Args:
-        frames: All frames in order, as `prefetch` gives them.
-        timestamps_ns: `(n,)` their times, increasing.
-        clock: Gives seconds.
-        sleep: Waits for some.
+        frames: All frames in order, as `prefetch` yields them.
+        timestamps_ns: `(n,)` timestamps of the frames in nanoseconds, increasing.
+        clock: Function that returns the time in seconds.
+        sleep: Function that waits for a number of seconds.
     """
     due_s = (np.asarray(timestamps_ns, np.int64) - timestamps_ns[0]) * 1e-9
     began = clock()

@@ -1,4 +1,4 @@
-"""Open a recording: recognize what kind its folder holds, and choose its camera."""
+"""Opening of recordings: recognize what kind a folder holds, and choose its camera."""
 
 import functools
 import importlib
@@ -18,14 +18,15 @@ def open_dataset(
     """Open a recording.
 
     Args:
-        path: Its folder.
+        path: Folder of the recording.
         kind: One of `dataset_kinds()`, or `auto` to recognize it by its files and name.
-        camera: A camera, the name of a known one or a camera file; for raw images of two cameras a rectified pair or
-            its file. `None` takes `camera.yaml` in the folder or, without one, the camera that the folder tells.
+        camera: A camera, the name of a known one or a camera file; for raw images of two cameras, a rectified pair or
+            its file. `None` takes `camera.yaml` in the folder or, without one, the camera that the folder's name or
+            calibration tells.
 
     Raises:
         DatasetError: If the folder is missing, of no known kind, incomplete or unreadable.
-        CameraError: If the camera cannot be told or loaded.
+        CameraError: If the camera is unknown or cannot be loaded.
     """
     folder = Path(path).expanduser().resolve()
     if not folder.is_dir():
@@ -41,7 +42,7 @@ def open_dataset(
 
 
 def dataset_kinds() -> list[str]:
-    """The kinds of recordings that can be opened."""
+    """Return the kinds of recordings that can be opened."""
     return sorted(_loaders())
 
 

@@ -1,1 +1,1 @@
-"""One module for each kind of recording; each holds a `LOADER` and is found by itself."""
+"""Loaders, one module for each kind of recording; each module that defines a `LOADER` is registered automatically."""

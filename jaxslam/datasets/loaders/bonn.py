@@ -1,4 +1,4 @@
-"""The Bonn RGB-D Dynamic dataset: the layout of TUM, folders named `rgbd_bonn_*`, one camera.
+"""The Bonn RGB-D Dynamic dataset: the layout of TUM, folders named `rgbd_bonn_*`, and one camera for all.
 
 Source: Palazzolo et al., "ReFusion: 3D Reconstruction in Dynamic Environments for RGB-D Cameras Exploiting
 Residuals", IROS 2019.

@@ -1,4 +1,4 @@
-"""Images of one's own in two folders, `left` and `right` or `rgb` and `depth`, and a camera file."""
+"""Your own images in two folders, `left` and `right` or `rgb` and `depth`, with a camera file."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -21,7 +21,13 @@ _METERS = ".npy"
 
 
 class _Layout(NamedTuple):
-    """The two folders: of images, and of what goes with them."""
+    """The two folders of images.
+
+    Attributes:
+        first: Folder of the color or left images.
+        second: Folder of the depth or right images.
+        pair: Whether they are stereo pairs.
+    """
 
     first: Path
     second: Path
@@ -29,24 +35,25 @@ class _Layout(NamedTuple):
 
 
 class FolderDataset(ImagePairs):
-    """Two folders of images, the n-th of one with the n-th of the other, sorted by name.
+    """Two folders of images, both sorted by name; the nth image of one belongs to the nth of the other.
 
-    `left` and `right` hold a stereo pair; `rgb` (or `color`, `image`) and `depth` color and depth, as counts in .png
-    (`depth_scale_per_m` of the camera) or as meters in .npy. Times are those of `times.txt` (seconds, one a line);
-    without it those that are the names, as nanoseconds (16 to 19 digits) or seconds (with decimals); without either,
-    frames follow each other at `fps` of the camera. `groundtruth.txt` may hold poses in the format of TUM.
+    `left` and `right` hold stereo pairs; `rgb` (or `color`, `image`) and `depth` hold color and depth, as counts in
+    .png (`depth_scale_per_m` of the camera) or as meters in .npy. Timestamps come from `times.txt` (seconds, one per
+    line); without it from the file names, as nanoseconds (16 to 19 digits) or seconds (with decimals); otherwise frames
+    are spaced by `fps` of the camera. `groundtruth.txt` may hold poses in the format of TUM.
 
     Attributes:
         name: The folder's name.
-        camera: The camera, that of the rectified pair if two cameras as they are were given.
-        timestamps_ns: `(n,)` int64 nanoseconds, strictly increasing.
+        camera: The camera, or the rectified camera of a stereo pair that is not rectified.
+        timestamps_ns: `(n,)` int64 timestamps in nanoseconds, strictly increasing.
     """
 
     def __init__(self, folder: Path, camera: Camera | RectifiedPair) -> None:
-        """List the images; they are decoded when a frame is asked for.
+        """List the images; they are decoded on access.
 
         Raises:
-            DatasetError: If folders are missing or ambiguous, the numbers of images differ, or times are malformed.
+            DatasetError: If folders are missing or ambiguous, the numbers of images differ, or timestamps are
+                malformed.
             CameraError: If the camera is not of the kind that the folders need.
         """
         layout = _layout(folder)
@@ -63,7 +70,7 @@ class FolderDataset(ImagePairs):
         self.timestamps_ns = times_of(first, folder / _TIMES, self.camera.fps)
 
     def _truth(self) -> Trajectory | None:
-        """The poses of `groundtruth.txt`; in the file they are of the camera as it is, before it is rectified."""
+        """Return the poses of `groundtruth.txt`, which are those of the camera before rectification."""
         path = self._folder / _GROUND_TRUTH
         if not path.is_file():
             return None
@@ -77,7 +84,7 @@ class FolderDataset(ImagePairs):
     def _depth(self, path: Path) -> np.ndarray:
         if path.suffix == _METERS:
             return read_depth_meters(path)
-        return read_depth(path, self.camera.depth_scale_per_m or 1.0)  # checked at the start
+        return read_depth(path, self.camera.depth_scale_per_m or 1.0)  # checked in __init__
 
 
 def _layout(folder: Path) -> _Layout:

@@ -1,4 +1,4 @@
-"""Recordings in the layout of EuRoC MAV: `mav0/cam0`, `mav0/cam1`, stereo pairs as the cameras take them.
+"""Recordings in the layout of EuRoC MAV: `mav0/cam0`, `mav0/cam1`, stereo pairs before rectification.
 
 Source: Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016.
 """
@@ -28,24 +28,24 @@ _LIST, _SENSOR, _TRUTH = "data.csv", "sensor.yaml", Path("state_groundtruth_esti
 
 
 class EurocDataset(ImagePairs):
-    """A folder such as `MH_01_easy`, or the `mav0` in it; pairs are rectified as they are decoded.
+    """A folder such as `MH_01_easy`, or the `mav0` in it; stereo pairs are rectified as they are decoded.
 
-    A pair is two images of exactly the same time. The ground truth of EuRoC is of the body (the IMU); here it is of
-    the rectified left camera, by `T_BS` of `cam0` and the rotation of rectification.
+    A stereo pair is two images with exactly the same timestamp. EuRoC's ground truth is that of the body (the IMU);
+    here it is converted to the rectified left camera, with `T_BS` of `cam0` and the rotation of rectification.
 
     Attributes:
-        name: The recording's folder.
+        name: Name of the recording's folder.
         camera: The rectified left camera, with the baseline.
-        timestamps_ns: `(n,)` int64 nanoseconds, strictly increasing.
-        unmatched: How many images of the left and of the right camera have no partner.
+        timestamps_ns: `(n,)` int64 timestamps in nanoseconds, strictly increasing.
+        unmatched: Number of images of the left and of the right camera without a partner.
     """
 
     def __init__(self, folder: Path, camera: Camera | RectifiedPair) -> None:
-        """Match the images of the two lists; they are decoded when a frame is asked for.
+        """Match the images of the two lists; they are decoded on access.
 
         Raises:
             DatasetError: If a list is missing or malformed, a listed image is missing, or nothing matches.
-            CameraError: If the camera is no stereo pair, or `T_BS` of `cam0` is missing or malformed.
+            CameraError: If the camera is not a stereo pair, or `T_BS` of `cam0` is missing or malformed.
         """
         self._taken_with(camera)
         check_stereo(self.camera)
@@ -83,7 +83,7 @@ def _name(mav: Path) -> str:
 
 
 def _listed(folder: Path) -> dict[int, Path]:
-    """Paths of the images of one camera by their times in nanoseconds."""
+    """Return the paths of one camera's images by timestamp in nanoseconds."""
     path = folder / _LIST
     found: dict[int, Path] = {}
     for number, row in text_rows(path, DatasetError, commas=True):
@@ -112,10 +112,10 @@ def _sensor(mav: Path, which: str) -> tuple[dict[str, Any], Path]:
 
 
 def _camera(folder: Path) -> RectifiedPair:
-    """The pair of `cam0/sensor.yaml` and `cam1/sensor.yaml`, rectified.
+    """Return the rectified pair of `cam0/sensor.yaml` and `cam1/sensor.yaml`.
 
     Raises:
-        CameraError: If one is missing or malformed, or the two are no pair.
+        CameraError: If a file is missing or malformed, or the two cameras do not form a stereo pair.
     """
     mav = _mav(folder)
     (left, left_path), (right, right_path) = (_sensor(mav, which) for which in _CAMERAS)

@@ -21,7 +21,14 @@ _CALIBRATION, _TIMES = "calib.txt", "times.txt"
 
 
 class _Pair(NamedTuple):
-    """Folders of the left and the right images, their names in the calibration, and how an image is read."""
+    """The folders of one stereo camera.
+
+    Attributes:
+        left: Folder of the left images.
+        right: Folder of the right images.
+        projections: Names of the left and the right camera in the calibration file.
+        gray: Whether the images are gray.
+    """
 
     left: str
     right: str
@@ -30,26 +37,27 @@ class _Pair(NamedTuple):
 
 
 _PAIRS = (_Pair("image_0", "image_1", ("P0", "P1"), True), _Pair("image_2", "image_3", ("P2", "P3"), False))
-"""Gray comes first: it is sharper, and color is not needed."""
+"""Gray comes first because it is sharper, and color is not needed."""
 
 
 class KittiDataset(ImagePairs):
     """A folder such as `sequences/06`, with poses in `poses/06.txt` two folders up if they are public.
 
-    Poses are those of the left camera that is used; KITTI's are of the left gray one, 6 cm beside the one for color.
+    The poses are converted to the left camera in use: KITTI's are those of the left gray camera, 6 cm from the left
+    color camera.
 
     Attributes:
-        name: `kitti_` and the folder's name.
+        name: The folder's name after `kitti_`.
         camera: The left camera, with the baseline.
         timestamps_ns: `(n,)` int64 nanoseconds from the start, strictly increasing.
     """
 
     def __init__(self, folder: Path, camera: Camera) -> None:
-        """Find the images; they are decoded when a frame is asked for.
+        """Find the images; they are decoded on access.
 
         Raises:
-            DatasetError: If times are missing or malformed, or images do not go with them.
-            CameraError: If the camera is no stereo pair.
+            DatasetError: If timestamps are missing or malformed, or do not match the images.
+            CameraError: If the camera is not a stereo pair.
         """
         check_stereo(camera)
         self._sides = _pair(folder)
@@ -97,10 +105,10 @@ def _pair(folder: Path) -> _Pair:
 
 
 def _camera(folder: Path) -> Camera:
-    """The left camera of the pair, from the folder's own calibration.
+    """Return the left camera of the stereo pair, from the folder's own calibration.
 
     Raises:
-        DatasetError: If there is no pair of images, or the first cannot be read.
+        DatasetError: If there is no stereo pair, or its first image cannot be read.
         CameraError: If the calibration is missing or malformed.
     """
     pair = _pair(folder)
@@ -118,7 +126,7 @@ def _camera(folder: Path) -> Camera:
 
 
 def _projections(folder: Path) -> dict[str, np.ndarray]:
-    """The `(3, 4)` projection matrices of `calib.txt` by name."""
+    """Return the `(3, 4)` projection matrices of `calib.txt` by name."""
     path = folder / _CALIBRATION
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -128,7 +136,7 @@ def _projections(folder: Path) -> dict[str, np.ndarray]:
     for number, line in enumerate(lines, 1):
         name, _, values = line.partition(":")
         if not name.strip().startswith("P"):
-            continue  # of the laser, and empty lines
+            continue  # calibration of the laser, or an empty line
         try:
             matrix = np.array([float(word) for word in values.split()]).reshape(3, 4)
         except ValueError:
@@ -142,7 +150,7 @@ def _projections(folder: Path) -> dict[str, np.ndarray]:
 
 
 def _offset(projection: np.ndarray) -> np.ndarray:
-    """`(3,)` where a camera stands in the axes of camera 0, whose poses KITTI gives."""
+    """Return the `(3,)` position of a camera in the axes of camera 0, whose poses KITTI gives."""
     return -np.linalg.solve(projection[:, :3], projection[:, 3])
 
 

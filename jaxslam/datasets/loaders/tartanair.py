@@ -1,8 +1,8 @@
-"""Recordings in the layout of TartanAir: `image_left`, `image_right`, `depth_left` and `pose_left.txt`, rendered.
+"""Recordings in the layout of TartanAir (rendered): `image_left`, `image_right`, `depth_left` and `pose_left.txt`.
 
 Source: Wang et al., "TartanAir: A Dataset to Push the Limits of Visual SLAM", IROS 2020. The camera is that of its
-tools: 640x480, fx = fy = 320, cx = 320, cy = 240, 0.25 m between left and right. Frames have no times; 10 a second are
-assumed, which only speeds of the motion model and errors a second depend on.
+tools: 640x480, fx = fy = 320, cx = 320, cy = 240, 0.25 m between left and right. Frames have no timestamps: 10 frames
+per second are assumed, which affects only the speeds of the motion model and errors per second.
 """
 
 from collections.abc import Callable
@@ -22,16 +22,16 @@ from jaxslam.trajectory.trajectory import Trajectory
 _LEFT, _RIGHT, _DEPTH, _POSES = "image_left", "image_right", "depth_left", "pose_left.txt"
 _BASELINE_M, _RATE_HZ = 0.25, 10.0
 _FARTHEST_M = 1000.0
-"""Depth beyond it is missing: the sky is some 10^4 m away in the files."""
+"""Larger depth counts as missing: in the files the sky is about 10^4 m away."""
 _CAMERA_FROM_NED = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
-"""x forward, y right, z down become x right, y down, z forward."""
+"""Rotation from axes x forward, y right, z down to x right, y down, z forward."""
 
 
 class TartanAirDataset(ImagePairs):
     """A folder such as `P001`: frames with depth if there is `depth_left`, otherwise stereo pairs.
 
-    For stereo where there is depth, give a camera with `baseline_m` and no `depth_scale_per_m`; `tartanair_stereo` as
-    kind does that.
+    For stereo pairs in a folder with depth, pass a camera with `baseline_m` and no `depth_scale_per_m`; the kind
+    `tartanair_stereo` does so.
 
     Attributes:
         name: The folder's name.
@@ -40,10 +40,10 @@ class TartanAirDataset(ImagePairs):
     """
 
     def __init__(self, folder: Path, camera: Camera) -> None:
-        """List the images; they are decoded when a frame is asked for.
+        """List the images; they are decoded on access.
 
         Raises:
-            DatasetError: If images are missing, or numbers of images differ.
+            DatasetError: If images are missing, or the numbers of images differ.
         """
         self.name, self.camera, self._folder = folder.name, camera, folder
         first, other = folder / _LEFT, folder / (_RIGHT if camera.is_stereo else _DEPTH)
@@ -71,7 +71,7 @@ def _read_depth(path: Path) -> np.ndarray:
 
 
 def _read_poses(path: Path, timestamps_ns: np.ndarray) -> Trajectory:
-    """Rows `tx ty tz qx qy qz qw` of a body with x forward, y right and z down, in a world of such axes."""
+    """Read rows `tx ty tz qx qy qz qw` of a body with x forward, y right and z down, in a world with the same axes."""
     try:
         rows = np.loadtxt(path, ndmin=2)
     except (OSError, ValueError) as problem:
@@ -96,7 +96,7 @@ def _camera(folder: Path) -> Camera:
 
 
 def tartanair_camera(*, stereo: bool) -> Camera:
-    """The camera of all recordings, with depth in meters or as a pair."""
+    """Return the camera of all recordings, with depth in meters or as a stereo pair."""
     lens = ("tartanair", 640, 480, 320.0, 320.0, 320.0, 240.0)
     if stereo:
         return Camera(*lens, fps=_RATE_HZ, baseline_m=_BASELINE_M)

@@ -1,4 +1,4 @@
-"""TartanAir as stereo pairs, whether there is depth or not: `kind="tartanair_stereo"`."""
+"""TartanAir as stereo pairs, even where there is depth: `kind="tartanair_stereo"`."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from jaxslam.sensors.camera import Camera
 
 
 def _fit(_: Path) -> Fit:
-    return Fit.NO  # only if asked for: `tartanair` takes depth where there is some
+    return Fit.NO  # chosen by name only: `tartanair` uses depth where available
 
 
 def _camera(_: Path) -> Camera:

@@ -1,4 +1,4 @@
-"""Recordings in the layout of the TUM RGB-D benchmark: `rgb.txt`, `depth.txt`, perhaps `groundtruth.txt`.
+"""Recordings in the layout of the TUM RGB-D benchmark: `rgb.txt`, `depth.txt` and optionally `groundtruth.txt`.
 
 Source: Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012.
 """
@@ -20,31 +20,31 @@ from jaxslam.sensors.image_files import read_color, read_depth
 from jaxslam.trajectory.trajectory import Trajectory, associate, read_tum
 
 MAX_GAP_S = 0.02
-"""Color and depth further apart in time than this are no pair (the benchmark's own `associate.py`)."""
+"""Largest gap in seconds between color and depth of a frame (as in the benchmark's own `associate.py`)."""
 
 _COLOR_LIST, _DEPTH_LIST, _GROUND_TRUTH = "rgb.txt", "depth.txt", "groundtruth.txt"
 _NAME = re.compile(r"rgbd_dataset_freiburg([123])_")
 
 
 class TumDataset(ImagePairs):
-    """A recording whose color and depth images are listed apart and matched by time, one to one.
+    """A recording whose color and depth images are listed separately and matched by time, one to one.
 
-    A frame has the time of its color image, and says that of its depth.
-    Depth counts become meters; nothing else is done to the images.
+    A frame has the timestamps of both its color and its depth image. Depth counts are converted to meters; the images
+    are not changed otherwise.
 
     Attributes:
         name: The folder's name.
         camera: The camera that took the frames.
-        timestamps_ns: `(n,)` int64 nanoseconds, strictly increasing.
-        unmatched: How many images were left out because they found no partner within `MAX_GAP_S`.
+        timestamps_ns: `(n,)` int64 timestamps in nanoseconds, strictly increasing.
+        unmatched: Number of images left out because they have no partner within `MAX_GAP_S`.
     """
 
     def __init__(self, folder: Path, camera: Camera) -> None:
-        """Read the lists and match them; images are decoded when a frame is asked for.
+        """Read the lists and match them; images are decoded on access.
 
         Raises:
             DatasetError: If a list is missing or malformed, a listed image is missing, or nothing matches.
-            CameraError: If the camera does not say how many counts make a meter.
+            CameraError: If the camera does not define the counts per meter.
         """
         if camera.depth_scale_per_m is None:
             raise CameraError(f"camera '{camera.name}': depth_scale_per_m: expected a number, got none")
@@ -75,12 +75,12 @@ class TumDataset(ImagePairs):
 
 
 def has_layout(folder: Path) -> bool:
-    """Whether a folder holds the two lists that every recording of this layout has."""
+    """Whether a folder contains the two lists that every recording of this layout has."""
     return (folder / _COLOR_LIST).is_file() and (folder / _DEPTH_LIST).is_file()
 
 
 def _match(color: FileList, depth: FileList) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of the color and depth images that belong together, in the order of time."""
+    """Return the indices of the color and depth images that belong together, in the order of time."""
     pairs = associate(color.timestamps_ns, depth.timestamps_ns, MAX_GAP_S)
     if not len(pairs[0]):
         raise DatasetError(

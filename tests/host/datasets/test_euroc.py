@@ -32,6 +32,7 @@ def tiny(tmp_path: Path, written: Path) -> Path:
     return Path(shutil.copytree(written, tmp_path / "V9"))
 
 
+@pytest.mark.slow
 class TestTracked:
     def test_every_pair_to_millimeters(self, flight: Path) -> None:
         """Rotation counts too: poses are of the rectified left camera, not of the body nor of the raw one."""

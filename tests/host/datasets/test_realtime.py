@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from jaxslam.results.run_results import RunInfo, write_results
 from small_scene import CONFIG, Clip, clip
 
 from jaxslam.config.loading import load_config
 from jaxslam.datasets.realtime import in_real_time
+from jaxslam.results.run_results import RunInfo, write_results
 from jaxslam.sensors.frame import Frame
 from jaxslam.slam.slam import Slam
 from jaxslam.tracking.state import TrackStatus

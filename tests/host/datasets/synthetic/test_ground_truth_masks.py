@@ -118,6 +118,7 @@ class TestNoNetwork:
         assert fails(capsys, "run", folder, *arguments) == expected
 
 
+@pytest.mark.slow
 class TestSuite:
     def test_recording_in_it(self, tmp_path: Path) -> None:
         path = tmp_path / "mine.yaml"
