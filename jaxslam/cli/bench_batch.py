@@ -1,28 +1,23 @@
-"""`jaxslam bench batch`: the whole tracker on many clips at once, beside clip by clip."""
+"""`jaxslam bench batch`: throughput of the whole tracker on many clips at once, compared with clip by clip."""
 
-import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jax
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn
 from rich.table import Table
 
-from jaxslam.benchmark.batch_throughput import DIFFERENT, make_task, measure
-from jaxslam.benchmark.reports.batch import COLUMNS, cells, how, markdown_report, picture
-from jaxslam.cli.console import console, make_table, plain_console, print_json, text_column
+from jaxslam.cli.console import console, make_table, plain_console, print_json, progress_bar
 from jaxslam.cli.shared_options import WithJson
 from jaxslam.errors import BenchmarkError
-from jaxslam.io.atomic_files import make_folder, write_atomically
-from jaxslam.runtime.machine import machine
+from jaxslam.io.atomic_files import make_folder
 
-_JSON, _MARKDOWN, _PICTURE = "batch.json", "batch.md", "batch.png"
 _LEFT_OUT = ("loop", "worst, m")
-"""Columns for which there is no room in a terminal."""
-_FEWEST_FRAMES, _MIN_PX, _MAX_PX = 3, 64, 8192
+"""Columns for which a terminal has no room."""
+_MIN_FRAMES, _MIN_PX, _MAX_PX = 3, 64, 8192
+
+# Heavy modules are imported where a command runs: `--help` needs none of them.
 
 
 @dataclass(frozen=True)
@@ -30,21 +25,28 @@ class Batch(WithJson):
     """Options of `jaxslam bench batch`."""
 
     clips: tuple[int, ...] = (1, 4, 16, 64)
-    """Numbers of clips."""
+    """Numbers of clips to track at once; each number is measured."""
     frames: int = 30
-    """Frames of each."""
+    """Number of frames of each clip."""
     size: str = "320x240"
-    """Width and height of the images."""
+    """Width and height of the images, in pixels."""
     rounds: int = 3
-    """How often each is timed."""
+    """Number of times that each measurement is repeated."""
     out: Path = Path("results") / "bench" / "batch"
-    """Folder for the table, the picture and the figures; those of an earlier time are replaced."""
+    """Folder for the table, the plot, and the figures. Those of an earlier measurement are replaced."""
 
     def main(self) -> None:
         """Run the command."""
         width, height = self._checked()
         make_folder(self.out, BenchmarkError)
-        counts = sorted(set(self.clips))  # the peak of memory is that of the largest so far
+        import jax  # noqa: PLC0415
+
+        from jaxslam.benchmark.batch_throughput import DIFFERENT  # noqa: PLC0415
+        from jaxslam.benchmark.reports.batch import how, markdown_report, picture  # noqa: PLC0415
+        from jaxslam.cli.measurement_files import write_measurements  # noqa: PLC0415
+        from jaxslam.runtime.machine import machine  # noqa: PLC0415
+
+        counts = sorted(set(self.clips))  # ascending, as the peak of memory is that of the largest count so far
         different = min(DIFFERENT, counts[-1])
         rows = self._measured(counts, different, width, height)
         content = {
@@ -62,22 +64,15 @@ class Batch(WithJson):
         else:
             console.print(clips_table(rows))
             plain_console.print(how(content))
-        files = {
-            _JSON: (json.dumps(content, indent=1) + "\n").encode(),
-            _MARKDOWN: markdown_report(content).encode(),
-            _PICTURE: picture(content),
-        }
-        for name, data in files.items():
-            write_atomically(self.out / name, data, BenchmarkError)
-        console.print(f"Table and picture: {self.out / _MARKDOWN}, {self.out / _PICTURE}; figures: {self.out / _JSON}")
+        write_measurements(self.out, "batch", content, markdown_report(content), picture(content))
 
     def _checked(self) -> tuple[int, int]:
-        """The size of the images, if all options are fit."""
+        """Check all options, and return the width and height of the images."""
         if not self.clips or min(self.clips) < 1:
             raise BenchmarkError(f"--clips: expected numbers of at least 1, got {' '.join(map(str, self.clips))}")
-        if self.frames < _FEWEST_FRAMES:
+        if self.frames < _MIN_FRAMES:
             raise BenchmarkError(
-                f"--frames: expected at least {_FEWEST_FRAMES}, to be aligned with the truth, got {self.frames}"
+                f"--frames: expected at least {_MIN_FRAMES}, to align them with the ground truth, got {self.frames}"
             )
         if self.rounds < 1:
             raise BenchmarkError(f"--rounds: expected at least 1, got {self.rounds}")
@@ -90,10 +85,11 @@ class Batch(WithJson):
         return sides[0], sides[1]
 
     def _measured(self, counts: Sequence[int], different: int, width: int, height: int) -> list[dict[str, Any]]:
-        columns = text_column("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+        """Render the clips, and measure each count with a progress bar."""
+        from jaxslam.benchmark.batch_throughput import make_task, measure  # noqa: PLC0415
+
         rows: list[dict[str, Any]] = []
-        # Drawn between measurements only: a thread that draws would run on a core where they are taken.
-        with Progress(*columns, console=console, auto_refresh=False) as progress:
+        with progress_bar("{task.description}", redraw=False) as progress:
             bar = progress.add_task(f"rendering {different} clips", total=1 + len(counts))
             progress.refresh()
             task = make_task(different, self.frames, width, height)
@@ -107,10 +103,10 @@ class Batch(WithJson):
 
 
 def clips_table(rows: Sequence[dict[str, Any]]) -> Table:
-    """The rows of `measure` for a terminal, but for columns for which there is no room."""
+    """Make a table of the rows of `measure` for a terminal, without the columns for which it has no room."""
+    from jaxslam.benchmark.reports.batch import COLUMNS, cells  # noqa: PLC0415
+
     shown = [index for index, column in enumerate(COLUMNS) if column not in _LEFT_OUT]
-    drawn = make_table("Clips at once", *(COLUMNS[index] for index in shown), left=2, gap=1)
-    for row in rows:
-        texts = cells(row)
-        drawn.add_row(*(texts[index] for index in shown))
-    return drawn
+    headings = (COLUMNS[index] for index in shown)
+    texts = ([cells(row)[index] for index in shown] for row in rows)
+    return make_table("Clips at once", *headings, rows=texts, left=2, gap=1)

@@ -1,23 +1,25 @@
-"""`jaxslam bench gate`: whether a suite has become worse than its baseline."""
+"""`jaxslam bench gate`: check whether a suite has become worse than its baseline."""
 
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from jaxslam.benchmark.suites.baseline import Baseline, check_same_plan, load_baseline, save_baseline
-from jaxslam.benchmark.suites.collected_results import as_table
-from jaxslam.benchmark.suites.gate import check_reason, complaints, differences, make_baseline, runs_at_once
-from jaxslam.benchmark.suites.plan import fingerprint
 from jaxslam.cli.bench import RunsOfSuite
 from jaxslam.cli.console import plain_console, print_json
 from jaxslam.errors import BenchmarkError
 
-_MAX_AGAIN = 2
+if TYPE_CHECKING:
+    from jaxslam.benchmark.suites.baseline import Baseline
+    from jaxslam.benchmark.suites.gate import Complaint
+
+_MAX_REPEATS = 2
 _OUT = Path("results") / "bench" / "gate"
+
+# Heavy modules are imported where a command runs: `--help` needs none of them.
 
 
 @dataclass(frozen=True)
@@ -25,20 +27,23 @@ class Gate(RunsOfSuite):
     """Options of `jaxslam bench gate`."""
 
     baseline: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """What to keep to."""
+    """Baseline file to compare with."""
     update: str | None = None
-    """Make the figures of now those to keep to, for this reason."""
+    """Replace the baseline by the figures measured now, and store this reason in it."""
     of: str | None = None
-    """The suite, where there is no baseline yet."""
+    """Suite to run if the baseline does not exist yet."""
 
     def main(self) -> None:
         """Run the command."""
+        from jaxslam.benchmark.suites.gate import runs_at_once  # noqa: PLC0415
+        from jaxslam.benchmark.suites.plan import fingerprint  # noqa: PLC0415
+
         if self.baseline is None:
             raise BenchmarkError("bench gate: expected --baseline FILE")
         before = self.before(self.baseline)
         suite = self.of or (None if before is None else before.suite)
         if suite is None:
-            raise BenchmarkError(f"{self.baseline}: not there yet; --of SUITE says of what to make it")
+            raise BenchmarkError(f"{self.baseline}: does not exist yet; --of SUITE names the suite to make it from")
         presets, runs = (self.presets, self.runs) if before is None else (before.presets, before.runs)
         out = self.out or _OUT
         options = replace(self, presets=self.presets or presets, runs=runs if self.runs is None else self.runs, out=out)
@@ -46,39 +51,23 @@ class Gate(RunsOfSuite):
             options = replace(options, workers=runs_at_once(before))
         planned = fingerprint(options.plan(suite).jobs)
         if self.update is not None:
-            self._update(self.baseline, self.update, options, suite, planned)
+            _write_baseline(self.baseline, self.update, options, suite, planned)
             return
         assert before is not None
-        _check(self.baseline, before, planned)
-        results = options.results(suite)
-        other = differences(before, results)
-        if other:
-            plain_console.print(
-                f"Here: {other}. Errors may differ as those of seeds do; times of other machines are left out."
-            )
-        worse = complaints(before, results)
-        for again in range(1, 1 + _MAX_AGAIN):
-            slow = sorted({complaint.row for complaint in worse if complaint.of_time})
-            if not slow:
-                break
-            plain_console.print(f"Slower, and measured again: {'; '.join(slow)}")
-            results += replace(options, out=out / f"again-{again}").results(suite, slow)
-            worse = complaints(before, results)
-        for complaint in worse:
-            plain_console.print(f"worse: {complaint}")
-        if self.json:
-            complained = [asdict(complaint) | {"text": str(complaint)} for complaint in worse]
-            print_json({"results": as_table(results), "here": other, "worse": complained})
-        if worse:
-            raise BenchmarkError(f"{len(worse)} figures are worse than in {self.baseline} ({before.reason})")
-        plain_console.print(f"Nothing is worse than in {self.baseline}.")
+        _check_plan(self.baseline, before, planned)
+        _compare(self.baseline, before, options, suite, out)
 
-    def before(self, path: Path) -> Baseline | None:
-        """The baseline that is there; `None` if a new one of a named suite takes the place of none, or of a bad one.
+    def before(self, path: Path) -> "Baseline | None":
+        """Read the baseline to compare with.
+
+        Returns:
+            The baseline; `None` if there is none, or a damaged one, and a new one replaces it.
 
         Raises:
-            BenchmarkError: If it is missing or damaged, and is not replaced.
+            BenchmarkError: If it is missing or damaged and is not going to be replaced.
         """
+        from jaxslam.benchmark.suites.baseline import load_baseline  # noqa: PLC0415
+
         if self.update is not None and not path.exists():
             return None
         try:
@@ -88,18 +77,72 @@ class Gate(RunsOfSuite):
                 raise
             return None
 
-    @staticmethod
-    def _update(path: Path, reason: str, options: "Gate", suite: str, planned: Mapping[str, Any]) -> None:
-        check_reason(reason)
-        results = options.results(suite)
-        presets = tuple(dict.fromkeys(of_label["preset"] for of_label in planned["presets"].values()))
-        save_baseline(path, make_baseline(suite, presets, planned["runs"], reason, results, planned))
-        plain_console.print(f"Baseline: {path}")
-        if options.json:
-            print_json(json.loads(path.read_text(encoding="utf-8")))
+
+def _compare(path: Path, before: "Baseline", options: Gate, suite: str, out: Path) -> None:
+    """Run the suite, print what is worse than the baseline, and fail if anything is."""
+    from jaxslam.benchmark.suites.collected_results import as_table  # noqa: PLC0415
+    from jaxslam.benchmark.suites.gate import differences  # noqa: PLC0415
+
+    results = options.results(suite)
+    other = differences(before, results)
+    if other:
+        plain_console.print(
+            f"Here: {other}. Errors may differ as they do between seeds; times of another machine are not compared."
+        )
+    worse = _complaints_after_repeats(before, options, suite, out, results)
+    for complaint in worse:
+        plain_console.print(f"worse: {complaint}")
+    if options.json:
+        complained = [asdict(complaint) | {"text": str(complaint)} for complaint in worse]
+        print_json({"results": as_table(results), "here": other, "worse": complained})
+    if worse:
+        raise BenchmarkError(f"{len(worse)} figures are worse than in {path} ({before.reason})")
+    plain_console.print(f"Nothing is worse than in {path}.")
 
 
-def _check(path: Path, before: Baseline, planned: Mapping[str, Any]) -> None:
+def _complaints_after_repeats(
+    before: "Baseline", options: Gate, suite: str, out: Path, results: list[dict[str, Any]]
+) -> "list[Complaint]":
+    """List the complaints that remain after rows that were slow have been measured again.
+
+    Args:
+        before: Baseline to compare with.
+        options: Options of the runs.
+        suite: Name of the suite.
+        out: Folder of the results; repeated runs go below it.
+        results: Results of all runs; the repeated runs are appended.
+    """
+    from jaxslam.benchmark.suites.gate import complaints  # noqa: PLC0415
+
+    worse = complaints(before, results)
+    for repeat in range(1, 1 + _MAX_REPEATS):
+        slow = sorted({complaint.row for complaint in worse if complaint.of_time})
+        if not slow:
+            break
+        plain_console.print(f"Slower, and measured again: {'; '.join(slow)}")
+        results += replace(options, out=out / f"again-{repeat}").results(suite, slow)
+        worse = complaints(before, results)
+    return worse
+
+
+def _write_baseline(path: Path, reason: str, options: Gate, suite: str, planned: Mapping[str, Any]) -> None:
+    """Run the suite and write its figures as the new baseline."""
+    from jaxslam.benchmark.suites.baseline import save_baseline  # noqa: PLC0415
+    from jaxslam.benchmark.suites.gate import check_reason, make_baseline  # noqa: PLC0415
+
+    check_reason(reason)
+    results = options.results(suite)
+    presets = tuple(dict.fromkeys(label["preset"] for label in planned["presets"].values()))
+    save_baseline(path, make_baseline(suite, presets, planned["runs"], reason, results, planned))
+    plain_console.print(f"Baseline: {path}")
+    if options.json:
+        print_json(json.loads(path.read_text(encoding="utf-8")))
+
+
+def _check_plan(path: Path, before: "Baseline", planned: Mapping[str, Any]) -> None:
+    """Raise an error that names the baseline file if other runs are planned than it has."""
+    from jaxslam.benchmark.suites.baseline import check_same_plan  # noqa: PLC0415
+
     try:
         check_same_plan(before, planned)
     except BenchmarkError as problem:

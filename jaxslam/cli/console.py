@@ -1,29 +1,45 @@
-"""Where commands print: long lines are left to the terminal to wrap, so that paths can be copied.
+"""Consoles, tables, and progress bars of the commands.
 
-No text is read as markup of rich, in tables neither: names of runs, files and settings may hold brackets.
+The terminal wraps long lines, so that paths can be copied. No text is read as rich markup, not even in tables, because
+the names of runs, files, and settings may contain brackets.
 """
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.progress import TextColumn
+from rich.progress import (
+    BarColumn,
+    DownloadColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+    TransferSpeedColumn,
+)
 from rich.table import Table
 
 from jaxslam.cli.shared_options import WithJson
 
 console = Console(soft_wrap=True, markup=False)
+"""Console that colors numbers and paths."""
 plain_console = Console(soft_wrap=True, markup=False, highlight=False)
-"""For texts in which numbers should not be colored."""
+"""Console for texts in which numbers should not be colored."""
 
 
 @contextmanager
 def messages_for(command: object) -> Iterator[None]:
-    """While a command runs with `--json`, both consoles print to standard error: the document stands alone."""
+    """Print the messages of a command with `--json` to standard error, so that the document stands alone.
+
+    Args:
+        command: The command to run; one without the option `--json` prints its messages to standard output.
+    """
     before = console.stderr, plain_console.stderr
     if isinstance(command, WithJson) and command.json:
         console.stderr = plain_console.stderr = True
@@ -34,12 +50,12 @@ def messages_for(command: object) -> Iterator[None]:
 
 
 def print_json(document: Any) -> None:
-    """Print a document to standard output; a figure that is not finite, which JSON has no number for, is null."""
+    """Print a document to standard output; a float that is not finite becomes null, as JSON has no number for it."""
     print(json.dumps(_finite(document), indent=2, allow_nan=False))
 
 
 def _finite(document: Any) -> Any:
-    """The document with `None` for floats that are not finite."""
+    """Replace every float that is not finite by `None`."""
     if isinstance(document, float):
         return document if math.isfinite(document) else None
     if isinstance(document, Mapping):
@@ -47,15 +63,23 @@ def _finite(document: Any) -> Any:
     return [_finite(value) for value in document] if isinstance(document, list | tuple) else document
 
 
-def make_table(title: str, *headings: str, left: int = 1, wrap_first: bool = False, gap: int = 2) -> Table:
-    """A table that fits 80 columns: a word too long for its cell goes on in the next line instead of being cut off.
+def make_table(
+    title: str,
+    *headings: str,
+    rows: Iterable[Sequence[str]] = (),
+    left: int = 1,
+    wrap_first: bool = False,
+    gap: int = 2,
+) -> Table:
+    """Make a table that fits 80 columns; a word too long for its cell continues on the next line and is never cut off.
 
     Args:
-        title: What stands above it; empty for none.
-        headings: Of the columns; words one below the other.
-        left: How many columns, from the first, hold texts. The others hold figures, which stand at the right.
-        wrap_first: Whether the first column, whose names are mostly there to be copied, may be broken too.
-        gap: Spaces between columns, 1 or more.
+        title: Text above the table; empty for none.
+        headings: Headings of the columns. The words of a heading above figures are printed one below the other.
+        rows: Cells of each row; more rows can be added later.
+        left: Number of columns, from the first, that hold left-aligned text. The others hold right-aligned figures.
+        wrap_first: Whether the cells of the first column may be broken too. They usually hold names to be copied.
+        gap: Number of spaces between columns, 1 or more.
     """
     table = Table(title=title or None, title_justify="left", box=SIMPLE_HEAD, padding=(0, 0, 0, gap - 1))
     for index, heading in enumerate(headings):
@@ -63,9 +87,36 @@ def make_table(title: str, *headings: str, left: int = 1, wrap_first: bool = Fal
         whole = index == 0 and not wrap_first
         text = heading if is_text else heading.replace(" ", "\n")
         table.add_column(text, justify="left" if is_text else "right", overflow="fold", no_wrap=whole)
+    for cells in rows:
+        table.add_row(*cells)
     return table
 
 
 def text_column(text: str) -> TextColumn:
-    """A column of a progress bar, whose text may hold brackets."""
+    """Make a progress bar column whose text may contain brackets."""
     return TextColumn(text, markup=False)
+
+
+def progress_bar(text: str, *columns: ProgressColumn, elapsed: bool = True, redraw: bool = True) -> Progress:
+    """Make a progress bar that counts tasks on `console`.
+
+    Args:
+        text: Text before the bar; it may name fields of a task, such as `{task.description}`.
+        columns: Columns to show after the count.
+        elapsed: Whether to show the elapsed time.
+        redraw: Whether a thread redraws the bar. Without it the bar is drawn only where the caller asks: during a
+            measurement, such a thread would run on a core that is being measured.
+    """
+    times = [TimeElapsedColumn()] if elapsed else []
+    shown = (text_column(text), BarColumn(), MofNCompleteColumn(), *times, *columns)
+    return Progress(*shown, console=console, auto_refresh=redraw)
+
+
+def download_bar(text: str) -> Progress:
+    """Make a progress bar that counts bytes on `plain_console`.
+
+    Args:
+        text: Text before the bar; it may name fields of a task, such as `{task.description}`.
+    """
+    columns = (text_column(text), BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
+    return Progress(*columns, console=plain_console)

@@ -158,6 +158,7 @@ def outcome(tmp_path_factory: pytest.TempPathFactory, cluster: Cluster) -> Outco
         return Outcome(suite, folder / "out", folder / "data", job.result(), executor)
 
 
+@pytest.mark.slow
 class TestWorkerThatIsKilled:
     def test_nothing_is_lost(self, outcome: Outcome) -> None:
         runs = [(run["sequence"], run["seed"], run["status"]) for run in results_in(outcome.out)]

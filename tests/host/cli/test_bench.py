@@ -220,6 +220,7 @@ class TestGoingOn:
         assert "| static | 2 of 2 |" in (mine / "report.md").read_text()
         assert "<td>static</td><td>2 of 2</td>" in (mine / "report.html").read_text()
 
+    @pytest.mark.slow
     def test_killed_in_the_middle(self, tmp_path: Path) -> None:
         """No run that was finished is repeated, and none is lost: one at work then, one not begun."""
         suite, folder = suite_file(tmp_path, SUITE.replace("runs: 2", "runs: 3")), tmp_path / "out"
@@ -266,6 +267,7 @@ class TestTrouble:
         assert "rgbd_bonn_nowhere: not there, nor in `jaxslam data list`" in (mine / "report.md").read_text()
         assert "rgbd_bonn_nowhere" in (mine / "report.html").read_text()
 
+    @pytest.mark.slow
     def test_kitti(self, tmp_path: Path, data_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
         """What is there of it is run, with the development kit's figures; the other ten are named."""
         text = "sequences: [{recording: kitti_06, sensor: stereo, stop: 12}, {recording: kitti_10, sensor: stereo}]"

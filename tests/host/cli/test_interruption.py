@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from jaxslam.results.run_results import RESULT_FILES
 from small_scene import CONFIG, SETTINGS, Clip, clip
 
 from jaxslam import datasets
@@ -23,6 +22,7 @@ from jaxslam.cli.interruption import Interruption
 from jaxslam.cli.tracking_run import track
 from jaxslam.io.atomic_files import write_atomically
 from jaxslam.map.npz_file import load_map
+from jaxslam.results.run_results import RESULT_FILES
 from jaxslam.slam import slam as slam_module
 from jaxslam.slam.slam import Slam
 from jaxslam.tracking.state import TrackStatus
