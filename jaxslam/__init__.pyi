@@ -1,5 +1,5 @@
-from .config.schema import Config as Config
 from .config.loading import load_config as load_config
+from .config.schema import Config as Config
 from .datasets import open_dataset as open_dataset
 from .datasets.protocol import Dataset as Dataset
 from .dense.point_cloud import DenseCloud as DenseCloud

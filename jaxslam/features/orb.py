@@ -15,8 +15,8 @@ from jaxtyping import Array, Bool, Float, Float32, UInt8
 from jaxslam.runtime.padding import padded
 from jaxslam.runtime.trace_cache import cached_trace
 from jaxslam.sensors.frame_arrays import FrameArrays
-from jaxslam.tracking.measurement import RIGHT_LEVELS, PreparedFrame, match_depth, measure
-from jaxslam.tracking.state import TrackParams
+from jaxslam.sensors.measurement import RIGHT_LEVELS, PreparedFrame, match_depth, measure
+from jaxslam.sensors.sensor_model import SensorModel
 
 DESCRIPTOR_BYTES = 32
 _PATCH_PX = 31
@@ -90,20 +90,20 @@ DEFAULT_PLAN = FeaturePlan()
 
 
 def features_of(
-    frame: FrameArrays, twist: np.ndarray, params: TrackParams, plan: FeaturePlan = DEFAULT_PLAN
+    frame: FrameArrays, twist: np.ndarray, sensor: SensorModel, plan: FeaturePlan = DEFAULT_PLAN
 ) -> Features:
     """Extract the features of a frame, remove distortion and rolling shutter, and read their depth.
 
     Args:
         frame: Frame with a uint8 image; no feature is taken where it says `ignore`.
         twist: `(6,)` velocity of the camera in its own axes, in meters per second, then radians per second.
-        params: Camera, readout time, and the range of valid depths.
+        sensor: Camera, readout time, and the range of valid depths.
         plan: Settings of feature extraction.
     """
     patches = extract(np.asarray(frame.image), np.asarray(frame.ignore), plan)
     num = len(patches.octave)
     fixed_size = padded(patches.uv_raw, plan.num_features, axis=1)  # so that it is compiled once
-    uv, depth = jax.device_get(_ideal(fixed_size, twist.astype(np.float32), frame, params))
+    uv, depth = jax.device_get(_ideal(fixed_size, twist.astype(np.float32), frame, sensor))
     return Features(patches.uv_raw, uv[:, :num], depth[:num], *patches[1:])
 
 
@@ -224,13 +224,13 @@ def _no_patches() -> Patches:
 
 @jax.jit
 @cached_trace
-def _ideal(uv_raw: Pixels, twist: Float[Array, "6"], frame: FrameArrays, params: TrackParams) -> tuple[Pixels, Weights]:
+def _ideal(uv_raw: Pixels, twist: Float[Array, "6"], frame: FrameArrays, sensor: SensorModel) -> tuple[Pixels, Weights]:
     """Convert pixels to those of the ideal camera and read depth; of a stereo pair by matching."""
-    believed = valid_depth(frame.depth, params.min_depth_m, params.max_depth_m)
+    believed = valid_depth(frame.depth, sensor.min_depth_m, sensor.max_depth_m)
     rough, matched = sample_depth(believed, uv_raw), None
     if frame.right is not None:
         pyramid = build_pyramid(frame.image, num_levels=RIGHT_LEVELS, dtype=uv_raw.dtype)
         view = PreparedFrame(frame, pyramid, believed, frame.dt_s).with_right()
-        matched = match_depth(view, uv_raw, rough, rough > 0, params, known_point=False)
-    seen = measure(uv_raw, rough, twist, believed, frame.depth_delay_s, params, matched=matched)
-    return to_pixels(params.intrinsics, seen.xy), seen.depth
+        matched = match_depth(view, uv_raw, rough, rough > 0, sensor, known_point=False)
+    seen = measure(uv_raw, rough, twist, believed, frame.depth_delay_s, sensor, matched=matched)
+    return to_pixels(sensor.intrinsics, seen.xy), seen.depth

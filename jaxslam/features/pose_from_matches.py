@@ -16,8 +16,8 @@ from jaxslam.features.orb import FeaturePlan, Features
 from jaxslam.runtime.compile_cache import FAST_COMPILE
 from jaxslam.runtime.padding import padded
 from jaxslam.runtime.trace_cache import cached_trace
-from jaxslam.tracking.measurement import depth_sigma
-from jaxslam.tracking.state import TrackParams
+from jaxslam.sensors.measurement import depth_sigma
+from jaxslam.sensors.sensor_model import SensorModel
 
 MIN_INLIERS = 30
 """Minimum number of features that agree with the final pose."""
@@ -110,7 +110,7 @@ def matches_of(
 def fit_pose(
     T_origin_cam: np.ndarray,
     matches: Matches,
-    params: TrackParams,
+    sensor: SensorModel,
     *,
     min_inliers: int | None = None,
     min_cells: int | None = None,
@@ -120,13 +120,13 @@ def fit_pose(
     Args:
         T_origin_cam: `(7,)` approximate pose to start from.
         matches: Points matched with features.
-        params: Camera, of which ideal pixels leave the pinhole, and the error model of its depth.
+        sensor: Camera, of which ideal pixels leave the pinhole, and the error model of its depth.
         min_inliers: Minimum number of inlier matches; `MIN_INLIERS` by default.
         min_cells: Minimum number of image cells the inliers cover; `MIN_CELLS` by default.
     """
     min_inliers = MIN_INLIERS if min_inliers is None else min_inliers
     min_cells = MIN_CELLS if min_cells is None else min_cells
-    refined: PoseRefinement = jax.device_get(_refined(SE3(jnp.asarray(T_origin_cam, jnp.float32)), matches, params))
+    refined: PoseRefinement = jax.device_get(_refined(SE3(jnp.asarray(T_origin_cam, jnp.float32)), matches, sensor))
     used = np.asarray(matches.weight) > 0
     gate = np.where(np.asarray(matches.depth) > 0, _CHI2_GATES[1], _CHI2_GATES[0])
     agree = np.flatnonzero(used & (np.asarray(refined.chi2) < gate))
@@ -139,38 +139,38 @@ def fit_pose(
     covariance = np.asarray(refined.covariance, np.float64) * max(float(refined.residual_scale), 1.0) ** 2
     covariance = 0.5 * (covariance + covariance.T)
     sigma_m = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
-    if _cells(np.asarray(matches.uv)[:, agree], params) < min_cells or sigma_m > MAX_SIGMA_M:
+    if _cells(np.asarray(matches.uv)[:, agree], sensor) < min_cells or sigma_m > MAX_SIGMA_M:
         return None
     return FeaturePose(pose, covariance, agree, share)
 
 
-def matches_depth_sigma(matches: Matches, params: TrackParams) -> Weights:
+def matches_depth_sigma(matches: Matches, sensor: SensorModel) -> Weights:
     """Compute the standard deviation of the difference between the earlier depth and the depth in the image."""
-    return jnp.hypot(depth_sigma(matches.depth_then, params), depth_sigma(matches.depth, params))
+    return jnp.hypot(depth_sigma(matches.depth_then, sensor), depth_sigma(matches.depth, sensor))
 
 
-def pinhole(params: TrackParams) -> tuple[np.ndarray, np.ndarray]:
+def pinhole(sensor: SensorModel) -> tuple[np.ndarray, np.ndarray]:
     """Return the focal lengths and the principal point, `(2, 1)` each."""
-    fx, fy, cx, cy = (float(value) for value in params.intrinsics[:4])
+    fx, fy, cx, cy = (float(value) for value in sensor.intrinsics[:4])
     return np.array([[fx], [fy]]), np.array([[cx], [cy]])
 
 
-def _cells(uv: np.ndarray, params: TrackParams) -> int:
+def _cells(uv: np.ndarray, sensor: SensorModel) -> int:
     """Count the image cells that contain at least one of the pixels."""
-    focal, center = pinhole(params)
+    focal, center = pinhole(sensor)
     return np.unique(np.floor((uv - center) / (_CELL * focal)), axis=1).shape[1]
 
 
 @partial(jax.jit, compiler_options=FAST_COMPILE)
 @cached_trace
-def _refined(T_origin_cam: SE3, matches: Matches, params: TrackParams) -> PoseRefinement:
+def _refined(T_origin_cam: SE3, matches: Matches, sensor: SensorModel) -> PoseRefinement:
     return refine_pose(
         T_origin_cam,
         matches.X,
         matches.uv,
-        without_distortion(params.intrinsics),
+        without_distortion(sensor.intrinsics),
         weights=matches.weight,
         depth=matches.depth,
         sigma_px=matches.sigma_px,
-        sigma_depth=matches_depth_sigma(matches, params),
+        sigma_depth=matches_depth_sigma(matches, sensor),
     )

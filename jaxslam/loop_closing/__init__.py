@@ -1,1 +1,1 @@
-"""Loop closing: place index, recognition, verification, essential graph, correction."""
+"""Loop closing: place index, place recognition, verification, essential graph optimization, map correction."""

@@ -1,6 +1,6 @@
-"""The pose graph of a submap, and whether it can bear a loop.
+"""Essential graph: optimize the poses of a submap with a loop, and reject the loop if it contradicts them.
 
-Source: Mur-Artal and Tardos, "ORB-SLAM2", 2017, section III-C, for the edges: tree, strong covisibility, loops.
+Source: Mur-Artal and Tardos, "ORB-SLAM2", 2017, section III-C (edges: spanning tree, strong covisibility, loops).
 """
 
 import threading
@@ -20,20 +20,20 @@ from jaxslam.runtime.padding import padded
 from jaxslam.runtime.trace_cache import cached_trace
 
 _STRONG = 100
-"""Points in common from which covisible keyframes are tied (ORB-SLAM's essential graph)."""
+"""Common points from which two covisible keyframes get an edge (ORB-SLAM's essential graph)."""
 _EDGE_M, _EDGE_M_PER_M, _EDGE_RAD, _EDGE_RAD_PER_RAD = 0.005, 0.005, 0.002, 0.005
-"""Standard deviation of the relative pose of two keyframes, and its growth with distance and angle, for the errors of
-calibration. In the synthetic room it is 3 mm and 0.7 mrad at 0.6 m and 20 degrees; recordings are worse."""
+"""Standard deviation of the relative pose of two keyframes, and its growth with distance and angle to allow for
+calibration errors. In the synthetic room it is 3 mm and 0.7 mrad at 0.6 m and 20 degrees; recordings are worse."""
 _MAX_CHI2 = 16.8
-"""Most that a loop may add to the squared whitened error of the graph: 99 % of six degrees of freedom. At the optimum
-that is the square of its contradiction, in standard deviations of loop and graph together."""
+"""Maximum that a loop may add to the squared whitened error of the graph: the 99 % quantile for six degrees of freedom.
+At the optimum, that is the squared contradiction in standard deviations of loop and graph together."""
 _SIZES = (64, 256, 1024, 4096)
-"""Keyframes a graph has room for; each size is compiled once."""
+"""Numbers of keyframes that a graph is padded to; each size is compiled once."""
 _EDGES_A_NODE = 6
 _FEWEST, _AHEAD = 4, 2.0
-"""Keyframes of a map from which graphs are compiled, and for how many times as many as there are."""
+"""Number of keyframes from which graphs are compiled ahead, and for which multiple of the current number."""
 _ONE_AT_A_TIME = {size: threading.Lock() for size in _SIZES}
-"""Two threads would each compile the same; those of different sizes need not wait for each other."""
+"""One lock per size: two threads would compile the same program twice, while different sizes need not wait."""
 
 
 class _Graph(NamedTuple):
@@ -46,18 +46,18 @@ class _Graph(NamedTuple):
 def poses_with_loop(
     slam_map: Map, source: int, target: int, T_source_target: np.ndarray, information: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """The poses that suit a loop and all relative poses of its submap, if that is within their uncertainty.
+    """Optimize the poses of a submap with a loop; `None` if the loop is not within the uncertainty of the graph.
 
     Args:
         slam_map: The map.
-        source: Id of a keyframe.
-        target: Id of another one of the same submap.
-        T_source_target: `(7,)` measured.
-        information: `(6, 6)` its inverse covariance.
+        source: Id of the first keyframe of the loop.
+        target: Id of the second keyframe, in the same submap.
+        T_source_target: `(7,)` measured relative pose.
+        information: `(6, 6)` inverse covariance of the measurement.
 
     Returns:
-        Ids of the keyframes of the submap and their poses, the first one's as it was; `None` if the loop contradicts
-        the graph, or the submap has more than 4096 keyframes.
+        Ids of the keyframes of the submap and their optimized poses, with the first keyframe's unchanged; `None` if the
+        loop contradicts the graph, or if the submap has more than 4096 keyframes.
     """
     inside = np.flatnonzero(slam_map.submap == slam_map.submap[slam_map.row(target)])
     if len(inside) > _SIZES[-1]:
@@ -78,37 +78,37 @@ def poses_with_loop(
 
 
 def compile_graph(num_keyframes: int = 2) -> None:
-    """Compile the optimization of graphs of the size that so many keyframes take."""
+    """Compile the optimization for the graph size that this number of keyframes needs."""
     graph = _Graph(np.array([0]), np.array([1]), IDENTITY[None], np.eye(6)[None])
     _solved(graph, np.tile(IDENTITY, (num_keyframes, 1)), np.arange(num_keyframes) == 0)
 
 
 class GraphCompiler:
-    """Compiles the optimization of larger graphs in a thread of its own, before a loop needs it.
+    """Compile the optimization of larger graphs in a separate thread, before a loop needs it.
 
-    When one did first, that frame took 2.9 s on an EPYC, 2.3 of them compiling.
+    When a loop needed it first, that frame took 2.9 s on an EPYC, 2.3 s of them for compilation.
     """
 
     def __init__(self) -> None:
-        """Begin with nothing compiled."""
+        """Start with nothing compiled."""
         self._size = 0
 
     def compile_now(self) -> None:
-        """Compile the smallest graph, and wait for it."""
+        """Compile the smallest graph and wait for it."""
         compile_graph()
         self._size = _SIZES[0]
 
     def keep_ahead(self, num_keyframes: int) -> None:
-        """Begin to compile what a map will need soon that has so many keyframes; returns at once."""
+        """Start compiling the next size that a map of this many keyframes will need soon; return at once."""
         size = next((size for size in _SIZES if size >= _AHEAD * num_keyframes), 0)
         if num_keyframes >= _FEWEST and size > self._size:
             self._size = size
-            # No daemon: at its end, the interpreter waits for it instead of pulling the compiler out of its hands.
+            # Not a daemon thread: on exit the interpreter then waits for the compiler instead of cutting it off.
             threading.Thread(target=compile_graph, args=(size,), name="jaxslam-compile").start()
 
 
 def _graph(slam_map: Map, inside: np.ndarray) -> _Graph:
-    """Rows of both ends, relative poses and information of all edges: tree, strong covisibility, loops."""
+    """Build the edges of a submap: spanning tree, strong covisibility, and earlier loops."""
     ids, poses = slam_map.ids[inside], slam_map.T_world_cam[inside]
     child = np.flatnonzero(slam_map.parent[inside] != NONE)
     tree = np.stack([rows(ids, slam_map.parent[inside][child]), child])
@@ -125,7 +125,7 @@ def _graph(slam_map: Map, inside: np.ndarray) -> _Graph:
     relative = between(poses[pairs[0]], poses[pairs[1]])
     sigma_m = _EDGE_M + _EDGE_M_PER_M * np.linalg.norm(relative[:, 4:], axis=1)
     sigma_rad = _EDGE_RAD + _EDGE_RAD_PER_RAD * angle(relative)
-    # Edges beside the tree come of the same observations and are no further evidence: they share that of the tree.
+    # Covisibility edges come from the same observations as the tree and are no further evidence: they share its weight.
     share = max(tree.shape[1], 1) / max(pairs.shape[1], 1)
     sigmas = np.repeat(np.stack([sigma_m, sigma_rad], axis=1), 3, axis=1) / np.sqrt(share)
     return _Graph(

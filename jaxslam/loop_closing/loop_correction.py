@@ -1,4 +1,4 @@
-"""A closed loop put into the map: two submaps become one, or keyframes get new poses and all else moves along."""
+"""Apply a loop closure to the map: merge two submaps, or correct keyframe poses and move everything else along."""
 
 import numpy as np
 
@@ -9,13 +9,13 @@ from jaxslam.map.types import NONE, Map, has, rows, surviving_keyframes
 
 
 def with_loop_closed(slam_map: Map, loop: LoopClosure) -> Map:
-    """The map with a loop closed; both its ends must be in it.
+    """Return the map with a loop closed; both of its keyframes must be in the map.
 
-    The map may have changed since the loop was found: keyframes that it does not name move as those do on which they
-    hang, and points as the keyframes that made them.
+    The map may have changed since the loop was detected: keyframes the closure does not name move with their parent in
+    the spanning tree, and points move with their reference keyframe.
 
     Raises:
-        KeyError: If an end is not in the map.
+        KeyError: If one of the two keyframes is not in the map.
     """
     first, second = slam_map.submap[rows(slam_map.ids, np.array([loop.source, loop.target]))]
     slam_map = _bent(slam_map, loop) if first == second else _merged(slam_map, loop, int(first), int(second))
@@ -23,7 +23,7 @@ def with_loop_closed(slam_map: Map, loop: LoopClosure) -> Map:
 
 
 def _merged(slam_map: Map, loop: LoopClosure, first: int, second: int) -> Map:
-    """The later of two submaps carried into the frame of the other."""
+    """Merge two submaps by transforming the later one into the frame of the earlier one."""
     T_new_old = compose(compose(slam_map.pose(loop.source), loop.T_source_target), inverse(slam_map.pose(loop.target)))
     if second > first:
         return transformed(slam_map, T_new_old, second, first, loop.source, loop.target)
@@ -31,12 +31,12 @@ def _merged(slam_map: Map, loop: LoopClosure, first: int, second: int) -> Map:
 
 
 def _bent(slam_map: Map, loop: LoopClosure) -> Map:
-    """New poses for the keyframes; what came after them, and all points, move along."""
+    """Set the corrected keyframe poses; later keyframes and all points move along."""
     known = np.flatnonzero(has(slam_map.ids, loop.keyframes))
     if not len(known):
         return slam_map
     row = rows(slam_map.ids, loop.keyframes[known])
-    first = known[0]  # the graph held it: the world is where it is now, even if all has been carried elsewhere since
+    first = known[0]  # fixed in the pose graph: the world stays where it is now, even if it was transformed since
     T_now_then = compose(slam_map.T_world_cam[row[0]], inverse(loop.T_world_cam[first]))
     change = np.tile(IDENTITY, (len(slam_map.ids), 1))
     change[row] = compose(compose(T_now_then, loop.T_world_cam[known]), inverse(slam_map.T_world_cam[row]))

@@ -1,8 +1,8 @@
-"""An index of keyframes by what they look like, without any vocabulary.
+"""Place index: find keyframes by appearance, without a vocabulary.
 
-Three bytes of a descriptor at a time are its keys in sorted tables, so that most descriptors that differ in few bits
-have a key in common. What does is compared in full, and every feature of an image votes for the keyframes that hold
-one like it, the more the fewer of them there are. Sources: multi-index hashing (Norouzi et al., Fast Exact Search in
+Each three bytes of a descriptor are a key in a sorted table, so that most descriptors that differ in few bits have a
+key in common. Those that do are compared in full, and every feature of an image votes for the keyframes that hold a
+similar one, with more weight the fewer they are. Sources: multi-index hashing (Norouzi et al., Fast Exact Search in
 Hamming Space with Multi-Index Hashing, 2014) and the weights of a bag of words (Sivic and Zisserman, Video Google,
 2003).
 """
@@ -21,14 +21,14 @@ from jaxslam.map.types import Map
 _KEY_BYTES = 3
 _NUM_TABLES = 8
 _INDEXED_STEP = 2
-"""Every second feature of a keyframe is indexed, and all of an image are sought. On TUM `fr1_rpy` among 350 images of
-other places the right keyframe comes first in 28 of 29 revisits, as with all of them, at half the memory."""
+"""Every second feature of a keyframe is indexed, and all features of an image are searched. On TUM `fr1_rpy` among 350
+images of other places, the right keyframe is first in 28 of 29 revisits, as with all features, at half the memory."""
 _ALIKE_BITS = 40
-"""Bits that may differ for a vote. With 50 the scores of right and wrong keyframes are 4.5 to 1, with 40 7.7 to 1."""
+"""Maximum Hamming distance for a vote. Scores of right and wrong keyframes: 4.5 to 1 with 50, 7.7 to 1 with 40."""
 
 
 class _Block(NamedTuple):
-    """Descriptors of some keyframes, sorted by every key."""
+    """Descriptors of several keyframes, sorted by every key."""
 
     keyframe: Int64[np.ndarray, " n"]
     descriptor: UInt8[np.ndarray, "n 32"]
@@ -37,10 +37,10 @@ class _Block(NamedTuple):
 
 
 class PlaceIndex:
-    """Which keyframes look like an image. For one thread at a time.
+    """Index of keyframes by appearance. Not thread-safe.
 
-    What it answers depends on the keyframes it holds, not on the order they came in. A keyframe of 1000 features takes
-    52 kB.
+    The results depend on the keyframes it holds, not on the order in which they were added. A keyframe of 1000 features
+    takes 52 kB.
     """
 
     def __init__(self) -> None:
@@ -50,7 +50,7 @@ class PlaceIndex:
 
     @classmethod
     def from_map(cls, slam_map: Map) -> "PlaceIndex":
-        """An index of all keyframes of a map."""
+        """Build an index of all keyframes of a map."""
         index = cls()
         for keyframe in slam_map.keyframes:
             index.add(keyframe.id, keyframe.features)
@@ -63,14 +63,14 @@ class PlaceIndex:
         return keyframe_id in self._alive
 
     def ids(self) -> set[int]:
-        """The keyframes it holds."""
+        """Return the ids of the indexed keyframes."""
         return set(self._alive)
 
     def add(self, keyframe_id: int, features: Features) -> None:
         """Add a keyframe.
 
         Raises:
-            ValueError: If it is there already, or was removed: ids are never given twice.
+            ValueError: If it is already indexed or was removed: ids are never reused.
         """
         if keyframe_id in self._added:
             raise ValueError(f"keyframe {keyframe_id} was added before")
@@ -79,10 +79,10 @@ class PlaceIndex:
         self._index(keyframe_id, features)
 
     def replace(self, keyframe_id: int, features: Features) -> None:
-        """Hold other features of a keyframe than before.
+        """Replace the features of a keyframe.
 
         Raises:
-            KeyError: If it is not there.
+            KeyError: If the keyframe is not indexed.
         """
         if keyframe_id not in self._alive:
             raise KeyError(keyframe_id)
@@ -94,30 +94,30 @@ class PlaceIndex:
 
     def _index(self, keyframe_id: int, features: Features) -> None:
         self._blocks.append(_block(keyframe_id, features.descriptor[::_INDEXED_STEP]))
-        # Sizes at least halve from block to block, so there are few of them and each entry is seldom merged.
+        # Sizes at least halve from block to block, so there are few blocks and each entry is rarely merged.
         while len(self._blocks) > 1 and 2 * len(self._blocks[-1].keyframe) > len(self._blocks[-2].keyframe):
             last = self._blocks.pop()
             self._blocks[-1] = _merged(self._blocks[-1], last, self._alive)
 
     def remove(self, keyframe_id: int) -> None:
-        """Forget a keyframe.
+        """Remove a keyframe.
 
         Raises:
-            KeyError: If it is not there.
+            KeyError: If the keyframe is not indexed.
         """
         self._alive.remove(keyframe_id)
 
     def query(self, features: Features, exclude: Set[int] = frozenset(), limit: int = 5) -> list[tuple[int, float]]:
-        """The keyframes that look most like an image.
+        """Find the keyframes that look most like an image.
 
         Args:
-            features: Of the image.
-            exclude: Ids not to be given.
-            limit: At most so many.
+            features: Features of the image.
+            exclude: Ids of keyframes to leave out.
+            limit: Maximum number of results.
 
         Returns:
-            Ids and scores, best first: the sum over the features that have their like in the keyframe of the logarithm
-            of all keyframes over those that have it.
+            Ids and scores, best first. A score sums, over the image features with a similar feature in the keyframe,
+            the logarithm of the number of all keyframes over the number of those that have one.
         """
         votes = [_votes(block, features.descriptor) for block in self._blocks]
         feature, keyframe = np.concatenate([np.zeros((2, 0), np.int64), *votes], axis=1)
@@ -145,7 +145,7 @@ def _keys(descriptor: UInt8[np.ndarray, "n 32"]) -> UInt32[np.ndarray, "t n"]:
 
 
 def _merged(first: _Block, second: _Block, alive: Set[int]) -> _Block:
-    """One block of two, without what was removed."""
+    """Merge two blocks into one, without removed keyframes."""
     owner = np.concatenate([first.keyframe, second.keyframe])
     kept = np.isin(owner, np.fromiter(alive, np.int64))
     place = np.cumsum(kept, dtype=np.int32) - 1
@@ -153,7 +153,7 @@ def _merged(first: _Block, second: _Block, alive: Set[int]) -> _Block:
     order = np.concatenate([first.order, second.order + np.int32(len(first.keyframe))], axis=1)
     shape = (_NUM_TABLES, int(kept.sum()))
     keys, order = keys[kept[order]].reshape(shape), place[order[kept[order]]].reshape(shape)
-    by_key = np.argsort(keys, axis=1, kind="stable")  # of two sorted runs: linear time
+    by_key = np.argsort(keys, axis=1, kind="stable")  # two sorted runs: linear time
     descriptor = np.concatenate([first.descriptor, second.descriptor])[kept]
     return _Block(
         owner[kept], descriptor, np.take_along_axis(keys, by_key, axis=1), np.take_along_axis(order, by_key, axis=1)
@@ -161,7 +161,7 @@ def _merged(first: _Block, second: _Block, alive: Set[int]) -> _Block:
 
 
 def _votes(block: _Block, descriptor: UInt8[np.ndarray, "n 32"]) -> Int64[np.ndarray, "2 k"]:
-    """Features and the keyframes of a block that hold one like them; some pairs come more than once."""
+    """Return image features paired with keyframes of a block that hold a similar one; pairs may repeat."""
     sought, entries = [np.zeros(0, np.int64)], [np.zeros(0, np.int32)]
     for wanted, keys, order in zip(_keys(descriptor), block.keys, block.order, strict=True):
         by_key = np.argsort(wanted)  # neighboring searches then touch the same memory

@@ -1,4 +1,4 @@
-"""Whether two keyframes can have been where they are said to be, by what is around what they have in common."""
+"""Free-space check of a loop candidate: compare the surroundings that two keyframes see."""
 
 import numpy as np
 
@@ -8,25 +8,25 @@ from jaxslam.sensors.camera import Camera
 
 _NEAR_PX = 8.0
 _SAME_SHARE, _SAME_M = 0.1, 0.02
-"""Difference of depth up to which two are the same, as a share of it and besides."""
+"""Largest depth difference within one surface: a share of the depth, plus meters."""
 _MIN_COMPARED = 50
 
 
 def see_through_ratio(camera: Camera, source: Features, target: Features, T_source_target: np.ndarray) -> float:
-    """Share of the surfaces of one keyframe that another would have to see through, of those it could see.
+    """Return the share of one keyframe's surfaces that another would have to see through, of those it could see.
 
-    What is nearer there than expected may hide a surface, or have come there. What is farther contradicts: a thing
-    that is there twice looks the same, but what is around it does not fit. Surfaces are compared at the features of
-    both, within 8 pixels.
+    A nearer depth there than expected may occlude a surface, or may have appeared since. A farther depth contradicts:
+    an object that exists twice looks the same, but its surroundings do not fit. Surfaces are compared at the features
+    of both, within 8 pixels.
 
     Args:
-        camera: Of both.
-        source: Features of the first.
-        target: Features of the second.
-        T_source_target: `(7,)` pose of the second in the axes of the first.
+        camera: Camera of both keyframes.
+        source: Features of the first keyframe.
+        target: Features of the second keyframe.
+        T_source_target: `(7,)` pose of the second keyframe in the axes of the first.
 
     Returns:
-        0 to 1; 0 where too few can be compared to tell.
+        The share, 0 to 1; 0 where too few surfaces can be compared.
     """
     from scipy.spatial import KDTree  # noqa: PLC0415 - see `late_imports`
 
@@ -34,8 +34,8 @@ def see_through_ratio(camera: Camera, source: Features, target: Features, T_sour
     known, measured = source.depth > 0, target.depth > 0
     if not known.any() or not measured.any():
         return 0.0
-    rays = np.concatenate([(source.uv[:, known] - center) / focal, np.ones((1, np.count_nonzero(known)))])
-    X = to_local(T_source_target, rays * source.depth[known])
+    X_source = camera.back_project(source.uv[:, known].astype(np.float64), source.depth[known])
+    X = to_local(T_source_target, X_source)
     X = X[:, X[2] > _SAME_M]
     uv = X[:2] / X[2] * focal + center
     apart, nearest = (

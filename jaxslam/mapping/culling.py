@@ -1,4 +1,4 @@
-"""What leaves the map: points that nobody confirmed, and keyframes that others make redundant.
+"""Culling: remove map points that too few keyframes confirm, and redundant keyframes.
 
 Source: Mur-Artal and Tardos, "ORB-SLAM2", 2017, and "ORB-SLAM", 2015, sections VI-B and VI-E, for the rules.
 """
@@ -9,24 +9,24 @@ from jaxslam.map.edit import without_keyframe, without_points
 from jaxslam.map.types import NONE, Map, covisible, has, rows
 
 CONFIRM_WITHIN = 3
-"""Keyframes after which a point must have been seen by others."""
+"""Number of keyframes after which a point must have been observed by others."""
 _MIN_VIEWS, _MIN_VIEWS_WITHOUT_DEPTH = 2, 3
-"""Keyframes that must see a point; one more if none measured its depth: two rays meet somewhere even if wrongly
-matched."""
+"""Minimum number of keyframes that observe a point; one more if none measured its depth, since two rays meet somewhere
+even if matched wrongly."""
 _REDUNDANT_SHARE, _REDUNDANT_VIEWS = 0.9, 3
-"""A keyframe goes if this share of its points is seen by so many others, as exactly as it sees them."""
+"""A keyframe is redundant if this share of its points is observed by this many others at least as accurately."""
 _AS_EXACT = 1.25
-"""Factor of the standard deviation up to which a observation is as exact as another: a level of the pyramid."""
+"""Factor on the standard deviation up to which an observation counts as accurate as another: one pyramid level."""
 KEEP_LATEST = 12
-"""Keyframes the tracker may still be looking into."""
+"""Latest keyframes, which the tracker may still use."""
 
 
 def without_unconfirmed(slam_map: Map, keyframe_id: int) -> Map:
-    """Drop the points that too few keyframes have seen, some keyframes after they were made.
+    """Drop points that too few keyframes have observed some keyframes after their creation.
 
     Args:
         slam_map: The map, or a part of it.
-        keyframe_id: The latest keyframe.
+        keyframe_id: Id of the latest keyframe.
     """
     row = rows(slam_map.points.ids, slam_map.observations.point)
     seen = np.bincount(row, minlength=len(slam_map.points.ids))
@@ -37,13 +37,13 @@ def without_unconfirmed(slam_map: Map, keyframe_id: int) -> Map:
 
 
 def without_redundant(slam_map: Map, keyframe_id: int, among: np.ndarray) -> Map:
-    """Drop the neighbors of a keyframe whose points others see well enough.
+    """Drop the neighbors of a keyframe whose points other keyframes observe well enough.
 
     Args:
         slam_map: The map, or a part of it.
-        keyframe_id: The latest keyframe.
-        among: Ids, ascending, of the keyframes that may go: those whose points are all here. The first of a submap
-            stays, and so do the latest.
+        keyframe_id: Id of the latest keyframe.
+        among: Ascending ids of the keyframes that may be dropped: those whose points are all in this part. The first
+            keyframe of a submap and the latest keyframes always stay.
     """
     near, _ = covisible(slam_map, keyframe_id)
     first = slam_map.parent[rows(slam_map.ids, near)] == NONE

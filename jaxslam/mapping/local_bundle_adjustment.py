@@ -1,4 +1,4 @@
-"""Bundle adjustment around a keyframe: cutting the window out of the map, solving, and putting the result back."""
+"""Local bundle adjustment around a keyframe: select the window from the map, solve it, and write the result back."""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -19,27 +19,27 @@ from jaxslam.runtime.padding import padded
 from jaxslam.runtime.trace_cache import cached_trace
 
 _NUM_FIXED = 4
-"""Keyframes outside the window that hold it in place."""
+"""Number of keyframes outside the window that are held fixed."""
 _POINT_SIZES = (512, 1536)
-"""Points a window has room for; each size is compiled once."""
+"""Numbers of points that a window is padded to; each size is compiled once."""
 _OBSERVATIONS_A_POINT = 6
 _MIN_KEYFRAMES = 4
-"""Below that tracking knows better: it has followed the points through all frames in between. With people in two or
-three keyframes, adjusting made 4.1 mm of 2.6 in the synthetic room."""
+"""Minimum number of keyframes. With fewer, tracking is more accurate: it has tracked the points through all frames in
+between. With people in two or three keyframes, adjusting turned 2.6 mm into 4.1 mm in the synthetic room."""
 _OUTLIER_CHI2 = 11.3
-"""Squared whitened error over which a observation is dropped: 1 % of good ones with three residuals."""
+"""Squared whitened error above which an observation is dropped: 1 % of the good ones with three residuals."""
 
 
 class AdjustPlan(NamedTuple):
-    """How a window is adjusted.
+    """Settings of local bundle adjustment.
 
     Attributes:
-        window: Keyframes that move.
-        max_steps: Bound on the steps of the solver.
+        window: Number of keyframes that are adjusted.
+        max_steps: Maximum number of solver steps.
         loss_scale: Scale of the Cauchy loss, in standard deviations.
-        depth_sigma_m: Standard deviation of measured depth close to the camera, meters.
-        depth_sigma_per_m2: Its growth with the square of depth, a meter.
-        occluded_weight: How much OCCLUDED points count, where others count 1.
+        depth_sigma_m: Standard deviation of depth measured close to the camera, in meters.
+        depth_sigma_per_m2: Growth of that standard deviation with the square of depth, per meter.
+        occluded_weight: Weight of OCCLUDED points, where others have 1.
     """
 
     window: int = 8
@@ -52,28 +52,29 @@ class AdjustPlan(NamedTuple):
 
 class _Window(NamedTuple):
     keyframes: np.ndarray
-    """Ids, those that move first."""
+    """Ids, the adjusted keyframes first."""
     num_free: int
+    """Number of adjusted keyframes."""
     points: np.ndarray
     """Ids, ascending."""
     observations: Observations
-    """Of the points in the keyframes,"""
+    """Observations of the points in the keyframes."""
     row: np.ndarray
-    """and the row of each in the map."""
+    """Row of each observation in the map."""
 
 
 def adjust_around(slam_map: Map, keyframe_id: int, plan: AdjustPlan, movable: np.ndarray | None = None) -> Map:
-    """The map with a keyframe, those covisible with it and their points where they fit what was seen best.
+    """Adjust a keyframe, its covisible keyframes and their points to fit their observations best.
 
-    Observations that do not fit are dropped. What the window does not move stays; a window that cannot be solved leaves
-    the map as it was.
+    Outlier observations are dropped. Everything outside the window stays; a window that cannot be solved leaves the map
+    unchanged.
 
     Args:
         slam_map: The map, or a part of it.
-        keyframe_id: The keyframe.
-        plan: How.
-        movable: Ids, ascending, of the keyframes that may move: of a part, those whose points are all here. By default
-            all may.
+        keyframe_id: Id of the keyframe at the center of the window.
+        plan: Settings of the adjustment.
+        movable: Ascending ids of the keyframes that may move; in a partial map, those whose points are all in it. By
+            default all may.
     """
     window = _window(slam_map, keyframe_id, plan, slam_map.ids if movable is None else movable)
     if window is None:
@@ -101,10 +102,10 @@ def adjust_around(slam_map: Map, keyframe_id: int, plan: AdjustPlan, movable: np
 
 
 def adjust_all(slam_map: Map, plan: AdjustPlan, movable: np.ndarray, sweeps: int = 2) -> Map:
-    """The map adjusted window by window, over some keyframes (ids, ascending) and over again.
+    """Adjust some keyframes (ids, ascending) window by window, in several sweeps.
 
-    They as one problem would need a Schur complement of all keyframes; windows that overlap by half pass on what a
-    loop changes, and each costs the same however many there are.
+    As one problem they would need a Schur complement over all keyframes. Windows that overlap by half propagate the
+    change of a loop, and each costs the same however many there are.
     """
     for _ in range(sweeps):
         for keyframe_id in movable[:: max(plan.window // 2, 1)].tolist():
@@ -113,7 +114,7 @@ def adjust_all(slam_map: Map, plan: AdjustPlan, movable: np.ndarray, sweeps: int
 
 
 def compile_adjustment(plan: AdjustPlan) -> None:
-    """Compile the adjustment for every size of window, so that none is compiled while frames come."""
+    """Compile the adjustment for every window size, so that nothing is compiled while frames arrive."""
     num_cameras = plan.window + _NUM_FIXED
     poses = padded(_identity_row()[None], num_cameras, axis=0, fill=_identity_row())
     for size in _POINT_SIZES:
@@ -129,12 +130,13 @@ def _no_observations(room: int) -> BundleObservations:
 
 
 def _window(slam_map: Map, keyframe_id: int, plan: AdjustPlan, movable: np.ndarray) -> _Window | None:
-    """The window, or nothing if there is nothing to hold it or to move."""
+    """Select the window; `None` if nothing holds it fixed or nothing can move."""
     near, _ = covisible(slam_map, keyframe_id)
     submap = slam_map.submap[slam_map.row(keyframe_id)]
     near = near[(slam_map.submap[rows(slam_map.ids, near)] == submap) & has(movable, near)]
     free = np.concatenate([[keyframe_id], near[: plan.window - 1]])
-    first = slam_map.parent[rows(slam_map.ids, free)] == NONE  # it never moves: the frame of the submap is where it is
+    # The first keyframe of a submap never moves: it defines the frame of the submap.
+    first = slam_map.parent[rows(slam_map.ids, free)] == NONE
     first, free = free[first], free[~first]
     of_window = np.isin(slam_map.observations.keyframe, free)
     points, counts = np.unique(slam_map.observations.point[of_window], return_counts=True)
@@ -157,7 +159,7 @@ def _window(slam_map: Map, keyframe_id: int, plan: AdjustPlan, movable: np.ndarr
 
 
 def _solve_input(slam_map: Map, window: _Window, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Poses and points in the axes of the reference, so that float32 does however far away the world's origin is."""
+    """Express poses and points in the axes of the reference, so that float32 suffices far from the world's origin."""
     poses = between(reference[None, :], slam_map.T_world_cam[rows(slam_map.ids, window.keyframes)])
     X = to_local(reference, slam_map.points.X_world[:, rows(slam_map.points.ids, window.points)])
     return poses.astype(np.float32), X.astype(np.float32)
@@ -221,7 +223,7 @@ def _put_back(slam_map: Map, window: _Window, reference: np.ndarray, solution: A
 
 
 def _moved_along(slam_map: Map, keyframe_ids: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The points that only one of some keyframes sees, and where they are when it has its new pose."""
+    """Return the points that only one of these keyframes observes, and their positions after it has moved."""
     row = rows(slam_map.points.ids, slam_map.observations.point)
     once = np.bincount(row, minlength=len(slam_map.points.ids))[row] == 1
     order = np.argsort(keyframe_ids)

@@ -1,4 +1,4 @@
-"""The pose of a frame from the points of the map around it, found by their descriptors: where flow is weak or lost.
+"""Localize a frame against the local map by matching descriptors, where optical flow is weak or lost.
 
 Source: Mur-Artal and Tardos, "ORB-SLAM2", 2017, section III, "tracking against the local map".
 """
@@ -11,31 +11,31 @@ from jaxslam.geometry.se3 import angle, between, compose, to_local
 from jaxslam.map.types import Map, covisible, rows
 from jaxslam.mapping.map_point_matching import described_points_in, find_points
 from jaxslam.mapping.occlusion_states import PointStates
-from jaxslam.tracking.state import TrackParams
+from jaxslam.sensors.sensor_model import SensorModel
 
 LOCAL_KEYFRAMES = 15
-"""Keyframes, those that share most with one, whose points are the local map."""
+"""Number of most covisible keyframes whose points form the local map."""
 _IN_VIEW = 5
-"""Further keyframes: those that show most of what is in view, however long ago they were made."""
+"""Number of further keyframes that show most of what is in view, whatever their age."""
 _NEAR_M, _NEAR_RAD = 0.15, 0.15
-"""How far from where it was thought to be the camera is found at most."""
+"""Maximum distance of the result from the approximate pose, in meters and radians."""
 _MIN_INLIERS, _MIN_CELLS = 15, 4
-"""Fewest points that agree, and cells of the image they lie in. Where a place is recognized it takes more, for things
-that are there twice; here it is known where the camera is, and a person may leave little of the view."""
+"""Minimum number of inliers, and of image cells they cover. Place recognition needs more, because an object may exist
+twice; here the camera pose is known approximately, and a person may leave little of the view."""
 _RADII_PX = (15.0, 5.0)
-"""How far from where the pose puts a point it is sought, at octave 0: first and once the pose is better known."""
+"""Search radii around the predicted pixels at octave 0: the first one, and the one once the pose is better known."""
 
 _MIN_POINTS = 60
-"""Fewest of its points in view for which a keyframe shows what is in view."""
+"""Minimum number of its points in view for a keyframe to be used."""
 _MAX_TURN = 0.7
-"""Cosine of the largest angle between the directions from which a point is seen, then and now."""
+"""Cosine of the largest angle between the directions from which a point was and is seen."""
 _SCALES = (0.5, 2.0)
-"""Bounds on how much nearer or farther a point was."""
+"""Bounds on the ratio of the earlier to the current distance of a point."""
 _MARGIN_PX = 8
 
 
 def local_keyframes(slam_map: Map, keyframe_id: int) -> np.ndarray:
-    """Ids of a keyframe and of those that share most points with it."""
+    """Return the ids of a keyframe and of those most covisible with it."""
     near, _ = covisible(slam_map, keyframe_id, at_least=1)
     return np.append(np.int64(keyframe_id), near[:LOCAL_KEYFRAMES])
 
@@ -43,19 +43,19 @@ def local_keyframes(slam_map: Map, keyframe_id: int) -> np.ndarray:
 def keyframes_in_view(
     slam_map: Map, T_world_cam: np.ndarray, submap: int, exclude: set[int], at_most: int
 ) -> list[int]:
-    """The keyframes that show most of what is in view, those with most points first.
+    """Return the keyframes that observe the most points in view, best first.
 
     Args:
         slam_map: The map.
         T_world_cam: `(7,)` pose of the camera.
-        submap: Number of the submap it is in.
-        exclude: Keyframes not to name.
-        at_most: How many.
+        submap: Number of the submap the camera is in.
+        exclude: Ids of keyframes to leave out.
+        at_most: Maximum number of keyframes.
     """
     camera = slam_map.camera
     X = to_local(T_world_cam, slam_map.points.X_world)
     z = np.where(X[2] > 0.1, X[2], np.inf)
-    uv = np.stack([camera.fx * X[0] / z + camera.cx, camera.fy * X[1] / z + camera.cy])
+    uv = camera.project(np.stack([X[0], X[1], z]))
     size = np.array([[camera.width], [camera.height]])
     inside = (X[2] > 0.1) & ((uv > _MARGIN_PX) & (uv < size - _MARGIN_PX)).all(axis=0)
     row, at = rows(slam_map.points.ids, slam_map.observations.point), rows(slam_map.ids, slam_map.observations.keyframe)
@@ -76,20 +76,20 @@ def match_local_map(
     keyframe_id: int,
     T_keyframe_cam: np.ndarray,
     features: Features,
-    params: TrackParams,
+    sensor: SensorModel,
     plan: FeaturePlan,
     states: PointStates | None = None,
 ) -> FeaturePose | None:
-    """Where a frame was taken, from the points of the local map that are found in it; `None` if that is not certain.
+    """Localize a frame against the local map from an approximate pose; `None` if too few points agree.
 
     Args:
         slam_map: The map.
-        keyframe_id: A keyframe in it, near which the frame was taken.
-        T_keyframe_cam: `(7,)` about where, in its axes.
-        features: Of the frame.
-        params: Camera, and the errors of its depth.
-        plan: How features were found.
-        states: By which points that are OCCLUDED count more.
+        keyframe_id: Id of a keyframe near the camera.
+        T_keyframe_cam: `(7,)` approximate pose of the camera in the axes of the keyframe.
+        features: Features of the frame.
+        sensor: Camera, and the error model of its depth.
+        plan: Settings of feature extraction.
+        states: Current point states, by which OCCLUDED points get more weight.
 
     Returns:
         The pose in the axes of the keyframe.
@@ -108,7 +108,7 @@ def match_local_map(
         if states is not None:
             counts = counts * states.weights(slam_map, points.ids[index])
         matches = matches_of(X, better_known, features, feature, plan, weight=counts)
-        found = fit_pose(T_keyframe_cam, matches, params, min_inliers=_MIN_INLIERS, min_cells=_MIN_CELLS)
+        found = fit_pose(T_keyframe_cam, matches, sensor, min_inliers=_MIN_INLIERS, min_cells=_MIN_CELLS)
         if found is None or not _near(found.T_origin_cam, T_first):
             return None
         T_keyframe_cam = found.T_origin_cam

@@ -45,9 +45,8 @@ from jaxslam.mapping.point_creation import new_points, with_triangulated
 from jaxslam.runtime.trace_cache import cached_trace
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame_arrays import FrameArrays
-from jaxslam.tracking.from_config import depth_noise
-from jaxslam.tracking.measurement import measure
-from jaxslam.tracking.state import TrackParams
+from jaxslam.sensors.measurement import measure
+from jaxslam.sensors.sensor_model import SensorModel, depth_noise
 
 _PART_KEYFRAMES = 30
 """Keyframes that mapping looks at and changes at all, for a new one."""
@@ -151,26 +150,26 @@ def point_ids(reloaded: np.ndarray) -> np.ndarray:
 class LocalMapping:
     """Makes the map out of keyframes."""
 
-    def __init__(self, camera: Camera, params: TrackParams, plan: MappingPlan, slam_map: Map | None = None) -> None:
+    def __init__(self, camera: Camera, sensor: SensorModel, plan: MappingPlan, slam_map: Map | None = None) -> None:
         """Start with a map, empty by default."""
         self.map = empty_map(camera) if slam_map is None else slam_map
-        self._params, self._plan = params, plan
+        self._sensor, self._plan = sensor, plan
         self._point_of: dict[int, int] = {}
         self._last_seen: dict[int, int] = {}
 
     def compile(self, frame: FrameArrays, num_tracks: int) -> None:
         """Compile all that a keyframe needs, for frames of this size with so many tracks."""
         twist = np.zeros(6, np.float32)
-        features_of(frame, twist, self._params, self._plan.features)
+        features_of(frame, twist, self._sensor, self._plan.features)
         nothing = np.zeros((2, num_tracks), np.float32)
-        jax.block_until_ready(_ideal(nothing, nothing[0], twist, frame, self._params))
+        jax.block_until_ready(_ideal(nothing, nothing[0], twist, frame, self._sensor))
         compile_adjustment(self._plan.adjust)
 
     def add(self, new: NewKeyframe) -> Map:
         """Take in a keyframe; gives the new map."""
         features = new.features
         if features is None:
-            features = features_of(new.frame, new.twist, self._params, self._plan.features)
+            features = features_of(new.frame, new.twist, self._sensor, self._plan.features)
         whole = with_new_keyframe(self.map, new, features)
         known = self._points(new.tracks.id)
         part = _part(whole, new.id, known[has(whole.points.ids, known)])
@@ -232,7 +231,7 @@ class LocalMapping:
         """The points the tracker saw: those the map has get a observation, the others become points."""
         tracks = new.tracks
         uv, depth = jax.device_get(
-            _ideal(tracks.uv_raw, tracks.X_cam[2].astype(np.float32), new.twist, new.frame, self._params)
+            _ideal(tracks.uv_raw, tracks.X_cam[2].astype(np.float32), new.twist, new.frame, self._sensor)
         )
         used = (tracks.weight > 0) & np.isfinite(uv).all(axis=0) & np.isfinite(tracks.X_cam).all(axis=0)
         fresh = np.flatnonzero(used & (known == NONE))
@@ -283,9 +282,8 @@ class LocalMapping:
         """A point for every feature with depth that is none yet."""
         free = np.flatnonzero(features.depth > 0)
         free = free[~np.isin(free, taken)]
-        camera, depth = slam_map.camera, features.depth[free].astype(np.float64)
-        u, v = features.uv[:, free].astype(np.float64)
-        X_cam = np.stack([(u - camera.cx) / camera.fx * depth, (v - camera.cy) / camera.fy * depth, depth])
+        uv, depth = features.uv[:, free].astype(np.float64), features.depth[free].astype(np.float64)
+        X_cam = slam_map.camera.back_project(uv, depth)
         points = new_points(
             slam_map, keyframe_id, transform(slam_map.pose(keyframe_id), X_cam), features.descriptor[free]
         )
@@ -332,12 +330,12 @@ def with_new_keyframe(slam_map: Map, new: NewKeyframe, features: Features) -> Ma
 @jax.jit
 @cached_trace
 def _ideal(
-    uv_raw: Pixels, expected_depth: Weights, twist: Float[Array, "6"], frame: FrameArrays, params: TrackParams
+    uv_raw: Pixels, expected_depth: Weights, twist: Float[Array, "6"], frame: FrameArrays, sensor: SensorModel
 ) -> tuple[Pixels, Weights]:
     """Pixels of the ideal camera, and depth."""
-    believed = valid_depth(frame.depth, params.min_depth_m, params.max_depth_m)
-    seen = measure(uv_raw, expected_depth, twist, believed, frame.depth_delay_s, params)
-    return to_pixels(params.intrinsics, seen.xy), seen.depth
+    believed = valid_depth(frame.depth, sensor.min_depth_m, sensor.max_depth_m)
+    seen = measure(uv_raw, expected_depth, twist, believed, frame.depth_delay_s, sensor)
+    return to_pixels(sensor.intrinsics, seen.xy), seen.depth
 
 
 def _part(slam_map: Map, keyframe_id: int, known: np.ndarray) -> PartialMap:

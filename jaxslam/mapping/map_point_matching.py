@@ -1,4 +1,4 @@
-"""Finding the points of the map in a keyframe, and points that are in the map twice."""
+"""Match map points with the features of a keyframe, and fuse points that are in the map twice."""
 
 from typing import NamedTuple
 
@@ -13,17 +13,18 @@ from jaxslam.map.types import NONE, Map, Observations, empty_observations, obser
 _MARGIN_PX = 1.0
 _NEAREST_M = 0.1
 _MAX_DEPTH_ERROR = 0.1
-"""Largest difference between the depth of a point and that measured at a feature, as a share of it."""
+"""Largest difference between the depth of a point and the depth measured at a feature, as a share of the former."""
 
 
 class DescribedPoints(NamedTuple):
-    """Points of the map that have a descriptor, with how they looked; `(r,)`, ascending by id.
+    """Map points with a descriptor, and how they appeared; `(r,)`, ascending by id.
 
     Attributes:
-        ids: Of the points.
-        X_world: `(3, r)` meters.
-        descriptor: `(r, 32)`.
-        size: Size of the feature times its distance: over another distance, its size from there in octave 0's.
+        ids: Ids of the points.
+        X_world: `(3, r)` positions in meters.
+        descriptor: `(r, 32)` descriptors.
+        size: Feature size times distance; divided by another distance it gives the size seen from there, relative to
+            octave 0.
     """
 
     ids: np.ndarray
@@ -33,7 +34,7 @@ class DescribedPoints(NamedTuple):
 
 
 def described_points_in(slam_map: Map, keyframe_ids: np.ndarray) -> DescribedPoints:
-    """The points with a descriptor that some keyframes see."""
+    """Return the points with a descriptor that these keyframes observe."""
     seen = np.flatnonzero(
         np.isin(slam_map.observations.keyframe, keyframe_ids) & (slam_map.observations.feature != NONE)
     )
@@ -63,16 +64,16 @@ def find_points(
     radius_px: float,
     max_distance: int = NEAR,
 ) -> np.ndarray:
-    """Find points of the map among the features of a picture taken from about `T_world_cam`.
+    """Match map points with the features of an image by projection from an approximate pose.
 
     Args:
-        slam_map: The map; for its camera.
-        points: What to look for.
-        features: Of the picture.
-        T_world_cam: `(7,)` where it was taken from.
-        plan: How features are found.
-        radius_px: How far from where the pose puts a point to look, at octave 0.
-        max_distance: Most bits of the descriptor that differ.
+        slam_map: The map, for its camera.
+        points: Points to match.
+        features: Features of the image.
+        T_world_cam: `(7,)` approximate pose of the camera.
+        plan: Settings of feature extraction.
+        radius_px: Search radius around the predicted pixel at octave 0.
+        max_distance: Maximum Hamming distance of a match, in bits.
 
     Returns:
         `(2, m)` index in `points` and in `features` of each match.
@@ -104,7 +105,7 @@ def find_points(
 def feature_observations(
     keyframe_id: int, features: Features, point_ids: np.ndarray, feature: np.ndarray, plan: FeaturePlan
 ) -> Observations:
-    """Observations of points at features of a keyframe."""
+    """Make observations of points at features of a keyframe."""
     return Observations(
         keyframe=np.full(len(feature), keyframe_id, np.int64),
         point=point_ids.astype(np.int64),
@@ -120,17 +121,17 @@ def feature_observations(
 def fuse_duplicates(
     slam_map: Map, keyframe_id: int, neighbors: np.ndarray, plan: FeaturePlan, *, radius_px: float
 ) -> tuple[Map, np.ndarray, np.ndarray]:
-    """Look for the points of a keyframe in its neighbors: what is there a point already becomes one with it.
+    """Match the points of a keyframe with the features of its neighbors, and fuse those that are the same point.
 
     Args:
-        slam_map: The map, or a part with all that these keyframes saw.
-        keyframe_id: The keyframe.
-        neighbors: Ids of others of its submap.
-        plan: How features are found.
-        radius_px: As for `find_points`.
+        slam_map: The map, or a part with all observations of these keyframes.
+        keyframe_id: Id of the keyframe.
+        neighbors: Ids of other keyframes of its submap.
+        plan: Settings of feature extraction.
+        radius_px: Search radius, as for `find_points`.
 
     Returns:
-        The map, and the points that others became one with: ids kept and ids dropped.
+        The map, and the fused points: the ids kept, and for each the id dropped.
     """
     points = described_points_in(slam_map, np.array([keyframe_id]))
     kept, dropped, new = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [empty_observations()]

@@ -1,11 +1,11 @@
-"""The states of map points while the camera looks at them: on from frame to frame, ahead of the map.
+"""Occlusion states of the map points in view, updated with every frame ahead of the map.
 
-The map is mapping's and never waited for. What the tracker has seen of its points since is kept beside it, by id, and
-goes over with the next keyframe; once it comes back in a map, the map has it and it is forgotten here.
+The map belongs to mapping and is never waited for. State changes observed by the tracker are kept beside it by point
+id and handed over with the next keyframe; once a map with them arrives, they are dropped here.
 
-Source: Occlusion SLAM, algorithm 1. It looks at the points of one keyframe; a keyframe that is made while a person
-stands there does not have the points behind. Those that are blocked are followed on here until they are seen again,
-"in any future frame" (section 2.3), whatever keyframe the frames hang on.
+Source: Occlusion SLAM, algorithm 1. The paper looks at the points of one keyframe; a keyframe that is made while a
+person stands in view does not have the points behind. Here blocked points are kept until they are visible again, "in
+any future frame" (section 2.3), whatever the reference keyframe of those frames.
 """
 
 from functools import partial
@@ -29,28 +29,29 @@ from jaxslam.runtime.compile_cache import SINGLE_THREAD
 from jaxslam.runtime.padding import padded
 from jaxslam.runtime.trace_cache import cached_trace
 from jaxslam.sensors.frame_arrays import FrameArrays
-from jaxslam.tracking.measurement import depth_sigma, measure, predict_pixels
-from jaxslam.tracking.state import TrackParams
+from jaxslam.sensors.measurement import depth_sigma, measure, predict_pixels
+from jaxslam.sensors.sensor_model import SensorModel
 
 _DEPTH_SIGMAS, _DEPTH_SHARE = 4.2, 0.02
 """Difference of measured and expected depth from which a point is displaced: three standard deviations of the
 difference of two measurements, and a share of the depth for errors of pose and calibration."""
 _REACH_PX = 2
-"""Around a point, all depth must be of one surface: at an edge, pixels of error in the pose would be one of depth."""
+"""Radius around a point in which all depth must be of one surface: at an edge, a pose error of pixels would become an
+error of depth."""
 _MAX_BENT = 0.5
-"""Share of the picture by which a lens moves a point at most: farther out, its polynomial may fold back inside."""
+"""Largest shift of a point by the lens, as a share of the image: farther out, its polynomial may fold back inside."""
 _MAX_BLOCKED = 512
-"""Blocked points of earlier keyframes that are followed on; those of the latest, if there are more."""
+"""Maximum number of blocked points of earlier keyframes that are kept; if there are more, the latest ones."""
 _AS_IN_MAP = -1
 
 
 class StateChanges(NamedTuple):
-    """States that points have got since those handed over before.
+    """State changes of points since the previous handover.
 
     Attributes:
-        number: Of these changes; it counts on.
-        ids: `(c,)` of points, some of which may not be in the map any more.
-        states: `(c,)` a `PointState` each.
+        number: Sequence number of these changes.
+        ids: `(c,)` ids of the points, some of which may have left the map.
+        states: `(c,)` new `PointState` of each.
     """
 
     number: int
@@ -59,13 +60,13 @@ class StateChanges(NamedTuple):
 
 
 class _Columns(NamedTuple):
-    """Points, padded to the size that the program is compiled for, where it finds them without a copy.
+    """Points padded to the compiled size, kept on the device so that no copy is needed.
 
     Attributes:
-        states: `(n,)` as they are now.
-        X_keyframe: `(3, n)` where they are in the axes of the keyframe, meters.
-        there: `(n,)` which slots hold a point,
-        own: `(n,)` and which of them one that the keyframe saw.
+        states: `(n,)` current states.
+        X_keyframe: `(3, n)` positions in the axes of the keyframe, in meters.
+        there: `(n,)` which slots hold a point.
+        own: `(n,)` which slots hold a point observed by the keyframe.
     """
 
     states: States
@@ -75,14 +76,14 @@ class _Columns(NamedTuple):
 
 
 class _VisiblePoints(NamedTuple):
-    """The points that are looked at, those of a keyframe first.
+    """Points whose states are updated, those of the reference keyframe first.
 
     Attributes:
-        map: The map they are of.
-        keyframe: The keyframe,
-        submap: and its submap.
-        ids: Of the points.
-        columns: What is known of them.
+        map: The map they belong to.
+        keyframe: Id of the reference keyframe.
+        submap: Number of its submap.
+        ids: Ids of the points.
+        columns: Their padded arrays.
     """
 
     map: Map
@@ -93,18 +94,18 @@ class _VisiblePoints(NamedTuple):
 
 
 class PointStates:
-    """Has the states of the points of the reference keyframe go on with every frame; of one thread."""
+    """Updates the states of the reference keyframe's points with every frame. Not thread-safe."""
 
-    def __init__(self, config: OcclusionConfig, params: TrackParams, slam_map: Map, most_points: int) -> None:
-        """Begin with the states that a map has.
+    def __init__(self, config: OcclusionConfig, sensor: SensorModel, slam_map: Map, most_points: int) -> None:
+        """Start with the states of a map.
 
         Args:
             config: Settings.
-            params: Camera and the errors of its depth.
-            slam_map: To begin with.
-            most_points: That a keyframe to come may see; those of the map may see more.
+            sensor: Camera and the error model of its depth.
+            slam_map: Map to start with.
+            most_points: Maximum number of points that a new keyframe may observe; those of the map may have more.
         """
-        self._config, self._params = config, params
+        self._config, self._sensor = config, sensor
         by_feature = [len(keyframe.features.octave) for keyframe in slam_map.keyframes]
         tracked = np.bincount(
             slam_map.observations.keyframe[slam_map.observations.feature == NONE], minlength=slam_map.next_keyframe
@@ -125,17 +126,17 @@ class PointStates:
     def see(
         self, slam_map: Map, keyframe_id: int, T_keyframe_cam: np.ndarray, twist: np.ndarray, arrays: FrameArrays
     ) -> float:
-        """Take in a frame whose pose is known.
+        """Update the states with a frame whose pose is known.
 
         Args:
             slam_map: The map that arrived last.
-            keyframe_id: The reference keyframe, of that map.
-            T_keyframe_cam: `(7,)` where the frame was taken, in its axes.
+            keyframe_id: Id of the reference keyframe in that map.
+            T_keyframe_cam: `(7,)` pose of the camera in the axes of the keyframe.
             twist: `(6,)` velocity of the camera in its own axes.
-            arrays: The frame, with what was not trusted in it.
+            arrays: The frame, with the pixels to ignore.
 
         Returns:
-            The share of the points of the keyframe that are OCCLUDED.
+            The share of the keyframe's points that are OCCLUDED.
         """
         shown = self._points_of(slam_map, keyframe_id)
         after, counted = self._after(shown.columns, T_keyframe_cam, twist, arrays)
@@ -150,34 +151,34 @@ class PointStates:
         return share
 
     def weights(self, slam_map: Map, point_ids: np.ndarray) -> Float32[np.ndarray, " n"]:
-        """How much points of the map that arrived last count beside each other, 1 on average.
+        """Return the relative weights of points of the latest map, 1 on average.
 
-        Only ratios matter to a pose; with that average, its covariance does not become less where many are OCCLUDED.
+        Only ratios matter to a pose; with an average of 1, its covariance does not shrink where many are OCCLUDED.
         """
         weights = state_weights(self._of(slam_map, point_ids), self._config.weight)
         return weights / weights.mean() if len(weights) else weights
 
     def handed_over(self) -> StateChanges:
-        """What has changed since it was asked last, for mapping."""
+        """Return the changes since the last call, for mapping."""
         ids = np.flatnonzero((self._change == self._number) & (self._state != _AS_IN_MAP))
         changes = StateChanges(self._number, ids, self._state[ids])
         self._number += 1
         return changes
 
     def arrived(self, slam_map: Map, number: int) -> None:
-        """Take in a new map, which has all changes up to a number."""
+        """Replace the map by a new one that contains all changes up to this number."""
         more = slam_map.next_point - len(self._state)
         self._state = np.append(self._state, np.full(more, _AS_IN_MAP, np.int8))
         self._change = np.append(self._change, np.zeros(more, np.int64))
         self._state[self._change <= number] = _AS_IN_MAP
 
     def _of(self, slam_map: Map, point_ids: np.ndarray) -> np.ndarray:
-        """The states of points as they are now."""
+        """Return the current states of points."""
         ahead = self._state[point_ids]
         return np.where(ahead == _AS_IN_MAP, slam_map.points.state[rows(slam_map.points.ids, point_ids)], ahead)
 
     def _points_of(self, slam_map: Map, keyframe_id: int) -> _VisiblePoints:
-        """What is looked at, anew for every map and every keyframe."""
+        """Collect the points to update, again for every new map and every new keyframe."""
         shown = self._shown
         if shown is not None and shown.map is slam_map and shown.keyframe == keyframe_id:
             return shown
@@ -192,13 +193,13 @@ class PointStates:
         return _VisiblePoints(slam_map, keyframe_id, submap, ids, columns)
 
     def _blocked(self, slam_map: Map) -> np.ndarray:
-        """Those of the points looked at that are blocked and in the map still, the latest first."""
+        """Return the collected points that are blocked and still in the map, the latest first."""
         ids = self._shown.ids if self._shown is not None else np.zeros(0, np.int64)
         ids = ids[has(slam_map.points.ids, ids)]
         return ids[self._of(slam_map, ids) == PointState.BLOCKED]
 
     def _columns(self, *columns: np.ndarray) -> _Columns:
-        """One column a point, filled up with zeros to the size that the program is compiled for."""
+        """Pad one column per point with zeros to the compiled size."""
         filled: Any = (jnp.asarray(padded(column, self._room, axis=-1)) for column in columns)
         return _Columns(*filled)
 
@@ -207,17 +208,17 @@ class PointStates:
     ) -> tuple[States, Float[Array, "2"]]:
         motion = T_keyframe_cam.astype(np.float32), twist
         seen = arrays.ignore, arrays.depth, arrays.depth_delay_s
-        return _after_frame(columns, *motion, *seen, self._params, guard=self._config.guard)
+        return _after_frame(columns, *motion, *seen, self._sensor, guard=self._config.guard)
 
 
 def with_changes(slam_map: Map, changes: StateChanges) -> Map:
-    """The map with changed states of those points that are in it still."""
+    """Apply state changes to those points that are still in the map."""
     there = has(slam_map.points.ids, changes.ids)
     return with_states(slam_map, changes.ids[there], changes.states[there])
 
 
 def occluded_shares(slam_map: Map) -> Float64[np.ndarray, " k"]:
-    """The share of the points that each keyframe saw which are OCCLUDED; 0 of none."""
+    """Return the share of each keyframe's points that are OCCLUDED; 0 for a keyframe without points."""
     seen = visibility(slam_map)
     return (seen @ (slam_map.points.state == PointState.OCCLUDED)) / np.maximum(seen.sum(axis=1), 1)
 
@@ -231,30 +232,30 @@ def _after_frame(
     ignore: Bool[Array, "h w"],
     depth: DepthImage,
     depth_delay_s: Scalar,
-    params: TrackParams,
+    sensor: SensorModel,
     *,
     guard: bool,
 ) -> tuple[States, Float[Array, "2"]]:
-    """States after a frame, how many have another state, and the share of the keyframe's own that is OCCLUDED."""
+    """Return the states after a frame, the number of changes, and the OCCLUDED share of the keyframe's points."""
     height, width = ignore.shape
     X_cam = to_camera(SE3(T_keyframe_cam), columns.X_keyframe)
-    uv = predict_pixels(X_cam, twist, height, params)
+    uv = predict_pixels(X_cam, twist, height, sensor)
     size = jnp.array([[width], [height]], uv.dtype)
     pixel = jnp.round(uv)
-    inside = columns.there & _before_the_lens(X_cam, size, params) & ((pixel >= 0) & (pixel < size)).all(axis=0)
+    inside = columns.there & _before_the_lens(X_cam, size, sensor) & ((pixel >= 0) & (pixel < size)).all(axis=0)
     column, row = jnp.clip(pixel, 0, size - 1).astype(jnp.int32)
     displaced = jnp.zeros_like(inside)
     if guard:
-        displaced = _displaced(X_cam[2], uv, twist, depth, depth_delay_s, params)
+        displaced = _displaced(X_cam[2], uv, twist, depth, depth_delay_s, sensor)
     states = next_states(columns.states, inside, ignore[row, column], displaced)
     num_changed = jnp.sum(states != columns.states, dtype=jnp.float32)
     return states, jnp.stack([num_changed, occluded_share(states, columns.own)])
 
 
-def _before_the_lens(X_cam: Points, size: Float[Array, "2 1"], params: TrackParams) -> Mask:
-    """Which points are in front of the camera, and not so far aside that a lens could only seem to show them."""
-    nearest = params.min_depth_m / 2
-    straight = to_pixels(params.intrinsics, X_cam[:2] / jnp.maximum(X_cam[2:], nearest))
+def _before_the_lens(X_cam: Points, size: Float[Array, "2 1"], sensor: SensorModel) -> Mask:
+    """Return which points are in front of the camera, and not so far aside that only distortion folds them inside."""
+    nearest = sensor.min_depth_m / 2
+    straight = to_pixels(sensor.intrinsics, X_cam[:2] / jnp.maximum(X_cam[2:], nearest))
     near = (straight > -_MAX_BENT * size) & (straight < (1 + _MAX_BENT) * size)
     return (X_cam[2] > nearest) & near.all(axis=0)
 
@@ -265,22 +266,22 @@ def _displaced(
     twist: Float[Array, "6"],
     depth: DepthImage,
     depth_delay_s: Scalar,
-    params: TrackParams,
+    sensor: SensorModel,
 ) -> Mask:
-    """Which points are not where they should be: another surface is seen there, in front or behind.
+    """Return which points are displaced: another surface is seen at their pixel, in front or behind.
 
-    Behind, the point is gone. In front, something that no mask covers hides it, or it has come nearer itself: nobody
-    can tell, and what is in doubt counts once.
+    If the surface is behind, the point is gone. If it is in front, something outside every mask hides the point, or the
+    point itself has come nearer: the two cannot be told apart, so a doubtful point gets the normal weight.
 
     Args:
-        expected: `(n,)` depth at which they should be, meters.
-        uv: `(2, n)` where they should be seen, pixels.
+        expected: `(n,)` expected depths, in meters.
+        uv: `(2, n)` expected pixels.
         twist: Velocity of the camera in its own axes.
-        depth: Depth image, meters, as it came.
-        depth_delay_s: Seconds from the time of the image to that of the depth.
-        params: Camera and the errors of its depth.
+        depth: Raw depth image in meters.
+        depth_delay_s: Time from the image to its depth, in seconds.
+        sensor: Camera and the error model of its depth.
     """
-    measured = measure(uv, expected, twist, depth, depth_delay_s, params, reach=_REACH_PX).depth
-    known = (measured > params.min_depth_m) & (measured < params.max_depth_m)
-    tolerance = _DEPTH_SIGMAS * depth_sigma(expected, params) + _DEPTH_SHARE * expected
+    measured = measure(uv, expected, twist, depth, depth_delay_s, sensor, reach=_REACH_PX).depth
+    known = (measured > sensor.min_depth_m) & (measured < sensor.max_depth_m)
+    tolerance = _DEPTH_SIGMAS * depth_sigma(expected, sensor) + _DEPTH_SHARE * expected
     return known & (jnp.abs(measured - expected) > tolerance)

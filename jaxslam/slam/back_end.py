@@ -33,11 +33,12 @@ from jaxslam.runtime.worker import Worker, close_all, make_worker
 from jaxslam.semantics import Detector
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame_arrays import FrameArrays
+from jaxslam.sensors.sensor_model import SensorModel
 from jaxslam.slam.dense_thread import DenseMapping
 from jaxslam.slam.keyframe_reload import MapKeyframe, reload_keyframe
 from jaxslam.slam.keyframe_semantics import KeyframeSemantics
 from jaxslam.slam.tracker_map_sync import AnchoredPose, TrackerMapSync, pose_of, tracks_of
-from jaxslam.tracking.state import TrackOutput, TrackParams, TrackPlan, TrackReason, TrackState, TrackStatus
+from jaxslam.tracking.state import TrackOutput, TrackPlan, TrackReason, TrackState, TrackStatus
 from jaxslam.tracking.state_updates import reset_at_pose
 
 _relocated = jax.jit(cached_trace(reset_at_pose), donate_argnums=0)
@@ -120,7 +121,7 @@ class BackEnd:
     def __init__(
         self,
         camera: Camera,
-        params: TrackParams,
+        sensor: SensorModel,
         plan: TrackPlan,
         config: Config,
         slam_map: Map | None = None,
@@ -134,7 +135,7 @@ class BackEnd:
 
         Args:
             camera: That takes the frames.
-            params: Of the tracker.
+            sensor: Camera with its depth noise.
             plan: Of the tracker.
             config: Settings.
             slam_map: To start with.
@@ -144,13 +145,13 @@ class BackEnd:
             times: Where to keep how long the jobs of the threads take.
         """
         self._times = times or StageTimes()
-        self._params, self._track_plan = params, plan
+        self._sensor, self._track_plan = sensor, plan
         self._plan = mapping_plan(camera, config)
         self._camera, self._config, self._localize_only = camera, config, localize_only
         start = empty_map(camera) if slam_map is None else slam_map
-        self._mapping = LocalMapping(camera, params, self._plan, start)
+        self._mapping = LocalMapping(camera, sensor, self._plan, start)
         self._index, self._lock = PlaceIndex.from_map(start), threading.Lock()
-        self._loops = LoopClosing(self._index, params, self._plan.features, self._lock)
+        self._loops = LoopClosing(self._index, sensor, self._plan.features, self._lock)
         self._to_mapping: Worker[_MapJob, _MapUpdate] = self._worker(self._map_job, "mapping", 1)
         self._to_places: Worker[_PlaceJob, _PlaceResult] = self._worker(self._place_job, "places", 2)
         self._semantics = None if detector is None else self._semantics_of(detector)
@@ -159,7 +160,7 @@ class BackEnd:
         self._link = TrackerMapSync(plan, start)
         most = config.mapping.num_features + self._num_tracks
         occlusion = config.dynamics.occlusion
-        self._states = PointStates(occlusion, params, start, most) if occlusion.enabled else None
+        self._states = PointStates(occlusion, sensor, start, most) if occlusion.enabled else None
         self._states_in_map = 0  # number of the changes that the newest map has
         self._arrived: Map | None = None
         self._waiting: list[MapKeyframe] = []
@@ -208,7 +209,7 @@ class BackEnd:
         self._mapping.compile(frame, self._num_tracks)
         if self._states is not None:
             self._states.compile(frame)
-        compile_recognition(self._params, self._plan.features)
+        compile_recognition(self._sensor, self._plan.features)
         self._compile_edits(state)
         if self._dense is not None:
             self._dense.compile()
@@ -284,7 +285,7 @@ class BackEnd:
             State and output, and how many points agree on the pose; as they were and 0 if too few do.
         """
         pose = pose_of(output)
-        self._features = features_of(arrays, np.asarray(output.twist), self._params, self._plan.features)
+        self._features = features_of(arrays, np.asarray(output.twist), self._sensor, self._plan.features)
         placed = self._in_local_map(self._features, pose)
         if placed is None:
             return state, output, 0
@@ -323,7 +324,7 @@ class BackEnd:
         Returns:
             Where; and if nowhere, whether the frame shows enough to tell that its place is not in the map.
         """
-        features = features_of(arrays, np.zeros(6, np.float32), self._params, self._plan.features)
+        features = features_of(arrays, np.zeros(6, np.float32), self._sensor, self._plan.features)
         near = None if predicted is None else self._in_local_map(features, predicted)
         if near is not None:
             return near, False
@@ -332,7 +333,7 @@ class BackEnd:
         if not self._lock.acquire(timeout=_PATIENCE_S):
             return None, False
         try:
-            found = recognize(self.map, self._index, features, self._params, plan=self._plan.features)
+            found = recognize(self.map, self._index, features, self._sensor, plan=self._plan.features)
         finally:
             self._lock.release()
         if found is None:
@@ -409,7 +410,7 @@ class BackEnd:
         if about is None:
             return None
         found = match_local_map(
-            self.map, about.keyframe, about.T_keyframe_cam, features, self._params, self._plan.features, self._states
+            self.map, about.keyframe, about.T_keyframe_cam, features, self._sensor, self._plan.features, self._states
         )
         if found is None:
             return None
@@ -458,7 +459,7 @@ class BackEnd:
         except BaseException:
             # What was begun is forgotten; those after a keyframe hang on it, and so it is there, without points.
             slam_map = with_new_keyframe(before, job, no_features()) if isinstance(job, NewKeyframe) else before
-            self._mapping = LocalMapping(self._camera, self._params, self._plan, slam_map)
+            self._mapping = LocalMapping(self._camera, self._sensor, self._plan, slam_map)
             raise
 
     def _place_job(self, job: _PlaceJob) -> _PlaceResult:

@@ -401,7 +401,7 @@ class Slam:
         self.dense_mapping = self._new_dense_mapping()
         self._back = BackEnd(
             self.camera,
-            self._params,
+            self._params.sensor,
             self._plan,
             self.config,
             self._start_map,
@@ -420,7 +420,7 @@ class Slam:
                 latency_frames=semantics.latency_frames,
                 propagate=semantics.propagate,
                 new_surfaces=dynamics.new_surfaces,
-                farthest_m=float(self._params.max_depth_m),
+                farthest_m=float(self._params.sensor.max_depth_m),
                 dilate_px=semantics.dilate_px,
                 seed=run.seed,
                 times=self.times,
@@ -439,7 +439,7 @@ class Slam:
             self._state = _awaiting_relocalization(self._state)
         self._frame = self._unrecognized = 0
         self._clock = FrameClock(self.camera.fps, self._warnings)
-        limits = float(self._params.min_depth_m), float(self._params.max_depth_m)
+        limits = float(self._params.sensor.min_depth_m), float(self._params.sensor.max_depth_m)
         self._background = None if self.camera.is_stereo else BackgroundConsistency(self.camera, *limits)
         self._last_pose, self._last_twist, self._lost_s = np.array(IDENTITY), np.zeros(6), 0.0
         self._given: list[_RecordedPose] = []
@@ -452,12 +452,12 @@ class Slam:
         dense_map = DenseMap(
             self.camera,
             self.config.dense,
-            nearest_m=float(self._params.min_depth_m),
-            farthest_m=float(self._params.max_depth_m),
+            nearest_m=float(self._params.sensor.min_depth_m),
+            farthest_m=float(self._params.sensor.max_depth_m),
             key_detector=self._key_detector,
             times=self.times,
         )
-        seen = SeenArea(self.camera, float(self._params.min_depth_m), float(self._params.max_depth_m))
+        seen = SeenArea(self.camera, float(self._params.sensor.min_depth_m), float(self._params.sensor.max_depth_m))
         return DenseMapping(dense_map, seen, self.config.dense, deterministic=self.config.run.in_turn)
 
     def _fresh_state(self) -> TrackState:

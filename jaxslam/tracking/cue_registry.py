@@ -14,7 +14,7 @@ from jaxslam.dynamics.epipolar_cue import EpipolarParams, make_epipolar_cue
 from jaxslam.dynamics.object_motion import MotionParams, MotionPlan
 from jaxslam.dynamics.regions import RegionPlan
 from jaxslam.dynamics.scene_flow_cue import TrajectoryParams, trajectory_cue
-from jaxslam.tracking.floating_dtype import floating_dtype
+from jaxslam.runtime.floating_dtype import floating_dtype
 from jaxslam.tracking.state import TrackParams, TrackPlan
 
 

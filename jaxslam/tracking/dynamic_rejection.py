@@ -21,7 +21,7 @@ from jaxslam.dynamics.regions import (
     of_points,
     region_weights,
 )
-from jaxslam.tracking.measurement import PreparedFrame, depth_sigma, measure_points
+from jaxslam.sensors.measurement import PreparedFrame, depth_sigma, measure_points
 from jaxslam.tracking.state import TrackParams, TrackPlan, TrackState
 from jaxslam.tracking.step_checks import check_verdict
 
@@ -195,12 +195,14 @@ def _motion(
     """What is known of the things that may move."""
     assert params.motion is not None
     points = state.points
-    observed = measure_points(points.X_world, seen.uv, coarse, twist, view, params, view.matched)
+    observed = measure_points(points.X_world, seen.uv, coarse, twist, view, params.sensor, view.matched)
     there = seen.there & (observed.depth > 0) & (points.depth > 0)
     across = (
-        params.pixel_sigma * observed.depth[None, :] / jnp.stack([params.intrinsics.fx, params.intrinsics.fy])[:, None]
+        params.pixel_sigma
+        * observed.depth[None, :]
+        / jnp.stack([params.sensor.intrinsics.fx, params.sensor.intrinsics.fy])[:, None]
     )
-    sigma = jnp.concatenate([across, depth_sigma(observed.depth, params)[None, :]])
+    sigma = jnp.concatenate([across, depth_sigma(observed.depth, params.sensor)[None, :]])
     X_world = points.X_world
     if as_published:
         before = jnp.concatenate([points.xy, jnp.ones_like(points.xy[:1])]) * points.depth[None, :]
@@ -245,8 +247,8 @@ def _cue_results(
 ) -> tuple[CueResult, ...]:
     if not plan.cues:
         return ()
-    points, ideal = state.points, without_distortion(params.intrinsics)
-    observed = measure_points(points.X_world, seen.uv, coarse, twist, view, params, view.matched)
+    points, ideal = state.points, without_distortion(params.sensor.intrinsics)
+    observed = measure_points(points.X_world, seen.uv, coarse, twist, view, params.sensor, view.matched)
     height, width = view.frame.image.shape
     scene = CueInput(
         uv_before=to_pixels(ideal, points.xy),

@@ -1,34 +1,16 @@
 """The settings of the tracker as its programs take them, for a camera that measures depth or for a stereo pair."""
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
 from jaxslam.config.schema import Config, TrackConfig
+from jaxslam.runtime.floating_dtype import floating_dtype
 from jaxslam.sensors.camera import Camera
-from jaxslam.tracking.floating_dtype import floating_dtype
+from jaxslam.sensors.sensor_model import max_valid_depth, sensor_model
 from jaxslam.tracking.state import TrackParams, TrackPlan
-
-
-class DepthNoise(NamedTuple):
-    """Standard deviation of depth: `sigma_m + sigma_per_m2 z^2`.
-
-    Attributes:
-        sigma_m: Close to the camera, meters.
-        sigma_per_m2: Its growth with the square of depth, a meter.
-    """
-
-    sigma_m: float
-    sigma_per_m2: float
-
-
-def depth_noise(camera: Camera, config: TrackConfig) -> DepthNoise:
-    """That of the sensor in the settings; of a stereo pair that of its disparity, to first order."""
-    if camera.baseline_m is None or not camera.is_stereo:
-        return DepthNoise(config.depth_sigma_m, config.depth_sigma_per_m2)
-    return DepthNoise(0.0, config.disparity_sigma_px / (camera.fx * camera.baseline_m))
 
 
 def with_dense_keyframes(config: Config) -> TrackConfig:
@@ -56,21 +38,10 @@ def track_params(camera: Camera, config: TrackConfig, dtype: DTypeLike = jnp.flo
         TypeError: If `dtype` is no floating-point type, or is float64 while `jax_enable_x64` is off.
     """
     dtype = floating_dtype(dtype)
-    noise = depth_noise(camera, config)
-    by_camera: dict[str, float] = {
-        "readout_s": camera.readout_s,
-        "baseline_m": 0.0,
-        "depth_sigma_m": noise.sigma_m,
-        "depth_sigma_per_m2": noise.sigma_per_m2,
-    }
-    if camera.baseline_m is not None and camera.is_stereo:
-        farthest_m = camera.far_depth_m or config.far_baselines * camera.baseline_m
-        by_camera |= {
-            "baseline_m": camera.baseline_m,
-            "max_depth_m": farthest_m,
-            "max_speed_m_per_s": max(config.max_speed_m_per_s, farthest_m),
-        }
-    names = [name for name in TrackParams._fields if name not in ("intrinsics", "cues", "motion")]
-    settings = {name: by_camera[name] if name in by_camera else getattr(config, name) for name in names}
+    max_speed_m_per_s = config.max_speed_m_per_s
+    if camera.is_stereo:
+        max_speed_m_per_s = max(max_speed_m_per_s, max_valid_depth(camera, config))
+    names = [name for name in TrackParams._fields if name not in ("sensor", "cues", "motion")]
+    settings = {name: getattr(config, name) for name in names} | {"max_speed_m_per_s": max_speed_m_per_s}
     arrays: dict[str, Any] = {name: jnp.asarray(value, dtype) for name, value in settings.items()}
-    return TrackParams(intrinsics=camera.intrinsics(dtype), **arrays)
+    return TrackParams(sensor=sensor_model(camera, config, dtype), **arrays)

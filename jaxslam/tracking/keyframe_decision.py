@@ -87,5 +87,5 @@ def _has_moved(keyframes: KeyframeRing, frame: KeyframeCandidate, params: TrackP
     """Whether the points have gone far enough in the axes of the camera since the last keyframe, in parts of depth."""
     last = SE3(keyframes.T_world_cam[(keyframes.made - 1) % plan.num_keyframes])
     then, now = (to_camera(pose, frame.points.X_world) for pose in (last, frame.T_world_cam))
-    parts = flow_length(now - then) / jnp.maximum(now[2], params.min_depth_m)
+    parts = flow_length(now - then) / jnp.maximum(now[2], params.sensor.min_depth_m)
     return weighted_median(parts, frame.tracked.astype(parts.dtype)) >= params.keyframe_motion

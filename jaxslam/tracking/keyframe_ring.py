@@ -10,7 +10,7 @@ from jaxslam_kernels.se3 import to_camera
 from jaxslam_kernels.types import Mask, Pixels, Scalar, Weights
 from jaxtyping import Array, Bool, Float, Int, Num
 
-from jaxslam.tracking.measurement import PreparedFrame, predict_pixels
+from jaxslam.sensors.measurement import PreparedFrame, predict_pixels
 from jaxslam.tracking.state import KeyframeMatches, KeyframeRing, TrackedPoints, TrackParams, TrackPlan
 
 _MARGIN_PX = 8
@@ -58,7 +58,7 @@ def align_keyframe_points(
     k, n = keyframes.weight.shape
     valid = keyframes.weight > 0
     X_cam = to_camera(T_world_cam, jnp.moveaxis(keyframes.X_world, 1, 0).reshape(3, k * n))
-    predicted = predict_pixels(X_cam, twist, height, params)
+    predicted = predict_pixels(X_cam, twist, height, params.sensor)
     alike = _similar_views(keyframes, T_world_cam).reshape(-1)
     visible = _visible(predicted, X_cam[2], height, width) & alike & valid.reshape(-1)
     shown = jnp.sum(visible.reshape(k, n), axis=1)
@@ -83,7 +83,7 @@ def align_keyframe_points(
         keyframes.images,
         source,
         take(jnp.moveaxis(keyframes.uv, 1, 0).reshape(2, k * n)),
-        _warp(guess, X_there[2], T_world_cam, keyframes.T_world_cam[source], params.intrinsics),
+        _warp(guess, X_there[2], T_world_cam, keyframes.T_world_cam[source], params.sensor.intrinsics),
         view.pyramid,
         guess,
         real & ~covered & ~ignored,

@@ -8,7 +8,7 @@ from jaxslam_kernels.se3 import to_world
 from jaxslam_kernels.types import Code
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.tracking.measurement import Measurements, PreparedFrame, depth_sigma, match_depth, measure
+from jaxslam.sensors.measurement import Measurements, PreparedFrame, depth_sigma, match_depth, measure
 from jaxslam.tracking.state import TrackedPoints, TrackParams, TrackPlan
 
 _MIN_SCORE = 2.0
@@ -66,7 +66,7 @@ def detect_new_points(
     uv = corners.points * 2
 
     rough = sample_depth(depth, uv, reach=2)
-    seen = measure(uv, rough, twist, depth, view.frame.depth_delay_s, params, reach=2)
+    seen = measure(uv, rough, twist, depth, view.frame.depth_delay_s, params.sensor, reach=2)
 
     good = (corners.score > _MIN_SCORE) & ~taken & (rough > 0) & (seen.depth > 0)
     one_surface = sample_depth(depth, uv, reach=plan.flow.finest.window // 2, max_step=_DEPTH_STEP) > 0
@@ -82,7 +82,7 @@ def detect_new_points(
     new = ~points.valid & (rank < room)
     uv, rough, *chosen = (jnp.take(array, candidate, axis=-1) for array in (uv, rough, *seen))
     seen = Measurements(*chosen)
-    matched = match_depth(view, uv, rough, new, params, known_point=False, plan=plan.pair_flow)
+    matched = match_depth(view, uv, rough, new, params.sensor, known_point=False, plan=plan.pair_flow)
     if matched is not None:
         seen, new = seen._replace(depth=matched), new & (matched > 0)
     X_world = to_world(T_world_cam, seen.in_camera())
@@ -94,7 +94,7 @@ def detect_new_points(
         depth=put(points.depth, seen.depth),
         X_world=put(points.X_world, X_world),
         X_anchor=put(points.X_anchor, X_world),
-        information=put(points.information, 1 / jnp.square(depth_sigma(seen.depth, params))),
+        information=put(points.information, 1 / jnp.square(depth_sigma(seen.depth, params.sensor))),
         weight=jnp.where(new, 1, points.weight),
         age=jnp.where(new, 0, points.age),
         anchor_age=jnp.where(new, 0, points.anchor_age),

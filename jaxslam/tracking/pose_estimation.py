@@ -10,7 +10,7 @@ from jaxslam_kernels.se3 import to_camera
 from jaxslam_kernels.types import Code, Mask, Pixels, Points, Weights
 from jaxtyping import Array, Float
 
-from jaxslam.tracking.measurement import PreparedFrame, depth_sigma, match_depth, measure_points
+from jaxslam.sensors.measurement import PreparedFrame, depth_sigma, match_depth, measure_points
 from jaxslam.tracking.state import KeyframeMatches, TrackParams, TrackPlan, TrackState
 
 _DEPTH_GATE_M, _DEPTH_SIGMAS = 0.1, 3.0
@@ -34,17 +34,17 @@ def coarse_pose(
     plan: TrackPlan,
 ) -> tuple[SE3, Mask, Code]:
     """The pose that gets most votes of points, which agree with it, and its `PoseStatus`."""
-    seen = measure_points(state.points.X_world, uv, predicted, state.twist, view, params, view.matched)
+    seen = measure_points(state.points.X_world, uv, predicted, state.twist, view, params.sensor, view.matched)
     by_noise = plan.balance_regions or view.right is not None
     result = ransac_pnp(
         jax.random.fold_in(state.random_key(), state.frame),
         state.points.X_world,
-        to_pixels(params.intrinsics, seen.xy),
-        without_distortion(params.intrinsics),
+        to_pixels(params.sensor.intrinsics, seen.xy),
+        without_distortion(params.sensor.intrinsics),
         weights=votes,
         depth=seen.depth,
         threshold_px=params.ransac_px,
-        threshold_depth=_DEPTH_SIGMAS * depth_sigma(seen.depth, params) if by_noise else _DEPTH_GATE_M,
+        threshold_depth=_DEPTH_SIGMAS * depth_sigma(seen.depth, params.sensor) if by_noise else _DEPTH_GATE_M,
         averaged=plan.balance_regions,
         num_hypotheses=plan.num_hypotheses,
         max_steps=plan.pose_steps,
@@ -71,21 +71,23 @@ def refined_pose(
     """The pose that fits followed points and points of keyframes together, and which followed points it fits."""
     X_world = jnp.concatenate([state.points.X_world, keyframe_matches.X_world], axis=1)
     expected = to_camera(coarse, keyframe_matches.X_world)[2]
-    matched = match_depth(view, keyframe_matches.uv, expected, keyframe_matches.weight > 0, params, plan=plan.pair_flow)
+    matched = match_depth(
+        view, keyframe_matches.uv, expected, keyframe_matches.weight > 0, params.sensor, plan=plan.pair_flow
+    )
     matched = None if view.matched is None or matched is None else jnp.concatenate([view.matched, matched])
     seen = measure_points(
-        X_world, jnp.concatenate([uv, keyframe_matches.uv], axis=1), coarse, twist, view, params, matched
+        X_world, jnp.concatenate([uv, keyframe_matches.uv], axis=1), coarse, twist, view, params.sensor, matched
     )
     weights = jnp.concatenate([trust, keyframe_matches.weight])
     refined = refine_pose(
         coarse,
         X_world,
-        to_pixels(params.intrinsics, seen.xy),
-        without_distortion(params.intrinsics),
+        to_pixels(params.sensor.intrinsics, seen.xy),
+        without_distortion(params.sensor.intrinsics),
         weights=weights,
         depth=seen.depth,
         sigma_px=params.pixel_sigma,
-        sigma_depth=depth_sigma(seen.depth, params),
+        sigma_depth=depth_sigma(seen.depth, params.sensor),
         loss="cauchy",
         scale=params.loss_scale,
         max_steps=plan.pose_steps,
@@ -103,9 +105,9 @@ def worse_status(coarse: Code, refined: Code) -> Code:
 def _close(T_world_cam: SE3, X_world: Points, xy: Pixels, params: TrackParams) -> Mask:
     """Which points are seen within the outlier threshold of where the pose puts them."""
     X_cam = to_camera(T_world_cam, X_world)
-    front = X_cam[2] > params.min_depth_m / 2
+    front = X_cam[2] > params.sensor.min_depth_m / 2
     predicted = X_cam[:2] / jnp.where(front, X_cam[2], 1)[None, :]
-    error = to_pixels(params.intrinsics, predicted) - to_pixels(params.intrinsics, xy)
+    error = to_pixels(params.sensor.intrinsics, predicted) - to_pixels(params.sensor.intrinsics, xy)
     return front & (jnp.sum(jnp.square(error), axis=0) < jnp.square(params.outlier_px))
 
 
@@ -114,7 +116,7 @@ def fits(
 ) -> Mask:
     """Which points are where a pose puts them, in the picture and in depth where that is measured."""
     X_world = state.points.X_world
-    seen = measure_points(X_world, uv, pose, twist, view, params, view.matched)
+    seen = measure_points(X_world, uv, pose, twist, view, params.sensor, view.matched)
     apart_m = jnp.abs(to_camera(pose, X_world)[2] - seen.depth)
-    near = (seen.depth <= 0) | (apart_m < _DEPTH_SIGMAS * depth_sigma(seen.depth, params))
+    near = (seen.depth <= 0) | (apart_m < _DEPTH_SIGMAS * depth_sigma(seen.depth, params.sensor))
     return _close(pose, X_world, seen.xy, params) & near

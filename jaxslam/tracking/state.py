@@ -5,7 +5,6 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 from jaxlie import SE3
-from jaxslam_kernels.camera import Intrinsics
 from jaxslam_kernels.flow.disparity import ROW_PLAN
 from jaxslam_kernels.flow.lk_flow import FlowPlan, LevelPlan
 from jaxslam_kernels.image.pyramid import Pyramid
@@ -15,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, Num, UInt32
 from jaxslam.dynamics.cue import Cue, CueResult
 from jaxslam.dynamics.object_motion import MotionMemory, MotionParams, MotionPlan, MotionState
 from jaxslam.dynamics.regions import RegionMemory, RegionPlan, Regions
+from jaxslam.sensors.sensor_model import SensorModel
 
 
 class TrackStatus(enum.IntEnum):
@@ -162,13 +162,7 @@ class TrackParams(NamedTuple):
     """Everything that can change, or be differentiated, without recompiling; scalars unless said otherwise.
 
     Attributes:
-        intrinsics: Pinhole camera with distortion.
-        readout_s: Seconds from the first row to the last of a rolling shutter; 0 for a global one.
-        depth_sigma_m: Standard deviation of measured depth close to the camera.
-        depth_sigma_per_m2: Its growth with the square of depth, a meter (Khoshelham and Elberink 2012). Both include
-            the errors that neighboring pixels share, and so are larger than the noise of a single one.
-        min_depth_m: Nearest depth believed.
-        max_depth_m: Farthest depth believed.
+        sensor: Camera with its depth noise.
         pixel_sigma: Standard deviation of a tracked point, pixels.
         loss_scale: Scale of the Cauchy loss, in standard deviations.
         ransac_px: Reprojection error up to which a point supports a pose hypothesis while nothing moves, pixels.
@@ -197,17 +191,11 @@ class TrackParams(NamedTuple):
         restart_after: Frames of loss after which tracking starts anew at the held pose.
         max_speed_m_per_s: Highest believed speed of the camera.
         max_turn_rad_per_s: Highest believed angular speed of the camera.
-        baseline_m: From the left to the right camera of a rectified pair, meters; 0 for a camera that measures depth.
         cues: Parameters of each of `TrackPlan.cues`.
         motion: Parameters of `TrackPlan.motion`; `None` without.
     """
 
-    intrinsics: Intrinsics
-    readout_s: Scalar
-    depth_sigma_m: Scalar
-    depth_sigma_per_m2: Scalar
-    min_depth_m: Scalar
-    max_depth_m: Scalar
+    sensor: SensorModel
     pixel_sigma: Scalar
     loss_scale: Scalar
     ransac_px: Scalar
@@ -232,7 +220,6 @@ class TrackParams(NamedTuple):
     restart_after: Scalar
     max_speed_m_per_s: Scalar
     max_turn_rad_per_s: Scalar
-    baseline_m: Scalar
     cues: tuple[Any, ...] = ()
     motion: MotionParams | None = None
 

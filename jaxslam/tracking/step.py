@@ -27,12 +27,12 @@ from jaxtyping import Array, Float, Int
 
 from jaxslam.dynamics.object_motion import labels_at, no_motion
 from jaxslam.dynamics.regions import Regions, balance_regions, find_regions, no_regions
+from jaxslam.runtime.floating_dtype import floating_dtype
 from jaxslam.sensors.frame_arrays import FrameArrays
+from jaxslam.sensors.measurement import PreparedFrame, depth_sigma, match_depth, measure_points, predict_pixels
 from jaxslam.tracking.dynamic_rejection import DynamicRejection, FramePoints, reject_dynamic_points
-from jaxslam.tracking.floating_dtype import floating_dtype
 from jaxslam.tracking.keyframe_decision import KeyframeCandidate, keyframe_reason
 from jaxslam.tracking.keyframe_ring import align_keyframe_points, empty_keyframes, with_keyframe
-from jaxslam.tracking.measurement import PreparedFrame, depth_sigma, match_depth, measure_points, predict_pixels
 from jaxslam.tracking.point_detection import detect_new_points
 from jaxslam.tracking.pose_estimation import coarse_pose, fits, refined_pose, worse_status
 from jaxslam.tracking.state import (
@@ -228,8 +228,8 @@ def follow_points(
     # Constant velocity.
     predicted = retract(state.T_world_cam, state.twist * jnp.clip(elapsed_s, 0, _MAX_PREDICTION_S))
     points = state.points
-    before = predict_pixels(to_camera(state.T_world_cam, points.X_world), state.twist, height, params)
-    after = predict_pixels(to_camera(predicted, points.X_world), state.twist, height, params)
+    before = predict_pixels(to_camera(state.T_world_cam, points.X_world), state.twist, height, params.sensor)
+    after = predict_pixels(to_camera(predicted, points.X_world), state.twist, height, params.sensor)
     guess = points.uv + lax.stop_gradient(after - before)
     inside = jnp.all((guess > 0) & (guess < jnp.array([[width - 1], [height - 1]], guess.dtype)), axis=0)
     guess = jnp.where(inside[None, :], guess, points.uv)
@@ -265,7 +265,7 @@ def track_followed(
     points = expected.points
     check_followed(followed_points, FlowResult(expected.pyramid, expected.T_world_cam, points.uv, points.valid))
     pyramid, predicted, uv, found = followed_points
-    depth = valid_depth(frame.depth, params.min_depth_m, params.max_depth_m)
+    depth = valid_depth(frame.depth, params.sensor.min_depth_m, params.sensor.max_depth_m)
     view = PreparedFrame(frame, pyramid, depth, state.elapsed_s + frame.dt_s)
     view = _matched(view, state, uv, found, predicted, params, plan)
     column, row = jnp.round(lax.stop_gradient(uv)).astype(jnp.int32)
@@ -338,7 +338,7 @@ def _matched(
     """The frame with the right image of a pair, and the depth of the points followed by it; without one as it was."""
     view = view.with_right()
     expected = to_camera(predicted, state.points.X_world)[2]
-    return view._replace(matched=match_depth(view, uv, expected, found, params, plan=plan.pair_flow))
+    return view._replace(matched=match_depth(view, uv, expected, found, params.sensor, plan=plan.pair_flow))
 
 
 def _widened(params: TrackParams, before: Pixels, after: Pixels, followed: Mask) -> TrackParams:
@@ -364,8 +364,8 @@ def _regions(
     """The surfaces of the frame, if something asks for them."""
     if plan.regions is None:
         return None
-    seen = measure_points(state.points.X_world, uv, predicted, state.twist, view, params, view.matched)
-    key, ideal = jax.random.fold_in(state.random_key(), -1 - state.frame), without_distortion(params.intrinsics)
+    seen = measure_points(state.points.X_world, uv, predicted, state.twist, view, params.sensor, view.matched)
+    key, ideal = jax.random.fold_in(state.random_key(), -1 - state.frame), without_distortion(params.sensor.intrinsics)
     return find_regions(key, view.depth, state.regions.centers, seen.in_camera(), ideal, plan.regions)
 
 
@@ -417,9 +417,9 @@ def _update_points(
     """
     points = state.points
     twist = _twist(state.T_world_cam, T_world_cam, view.elapsed_s)
-    seen = measure_points(points.X_world, uv, T_world_cam, twist, view, params, view.matched)
+    seen = measure_points(points.X_world, uv, T_world_cam, twist, view, params.sensor, view.matched)
     X_cam = to_camera(T_world_cam, points.X_world)
-    sigma = depth_sigma(seen.depth, params)
+    sigma = depth_sigma(seen.depth, params.sensor)
     agrees = inliers & (seen.depth > 0) & (jnp.abs(seen.depth - X_cam[2]) < 3 * sigma)
     information = jnp.where(agrees, 1 / jnp.square(sigma), 0)
     total = jnp.where(agrees, points.information + information, 1)

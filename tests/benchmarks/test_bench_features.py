@@ -8,7 +8,7 @@ import time
 import cv2
 import numpy as np
 import pytest
-from room_views import STILL, features, params, picture
+from room_views import STILL, features, picture, sensor
 
 from jaxslam.benchmark.timing import compare
 from jaxslam.features.matching import hamming, match_by_projection, match_descriptors
@@ -38,7 +38,7 @@ def test_extraction(gray):
     extracted = compare(lambda: extract(gray), plain)
     print(f"\nextract, against cv2.ORB without spreading: {extracted}")
     print(f"masked: {compare(lambda: extract(gray, ignore), plain)}")
-    print(f"features_of: {compare(lambda: features_of(frame, STILL, params()), plain)}")
+    print(f"features_of: {compare(lambda: features_of(frame, STILL, sensor()), plain)}")
     assert extracted.processor_ratio < 3
 
 
@@ -52,7 +52,7 @@ def test_matching():
     projected = lambda: match_by_projection(a.uv, a.octave, a.descriptor, b, radius_px=8.0)
     print(f"match_by_projection of 1000 points: {compare(projected, theirs)}")
     keyframe = Keyframe(0, 0, a, b"")
-    print(f"verify: {compare(lambda: verify(keyframe, b, params()), theirs)}")
+    print(f"verify: {compare(lambda: verify(keyframe, b, sensor()), theirs)}")
     assert distances.processor_ratio < 1.5
 
 

@@ -19,8 +19,8 @@ from jaxslam.datasets import open_dataset
 from jaxslam.map.types import NONE, Map
 from jaxslam.mapping import local_mapping as module
 from jaxslam.mapping.local_mapping import LocalMapping, NewKeyframe, mapping_plan
+from jaxslam.sensors.sensor_model import sensor_model
 from jaxslam.slam.slam import Slam
-from jaxslam.tracking.from_config import track_params
 
 pytestmark = pytest.mark.benchmark
 
@@ -70,7 +70,7 @@ def repeated(jobs: list[NewKeyframe], number: int) -> NewKeyframe:
 
 def fresh(slam: Slam, jobs: list[NewKeyframe]) -> LocalMapping:
     plan = mapping_plan(slam.camera, slam.config)
-    mapping = LocalMapping(slam.camera, track_params(slam.camera, slam.config.track), plan)
+    mapping = LocalMapping(slam.camera, sensor_model(slam.camera, slam.config.track), plan)
     mapping.compile(jobs[0].frame, len(jobs[0].tracks.id))
     return mapping
 

@@ -3,7 +3,7 @@
 import functools
 
 import numpy as np
-from room_views import features, params, picture, room
+from room_views import features, picture, room, sensor
 
 from jaxslam.config.schema import Config
 from jaxslam.geometry.se3 import between, retract, to_local, transform
@@ -83,7 +83,7 @@ def errors_of(seed: int, count: int) -> np.ndarray:
 
 def mapped(count: int, *, noisy: bool = True) -> tuple[LocalMapping, list[Map]]:
     """Keyframes of the room taken in, and the map after each."""
-    mapping, maps = LocalMapping(room().camera, params(), PLAN), []
+    mapping, maps = LocalMapping(room().camera, sensor(), PLAN), []
     for number, error in enumerate(errors_of(3, count)):
         before = (number - 1) * STEP if number else None
         maps.append(mapping.add(new_keyframe(number, number * STEP, before, error=error if noisy and number else None)))

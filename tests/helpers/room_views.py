@@ -12,8 +12,7 @@ from jaxslam.map.edit import with_keyframe
 from jaxslam.map.types import NONE, Keyframe, Map, empty_map
 from jaxslam.sensors.frame import Frame
 from jaxslam.sensors.frame_arrays import frame_arrays
-from jaxslam.tracking.from_config import track_params
-from jaxslam.tracking.state import TrackParams
+from jaxslam.sensors.sensor_model import SensorModel, sensor_model
 
 STILL = np.zeros(6)
 FRAMES = 960
@@ -32,12 +31,12 @@ def picture(index: int, seed: int = 0) -> Frame:
 
 @functools.cache
 def features(index: int, seed: int = 0) -> Features:
-    return features_of(frame_arrays(picture(index, seed), 1 / 30), STILL, params(seed))
+    return features_of(frame_arrays(picture(index, seed), 1 / 30), STILL, sensor(seed))
 
 
 @functools.cache
-def params(seed: int = 0) -> TrackParams:
-    return track_params(room(seed).camera, TrackConfig())
+def sensor(seed: int = 0) -> SensorModel:
+    return sensor_model(room(seed).camera, TrackConfig())
 
 
 def map_of(indices: Sequence[int], seed: int = 0) -> Map:

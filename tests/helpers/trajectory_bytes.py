@@ -21,7 +21,7 @@ RECORDINGS = {
     "kitchen_people": ["composite/kitchen_people", "--camera", str(KITCHEN_CAMERA)],
     "kitti_06": ["kitti/sequences/06", "--max-frames", "51"],
 }
-"""Arguments of `jaxslam run`, of which the first is the folder in `JAXSLAM_DATA`; KITTI with the default preset only."""
+"""Arguments of `jaxslam run`, the first a folder in `JAXSLAM_DATA`; KITTI with the default preset only."""
 
 
 def trajectory_sha256(checkout: Path, recording: str, preset: str) -> str:
@@ -30,7 +30,7 @@ def trajectory_sha256(checkout: Path, recording: str, preset: str) -> str:
     paths = os.pathsep.join([str(checkout), str(checkout / "kernels")])
     with tempfile.TemporaryDirectory() as out:
         command = [sys.executable, "-m", "jaxslam", "run", str(Path(os.environ["JAXSLAM_DATA"]) / folder), *options]
-        command += ["--preset", preset, "--out", out, "--allow-missing-model"]
+        command += ["--preset", preset, "--out", out]
         done = subprocess.run(
             command, env=os.environ | {"PYTHONPATH": paths}, cwd=out, capture_output=True, text=True, check=False
         )

@@ -29,6 +29,7 @@ from jaxslam.map.edit import with_keyframe, with_observations, with_points
 from jaxslam.map.types import NONE, Keyframe, Map, MapPoints, Observations, empty_map
 from jaxslam.mapping.occlusion_states import PointStates
 from jaxslam.sensors.frame_arrays import FrameMemory
+from jaxslam.sensors.sensor_model import sensor_model
 from jaxslam.tracking.cue_registry import with_cue_params, with_cues
 from jaxslam.tracking.from_config import track_params
 from jaxslam.tracking.state import TrackPlan
@@ -102,7 +103,7 @@ def _occlusion(num_points: int) -> Problem:
     X_world = _of_empty_room(views, num_points)
     under = _under(views, X_world)
     slam_map = _keyframe_map(views, X_world, np.where(under, PointState.BLOCKED, PointState.STATIC).astype(np.int8))
-    states = PointStates(OcclusionConfig(enabled=True), track_params(views.camera, TrackConfig()), slam_map, num_points)
+    states = PointStates(OcclusionConfig(enabled=True), sensor_model(views.camera, TrackConfig()), slam_map, num_points)
     arrays = FrameMemory(views.camera.height, views.camera.width).hold(views.empty.measured, 1 / 30)
     T_keyframe_cam = between(slam_map.pose(0), views.empty.T_world_cam)
     still = np.zeros(6, np.float32)

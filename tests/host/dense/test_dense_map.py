@@ -117,6 +117,7 @@ class TestSurface:
         assert len(cloud.points) < 0.25 * sum(np.count_nonzero(frame.depth_m) for frame in frames)
         assert cloud.points.shape == cloud.colors.shape == (len(cloud.counts), 3)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(("path", "seed"), [("xyz", 0), ("halfsphere", 1)])
     def test_of_a_run(self, path: CameraPathKind, seed: int) -> None:
         """The same of all that a tracked camera has seen, where it was tracked: keyframes come often enough.

@@ -220,6 +220,7 @@ def test_what_the_caller_masks_is_left_out_in_any_case() -> None:
             assert slam.track(frame).dynamic_mask[mask].all()
 
 
+@pytest.mark.slow
 def test_a_box_that_is_pushed() -> None:
     """It stands, is pushed, and stands again: known within five frames, and the pose is good all the while.
 

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 from room_views import STILL, picture
 
-from jaxslam import Camera, track_params
+from jaxslam import Camera
 from jaxslam.config.schema import TrackConfig
 from jaxslam.features import orb as module
 from jaxslam.features.matching import match_descriptors
 from jaxslam.features.orb import FeaturePlan, extract, features_of
 from jaxslam.sensors.frame import Frame, to_gray
 from jaxslam.sensors.frame_arrays import FrameArrays, frame_arrays
+from jaxslam.sensors.sensor_model import sensor_model
 
 HEIGHT, WIDTH = 480, 640
 
@@ -113,9 +114,9 @@ def test_a_turned_picture_has_the_same_features_turned(gray):
     square = np.ascontiguousarray(gray[:, 80:560])
     frame = lambda image: frame_arrays(Frame(0, image, np.ones(image.shape, np.float32)), 1 / 30)
     camera = Camera("square", 480, 480, 525, 525, 239.5, 239.5)
-    ours = track_params(camera, TrackConfig())
-    first = features_of(frame(square), STILL, ours)
-    second = features_of(frame(np.ascontiguousarray(np.rot90(square, k=-1))), STILL, ours)  # u becomes v
+    sensor = sensor_model(camera, TrackConfig())
+    first = features_of(frame(square), STILL, sensor)
+    second = features_of(frame(np.ascontiguousarray(np.rot90(square, k=-1))), STILL, sensor)  # u becomes v
     i, j = match_descriptors(first, second)
     assert len(i) > 500
     expected = np.stack([479 - first.uv_raw[1, i], first.uv_raw[0, i]])
@@ -134,7 +135,7 @@ def test_distortion_is_removed_and_depth_checked():
     depth[:, :200] = 0
     depth[:, 400:] = 3.0
     depth[:, 500:] = 9.0
-    features = features_of(with_depth(depth), STILL, track_params(camera, TrackConfig()))
+    features = features_of(with_depth(depth), STILL, sensor_model(camera, TrackConfig()))
     matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
     criteria = (cv2.TERM_CRITERIA_MAX_ITER | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
     expected = cv2.undistortPoints(
@@ -155,7 +156,7 @@ def test_rolling_shutter_is_removed():
     camera = Camera("rolling", WIDTH, HEIGHT, 525, 525, 319.5, 239.5, readout_s=0.02)
     turn = np.array([0, 0, 0, 0, 1.0, 0])
     depth = np.full((HEIGHT, WIDTH), 2.0, np.float32)
-    features = features_of(with_depth(depth), turn, track_params(camera, TrackConfig()))
+    features = features_of(with_depth(depth), turn, sensor_model(camera, TrackConfig()))
     x, y = (features.uv_raw - [[camera.cx], [camera.cy]]) / 525
     late_s = (features.uv_raw[1] / (HEIGHT - 1) - 0.5) * camera.readout_s
     expected = features.uv_raw + 525 * late_s * np.stack([1 + x * x, x * y])
@@ -165,11 +166,11 @@ def test_rolling_shutter_is_removed():
 
 def test_compiles_once_however_many_features_there_are(monkeypatch):
     monkeypatch.setattr(module, "_ideal", jax.jit(eqx.debug.assert_max_traces(module._ideal, max_traces=1)))
-    params = track_params(Camera.load("tum_fr1"), TrackConfig())
+    sensor = sensor_model(Camera.load("tum_fr1"), TrackConfig())
     depth = np.ones((HEIGHT, WIDTH), np.float32)
     counts = []
     for image in (dots(0), dots(60), picture(0).image):
-        features = features_of(frame_arrays(Frame(0, image, depth), 1 / 30), STILL, params)
+        features = features_of(frame_arrays(Frame(0, image, depth), 1 / 30), STILL, sensor)
         counts.append(len(features.octave))
         assert features.uv.shape == features.uv_raw.shape == (2, counts[-1])
         assert all(type(array) is np.ndarray for array in features)

@@ -26,7 +26,7 @@ from jaxslam.tracking.step import init_state, track_step
 
 FRAMES = 6
 BY: dict[str, Callable[[TrackParams], Any]] = {
-    "fx": lambda p: p.intrinsics.fx,
+    "fx": lambda p: p.sensor.intrinsics.fx,
     "pixel_sigma": lambda p: p.pixel_sigma,
     "loss_scale": lambda p: p.loss_scale,
     "times_mean": lambda p: p.cues[0].times_mean,
@@ -65,6 +65,7 @@ class TestOwnCue:
         assert (np.asarray(output.uv)[0, kept] > WIDTH / 2 - 2).all()
         assert set(np.asarray(verdict.weight)[np.asarray(verdict.known)].tolist()) == {0.0, 1.0}
 
+    @pytest.mark.slow
     def test_that_would_lose_the_frame_is_not_heard(self) -> None:
         _, without = tracked(PLAN, ())
         _, output = tracked(PLAN._replace(cues=(left_of,)), (jnp.asarray(float(10 * WIDTH)),))
@@ -117,6 +118,7 @@ class TestSettings:
         with pytest.raises(ConfigError, match="trajectry"):
             load_config(overrides=["dynamics.cues=[trajectry]"])
 
+    @pytest.mark.slow
     def test_in_a_run(self) -> None:
         """With somebody walking through the room, and nothing else that would leave him out."""
         recording = clip(1)
@@ -139,6 +141,7 @@ class TestGradient:
         after = jax.tree.map(lambda a, b: a - 0.1 * b, given, gradient)
         jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6), after, jax.tree.map(lambda a: 0.8 * a, given))
 
+    @pytest.mark.slow
     def test_of_the_pose_equals_finite_differences(self) -> None:
         """With a temperature the pose has a derivative by limits of cues.
 

@@ -21,6 +21,7 @@ SCENES: list[tuple[CameraPathKind, int]] = [("xyz", 2), ("halfsphere", 1)]
 """Some of those where `static` fails."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("path", "people"), SCENES)
 def test_late_masks_are_as_good(path: CameraPathKind, people: int) -> None:
     found = [

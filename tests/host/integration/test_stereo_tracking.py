@@ -16,8 +16,8 @@ from jaxslam.errors import CameraError, DatasetError, FrameError
 from jaxslam.features.orb import features_of
 from jaxslam.mapping.local_mapping import mapping_plan
 from jaxslam.sensors.frame_arrays import FrameMemory, frame_arrays
+from jaxslam.sensors.sensor_model import sensor_model
 from jaxslam.sensors.stereo_depth import RoughDepth
-from jaxslam.tracking.from_config import track_params
 from jaxslam.trajectory.evaluation import evaluate
 
 WIDTH, HEIGHT = 320, 240
@@ -93,7 +93,7 @@ class TestRoughDepth:
         camera = Camera("motorcycle", left.shape[1], left.shape[0], 995.0, 995.0, 311.0, 254.0, baseline_m=0.193)
         rough = RoughDepth(camera).of(left, right)
         arrays = frame_arrays(Frame(0, left, rough, right=right), 0.1)
-        features = features_of(arrays, np.zeros(6, np.float32), track_params(camera, _settings().track))
+        features = features_of(arrays, np.zeros(6, np.float32), sensor_model(camera, _settings().track))
         column, row = features.uv_raw.round().astype(int)
         known = np.isfinite(true[row, column]) & (features.depth > 0) & (rough[row, column] > 0)
         errors = [
@@ -109,11 +109,11 @@ class TestRoughDepth:
 
 class TestSettings:
     def test_noise_is_that_of_the_disparity(self) -> None:
-        params = track_params(PAIR, _settings(disparity_sigma_px=0.6).track)
-        assert params.baseline_m == pytest.approx(0.2)
-        assert params.depth_sigma_per_m2 == pytest.approx(0.6 / 60)
-        assert params.depth_sigma_m == 0
-        assert params.max_depth_m == pytest.approx(15)
+        sensor = sensor_model(PAIR, _settings(disparity_sigma_px=0.6).track)
+        assert sensor.baseline_m == pytest.approx(0.2)
+        assert sensor.depth_sigma_per_m2 == pytest.approx(0.6 / 60)
+        assert sensor.depth_sigma_m == 0
+        assert sensor.max_depth_m == pytest.approx(15)
 
     def test_mapping_takes_the_same(self) -> None:
         """The map of a pair is adjusted with the noise of its disparity, not with that of a sensor of depth."""
@@ -123,15 +123,15 @@ class TestSettings:
         assert (measured.depth_sigma_m, measured.depth_sigma_per_m2) == (0.005, 0.007)
 
     def test_far_depth_of_the_camera_file(self) -> None:
-        assert track_params(dataclasses.replace(PAIR, far_depth_m=7.0), _settings().track).max_depth_m == 7
+        assert sensor_model(dataclasses.replace(PAIR, far_depth_m=7.0), _settings().track).max_depth_m == 7
 
     def test_baseline_of_a_camera_that_measures_depth(self) -> None:
         """ORB-SLAM's files of RGB-D cameras have one too, of a pair that it pretends."""
         camera = dataclasses.replace(PAIR, depth_scale_per_m=5000.0)
-        params = track_params(camera, _settings().track)
+        sensor = sensor_model(camera, _settings().track)
         assert not camera.is_stereo
-        assert params.baseline_m == 0
-        assert params.max_depth_m == _settings().track.max_depth_m
+        assert sensor.baseline_m == 0
+        assert sensor.max_depth_m == _settings().track.max_depth_m
 
 
 class TestRoom:
@@ -161,6 +161,7 @@ class TestRoom:
         assert [record.status for record in records[1:]] == [TrackStatus.OK] * (len(dataset) - 1)
         assert error_m < 0.002
 
+    @pytest.mark.slow
     def test_without_looking_points_up(self) -> None:
         """A plan that follows points from keyframe to keyframe alone has none to match."""
         dataset = _room(0.1, frames=6)

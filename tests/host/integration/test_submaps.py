@@ -8,7 +8,6 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from jaxslam.results.run_results import RunInfo, write_results
 from replay import BLACK, SUBMAP, Played
 from room_round import TRACK, room
 
@@ -17,6 +16,7 @@ from jaxslam.config.schema import Config
 from jaxslam.geometry.se3 import between
 from jaxslam.map.npz_file import save_map
 from jaxslam.map.types import empty_map
+from jaxslam.results.run_results import RunInfo, write_results
 from jaxslam.sensors.frame import Frame
 from jaxslam.slam.frame_result import FrameRecord
 from jaxslam.slam.slam import Slam, _track_followed

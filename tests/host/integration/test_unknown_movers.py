@@ -43,6 +43,7 @@ def ate_m(preset: str, *overrides: str, true_masks: bool = False) -> float:
 WITHOUT = ("dynamics.cues=[]", "dynamics.balance_regions=false")
 
 
+@pytest.mark.slow
 def test_votes_of_points_follow_a_box() -> None:
     """What cues and even votes are for."""
     assert ate_m("default", "semantics.model=null", *WITHOUT) > 0.02

@@ -93,6 +93,7 @@ def test_people_do_not_lead_astray(slam: Slam, seed: int) -> None:
     assert naive_m > TIMES_WORSE * ate_m
 
 
+@pytest.mark.slow
 def test_it_is_the_people() -> None:
     """What the naive odometry gets wrong: in the same room with nobody there it does well."""
     assert naive_ate_m(scene(2, people=2)) > 10 * naive_ate_m(scene(2, people=0))

@@ -4,7 +4,7 @@ import functools
 
 import numpy as np
 import pytest
-from room_views import FRAMES, features, map_of, params, room
+from room_views import FRAMES, features, map_of, room, sensor
 from small_map import pose as any_pose
 from small_map import same, small_map
 
@@ -45,7 +45,7 @@ def errors(slam_map: Map, truth: Map) -> np.ndarray:
 
 def look_at_all(slam_map: Map, prefix: bool = True) -> list[LoopClosure]:
     """What loop closing finds in a recording whose keyframes come one by one, until it finds one."""
-    closing, found = LoopClosing(PlaceIndex(), params(), DEFAULT_PLAN), []
+    closing, found = LoopClosing(PlaceIndex(), sensor(), DEFAULT_PLAN), []
     for keyframe_id in slam_map.ids.tolist():
         found.append(closing.look(until(slam_map, keyframe_id) if prefix else slam_map, keyframe_id))
     return [closure for closure in found if closure is not None]
@@ -96,7 +96,7 @@ class TestLook:
         assert look_at_all(drifted(truth, 0.006, 0.004)) == []
 
     def test_a_keyframe_that_is_gone_is_passed_over(self, truth):
-        closing = LoopClosing(PlaceIndex(), params(), DEFAULT_PLAN)
+        closing = LoopClosing(PlaceIndex(), sensor(), DEFAULT_PLAN)
         assert closing.look(without_keyframe(truth, 3), 3) is None
 
     def test_two_submaps_that_show_one_place_become_one(self, truth):
@@ -123,7 +123,7 @@ class TestLook:
 @functools.cache
 def crowded(index: int, seed: int) -> Features:
     """Features of a picture of the room with people and boxes, which nobody masks."""
-    return features_of(frame_arrays(crowd(seed)[index], 1 / 30), np.zeros(6), params(seed))
+    return features_of(frame_arrays(crowd(seed)[index], 1 / 30), np.zeros(6), sensor(seed))
 
 
 @functools.cache

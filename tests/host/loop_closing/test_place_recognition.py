@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
-from room_views import FRAMES, STILL, features, map_of, params, room
+from room_views import FRAMES, STILL, features, map_of, room, sensor
 from scipy.spatial.transform import Rotation, Slerp
 
 from jaxslam.config.schema import TrackConfig
@@ -22,7 +22,7 @@ from jaxslam.loop_closing.place_recognition import Recognition, recognize, verif
 from jaxslam.map.edit import with_keyframe, without_keyframe
 from jaxslam.map.types import NONE, Keyframe, Map, empty_map
 from jaxslam.sensors.frame_arrays import frame_arrays
-from jaxslam.tracking.from_config import track_params
+from jaxslam.sensors.sensor_model import sensor_model
 
 ROUND = range(0, FRAMES, 120)
 
@@ -154,7 +154,7 @@ def error(slam_map: Map, found: Recognition, T_world_cam: np.ndarray) -> tuple[f
 
 
 def test_recognizes_places_of_the_room(round_map, round_index):
-    recognized = [(i, recognize(round_map, round_index, features(i), params())) for i in range(10, FRAMES, 80)]
+    recognized = [(i, recognize(round_map, round_index, features(i), sensor())) for i in range(10, FRAMES, 80)]
     sure = [(index, found) for index, found in recognized if found is not None]
     assert len(sure) >= 8
     for index, found in sure:
@@ -165,12 +165,12 @@ def test_recognizes_places_of_the_room(round_map, round_index):
         np.testing.assert_array_equal(found.covariance, found.covariance.T)
         assert 0 < np.linalg.eigvalsh(found.covariance[:3, :3])[-1] <= MAX_SIGMA_M**2
         assert meters**2 < 25 * found.covariance[:3, :3].trace()
-    near = [recognize(round_map, round_index, features(index + 10), params()) for index in ROUND]
+    near = [recognize(round_map, round_index, features(index + 10), sensor()) for index in ROUND]
     assert [found.keyframe for found in near if found is not None] == round_map.ids.tolist()
 
 
 def test_same_call_same_bytes(round_map):
-    found = [recognize(round_map, PlaceIndex.from_map(round_map), features(130), params()) for _ in range(2)]
+    found = [recognize(round_map, PlaceIndex.from_map(round_map), features(130), sensor()) for _ in range(2)]
     assert found[0] is not None
     for first, second in zip(*found, strict=True):
         assert np.asarray(first).tobytes() == np.asarray(second).tobytes()
@@ -178,13 +178,13 @@ def test_same_call_same_bytes(round_map):
 
 def test_passes_over_what_is_excluded_or_no_longer_in_the_map(round_map, round_index):
     sought, best = features(130), 1
-    found = recognize(round_map, round_index, sought, params())
+    found = recognize(round_map, round_index, sought, sensor())
     assert found is not None
     assert found.keyframe == best
-    other = recognize(round_map, round_index, sought, params(), exclude={best})
+    other = recognize(round_map, round_index, sought, sensor(), exclude={best})
     assert other is None or other.keyframe != best
     culled = without_keyframe(round_map, best)
-    elsewhere = recognize(culled, round_index, sought, params())
+    elsewhere = recognize(culled, round_index, sought, sensor())
     assert elsewhere is None or elsewhere.keyframe != best
 
 
@@ -192,26 +192,26 @@ def test_another_room_is_not_recognized(round_map, round_index):
     for seed in range(1, 4):
         assert round_index.query(features(0, seed)), "nothing was looked at"
         for index in range(0, FRAMES, 160):
-            assert recognize(round_map, round_index, features(index, seed), params()) is None
+            assert recognize(round_map, round_index, features(index, seed), sensor()) is None
 
 
 def test_too_little_to_be_certain(round_map, monkeypatch):
     """The same picture, but only what lies in a corner of it, or only a few features, or none with depth."""
     keyframe, whole = round_map.keyframes[0], features(0)
-    assert verify(keyframe, whole, params()) is not None
+    assert verify(keyframe, whole, sensor()) is not None
     take = lambda index: Features(
         *(array[..., index] if array.ndim < 2 or len(array) == 2 else array[index] for array in whole)
     )
     corner = np.flatnonzero((whole.uv[0] < 240) & (whole.uv[1] < 200))
     assert len(corner) > 2 * MIN_INLIERS
     for index in (corner, np.arange(0, 1000, 40), np.arange(0)):
-        assert verify(keyframe, take(index), params()) is None
+        assert verify(keyframe, take(index), sensor()) is None
     flat = keyframe._replace(features=keyframe.features._replace(depth=np.zeros_like(whole.depth)))
-    assert verify(flat, whole, params()) is None
+    assert verify(flat, whole, sensor()) is None
     for gates, certain in (((12, 1.0), False), ((1, 0.03), False), ((1, 1.0), True)):  # each alone refuses the corner
         monkeypatch.setattr(feature_pose, "MIN_CELLS", gates[0])
         monkeypatch.setattr(feature_pose, "MAX_SIGMA_M", gates[1])
-        assert (verify(keyframe, take(corner), params()) is not None) == certain
+        assert (verify(keyframe, take(corner), sensor()) is not None) == certain
 
 
 def test_compiles_once(round_map, monkeypatch):
@@ -219,7 +219,7 @@ def test_compiles_once(round_map, monkeypatch):
         monkeypatch.setattr(
             module, name, jax.jit(eqx.debug.assert_max_traces(getattr(module, name).__wrapped__, max_traces=1))
         )
-    found = [verify(round_map.keyframes[0], features(index), params()) for index in (0, 10)]
+    found = [verify(round_map.keyframes[0], features(index), sensor()) for index in (0, 10)]
     assert all(found)
 
 
@@ -240,11 +240,11 @@ def true_motion(dataset: Dataset, time_ns: int) -> tuple[np.ndarray, np.ndarray]
 
 
 def recorded(dataset: Dataset, indices: range, *, moving: bool) -> tuple[list[Features], list[np.ndarray]]:
-    parameters, found, poses = track_params(dataset.camera, TrackConfig()), [], []
+    of_camera, found, poses = sensor_model(dataset.camera, TrackConfig()), [], []
     for index in indices:
         frame = dataset[index]
         pose, twist = true_motion(dataset, frame.timestamp_ns)
-        found.append(features_of(frame_arrays(frame, 1 / 30), twist if moving else STILL, parameters))
+        found.append(features_of(frame_arrays(frame, 1 / 30), twist if moving else STILL, of_camera))
         poses.append(pose)
     return found, poses
 
@@ -269,11 +269,11 @@ def test_real_places(data_dir: Path):
     seen, poses = recorded(desk, range(0, 160, 5), moving=True)
     others, places = recorded(hall, range(0, 900, 60), moving=False)
     slam_map = recorded_map(desk, seen[::2], poses[::2])
-    index, parameters = PlaceIndex.from_map(slam_map), track_params(desk.camera, TrackConfig())
+    index, of_camera = PlaceIndex.from_map(slam_map), sensor_model(desk.camera, TrackConfig())
     errors = []
     for i, (one, pose) in enumerate(zip(seen, poses, strict=True)):
         neighbors = {k for k in range(len(slam_map.ids)) if abs(10 * k - 5 * i) <= 15}
-        found = recognize(slam_map, index, one, parameters, exclude=neighbors)
+        found = recognize(slam_map, index, one, of_camera, exclude=neighbors)
         if found is not None:
             errors.append(error(slam_map, found, pose))
     meters, radians = np.transpose(errors)
@@ -281,7 +281,7 @@ def test_real_places(data_dir: Path):
     assert np.median(meters) < 0.012
     assert meters.max() < 0.08
     assert np.degrees(radians).max() < 4
-    assert all(recognize(slam_map, index, one, parameters, limit=10) is None for one in others)
-    elsewhere, hall_params = recorded_map(hall, others, places), track_params(hall.camera, TrackConfig())
+    assert all(recognize(slam_map, index, one, of_camera, limit=10) is None for one in others)
+    elsewhere, hall_sensor = recorded_map(hall, others, places), sensor_model(hall.camera, TrackConfig())
     hall_index = PlaceIndex.from_map(elsewhere)
-    assert all(recognize(elsewhere, hall_index, one, hall_params, limit=10) is None for one in seen)
+    assert all(recognize(elsewhere, hall_index, one, hall_sensor, limit=10) is None for one in seen)

@@ -19,9 +19,9 @@ from jaxslam.mapping.local_map_tracking import keyframes_in_view, local_keyframe
 from jaxslam.mapping.local_mapping import mapping_plan
 from jaxslam.sensors.frame import Frame
 from jaxslam.sensors.frame_arrays import frame_arrays
+from jaxslam.sensors.sensor_model import sensor_model
 from jaxslam.slam.frame_result import FrameResult
 from jaxslam.slam.slam import Slam
-from jaxslam.tracking.from_config import track_params
 from jaxslam.tracking.state import TrackReason, TrackStatus
 
 CONFIG = Config(track=TRACK)
@@ -42,11 +42,11 @@ def mapped() -> tuple[Map, tuple[FrameResult, ...]]:
 def features(index: int, image: np.ndarray | None = None) -> Features:
     frame = room()[index]
     frame = frame if image is None else replace(frame, image=image)
-    return features_of(frame_arrays(frame, 1 / 15), np.zeros(6, np.float32), params(), PLAN)
+    return features_of(frame_arrays(frame, 1 / 15), np.zeros(6, np.float32), sensor(), PLAN)
 
 
-def params() -> Any:
-    return track_params(room().camera, TRACK)
+def sensor() -> Any:
+    return sensor_model(room().camera, TRACK)
 
 
 def nearest_keyframe(slam_map: Map, T_world_cam: np.ndarray) -> int:
@@ -59,7 +59,7 @@ def match(slam_map: Map, index: int, error: np.ndarray, seen: Features | None = 
     keyframe_id = nearest_keyframe(slam_map, pose)
     true = between(slam_map.pose(keyframe_id), pose)
     seen = features(index) if seen is None else seen
-    return match_local_map(slam_map, keyframe_id, retract(true, error), seen, params(), PLAN), true
+    return match_local_map(slam_map, keyframe_id, retract(true, error), seen, sensor(), PLAN), true
 
 
 class TestKeyframesInView:

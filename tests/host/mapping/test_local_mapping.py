@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from room_keyframes import PLAN, STEP, errors_of, mapped, new_keyframe, pose_errors
-from room_views import features, params, room
+from room_views import features, room, sensor
 from small_map import arrays, same
 
 from jaxslam.geometry.se3 import between, compose, to_local, transform
@@ -25,7 +25,7 @@ def maps() -> list[Map]:
 
 
 def test_every_map_is_whole_and_stays_as_it_was():
-    mapping, before = LocalMapping(room().camera, params(), PLAN), {}
+    mapping, before = LocalMapping(room().camera, sensor(), PLAN), {}
     for number in range(4):
         held = mapping.map
         before = {name: array.copy() for name, array in arrays(held).items()}
@@ -102,7 +102,7 @@ def test_every_feature_with_depth_is_a_point():
 
 def test_features_without_depth_are_triangulated(maps):
     """Of a camera that measures no depth beyond the middle of the picture."""
-    mapping = LocalMapping(room().camera, params(), PLAN)
+    mapping = LocalMapping(room().camera, sensor(), PLAN)
     for number in range(4):
         new = new_keyframe(number, number * STEP, (number - 1) * STEP if number else None)
         depth = np.array(new.frame.depth)
@@ -158,7 +158,7 @@ def test_unconfirmed_points_go(maps):
 
 def still(count: int) -> LocalMapping:
     """A camera that hardly moves: all keyframes see the same."""
-    mapping = LocalMapping(room().camera, params(), PLAN)
+    mapping = LocalMapping(room().camera, sensor(), PLAN)
     for number in range(count):
         mapping.add(new_keyframe(number, number % 3, (number - 1) % 3 if number else None))
     return mapping

@@ -50,9 +50,9 @@ from jaxslam.results.run_results import RunInfo, write_results
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame
 from jaxslam.sensors.frame_arrays import FrameArrays
+from jaxslam.sensors.sensor_model import sensor_model
 from jaxslam.slam.frame_result import FrameResult
 from jaxslam.slam.slam import Slam
-from jaxslam.tracking.from_config import track_params
 from jaxslam.tracking.state import TrackStatus
 
 STATIC, BLOCKED, OCCLUDED = (int(state) for state in PointState)
@@ -76,7 +76,7 @@ def wall(*shown: int) -> Map:
 
 def states_of(slam_map: Map, *, guard: bool = True, camera: Camera = CAMERA) -> PointStates:
     config = OcclusionConfig(enabled=True, guard=guard)
-    return PointStates(config, track_params(camera, TrackConfig()), slam_map, POINTS)
+    return PointStates(config, sensor_model(camera, TrackConfig()), slam_map, POINTS)
 
 
 def look(
@@ -382,9 +382,9 @@ class TestMotionOnly:
         )
         state = np.where(~wrong if occluded is None else occluded, OCCLUDED, STATIC)
         slam_map = with_states(slam_map, slam_map.points.ids, state)
-        params = track_params(EXACT, TrackConfig())
-        states = None if config is None else PointStates(config, params, slam_map, count)
-        pose = match_local_map(slam_map, 0, IDENTITY, seen, params, PLAN, states)
+        sensor = sensor_model(EXACT, TrackConfig())
+        states = None if config is None else PointStates(config, sensor, slam_map, count)
+        pose = match_local_map(slam_map, 0, IDENTITY, seen, sensor, PLAN, states)
         assert pose is not None
         return pose, float(np.linalg.norm(pose.T_origin_cam[4:]))
 
@@ -533,6 +533,7 @@ class MappingError(Exception):
 
 
 class TestRoomWithPeople:
+    @pytest.mark.slow
     def test_points_that_people_passed(self) -> None:
         run = as_published()
         shares = [share for share in run.shares if share is not None]
@@ -571,6 +572,7 @@ class TestRoomWithPeople:
             save_map(tmp_path / name, run.map)
         assert (tmp_path / "first").read_bytes() == (tmp_path / "again").read_bytes()
 
+    @pytest.mark.slow
     def test_states_alone_change_nothing(self) -> None:
         """With a weight of one, every pose and every point is to the bit that of a run without states."""
         off = _Run(settings(preset="occlusion-masks"))

@@ -48,7 +48,7 @@ def test_types_may_be_named_as_in_numpy() -> None:
     camera = jaxslam.Camera.load("tum_fr1")
     for dtype in ("float32", np.float32, jnp.float32, np.dtype(np.float32)):
         state = init_state(24, 32, SMALL, image_dtype="uint8", dtype=dtype)
-        intrinsics: Intrinsics = track_params(camera, TrackConfig(), dtype).intrinsics
+        intrinsics: Intrinsics = track_params(camera, TrackConfig(), dtype).sensor.intrinsics
         assert state.twist.dtype == intrinsics.fx.dtype == np.float32
     assert halved(state).points.weight.tolist() == [0.5] * 4
 

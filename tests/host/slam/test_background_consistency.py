@@ -46,6 +46,7 @@ def sigma_m(result: FrameResult) -> float:
 
 
 class TestOnlyPeople:
+    @pytest.mark.slow
     @pytest.mark.parametrize(("path", "seed"), [("xyz", 0), ("static", 1)])
     def test_no_wrong_pose_is_sure(self, path: CameraPathKind, seed: int) -> None:
         """All are carried along with the people; those said to be OK are within 5 standard deviations."""

@@ -69,6 +69,7 @@ def _there_and_back() -> tuple[list[Frame], np.ndarray]:
 
 
 class TestTracking:
+    @pytest.mark.slow
     def test_finds_their_points_again(self) -> None:
         """Back where the ring of keyframes has moved on from, the tracker finds more, and is no less right."""
         frames, truth = _there_and_back()

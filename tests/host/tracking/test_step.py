@@ -25,12 +25,12 @@ from jaxslam import FlowPlan
 from jaxslam.config.loading import load_config
 from jaxslam.config.schema import Config, DynamicsConfig, SemanticsConfig
 from jaxslam.semantics import Detections, no_detections
+from jaxslam.sensors import measurement
 from jaxslam.sensors.frame_arrays import FrameArrays
+from jaxslam.sensors.measurement import PreparedFrame
 from jaxslam.slam.frame_result import FrameResult
 from jaxslam.slam.slam import Slam
-from jaxslam.tracking import measurement as observe
 from jaxslam.tracking import pose_estimation as frame_pose
-from jaxslam.tracking.measurement import PreparedFrame
 from jaxslam.tracking.pose_estimation import refined_pose, worse_status
 from jaxslam.tracking.state import (
     KeyframeMatches,
@@ -117,13 +117,15 @@ class TestCompiled:
 
     def test_single_trace(self, counted: Counted, frames: FrameArrays) -> None:
         track(counted.step, frames)
-        track(counted.step, frames, seed=7, loss_scale=jnp.float32(2.0), readout_s=jnp.float32(0.01))
+        rolling = params().sensor._replace(readout_s=jnp.float32(0.01))
+        track(counted.step, frames, seed=7, loss_scale=jnp.float32(2.0), sensor=rolling)
         assert counted.traces == 1
 
     def test_same_bytes_again(self, counted: Counted, frames: FrameArrays) -> None:
         first, second = (track(counted.step, frames) for _ in range(2))
         np.testing.assert_array_equal(poses(first[1]), poses(second[1]))
 
+    @pytest.mark.slow
     def test_equals_uncompiled(self, counted: Counted, frames: FrameArrays) -> None:
         """Operation by operation, without `jit` around them, on a frame that has points, velocity and keyframes."""
         before, step = new_state(), 5
@@ -285,7 +287,7 @@ def test_pairs_are_matched_by_the_plan(monkeypatch: pytest.MonkeyPatch) -> None:
         given.append(kwargs["plan"])
         return row_disparities(*args, **kwargs)
 
-    monkeypatch.setattr(observe, "row_disparities", watched)
+    monkeypatch.setattr(measurement, "row_disparities", watched)
     plan = PLAN.exact()
     with jax.enable_x64(True):
         frame = at(stacked(clip().frames[:1], np.float64), 0)

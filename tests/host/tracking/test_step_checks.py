@@ -14,8 +14,8 @@ from jaxlie import SE3
 from small_scene import HEIGHT, PLAN, TRACK, WIDTH, clip, new_state, params, stacked
 
 from jaxslam import FlowPlan, LevelPlan, TrackParams, follow_points, init_state, track_clips, track_followed
-from jaxslam.dynamics import CueResult
 from jaxslam.config.loading import load_config
+from jaxslam.dynamics import CueResult
 from jaxslam.dynamics.object_motion import MotionPlan
 from jaxslam.errors import ConfigError, FrameError
 from jaxslam.sensors.frame_arrays import FrameArrays, check_gray_range
@@ -28,7 +28,9 @@ from jaxslam.tracking.step_checks import check_verdict
 
 SIZE = (HEIGHT, WIDTH)
 USD = load_config("usd").dynamics
-FOUR = params().intrinsics._replace(distortion=jnp.zeros(4))
+SENSOR = params().sensor
+FOUR = SENSOR._replace(intrinsics=SENSOR.intrinsics._replace(distortion=jnp.zeros(4)))
+INTEGER, BOOL = (SENSOR._replace(readout_s=jnp.ones((), dtype)) for dtype in (jnp.int32, bool))
 
 
 @pytest.fixture(scope="module")
@@ -160,10 +162,10 @@ class TestParams:
         ("changes", "error", "message"),
         [
             ({"pixel_sigma": jnp.ones(3)}, ValueError, "pixel_sigma: expected () as the state, got (3,)"),
-            ({"readout_s": jnp.ones((), jnp.int32)}, TypeError, "readout_s: expected float32 as the state, got int32"),
-            ({"readout_s": jnp.ones((), bool)}, TypeError, "readout_s: expected float32 as the state, got bool"),
+            ({"sensor": INTEGER}, TypeError, "sensor.readout_s: expected float32 as the state, got int32"),
+            ({"sensor": BOOL}, TypeError, "sensor.readout_s: expected float32 as the state, got bool"),
             ({"pixel_sigma": None}, TypeError, "pixel_sigma: expected float32 () as the state, got NoneType"),
-            ({"intrinsics": FOUR}, ValueError, "intrinsics.distortion: expected (5,) as the state, got (4,)"),
+            ({"sensor": FOUR}, ValueError, "sensor.intrinsics.distortion: expected (5,) as the state, got (4,)"),
             ({"cues": (jnp.ones(()),)}, ValueError, "cues: expected 0, one for each of plan.cues, got 1"),
         ],
     )  # fmt: skip
@@ -199,7 +201,12 @@ class TestPrecision:
             state, given, double = new_state(np.float64), params(np.float64), stacked(clip().frames[:1], np.float64)
             double = jax.tree.map(lambda array: array[0], double)
             refused(TypeError, "frame.depth: expected float64 as the state, got float32", frame, state=state)
-            refused(TypeError, "params.intrinsics.fx: expected float64 as the state, got float32", double, state=state)
+            refused(
+                TypeError,
+                "params.sensor.intrinsics.fx: expected float64 as the state, got float32",
+                double,
+                state=state,
+            )
             refused(TypeError, "frame.depth: expected float32 as the state, got float64", double, given=given)
             plan, dynamics = with_cues(PLAN, load_config().dynamics), load_config().dynamics
             state = init_state(HEIGHT, WIDTH, plan, dtype="float64")
@@ -287,7 +294,7 @@ def test_points_followed_by_another_plan(frame: FrameArrays) -> None:
     bad = followed._replace(uv=jax.ShapeDtypeStruct((2, 64), np.float32))
     with pytest.raises(ValueError, match=re.escape("followed_points.uv: expected (2, 128) for the plan and the frame")):
         jax.eval_shape(call, new_state(), frame, bad, params())
-    with pytest.raises(TypeError, match="followed_points: expected Followed, got tuple"):
+    with pytest.raises(TypeError, match="followed_points: expected FlowResult, got tuple"):
         jax.eval_shape(call, new_state(), frame, tuple(followed), params())
 
 

@@ -72,7 +72,8 @@ def problem() -> Iterator[Problem]:
 
 def _problem(recording: Clip) -> Problem:
     frames = stacked(recording.frames[: BEFORE + STEPS], np.float64, np.float64)
-    given = params(np.float64)._replace(readout_s=jnp.asarray(0.005))
+    given = params(np.float64)
+    given = given._replace(sensor=given.sensor._replace(readout_s=jnp.asarray(0.005)))
     step = quick_compile(track_step, static_argnums=3)
     state = new_state(np.float64, np.float64)
     for index in range(BEFORE):
@@ -84,12 +85,10 @@ def _problem(recording: Clip) -> Problem:
 
     def loss(inputs: Inputs) -> Array:
         fx, fy, cx, cy = inputs.camera
-        changed = given._replace(
-            intrinsics=given.intrinsics._replace(fx=fx, fy=fy, cx=cx, cy=cy),
-            loss_scale=inputs.loss_scale,
-            pixel_sigma=inputs.pixel_sigma,
-            readout_s=inputs.readout_s,
+        sensor = given.sensor._replace(
+            intrinsics=given.sensor.intrinsics._replace(fx=fx, fy=fy, cx=cx, cy=cy), readout_s=inputs.readout_s
         )
+        changed = given._replace(sensor=sensor, loss_scale=inputs.loss_scale, pixel_sigma=inputs.pixel_sigma)
 
         def advance(state: TrackState, frame: FrameArrays) -> tuple[TrackState, Array]:
             state, output = track_step(state, frame, changed, EXACT)
@@ -100,14 +99,14 @@ def _problem(recording: Clip) -> Problem:
         _, positions = lax.scan(advance, state._replace(points=points), seen)
         return jnp.sum(jnp.square(positions - truth))
 
-    camera = given.intrinsics
+    camera = given.sensor.intrinsics
     inputs = Inputs(
         camera=jnp.stack([camera.fx, camera.fy, camera.cx, camera.cy]),
         weight=0.9 * state.points.weight,
         X_world=state.points.X_world,
         loss_scale=given.loss_scale,
         pixel_sigma=given.pixel_sigma,
-        readout_s=given.readout_s,
+        readout_s=given.sensor.readout_s,
         image=jnp.zeros(()),
     )
     gradient = quick_compile(jax.grad(loss))(inputs)

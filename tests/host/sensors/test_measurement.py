@@ -7,16 +7,17 @@ import pytest
 from jaxlie import SE3
 from jaxslam_kernels.se3 import retract, to_camera
 
-from jaxslam import Camera, track_params
+from jaxslam import Camera
 from jaxslam.config.schema import TrackConfig
-from jaxslam.tracking.measurement import measure, predict_pixels
+from jaxslam.sensors.measurement import measure, predict_pixels
+from jaxslam.sensors.sensor_model import sensor_model
 
 TWIST = np.array([0.2, -0.1, 0.15, 0.3, -0.6, 0.4])
 
 
 @pytest.fixture(scope="module")
-def params():
-    return track_params(Camera.load("tum_fr1"), TrackConfig())
+def sensor():
+    return sensor_model(Camera.load("tum_fr1"), TrackConfig())
 
 
 @pytest.fixture
@@ -28,29 +29,29 @@ def points():
     )
 
 
-def test_observing_undoes_predicting(params, points):
+def test_observing_undoes_predicting(sensor, points):
     twist = jnp.asarray(TWIST, jnp.float32)
-    uv = predict_pixels(points, twist, 480, params)
-    seen = measure(uv, points[2], twist, jnp.ones((480, 640), jnp.float32), jnp.float32(0), params)
+    uv = predict_pixels(points, twist, 480, sensor)
+    seen = measure(uv, points[2], twist, jnp.ones((480, 640), jnp.float32), jnp.float32(0), sensor)
     error = np.abs(np.asarray(seen.xy) - np.asarray(points[:2] / points[2:3])) * 517
     # Second order in the readout time: the prediction looks up the row before the motion, the observation after it.
     assert error.max() < 0.3
     still = measure(
-        predict_pixels(points, 0 * twist, 480, params),
+        predict_pixels(points, 0 * twist, 480, sensor),
         points[2],
         0 * twist,
         jnp.ones((480, 640), jnp.float32),
         jnp.float32(0),
-        params,
+        sensor,
     )
     assert (np.abs(np.asarray(still.xy) - np.asarray(points[:2] / points[2:3])) * 517).max() < 1e-2
 
 
-def test_a_late_depth_image_is_read_where_the_point_is_then(params):
+def test_a_late_depth_image_is_read_where_the_point_is_then(sensor):
     """A wall with a step in depth, seen from a camera that turns: the depth image of 20 ms later has moved."""
     turn = jnp.asarray([0, 0, 0, 0, -2.0, 0], jnp.float32)
-    global_shutter = params._replace(
-        readout_s=jnp.float32(0), intrinsics=params.intrinsics._replace(distortion=jnp.zeros(5, jnp.float32))
+    global_shutter = sensor._replace(
+        readout_s=jnp.float32(0), intrinsics=sensor.intrinsics._replace(distortion=jnp.zeros(5, jnp.float32))
     )
     X = jnp.asarray([[-0.02], [0.0], [2.0]], jnp.float32)  # left of the step, by 5 pixels
     later = retract(SE3.identity(), turn * 0.02)
@@ -73,10 +74,10 @@ def test_a_late_depth_image_is_read_where_the_point_is_then(params):
     assert read(0.0) == 2.0  # what ignoring the delay would give: the near side
 
 
-def test_gradient_reaches_the_camera(params, points):
+def test_gradient_reaches_the_camera(sensor, points):
     def loss(focal, readout):
-        changed = params._replace(intrinsics=params.intrinsics._replace(fx=focal), readout_s=readout)
+        changed = sensor._replace(intrinsics=sensor.intrinsics._replace(fx=focal), readout_s=readout)
         return jnp.sum(predict_pixels(points, jnp.asarray(TWIST, jnp.float32), 480, changed))
 
-    gradient = jax.grad(loss, argnums=(0, 1))(params.intrinsics.fx, params.readout_s)
+    gradient = jax.grad(loss, argnums=(0, 1))(sensor.intrinsics.fx, sensor.readout_s)
     assert all(np.isfinite(g) and abs(g) > 0 for g in gradient)

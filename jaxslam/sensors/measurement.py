@@ -15,7 +15,7 @@ from jaxslam_kernels.types import DepthImage, Mask, Pixels, Points, Scalar, Weig
 from jaxtyping import Array, Bool, Float
 
 from jaxslam.sensors.frame_arrays import FrameArrays
-from jaxslam.tracking.state import TrackParams
+from jaxslam.sensors.sensor_model import SensorModel
 
 RIGHT_LEVELS = 2
 """Of the pyramid of the right image: where matching begins is known to a few pixels."""
@@ -77,7 +77,7 @@ def measure(
     twist: Float[Array, "6"],
     depth: DepthImage,
     depth_delay_s: Scalar,
-    params: TrackParams,
+    sensor: SensorModel,
     *,
     reach: int = 1,
     matched: Weights | None = None,
@@ -90,14 +90,14 @@ def measure(
         twist: Velocity of the camera in its own axes.
         depth: Depth image, 0 where missing.
         depth_delay_s: Seconds from the time of the image to that of the depth.
-        params: Camera and its readout time.
+        sensor: Camera and its readout time.
         reach: As for `sample_depth`, static.
         matched: `(n,)` depth at the pixels by `match_depth`, which then is what was measured.
     """
-    xy = normalize(params.intrinsics, uv)
-    focal = jnp.stack([params.intrinsics.fx, params.intrinsics.fy])[:, None]
+    xy = normalize(sensor.intrinsics, uv)
+    focal = jnp.stack([sensor.intrinsics.fx, sensor.intrinsics.fy])[:, None]
     velocity = image_velocity(xy, expected_depth, twist)
-    at_once = as_if_at_once(xy, velocity, uv[1], depth.shape[0], params.readout_s)
+    at_once = as_if_at_once(xy, velocity, uv[1], depth.shape[0], sensor.readout_s)
     if matched is not None:
         return Measurements(at_once, matched)
     later = uv + focal * velocity * depth_delay_s
@@ -110,12 +110,12 @@ def measure_points(
     pose: SE3,
     twist: Float[Array, "6"],
     view: PreparedFrame,
-    params: TrackParams,
+    sensor: SensorModel,
     matched: Weights | None = None,
 ) -> Measurements:
     """What a frame says of map points, `(3, n)` meters, seen at pixels `uv` from about `pose`; `matched` as above."""
-    expected = jnp.maximum(to_camera(pose, X_world)[2], params.min_depth_m)
-    return measure(uv, expected, twist, view.depth, view.frame.depth_delay_s, params, matched=matched)
+    expected = jnp.maximum(to_camera(pose, X_world)[2], sensor.min_depth_m)
+    return measure(uv, expected, twist, view.depth, view.frame.depth_delay_s, sensor, matched=matched)
 
 
 def match_depth(
@@ -123,7 +123,7 @@ def match_depth(
     uv: Pixels,
     expected_depth: Weights,
     mask: Mask,
-    params: TrackParams,
+    sensor: SensorModel,
     *,
     known_point: bool = True,
     plan: FlowPlan = ROW_PLAN,
@@ -135,7 +135,7 @@ def match_depth(
         uv: `(2, n)` pixels as seen.
         expected_depth: `(n,)` meters, where matching begins; where it is not positive, the frame's own rough depth.
         mask: `(n,)` which to match.
-        params: Camera, and the depths to be believed.
+        sensor: Camera, and the depths to be believed.
         known_point: Whether `expected_depth` is that of points of the map, static: where it is confirmed, a match needs
             no way back. Else it is rough depth of this very pair, which may be wrong in the same way.
         plan: How rows are searched, static.
@@ -147,7 +147,7 @@ def match_depth(
         return None
     if not uv.shape[1]:  # a plan that looks nothing up
         return jnp.zeros(0, expected_depth.dtype)
-    focal_baseline = params.intrinsics.fx * params.baseline_m
+    focal_baseline = sensor.intrinsics.fx * sensor.baseline_m
     rough = jnp.where(expected_depth > 0, expected_depth, sample_depth(view.depth, uv, reach=0))
     known = mask & (rough > 0)
     left = Pyramid(view.pyramid.levels[: len(view.right.levels)], view.pyramid.border)
@@ -155,18 +155,18 @@ def match_depth(
     expected_px = _EXPECTED_PX if known_point else 0.0
     match = row_disparities(left, view.right, uv, guess, known, expected_px=expected_px, plan=plan)
     depth = focal_baseline / jnp.where(match.found, match.disparity, 1)
-    return valid_depth(jnp.where(match.found, depth, 0), params.min_depth_m, params.max_depth_m)
+    return valid_depth(jnp.where(match.found, depth, 0), sensor.min_depth_m, sensor.max_depth_m)
 
 
-def predict_pixels(X_cam: Points, twist: Float[Array, "6"], height: int, params: TrackParams) -> Pixels:
+def predict_pixels(X_cam: Points, twist: Float[Array, "6"], height: int, sensor: SensorModel) -> Pixels:
     """Where points appear in a frame of a rolling shutter, while the camera moves with `twist`."""
-    depth = jnp.maximum(X_cam[2], params.min_depth_m / 2)
+    depth = jnp.maximum(X_cam[2], sensor.min_depth_m / 2)
     xy = X_cam[:2] / depth[None, :]
-    v = to_pixels(params.intrinsics, distort(params.intrinsics, xy))[1]
-    late = xy + image_velocity(xy, depth, twist) * row_time(v, height, params.readout_s)[None, :]
-    return to_pixels(params.intrinsics, distort(params.intrinsics, late))
+    v = to_pixels(sensor.intrinsics, distort(sensor.intrinsics, xy))[1]
+    late = xy + image_velocity(xy, depth, twist) * row_time(v, height, sensor.readout_s)[None, :]
+    return to_pixels(sensor.intrinsics, distort(sensor.intrinsics, late))
 
 
-def depth_sigma(depth: Weights, params: TrackParams) -> Weights:
+def depth_sigma(depth: Weights, sensor: SensorModel) -> Weights:
     """Standard deviation of measured depth, meters."""
-    return params.depth_sigma_m + params.depth_sigma_per_m2 * jnp.square(depth)
+    return sensor.depth_sigma_m + sensor.depth_sigma_per_m2 * jnp.square(depth)
