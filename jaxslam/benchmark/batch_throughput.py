@@ -13,8 +13,8 @@ import numpy as np
 from jaxslam.config.schema import TrackConfig
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.runtime.compile_cache import threads
+from jaxslam.runtime.compiled import compiled
 from jaxslam.runtime.machine import peak_rss_mb
-from jaxslam.runtime.trace_cache import cached_trace
 from jaxslam.sensors.frame_arrays import FrameArrays, stack_frames
 from jaxslam.tracking.batch import TrackedClips, track_clips
 from jaxslam.tracking.from_config import track_params, track_plan
@@ -174,8 +174,8 @@ def _batch(clips: Sequence[FrameArrays], task: Task, way: Way) -> TrackedClips:
     return track_clips(clips, task.params, task.plan, at_once=way.at_once, threads=way.threads)
 
 
-_new_state = jax.jit(cached_trace(init_state), static_argnames=("height", "width", "plan"))
-_step_alone = jax.jit(cached_trace(track_step), static_argnames="plan", donate_argnames="state")
+_new_state = compiled(when="first use", static=("height", "width", "plan"))(init_state)
+_step_alone = compiled(when="first use", static="plan", donate="state")(track_step)
 
 
 def loop(clips: Iterable[FrameArrays], task: Task) -> TrackedClips:

@@ -4,11 +4,11 @@ import math
 from typing import NamedTuple
 
 import cv2
-import jax
 import numpy as np
 from jaxslam_kernels.camera import Intrinsics, normalize
 from jaxtyping import Bool, Float, Float32, Shaped, UInt8
 
+from jaxslam.runtime.compiled import compiled
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.downscale import Downscaler, ImageGrid
 
@@ -16,6 +16,8 @@ _EDGE_SHARE, _EDGE_M = 0.025, 0.04
 """Depth that differs by more around a pixel, a share for each pixel of the step and meters, is that of an outline:
 there a sensor mixes near and far."""
 _THREE = np.ones((3, 3), np.uint8)
+
+_rays = compiled(when="warm-up")(normalize)
 
 
 class Looks(NamedTuple):
@@ -55,9 +57,7 @@ class DepthView:
         self.shape, intrinsics = reduced[-1].raster
         self.intrinsics: Intrinsics = intrinsics
         v, u = np.mgrid[: self.shape[0], : self.shape[1]].astype(np.float32)
-        self.rays: Float32[np.ndarray, "2 n"] = np.array(
-            jax.jit(normalize)(self.intrinsics, np.stack([u.ravel(), v.ravel()]))
-        )
+        self.rays: Float32[np.ndarray, "2 n"] = np.array(_rays(self.intrinsics, np.stack([u.ravel(), v.ravel()])))
         pixel = 1 / np.array([self.intrinsics.fx, self.intrinsics.fy], np.float32)
         self.borders = np.stack([self.rays.min(axis=1) - pixel, self.rays.max(axis=1) + pixel])
         self.nearest_m, self.farthest_m = nearest_m, farthest_m

@@ -6,10 +6,8 @@ a block stays in the processor's cache; arrays as long as the grid would be fetc
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple, TypeVar
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxlie import SE3
@@ -32,7 +30,7 @@ from jaxslam_kernels.types import Points, Weights
 from jaxtyping import Array, Float, Float16, Float32, Int, Int16, Int32, UInt8
 
 from jaxslam.runtime.compile_cache import SINGLE_THREAD
-from jaxslam.runtime.trace_cache import cached_trace
+from jaxslam.runtime.compiled import compiled
 
 ROWS = 1024
 """Rows of the grid in a block: small, so that few of a block in view are out of it."""
@@ -78,8 +76,7 @@ def cloud_size(points: int) -> int:
     return -(-points // _POINTS) * _POINTS
 
 
-@partial(jax.jit, static_argnames="capacity", compiler_options=SINGLE_THREAD)
-@cached_trace
+@compiled(when="warm-up", static="capacity", options=SINGLE_THREAD)
 def reduced(
     X_cam: Float32[Array, "3 n"],
     color: UInt8[Array, "3 n"],
@@ -96,8 +93,7 @@ def reduced(
     return (X, jnp.round(voxels.color).astype(jnp.uint8), voxels.counts.astype(jnp.float16)), voxels.num
 
 
-@partial(jax.jit, donate_argnums=0, compiler_options=SINGLE_THREAD)
-@cached_trace
+@compiled(when="warm-up", donate="grid", options=SINGLE_THREAD)
 def put(
     grid: VoxelGrid, cloud: Cloud, evidence: Float[Array, " m"], pose: Float[Array, "7"], voxel_m: Float[Array, ""]
 ) -> tuple[VoxelGrid, Int[Array, " m"]]:
@@ -113,8 +109,7 @@ def put(
     return _over_blocks(cloud, add, (grid, jnp.full(cloud.size, NO_ROW, jnp.int32)))
 
 
-@partial(jax.jit, donate_argnums=0, compiler_options=SINGLE_THREAD)
-@cached_trace
+@compiled(when="warm-up", donate="grid", options=SINGLE_THREAD)
 def taken_out(
     grid: VoxelGrid,
     rows: Int[Array, " m"],
@@ -133,8 +128,7 @@ def taken_out(
     return _over_blocks(cloud, take, grid)
 
 
-@partial(jax.jit, donate_argnums=0, compiler_options=SINGLE_THREAD)
-@cached_trace
+@compiled(when="warm-up", donate="grid", options=SINGLE_THREAD)
 def looked(
     grid: VoxelGrid,
     blocks: Int[Array, " b"],
@@ -160,8 +154,7 @@ def looked(
     return grid._replace(sums=lax.fori_loop(0, num, look, grid.sums))
 
 
-@partial(jax.jit, compiler_options=SINGLE_THREAD)
-@cached_trace
+@compiled(when="warm-up", options=SINGLE_THREAD)
 def num_past(
     cloud: Cloud,
     pose: Float[Array, "7"],
@@ -181,15 +174,13 @@ def num_past(
     return _over_blocks(cloud, count, jnp.zeros(cloud.size, jnp.int32))
 
 
-@jax.jit
-@cached_trace
+@compiled(when="warm-up")
 def all_centroids(grid: VoxelGrid, voxel_m: Float[Array, ""]) -> Voxels:
     """The points of all rows."""
     return centroids(grid, jnp.zeros((), jnp.int32), voxel_m, size=len(grid.sums))
 
 
-@partial(jax.jit, static_argnums=3)
-@cached_trace
+@compiled(when="first use", static="capacity")
 def rebuilt(
     grid: VoxelGrid, old_m: Float[Array, ""], new_m: Float[Array, ""], capacity: int
 ) -> tuple[VoxelGrid, Int[Array, " c"], Points]:

@@ -13,11 +13,15 @@ from jaxslam_kernels.scene_flow import flow_length, group_motion, scene_flow, up
 from jaxslam_kernels.types import Mask, Pixels, Points, Scalar, Weights
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
+from jaxslam.config.cue_sections import MotionConfig
 from jaxslam.dynamics.cue import threshold_evidence
 from jaxslam.dynamics.regions import RegionCueResult
 
 Labels = UInt8[Array, "h w"]
 """Number of the movable object at each pixel, from 1; 0 where there is none."""
+
+
+_SETTINGS = MotionConfig()  # the only place of defaults
 
 
 class MotionPlan(NamedTuple):
@@ -32,10 +36,10 @@ class MotionPlan(NamedTuple):
             standard deviation, and an object classified by counting its points alone.
     """
 
-    num_objects: int = 16
-    reserved: int = 48
-    dense_cell_px: int = 14
-    as_published: bool = False
+    num_objects: int = _SETTINGS.num_objects
+    reserved: int = _SETTINGS.reserved
+    dense_cell_px: int = _SETTINGS.dense_cell_px
+    as_published: bool = _SETTINGS.as_published
 
 
 class MotionParams(NamedTuple):

@@ -15,10 +15,15 @@ from jaxslam_kernels.clustering.kmeans import kmeans
 from jaxslam_kernels.types import DepthImage, Mask, Points, Weights
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from jaxslam.config.cue_sections import ClusterCueConfig
+
 _PER_LIMIT = 0.25
 """Loss of weight for evidence that exceeds the threshold by one threshold."""
 Centers = Float[Array, "3 k"]
 """Region centers in camera axes, in meters; not finite where none is known."""
+
+
+_SETTINGS = ClusterCueConfig()  # the only place of defaults
 
 
 class RegionPlan(NamedTuple):
@@ -32,10 +37,10 @@ class RegionPlan(NamedTuple):
             object pauses.
     """
 
-    num_regions: int = 24
-    step_px: int = 4
-    num_steps: int = 2
-    recover_frames: int = 15
+    num_regions: int = _SETTINGS.num_regions
+    step_px: int = _SETTINGS.step_px
+    num_steps: int = _SETTINGS.num_steps
+    recover_frames: int = _SETTINGS.recover_frames
 
 
 class Regions(NamedTuple):

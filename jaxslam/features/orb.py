@@ -12,8 +12,9 @@ from jaxslam_kernels.image.pyramid import build_pyramid
 from jaxslam_kernels.types import Pixels, Weights
 from jaxtyping import Array, Bool, Float, Float32, UInt8
 
+from jaxslam.config.schema import MappingConfig
+from jaxslam.runtime.compiled import compiled
 from jaxslam.runtime.padding import padded
-from jaxslam.runtime.trace_cache import cached_trace
 from jaxslam.sensors.frame_arrays import FrameArrays
 from jaxslam.sensors.measurement import RIGHT_LEVELS, PreparedFrame, match_depth, measure
 from jaxslam.sensors.sensor_model import SensorModel
@@ -49,6 +50,9 @@ class Features(NamedTuple):
     descriptor: UInt8[np.ndarray, "n 32"]
 
 
+_SETTINGS = MappingConfig()  # the only place of defaults
+
+
 class FeaturePlan(NamedTuple):
     """Settings of feature extraction.
 
@@ -60,11 +64,11 @@ class FeaturePlan(NamedTuple):
         min_fast_threshold: Minimum contrast in cells without a corner at `fast_threshold`, in gray values.
     """
 
-    num_features: int = 1000
-    num_levels: int = 8
-    scale_factor: float = 1.2
-    fast_threshold: int = 20
-    min_fast_threshold: int = 7
+    num_features: int = _SETTINGS.num_features
+    num_levels: int = _SETTINGS.num_levels
+    scale_factor: float = _SETTINGS.scale_factor
+    fast_threshold: int = _SETTINGS.fast_threshold
+    min_fast_threshold: int = _SETTINGS.min_fast_threshold
 
     def quotas(self) -> np.ndarray:
         """Return `(num_levels,)` features per level, in proportion to its scale (Mur-Artal et al. 2015)."""
@@ -222,8 +226,7 @@ def _no_patches() -> Patches:
     )
 
 
-@jax.jit
-@cached_trace
+@compiled(when="warm-up")
 def _ideal(uv_raw: Pixels, twist: Float[Array, "6"], frame: FrameArrays, sensor: SensorModel) -> tuple[Pixels, Weights]:
     """Convert pixels to those of the ideal camera and read depth; of a stereo pair by matching."""
     believed = valid_depth(frame.depth, sensor.min_depth_m, sensor.max_depth_m)

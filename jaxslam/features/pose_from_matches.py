@@ -1,6 +1,5 @@
 """Pose of an image from map points matched with its features, if enough matches agree."""
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -14,8 +13,8 @@ from jaxtyping import Float64, Int64
 
 from jaxslam.features.orb import FeaturePlan, Features
 from jaxslam.runtime.compile_cache import FAST_COMPILE
+from jaxslam.runtime.compiled import compiled
 from jaxslam.runtime.padding import padded
-from jaxslam.runtime.trace_cache import cached_trace
 from jaxslam.sensors.measurement import depth_sigma
 from jaxslam.sensors.sensor_model import SensorModel
 
@@ -161,8 +160,7 @@ def _cells(uv: np.ndarray, sensor: SensorModel) -> int:
     return np.unique(np.floor((uv - center) / (_CELL * focal)), axis=1).shape[1]
 
 
-@partial(jax.jit, compiler_options=FAST_COMPILE)
-@cached_trace
+@compiled(when="warm-up", options=FAST_COMPILE)
 def _refined(T_origin_cam: SE3, matches: Matches, sensor: SensorModel) -> PoseRefinement:
     return refine_pose(
         T_origin_cam,

@@ -4,7 +4,6 @@ Source: Mur-Artal and Tardos, "ORB-SLAM2", 2017, section III-C (edges: spanning 
 """
 
 import threading
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -16,8 +15,8 @@ from jaxslam_kernels.pose_graph.pose_graph import PoseGraphStatus, band_rank, op
 from jaxslam.geometry.se3 import IDENTITY, angle, between
 from jaxslam.map.types import NONE, Map, has, rows, visibility
 from jaxslam.runtime.compile_cache import FAST_COMPILE
+from jaxslam.runtime.compiled import compiled
 from jaxslam.runtime.padding import padded
-from jaxslam.runtime.trace_cache import cached_trace
 
 _STRONG = 100
 """Common points from which two covisible keyframes get an edge (ORB-SLAM's essential graph)."""
@@ -155,8 +154,7 @@ def _solved(graph: _Graph, poses: np.ndarray, fixed: np.ndarray) -> Any:
     return solved._replace(chi2=solved.chi2[:num_edges])
 
 
-@partial(jax.jit, compiler_options=FAST_COMPILE)
-@cached_trace
+@compiled(when="warm-up", options=FAST_COMPILE)
 def _optimize(T_world_cam: SE3, edges: PoseGraphEdges, fixed: Any, mask: Any, rank: Any) -> Any:
     return optimize_pose_graph(T_world_cam, edges, fixed, mask=mask, rank=rank, loss="squared", max_steps=30)
 

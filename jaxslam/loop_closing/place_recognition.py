@@ -1,7 +1,6 @@
 """Place recognition: estimate the camera pose of an image relative to a keyframe that shows the same place."""
 
 from collections.abc import Set
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -18,7 +17,7 @@ from jaxslam.geometry.se3 import IDENTITY, to_local
 from jaxslam.loop_closing.place_index import PlaceIndex
 from jaxslam.map.types import Keyframe, Map, has
 from jaxslam.runtime.compile_cache import FAST_COMPILE
-from jaxslam.runtime.trace_cache import cached_trace
+from jaxslam.runtime.compiled import compiled
 from jaxslam.sensors.sensor_model import SensorModel
 
 MIN_AGREEING = 12
@@ -152,8 +151,7 @@ def _matches(
     return matches_of(X, source.depth[then], features, now, plan, capacity=capacity)
 
 
-@partial(jax.jit, compiler_options=FAST_COMPILE)
-@cached_trace
+@compiled(when="warm-up", options=FAST_COMPILE)
 def _agreed(key: Key[Array, ""], matches: Matches, sensor: SensorModel) -> PnpResult:
     return ransac_pnp(
         key,

@@ -1,6 +1,5 @@
 """Local bundle adjustment around a keyframe: select the window from the map, solve it, and write the result back."""
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -10,13 +9,14 @@ from jaxslam_kernels.bundle.cost import Observations as BundleObservations
 from jaxslam_kernels.types import Scalar
 from jaxtyping import Array, Bool, Float
 
+from jaxslam.config.schema import MappingConfig, TrackConfig
 from jaxslam.dynamics.occlusion import state_weights
 from jaxslam.geometry.se3 import between, compose, inverse, rotate, to_local, transform
 from jaxslam.map.edit import with_positions, without_observations
 from jaxslam.map.types import NONE, Map, Observations, covisible, has, observations_at, rows
 from jaxslam.runtime.compile_cache import FAST_COMPILE
+from jaxslam.runtime.compiled import compiled
 from jaxslam.runtime.padding import padded
-from jaxslam.runtime.trace_cache import cached_trace
 
 _NUM_FIXED = 4
 """Number of keyframes outside the window that are held fixed."""
@@ -28,6 +28,9 @@ _MIN_KEYFRAMES = 4
 between. With people in two or three keyframes, adjusting turned 2.6 mm into 4.1 mm in the synthetic room."""
 _OUTLIER_CHI2 = 11.3
 """Squared whitened error above which an observation is dropped: 1 % of the good ones with three residuals."""
+
+
+_MAPPING, _TRACKING = MappingConfig(), TrackConfig()  # the only place of defaults
 
 
 class AdjustPlan(NamedTuple):
@@ -42,11 +45,11 @@ class AdjustPlan(NamedTuple):
         occluded_weight: Weight of OCCLUDED points, where others have 1.
     """
 
-    window: int = 8
-    max_steps: int = 10
-    loss_scale: float = 1.0
-    depth_sigma_m: float = 0.005
-    depth_sigma_per_m2: float = 0.007
+    window: int = _MAPPING.window
+    max_steps: int = _MAPPING.max_steps
+    loss_scale: float = _TRACKING.loss_scale
+    depth_sigma_m: float = _TRACKING.depth_sigma_m
+    depth_sigma_per_m2: float = _TRACKING.depth_sigma_per_m2
     occluded_weight: float = 1.0
 
 
@@ -193,8 +196,7 @@ def _observations(slam_map: Map, window: _Window, size: int, plan: AdjustPlan) -
     )
 
 
-@partial(jax.jit, static_argnames="max_steps", compiler_options=FAST_COMPILE)
-@cached_trace
+@compiled(when="warm-up", static="max_steps", options=FAST_COMPILE)
 def _adjust(
     poses: Float[Array, "k 7"],
     X: Float[Array, "3 n"],

@@ -16,7 +16,7 @@ from jaxslam_kernels.depth.sampling import valid_depth
 from jaxslam_kernels.types import Pixels, Weights
 from jaxtyping import Array, Float
 
-from jaxslam.config.schema import Config
+from jaxslam.config.schema import Config, MappingConfig
 from jaxslam.features.orb import FeaturePlan, Features, features_of
 from jaxslam.geometry.se3 import compose, transform
 from jaxslam.loop_closing.loop_correction import with_loop_closed
@@ -42,7 +42,8 @@ from jaxslam.mapping.local_map_tracking import LOCAL_KEYFRAMES, local_keyframes
 from jaxslam.mapping.map_point_matching import described_points_in, feature_observations, find_points, fuse_duplicates
 from jaxslam.mapping.occlusion_states import StateChanges, with_changes
 from jaxslam.mapping.point_creation import new_points, with_triangulated
-from jaxslam.runtime.trace_cache import cached_trace
+from jaxslam.mapping.track_table import TrackId, TrackTable
+from jaxslam.runtime.compiled import compiled
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame_arrays import FrameArrays
 from jaxslam.sensors.measurement import measure
@@ -53,17 +54,13 @@ _PART_KEYFRAMES = 30
 _FUSE_KEYFRAMES = 6
 _LOOP_KEYFRAMES = 96
 """Keyframes around a loop that are adjusted when it is closed: where those that see the same do not yet agree."""
-_SPAN = 64
-"""Keyframes after which the number the tracker gave a point is forgotten."""
-_GONE = -2
-"""In place of a point of the map: none, and none is to be made."""
 
 
 class TrackedObservations(NamedTuple):
     """Points the tracker saw in a keyframe.
 
     Attributes:
-        id: `(n,)` the tracker's numbers; of a point reloaded from the map, `reloaded_id` of its id.
+        id: `(n,)` the tracker's ids, see `TrackId`.
         uv_raw: `(2, n)` pixels as seen.
         X_cam: `(3, n)` in the axes of the camera, meters.
         weight: `(n,)` 0 to 1; 0 for no point.
@@ -103,6 +100,9 @@ class NewKeyframe(NamedTuple):
     states: StateChanges | None = None
 
 
+_SETTINGS = MappingConfig()  # the only place of defaults
+
+
 class MappingPlan(NamedTuple):
     """Settings of local mapping, static.
 
@@ -115,15 +115,21 @@ class MappingPlan(NamedTuple):
 
     features: FeaturePlan = FeaturePlan()
     adjust: AdjustPlan = AdjustPlan()
-    track_sigma_px: float = 0.3
-    search_px: float = 3.0
+    track_sigma_px: float = _SETTINGS.track_sigma_px
+    search_px: float = _SETTINGS.search_px
 
 
 def mapping_plan(camera: Camera, config: Config) -> MappingPlan:
     """The settings of local mapping; depth is measured as well as in tracking."""
     mapping, occlusion, noise = config.mapping, config.dynamics.occlusion, depth_noise(camera, config.track)
     return MappingPlan(
-        features=FeaturePlan(**{name: getattr(mapping, name) for name in FeaturePlan._fields}),
+        features=FeaturePlan(
+            num_features=mapping.num_features,
+            num_levels=mapping.num_levels,
+            scale_factor=mapping.scale_factor,
+            fast_threshold=mapping.fast_threshold,
+            min_fast_threshold=mapping.min_fast_threshold,
+        ),
         adjust=AdjustPlan(
             window=mapping.window,
             max_steps=mapping.max_steps,
@@ -137,16 +143,6 @@ def mapping_plan(camera: Camera, config: Config) -> MappingPlan:
     )
 
 
-def reloaded_id(point_ids: np.ndarray) -> np.ndarray:
-    """The tracker's numbers for points of the map: negative, so that none is one of its own."""
-    return -1 - point_ids
-
-
-def point_ids(reloaded: np.ndarray) -> np.ndarray:
-    """The points of the map by the tracker's numbers of reloaded ones."""
-    return -1 - reloaded
-
-
 class LocalMapping:
     """Makes the map out of keyframes."""
 
@@ -154,8 +150,7 @@ class LocalMapping:
         """Start with a map, empty by default."""
         self.map = empty_map(camera) if slam_map is None else slam_map
         self._sensor, self._plan = sensor, plan
-        self._point_of: dict[int, int] = {}
-        self._last_seen: dict[int, int] = {}
+        self._tracks = TrackTable()
 
     def compile(self, frame: FrameArrays, num_tracks: int) -> None:
         """Compile all that a keyframe needs, for frames of this size with so many tracks."""
@@ -171,7 +166,7 @@ class LocalMapping:
         if features is None:
             features = features_of(new.frame, new.twist, self._sensor, self._plan.features)
         whole = with_new_keyframe(self.map, new, features)
-        known = self._points(new.tracks.id)
+        known = self._tracks.points(new.tracks.id)
         part = _part(whole, new.id, known[has(whole.points.ids, known)])
         slam_map = self._with_tracks(part.map, new, known)
         slam_map, taken = self._with_found_points(slam_map, new.id, features)
@@ -183,7 +178,7 @@ class LocalMapping:
         slam_map = without_unconfirmed(slam_map, new.id)
         slam_map = adjust_around(slam_map, new.id, self._plan.adjust, part.keyframes)
         slam_map = without_redundant(slam_map, new.id, part.keyframes)
-        self._forget(new.id)
+        self._tracks.forget(new.id)
         self.map = merge_back(whole, part, slam_map)
         return self.map
 
@@ -217,15 +212,12 @@ class LocalMapping:
         before = slam_map = self.map
         if has(slam_map.ids, np.array([movers.keyframe]))[0]:
             slam_map = without_dynamic(slam_map, movers.keyframe, movers.mask)
-        slam_map = without_dynamic_points(slam_map, self._points(movers.tracks))
+        slam_map = without_dynamic_points(slam_map, self._tracks.points(movers.tracks))
         self.map = slam_map
         gone = before.points.ids[~has(slam_map.points.ids, before.points.ids)]
-        points = set(gone.tolist())
-        tracks = [track for track, point in self._point_of.items() if point in points]
-        for track in movers.tracks[movers.tracks >= 0].tolist():
-            self._point_of.setdefault(track, _GONE)
-            self._last_seen.setdefault(track, movers.keyframe)
-        return slam_map, np.append(reloaded_id(gone), np.array(tracks, np.int64))
+        tracks = self._tracks.tracks_of(gone)
+        self._tracks.mark_removed(movers.tracks, movers.keyframe)
+        return slam_map, np.append(TrackId.of_map_points(gone), tracks)
 
     def _with_tracks(self, slam_map: Map, new: NewKeyframe, known: np.ndarray) -> Map:
         """The points the tracker saw: those the map has get a observation, the others become points."""
@@ -241,8 +233,8 @@ class LocalMapping:
         points = new_points(slam_map, new.id, X_world)
         slam_map = with_points(slam_map, points)
         known[fresh] = points.ids
-        self._point_of.update(zip(tracks.id[fresh].tolist(), points.ids.tolist(), strict=True))
-        self._last_seen.update(dict.fromkeys(tracks.id[used].tolist(), new.id))
+        self._tracks.add(tracks.id[fresh], points.ids)
+        self._tracks.observed(tracks.id[used], new.id)
         seen = np.flatnonzero(used & has(slam_map.points.ids, known))
         of_submap = (
             point_submaps(slam_map)[rows(slam_map.points.ids, known[seen])] == slam_map.submap[slam_map.row(new.id)]
@@ -261,11 +253,6 @@ class LocalMapping:
                 weight=tracks.weight[seen],
             ),
         )
-
-    def _points(self, tracks: np.ndarray) -> np.ndarray:
-        """The points of the map by the tracker's numbers of them; `NONE` where one has not come up yet."""
-        points = (-1 - track if track < 0 else self._point_of.get(track, NONE) for track in tracks.tolist())
-        return np.fromiter(points, np.int64, len(tracks))
 
     def _with_found_points(self, slam_map: Map, keyframe_id: int, features: Features) -> tuple[Map, np.ndarray]:
         """Points of the map that its neighbors see, found in it by their descriptor; and the features they are."""
@@ -296,19 +283,8 @@ class LocalMapping:
         slam_map, keep, drop = fuse_duplicates(
             slam_map, keyframe_id, neighbors, self._plan.features, radius_px=self._plan.search_px
         )
-        into = dict(zip(drop.tolist(), keep.tolist(), strict=True))
-        for track, point in self._point_of.items() if into else ():
-            while point in into:
-                point = into[point]  # noqa: PLW2901 - one may have become one with a third
-            self._point_of[track] = point
+        self._tracks.fuse(dict(zip(drop.tolist(), keep.tolist(), strict=True)))
         return slam_map
-
-    def _forget(self, keyframe_id: int) -> None:
-        """Forget numbers of the tracker that have not come up for long."""
-        old = [track for track, last in self._last_seen.items() if last < keyframe_id - _SPAN]
-        for track in old:
-            del self._last_seen[track]
-            self._point_of.pop(track, None)
 
 
 def with_new_keyframe(slam_map: Map, new: NewKeyframe, features: Features) -> Map:
@@ -327,8 +303,7 @@ def with_new_keyframe(slam_map: Map, new: NewKeyframe, features: Features) -> Ma
     return with_keyframe(slam_map, keyframe, pose, parent, submap)
 
 
-@jax.jit
-@cached_trace
+@compiled(when="warm-up")
 def _ideal(
     uv_raw: Pixels, expected_depth: Weights, twist: Float[Array, "6"], frame: FrameArrays, sensor: SensorModel
 ) -> tuple[Pixels, Weights]:

@@ -8,7 +8,6 @@ person stands in view does not have the points behind. Here blocked points are k
 any future frame" (section 2.3), whatever the reference keyframe of those frames.
 """
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -26,8 +25,8 @@ from jaxslam.geometry.se3 import IDENTITY, to_local
 from jaxslam.map.edit import with_states
 from jaxslam.map.types import NONE, Map, has, rows, visibility
 from jaxslam.runtime.compile_cache import SINGLE_THREAD
+from jaxslam.runtime.compiled import compiled
 from jaxslam.runtime.padding import padded
-from jaxslam.runtime.trace_cache import cached_trace
 from jaxslam.sensors.frame_arrays import FrameArrays
 from jaxslam.sensors.measurement import depth_sigma, measure, predict_pixels
 from jaxslam.sensors.sensor_model import SensorModel
@@ -223,8 +222,7 @@ def occluded_shares(slam_map: Map) -> Float64[np.ndarray, " k"]:
     return (seen @ (slam_map.points.state == PointState.OCCLUDED)) / np.maximum(seen.sum(axis=1), 1)
 
 
-@partial(jax.jit, static_argnames="guard", compiler_options=SINGLE_THREAD)
-@cached_trace
+@compiled(when="warm-up", static="guard", options=SINGLE_THREAD)
 def _after_frame(
     columns: _Columns,
     T_keyframe_cam: Float[Array, "7"],

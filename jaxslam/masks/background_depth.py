@@ -7,7 +7,6 @@ moves by.
 
 import math
 from collections.abc import Sequence
-from functools import partial
 from typing import NamedTuple
 
 import cv2
@@ -21,7 +20,7 @@ from jaxtyping import Array, Bool, Float
 from jaxslam.geometry.se3 import between, compose
 from jaxslam.runtime.aligned_memory import aligned_array
 from jaxslam.runtime.compile_cache import SINGLE_THREAD
-from jaxslam.runtime.trace_cache import cached_trace
+from jaxslam.runtime.compiled import compiled
 from jaxslam.sensors.downscale import Downscaler, ImageGrid
 
 _COARSE_WIDTH = 160
@@ -197,8 +196,7 @@ def new_surfaces(seen: BackgroundSurfaces, mask: Bool[np.ndarray, "h w"]) -> Boo
     return coming
 
 
-@partial(jax.jit, compiler_options=SINGLE_THREAD)
-@cached_trace
+@compiled(when="warm-up", options=SINGLE_THREAD)
 def _compared(
     depth: Float[Array, "h w"],
     depths_then: Float[Array, "k h w"],

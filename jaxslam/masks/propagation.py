@@ -11,11 +11,9 @@ Lengths in pixels are of images about 320 wide, whatever the camera gives.
 
 import itertools
 from collections.abc import Sequence
-from functools import partial
 from typing import NamedTuple
 
 import cv2
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxslam_kernels.clustering.dbscan import dbscan
@@ -27,7 +25,7 @@ from jaxtyping import Array, Bool, Float, Float32, Int, Int32, UInt8
 from jaxslam.masks.point_sampling import sample_mask
 from jaxslam.runtime.aligned_memory import aligned_array
 from jaxslam.runtime.compile_cache import SINGLE_THREAD
-from jaxslam.runtime.trace_cache import cached_trace
+from jaxslam.runtime.compiled import compiled
 
 CAPACITY = 128
 """Most points: of a person who fills a fifth of the image, one in about every other cell."""
@@ -129,8 +127,7 @@ def follow(
     return _follow_last(pyramids[-1], gray, uv, ok, depth, origin.spacing)
 
 
-@jax.jit
-@cached_trace
+@compiled(when="warm-up")
 def as_objects(uv: Pixels, ok: Mask, depth: Float[Array, "h w"], spacing: Float[Array, ""]) -> MaskFlow:
     """Points with depth that lie close together, taken for one object.
 
@@ -255,11 +252,10 @@ def _flow(before: Pyramid, now: Pyramid, uv: Pixels, ok: Mask) -> tuple[Pixels, 
     return flow.points, flow.ok
 
 
-_follow_between = jax.jit(cached_trace(_flow), compiler_options=SINGLE_THREAD)
+_follow_between = compiled(when="warm-up", options=SINGLE_THREAD)(_flow)
 
 
-@partial(jax.jit, compiler_options=SINGLE_THREAD)
-@cached_trace
+@compiled(when="warm-up", options=SINGLE_THREAD)
 def _follow_last(
     before: Pyramid,
     gray: UInt8[Array, "h w"],

@@ -24,8 +24,9 @@ from jaxslam.loop_closing.place_recognition import compile_recognition, recogniz
 from jaxslam.map.dynamic_removal import DynamicObservations
 from jaxslam.map.types import NONE, Map, empty_map, has
 from jaxslam.mapping.local_map_tracking import keyframes_in_view, match_local_map
-from jaxslam.mapping.local_mapping import LocalMapping, NewKeyframe, mapping_plan, point_ids, with_new_keyframe
+from jaxslam.mapping.local_mapping import LocalMapping, NewKeyframe, mapping_plan, with_new_keyframe
 from jaxslam.mapping.occlusion_states import PointStates, StateChanges
+from jaxslam.mapping.track_table import TrackId
 from jaxslam.runtime.preload import import_scipy
 from jaxslam.runtime.stage_timer import StageTimes
 from jaxslam.runtime.trace_cache import cached_trace
@@ -551,7 +552,7 @@ class BackEnd:
 
 def _without_removed(keyframe: MapKeyframe, slam_map: Map) -> MapKeyframe:
     """A keyframe that was prepared from an earlier map, without the points that have left it since."""
-    there = has(slam_map.points.ids, point_ids(keyframe.id))
+    there = has(slam_map.points.ids, TrackId.map_points(keyframe.id))
     return keyframe._replace(weight=np.where(there, keyframe.weight, np.float32(0)))
 
 

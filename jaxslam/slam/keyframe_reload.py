@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxslam.geometry.se3 import to_local
 from jaxslam.map.types import NONE, Map, observations_at, rows
-from jaxslam.mapping.local_mapping import reloaded_id
+from jaxslam.mapping.track_table import TrackId
 from jaxslam.runtime.padding import padded
 
 
@@ -24,7 +24,7 @@ class MapKeyframe(NamedTuple):
         uv_raw: `(2, n)` points in it, pixels as seen.
         X_cam: `(3, n)` where they are in its axes, meters.
         weight: `(n,)`.
-        id: `(n,)` the tracker's numbers for them.
+        id: `(n,)` the tracker's ids for them, see `TrackId`.
     """
 
     keyframe: int
@@ -57,5 +57,5 @@ def reload_keyframe(slam_map: Map, keyframe_id: int, num_points: int) -> MapKeyf
         fit(seen.uv_raw, np.float32),
         fit(to_local(slam_map.pose(keyframe_id), X_world), np.float32),
         fit(weight, np.float32),
-        fit(reloaded_id(seen.point), np.int32),
+        fit(TrackId.of_map_points(seen.point), np.int32),
     )

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxslam.errors import ConfigError, FrameError
 from jaxslam.runtime.compile_cache import FAST_COMPILE, SINGLE_THREAD
-from jaxslam.runtime.trace_cache import cached_trace
+from jaxslam.runtime.compiled import compiled
 from jaxslam.sensors.frame_arrays import FrameArrays, check_gray_range
 from jaxslam.tracking.state import TrackParams, TrackPlan, TrackState
 from jaxslam.tracking.step import DEFAULT_PLAN, init_state, track_step
@@ -104,8 +104,7 @@ def _track(batch: _Batch, size: int, plan: TrackPlan, first: int) -> TrackedClip
     return TrackedClips(np.stack(poses, axis=1), np.stack(statuses, axis=1))
 
 
-@partial(jax.jit, static_argnums=(1, 2, 3, 4, 5))
-@cached_trace
+@compiled(when="first use", static=("height", "width", "plan", "image_dtype", "dtype"))
 def _new_states(
     seeds: Int[Array, " clips"], height: int, width: int, plan: TrackPlan, image_dtype: np.dtype, dtype: np.dtype
 ) -> TrackState:
@@ -114,8 +113,7 @@ def _new_states(
 
 
 # In its thread: for a batch as fast as without, and programs in several threads do not wait for each other's parts.
-@partial(jax.jit, static_argnames="plan", donate_argnums=0, compiler_options=FAST_COMPILE | SINGLE_THREAD)
-@cached_trace
+@compiled(when="first use", static="plan", donate="states", options=FAST_COMPILE | SINGLE_THREAD)
 def _step(
     states: TrackState, frames: FrameArrays, params: TrackParams, plan: TrackPlan
 ) -> tuple[TrackState, tuple[Array, Array]]:

@@ -1,7 +1,6 @@
 """The settings of the tracker as its programs take them, for a camera that measures depth or for a stereo pair."""
 
 from dataclasses import replace
-from typing import Any
 
 import jax.numpy as jnp
 from jax.typing import DTypeLike
@@ -22,7 +21,18 @@ def with_dense_keyframes(config: Config) -> TrackConfig:
 
 def track_plan(config: TrackConfig) -> TrackPlan:
     """The static part of the tracker's settings."""
-    return TrackPlan(**{name: getattr(config, name) for name in TrackPlan._fields if hasattr(config, name)})
+    return TrackPlan(
+        num_points=config.num_points,
+        num_levels=config.num_levels,
+        num_keyframes=config.num_keyframes,
+        num_reloaded=config.num_reloaded,
+        num_sources=config.num_sources,
+        points_per_source=config.points_per_source,
+        num_hypotheses=config.num_hypotheses,
+        cell_px=config.cell_px,
+        new_points=config.new_points,
+        keyframe_policy=config.keyframe_policy,
+    )
 
 
 def track_params(camera: Camera, config: TrackConfig, dtype: DTypeLike = jnp.float32) -> TrackParams:
@@ -41,7 +51,31 @@ def track_params(camera: Camera, config: TrackConfig, dtype: DTypeLike = jnp.flo
     max_speed_m_per_s = config.max_speed_m_per_s
     if camera.is_stereo:
         max_speed_m_per_s = max(max_speed_m_per_s, max_valid_depth(camera, config))
-    names = [name for name in TrackParams._fields if name not in ("sensor", "cues", "motion")]
-    settings = {name: getattr(config, name) for name in names} | {"max_speed_m_per_s": max_speed_m_per_s}
-    arrays: dict[str, Any] = {name: jnp.asarray(value, dtype) for name, value in settings.items()}
-    return TrackParams(sensor=sensor_model(camera, config, dtype), **arrays)
+    of = lambda value: jnp.asarray(value, dtype)
+    return TrackParams(
+        sensor=sensor_model(camera, config, dtype),
+        pixel_sigma=of(config.pixel_sigma),
+        loss_scale=of(config.loss_scale),
+        ransac_px=of(config.ransac_px),
+        outlier_px=of(config.outlier_px),
+        error_per_flow=of(config.error_per_flow),
+        min_correlation=of(config.min_correlation),
+        min_inliers=of(config.min_inliers),
+        weak_inliers=of(config.weak_inliers),
+        min_share=of(config.min_share),
+        detect_below=of(config.detect_below),
+        keyframe_below=of(config.keyframe_below),
+        keyframe_followed_below=of(config.keyframe_followed_below),
+        keyframe_points_below=of(config.keyframe_points_below),
+        keyframe_after_s=of(config.keyframe_after_s),
+        keyframe_weak_after_s=of(config.keyframe_weak_after_s),
+        keyframe_min_s=of(config.keyframe_min_s),
+        keyframe_motion=of(config.keyframe_motion),
+        keyframe_movable_below=of(config.keyframe_movable_below),
+        keyframe_patience_s=of(config.keyframe_patience_s),
+        probation_frames=of(config.probation_frames),
+        anchor_frames=of(config.anchor_frames),
+        restart_after=of(config.restart_after),
+        max_speed_m_per_s=of(max_speed_m_per_s),
+        max_turn_rad_per_s=of(config.max_turn_rad_per_s),
+    )

@@ -11,6 +11,7 @@ from jaxslam_kernels.image.pyramid import Pyramid
 from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Points, Scalar, Weights
 from jaxtyping import Array, Bool, Float, Int, Key, Num, UInt32
 
+from jaxslam.config.schema import TrackConfig
 from jaxslam.dynamics.cue import Cue, CueResult
 from jaxslam.dynamics.object_motion import MotionMemory, MotionParams, MotionPlan, MotionState
 from jaxslam.dynamics.regions import RegionMemory, RegionPlan, Regions
@@ -91,6 +92,9 @@ _REASON_TEXT = {
 }
 
 
+_SETTINGS = TrackConfig()  # the only place of defaults
+
+
 class TrackPlan(NamedTuple):
     """Sizes of all arrays and how searches run; static: each combination is compiled once.
 
@@ -117,22 +121,22 @@ class TrackPlan(NamedTuple):
         pair_flow: How points of a stereo pair are matched along the rows of its images.
     """
 
-    num_points: int = 512
-    num_levels: int = 4
-    num_keyframes: int = 12
-    num_reloaded: int = 4
-    num_sources: int = 2
-    points_per_source: int = 160
-    num_hypotheses: int = 64
-    cell_px: int = 20
-    new_points: Literal["always", "keyframes"] = "always"
+    num_points: int = _SETTINGS.num_points
+    num_levels: int = _SETTINGS.num_levels
+    num_keyframes: int = _SETTINGS.num_keyframes
+    num_reloaded: int = _SETTINGS.num_reloaded
+    num_sources: int = _SETTINGS.num_sources
+    points_per_source: int = _SETTINGS.points_per_source
+    num_hypotheses: int = _SETTINGS.num_hypotheses
+    cell_px: int = _SETTINGS.cell_px
+    new_points: Literal["always", "keyframes"] = _SETTINGS.new_points
     flow: FlowPlan = FlowPlan()
     look_up: LevelPlan = LevelPlan(15, 8, 0.05)
     cues: tuple[Cue, ...] = ()
     regions: RegionPlan | None = None
     balance_regions: bool = False
     motion: MotionPlan | None = None
-    keyframe_policy: Literal["as_needed", "sparing"] = "as_needed"
+    keyframe_policy: Literal["as_needed", "sparing"] = _SETTINGS.keyframe_policy
     pose_steps: int = 25
     pair_flow: FlowPlan = ROW_PLAN
 

@@ -6,7 +6,6 @@ see `jaxslam_kernels.trajectory.kitti_drift`.
 """
 
 import math
-from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -27,7 +26,7 @@ from jaxslam_kernels.trajectory.kitti_drift import KITTI_LENGTHS_M, KITTI_STEP, 
 from jaxslam.errors import TrajectoryError, nearest
 from jaxslam.geometry.so3 import matrices
 from jaxslam.runtime.compile_cache import FAST_COMPILE
-from jaxslam.runtime.trace_cache import cached_trace
+from jaxslam.runtime.compiled import compiled
 from jaxslam.trajectory.coverage import coverage_of
 from jaxslam.trajectory.evaluation_figures import ALIGNMENT_NAMES, Evaluation
 from jaxslam.trajectory.evaluation_notes import (
@@ -161,8 +160,7 @@ def _errors(matches: Matches, later: PosePairs, align: AlignmentKind) -> _Errors
         return jax.tree.map(np.asarray, errors)
 
 
-@partial(jax.jit, compiler_options=FAST_COMPILE)
-@cached_trace
+@compiled(when="first use", options=FAST_COMPILE)
 def _padded_errors(P: jax.Array, Q: jax.Array, mask: jax.Array, later: jax.Array, scaled: jax.Array) -> _Errors:
     """All alignments at once: one compilation serves them all."""
     x, y, weights = P[:, 4:].T, Q[:, 4:].T, mask.astype(P.dtype)

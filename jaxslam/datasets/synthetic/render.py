@@ -3,7 +3,6 @@
 Rays have unit depth, so that a distance along a ray is a depth along the optical axis.
 """
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -26,7 +25,7 @@ from jaxslam.datasets.synthetic.raycast import (
 from jaxslam.datasets.synthetic.shading import SUN, Hits, shade
 from jaxslam.datasets.synthetic.texture import N_WORDS
 from jaxslam.runtime.compile_cache import FUSION_EMITTERS
-from jaxslam.runtime.trace_cache import cached_trace
+from jaxslam.runtime.compiled import compiled
 
 _CAPACITY_STEP = 64
 
@@ -120,8 +119,7 @@ def _capacity(count: int) -> int:
     return _CAPACITY_STEP * -(-max(count, 1) // _CAPACITY_STEP)
 
 
-@partial(jax.jit, static_argnames=("height", "width"), compiler_options=FUSION_EMITTERS)
-@cached_trace
+@compiled(when="first use", static=("height", "width"), options=FUSION_EMITTERS)
 def render(scene: RenderScene, view: CameraView, *, height: int, width: int) -> Rendering:
     """Cast one ray a pixel.
 

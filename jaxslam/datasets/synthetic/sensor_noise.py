@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Annotated, NamedTuple
 
 import jax
@@ -13,7 +12,7 @@ from jaxtyping import Array, Bool, Float, UInt, UInt8
 from jaxslam.config.validation import Range, ValidatedConfig
 from jaxslam.datasets.synthetic.shading import unpack_color
 from jaxslam.runtime.compile_cache import FUSION_EMITTERS
-from jaxslam.runtime.trace_cache import cached_trace
+from jaxslam.runtime.compiled import compiled
 
 
 @dataclass(frozen=True)
@@ -97,8 +96,7 @@ def sensor_params(config: SensorConfig) -> SensorParams:
     )
 
 
-@partial(jax.jit, compiler_options=FUSION_EMITTERS)
-@cached_trace
+@compiled(when="first use", options=FUSION_EMITTERS)
 def measure(
     exposures: tuple[UInt[Array, "h w"], ...],
     depth_m: Float[Array, "h w"],

@@ -13,7 +13,8 @@ from jaxslam.map.types import NONE, Map, covisible, rows
 from jaxslam.map.validate import problems
 from jaxslam.mapping import local_mapping
 from jaxslam.mapping.culling import CONFIRM_WITHIN, KEEP_LATEST, without_redundant, without_unconfirmed
-from jaxslam.mapping.local_mapping import LocalMapping, reloaded_id
+from jaxslam.mapping.local_mapping import LocalMapping
+from jaxslam.mapping.track_table import TrackId
 
 COUNT = 8
 
@@ -56,10 +57,10 @@ def test_a_point_recalled_from_the_map_is_known_again():
     ids, where = slam_map.observations.point[seen], slam_map.observations.uv_raw[:, seen]
     X_cam = to_local(slam_map.pose(2), slam_map.points.X_world[:, rows(slam_map.points.ids, ids)])
     again = new_keyframe(3, 2 * STEP, 2 * STEP)
-    unknown = reloaded_id(np.array([slam_map.next_point + 10**6]))
+    unknown = TrackId.of_map_points(np.array([slam_map.next_point + 10**6]))
     again = again._replace(
         tracks=again.tracks._replace(
-            id=np.append(reloaded_id(ids), unknown),
+            id=np.append(TrackId.of_map_points(ids), unknown),
             uv_raw=np.append(where, where[:, :1], axis=1),
             X_cam=np.append(X_cam, X_cam[:, :1], axis=1).astype(np.float32),
             weight=np.ones(51, np.float32),

@@ -13,7 +13,7 @@ from wall_map import POINTS, at, seen_from
 from jaxslam.config.schema import Config
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.geometry.se3 import between, to_local
-from jaxslam.mapping.local_mapping import reloaded_id
+from jaxslam.mapping.track_table import TrackId
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame
 from jaxslam.slam.frame_result import FrameResult
@@ -29,7 +29,7 @@ class TestRecall:
         assert keyframe.keyframe == 1
         np.testing.assert_array_equal(keyframe.image, cv2.imdecode(np.frombuffer(png(1), np.uint8), 0))
         ids = -1 - keyframe.id[:POINTS]
-        np.testing.assert_array_equal(reloaded_id(ids), keyframe.id[:POINTS])
+        np.testing.assert_array_equal(TrackId.of_map_points(ids), keyframe.id[:POINTS])
         np.testing.assert_array_equal(ids, [*range(1, POINTS, 2), *range(0, POINTS, 2)])
         np.testing.assert_allclose(
             keyframe.X_cam[:, :POINTS], to_local(at(x=0.3), made.points.X_world[:, ids]), atol=1e-6

@@ -24,7 +24,8 @@ from jaxslam.map.dynamic_removal import DynamicObservations, under, without_dyna
 from jaxslam.map.edit import without_keyframe, without_points
 from jaxslam.map.types import NONE, Map, has
 from jaxslam.map.validate import problems
-from jaxslam.mapping.local_mapping import LocalMapping, NewKeyframe, TrackedObservations, point_ids, reloaded_id
+from jaxslam.mapping.local_mapping import LocalMapping, NewKeyframe, TrackedObservations
+from jaxslam.mapping.track_table import TrackId
 from jaxslam.results.run_results import RunInfo, write_results
 from jaxslam.semantics import Detections, no_detections
 from jaxslam.sensors.frame import Frame
@@ -568,7 +569,7 @@ class TestMapping:
         assert len(removed) > 100
         assert not has(after.points.ids, removed).any()
         assert problems(after) == []
-        assert set(reloaded_id(removed).tolist()) <= set(gone.tolist())
+        assert set(TrackId.of_map_points(removed).tolist()) <= set(gone.tolist())
         assert set(movers.tracks.tolist()) <= set(gone.tolist())
         again = mapping.add(new_keyframe(3, 2 * STEP, 2 * STEP))
         by_flow = again.observations.point[(again.observations.keyframe == 3) & (again.observations.feature == NONE)]
@@ -579,26 +580,28 @@ class TestMapping:
     def test_a_track_that_is_no_point_yet_becomes_none(self, mask: np.ndarray) -> None:
         mapping, _ = mapped(1, noisy=False)
         new = new_keyframe(1, STEP, 0)
-        fresh = np.setdiff1d(new.tracks.id[new.tracks.weight > 0], list(mapping._point_of))
+        fresh = np.setdiff1d(new.tracks.id[new.tracks.weight > 0], list(mapping._tracks._point_of))
         assert len(fresh) > 5
         mapping.remove(DynamicObservations(0, np.zeros_like(mask), fresh))
         after = mapping.add(new)
         seen = after.observations.point[(after.observations.keyframe == 1) & (after.observations.feature == NONE)]
         assert 0 < len(seen) <= (new.tracks.weight > 0).sum() - len(fresh)
-        assert not set(fresh.tolist()) & {t for t, p in mapping._point_of.items() if p in after.points.ids.tolist()}
+        assert not set(fresh.tolist()) & {
+            t for t, p in mapping._tracks._point_of.items() if p in after.points.ids.tolist()
+        }
 
     def test_a_keyframe_that_was_culled(self, mask: np.ndarray) -> None:
         """The points that the tracker saw there leave all the same."""
         mapping, _ = mapped(4, noisy=False)
         mapping.map = without_keyframe(mapping.map, 2)
         movers = self.movers(2, mask)
-        points = np.array([mapping._point_of[track] for track in movers.tracks.tolist()])
+        points = np.array([mapping._tracks._point_of[track] for track in movers.tracks.tolist()])
         known = points[has(mapping.map.points.ids, points)]
         assert len(known) > 10
         before = mapping.map
         after, gone = mapping.remove(movers)
         assert same(after, without_points(before, np.unique(known)))
-        assert set(reloaded_id(known).tolist()) <= set(gone.tolist())
+        assert set(TrackId.of_map_points(known).tolist()) <= set(gone.tolist())
 
     def test_a_keyframe_that_was_never_there(self, mask: np.ndarray) -> None:
         mapping, maps = mapped(2, noisy=False)
@@ -610,9 +613,9 @@ class TestMapping:
         """The tracker names points of the map by their own number."""
         mapping, maps = mapped(2, noisy=False)
         some = maps[-1].points.ids[5:15]
-        after, gone = mapping.remove(DynamicObservations(1, np.zeros_like(mask), reloaded_id(some)))
+        after, gone = mapping.remove(DynamicObservations(1, np.zeros_like(mask), TrackId.of_map_points(some)))
         assert same(after, without_points(maps[-1], some))
-        assert set(reloaded_id(some).tolist()) <= set(gone.tolist())
+        assert set(TrackId.of_map_points(some).tolist()) <= set(gone.tolist())
 
 
 class TestRecall:
@@ -620,10 +623,10 @@ class TestRecall:
         """A keyframe was prepared for the tracker from a map that had them: they do not count."""
         slam_map = small_map()
         keyframe = reload_keyframe(slam_map, 1, 16)
-        gone = point_ids(keyframe.id)[keyframe.weight > 0][::2]
+        gone = TrackId.map_points(keyframe.id)[keyframe.weight > 0][::2]
         left = _without_removed(keyframe, without_points(slam_map, gone))
         assert len(gone) > 2
-        stays = ~np.isin(point_ids(keyframe.id), gone)
+        stays = ~np.isin(TrackId.map_points(keyframe.id), gone)
         np.testing.assert_array_equal(left.weight, np.where(stays, keyframe.weight, 0))
         assert left.weight.dtype == np.float32
         np.testing.assert_array_equal(_without_removed(keyframe, slam_map).weight, keyframe.weight)

@@ -12,7 +12,8 @@ from small_map import pose as random_pose
 from jaxslam.geometry.se3 import IDENTITY, between, compose, to_local, transform
 from jaxslam.map.edit import transformed, with_keyframe, with_positions, without_keyframe
 from jaxslam.map.types import NONE, Keyframe, Map, empty_map
-from jaxslam.mapping.local_mapping import NewKeyframe, reloaded_id
+from jaxslam.mapping.local_mapping import NewKeyframe
+from jaxslam.mapping.track_table import TrackId
 from jaxslam.sensors.frame import Frame
 from jaxslam.sensors.frame_arrays import FrameArrays, frame_arrays
 from jaxslam.slam.keyframe_reload import reload_keyframe
@@ -248,7 +249,7 @@ class TestKeyframes:
     def test_tracks(self, rng: np.random.Generator) -> None:
         """Points in the axes of the camera, with the tracker's numbers; a reloaded point keeps that of the map."""
         pose, X = random_pose(rng), some_points(rng)
-        ids = np.concatenate([np.arange(4), reloaded_id(np.array([0, 3, 9, 11]))]).astype(np.int32)
+        ids = np.concatenate([np.arange(4), TrackId.of_map_points(np.array([0, 3, 9, 11]))]).astype(np.int32)
         new = TrackerMapSync(PLAN, empty_map(CAMERA)).register_keyframe(
             0, frame(), output(pose, X, TrackStatus.STARTED, ids), None
         )

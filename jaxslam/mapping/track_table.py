@@ -1,0 +1,84 @@
+"""Which map point each point of the tracker is: the codec of the tracker's ids, and a table of its tracks."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Bool, Int, Int64
+
+from jaxslam.map.types import NONE
+
+REMOVED = -2
+"""In place of a map point: the track was on a movable object; never make a map point of it."""
+_SPAN = 64
+"""Keyframes without an observation after which a track is forgotten."""
+
+
+class TrackId:
+    """Codec of the ids that the tracker gives to points.
+
+    A point that the tracker detected itself has an id of 0 or more. A map point that it got with a reloaded keyframe
+    has the negative id `-1 - point`, so that neither is mistaken for the other.
+    """
+
+    @staticmethod
+    def of_map_points(points: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
+        """Encode ids of map points."""
+        return -1 - points
+
+    @staticmethod
+    def map_points(tracks: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+        """Decode ids that `of_map_points` encoded."""
+        return -1 - tracks
+
+    @staticmethod
+    def is_map_point(tracks: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+        """Tell which ids are of map points."""
+        return tracks < 0
+
+
+class TrackTable:
+    """Map points by the tracker's ids, for the tracks observed in the latest keyframes."""
+
+    def __init__(self) -> None:
+        """Start with no tracks."""
+        self._point_of: dict[int, int] = {}
+        self._last_keyframe: dict[int, int] = {}
+
+    def points(self, tracks: Int[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
+        """Look up the map points of tracks; `NONE` for a new track and `REMOVED` for one that must not become one."""
+        own = (self._point_of.get(track, NONE) for track in tracks.tolist())
+        points = np.fromiter(own, np.int64, len(tracks))
+        return np.where(TrackId.is_map_point(tracks), TrackId.map_points(tracks), points)
+
+    def tracks_of(self, points: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " m"]:
+        """List the tracks whose map point is one of `points`."""
+        wanted = set(points.tolist())
+        return np.array([track for track, point in self._point_of.items() if point in wanted], np.int64)
+
+    def add(self, tracks: Int[np.ndarray, " n"], points: Int64[np.ndarray, " n"]) -> None:
+        """Record that tracks have become map points."""
+        self._point_of.update(zip(tracks.tolist(), points.tolist(), strict=True))
+
+    def observed(self, tracks: Int[np.ndarray, " n"], keyframe: int) -> None:
+        """Record that tracks were observed in a keyframe."""
+        self._last_keyframe.update(dict.fromkeys(tracks.tolist(), keyframe))
+
+    def mark_removed(self, tracks: Int[np.ndarray, " n"], keyframe: int) -> None:
+        """Keep tracks that were on a movable object in a keyframe from becoming map points."""
+        for track in tracks[~TrackId.is_map_point(tracks)].tolist():
+            self._point_of.setdefault(track, REMOVED)
+            self._last_keyframe.setdefault(track, keyframe)
+
+    def fuse(self, into: Mapping[int, int]) -> None:
+        """Follow map points that were fused: each key of `into` has become its value, which may be a key as well."""
+        for track, point in self._point_of.items() if into else ():
+            while point in into:
+                point = into[point]  # noqa: PLW2901 - one may have been fused with a third
+            self._point_of[track] = point
+
+    def forget(self, keyframe: int) -> None:
+        """Forget tracks that have not been observed in the last 64 keyframes before `keyframe`."""
+        old = [track for track, last in self._last_keyframe.items() if last < keyframe - _SPAN]
+        for track in old:
+            del self._last_keyframe[track]
+            self._point_of.pop(track, None)

@@ -1,0 +1,75 @@
+"""The one way in which jaxslam compiles a function: `jax.jit` with its options, the trace cache, and a register."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial, wraps
+from typing import Any, Literal, TypeAlias, TypeVar
+
+import jax
+
+from jaxslam.runtime.trace_cache import cached_trace
+
+R = TypeVar("R")
+
+When: TypeAlias = Literal["warm-up", "first use"]
+"""When a program is compiled: by `Slam.warm_up`, so that no frame waits for it, or when it is called first."""
+
+
+@dataclass
+class Program:
+    """An entry of the register of compiled functions.
+
+    Attributes:
+        name: Module and name of the function.
+        when: When it is compiled.
+        num_compiled: For how many combinations of shapes, types and static arguments it was compiled in this process.
+    """
+
+    name: str
+    when: When
+    num_compiled: int = 0
+
+
+programs: list[Program] = []
+"""Every compiled function of the modules imported so far. A test reads it: a program for `warm-up` that `Slam.warm_up`
+leaves out would stop a robot for seconds in the middle of a run."""
+
+
+def compiled(
+    *,
+    when: When,
+    static: str | Sequence[str] = (),
+    donate: str | Sequence[str] = (),
+    options: Mapping[str, bool | str] | None = None,
+) -> Callable[[Callable[..., R]], Callable[..., R]]:
+    """Compile a pure function of arrays, and keep its trace on the disk for later starts.
+
+    What is compiled takes NumPy arrays as well as JAX arrays.
+
+    Args:
+        when: When it is compiled; whoever writes `warm-up` also calls it in `Slam.warm_up`, which a test checks.
+        static: Names of the arguments that are no arrays: each value is compiled by itself.
+        donate: Names of the arguments whose memory the result may take over; the caller must not use them again.
+        options: Compiler options, one of the sets of `jaxslam.runtime.compile_cache`.
+    """
+
+    def decorate(function: Callable[..., R]) -> Callable[..., R]:
+        inner: Any = function.func if isinstance(function, partial) else function
+        program = Program(f"{inner.__module__}.{inner.__qualname__}", when)
+        programs.append(program)
+        cached = cached_trace(function)
+
+        @wraps(inner)
+        def traced(*args: Any, **kwargs: Any) -> R:
+            program.num_compiled += 1  # `jax.jit` calls this once for each combination that it compiles
+            return cached(*args, **kwargs)
+
+        jitted: Any = jax.jit(
+            traced,
+            static_argnames=static or None,
+            donate_argnames=donate or None,
+            compiler_options=None if options is None else dict(options),
+        )
+        return jitted
+
+    return decorate
