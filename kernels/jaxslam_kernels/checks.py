@@ -61,7 +61,7 @@ class _Known(NamedTuple):
 
 
 class _Scope:
-    """What the arguments looked at so far have told."""
+    """Sizes and types known from the arguments checked so far."""
 
     def __init__(self, function: str):
         self.function = function
@@ -73,7 +73,7 @@ class _Scope:
 
 
 class _Spec(ABC):
-    """What an annotation asks for."""
+    """Requirement of an annotation."""
 
     @abstractmethod
     def check(self, value: Any, path: str, scope: _Scope) -> None:
@@ -259,7 +259,7 @@ class _OneOf(_Spec):
 
 
 def _spec(annotation: Any) -> _Spec:
-    """What an annotation asks for; anything, where that is nothing that kernels know."""
+    """Read the requirement of an annotation; anything is allowed where the annotation is of no known kind."""
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin in (Union, UnionType):
         members = [_spec(argument) for argument in arguments if argument is not type(None)]

@@ -15,12 +15,12 @@ Measures = PyTree[Float[Array, " n"]]
 
 
 class ConvergedPositions(NamedTuple):
-    """Where a search for positions ended.
+    """Result of a search for positions.
 
     Attributes:
-        positions: `(2, n)`, finite.
-        converged: `(n,)` which of them are solutions.
-        measures: What else is known of them, any number of arrays `(n,)`.
+        positions: `(2, n)` final positions, finite.
+        converged: `(n,)` true for positions that are solutions.
+        measures: Further measures of the positions, any number of arrays `(n,)`.
     """
 
     positions: Pixels
@@ -34,7 +34,7 @@ def implicit_positions(
     explain: Callable[[Pixels, Any], tuple[Pixels, Measures]],
     inputs: PyTree[Array],
 ) -> ConvergedPositions:
-    """Positions at which a slope vanishes, differentiable whatever iteration found them.
+    """Find positions at which a slope vanishes, differentiable regardless of the iteration that found them.
 
     The derivative of a position is `-(d slope / d position)^-1 (d slope / d inputs)`, forward and reverse; a measure
     changes with the inputs and with its position. Both are zero for a point that did not converge, or whose system is
@@ -45,8 +45,8 @@ def implicit_positions(
         explain: The slope at positions, `(2, n)` and zero at a solution, and the measures there, as plain
             differentiable functions; those of a point depend on its own position alone. A measure that is to have no
             derivative is a constant here.
-        inputs: What both take. Numbers in it that are not finite are replaced by 0 for the derivative; a point that
-            has seen one must not count as converged.
+        inputs: Arguments of both functions. Values that are not finite are replaced by 0 for the derivative; a point
+            that depends on one must not count as converged.
     """
     return solve(inputs)
 

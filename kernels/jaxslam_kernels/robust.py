@@ -34,7 +34,7 @@ def loss_value(squared: SquaredResiduals, scale: Scalar | float, loss: Loss) -> 
     Args:
         squared: Squared whitened residuals `s`, any shape.
         scale: The scale `c` at which the loss departs from a parabola, traced.
-        loss: Which loss, static.
+        loss: Name of the loss, static.
     """
     s, known = _known(squared)
     c2 = _squared_scale(scale, s)
@@ -61,7 +61,7 @@ def loss_weight(squared: SquaredResiduals, scale: Scalar | float, loss: Loss) ->
     Args:
         squared: Squared whitened residuals `s`, any shape.
         scale: The scale `c`, traced.
-        loss: Which loss, static.
+        loss: Name of the loss, static.
     """
     s, known = _known(squared)
     c2 = _squared_scale(scale, s)

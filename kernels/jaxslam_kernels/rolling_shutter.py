@@ -41,7 +41,7 @@ def image_velocity(xy: Pixels, depth: Weights, twist: Float[Array, "6"]) -> Pixe
 
 @checked
 def row_time(v: Float[Array, " n"], height: int, readout_s: Scalar) -> Float[Array, " n"]:
-    """When rows are taken, in seconds after the middle row; 0 for a row that is not a number.
+    """Return the time at which rows are taken, in seconds after the middle row; 0 for a row that is not a number.
 
     Args:
         v: `(n,)` rows, pixel coordinates in the image as taken, distortion included.
@@ -54,7 +54,7 @@ def row_time(v: Float[Array, " n"], height: int, readout_s: Scalar) -> Float[Arr
 
 @checked
 def as_if_at_once(xy: Pixels, velocity: Pixels, v: Float[Array, " n"], height: int, readout_s: Scalar) -> Pixels:
-    """Where points would have been seen had the whole image been taken at the time of its middle row.
+    """Correct points to where a global shutter at the time of the middle row would have seen them.
 
     First order in the readout time. A camera of 640x480 pixels and 517 pixels focal length that turns at 140 degrees a
     second and reads out in 20 ms moves points by up to 19 pixels; a third of a pixel of that remains, and the error
@@ -62,10 +62,10 @@ def as_if_at_once(xy: Pixels, velocity: Pixels, v: Float[Array, " n"], height: i
 
     Args:
         xy: `(2, n)` normalized coordinates of the points as seen.
-        velocity: `(2, n)` from `image_velocity` there.
-        v: As for `row_time`.
-        height: As for `row_time`.
-        readout_s: As for `row_time`.
+        velocity: `(2, n)` velocity of the points from `image_velocity`, normalized coordinates per second.
+        v: `(n,)` rows, pixel coordinates in the image as taken, distortion included.
+        height: Rows of the image, static, at least 2.
+        readout_s: Seconds from the first row to the last; 0 for a global shutter.
 
     Returns:
         `(2, n)` normalized coordinates; 0 where `xy` is not finite.

@@ -17,12 +17,12 @@ from jaxslam_kernels.types import Mask, Points, Scalar, Weights
 
 
 class GroupMotion(NamedTuple):
-    """How groups of points move; `(k,)` each, 0 for a group without points.
+    """Motion of groups of points; 0 for a group without points.
 
     Attributes:
-        share: Weight of the points that move, as a share of the group's.
-        mean: Length of the mean flow of the group, in the unit of the flow.
-        number: Weight of its points.
+        share: `(k,)` weight of the moving points, as a share of the weight of the group.
+        mean: `(k,)` length of the mean flow of the group, in the unit of the flow.
+        number: `(k,)` total weight of the points of the group.
     """
 
     share: Float[Array, " k"]
@@ -32,19 +32,19 @@ class GroupMotion(NamedTuple):
 
 @checked
 def scene_flow(X_world: Points, X_cam: Points, T_world_cam: SE3) -> Points:
-    """How far points have come from where they would be at rest, in the axes of the camera (equations 4 and 5).
+    """Compute the motion of points beyond that of the camera, in camera axes (equations 4 and 5).
 
     Args:
-        X_world: `(3, n)` where they were in the world, meters.
-        X_cam: `(3, n)` where they are in the axes of the camera, meters.
-        T_world_cam: Pose of the camera now.
+        X_world: `(3, n)` earlier positions in the world, meters.
+        X_cam: `(3, n)` current positions in camera axes, meters.
+        T_world_cam: Current pose of the camera.
     """
     return X_cam - to_camera(T_world_cam, X_world)
 
 
 @checked
 def flow_length(flow: Points) -> Weights:
-    """`(n,)` length of each vector of `(3, n)` (equation 6); with derivative 0 where there is none."""
+    """Compute the length of each vector of `(3, n)` (equation 6); the derivative at length 0 is 0."""
     squared = jnp.sum(jnp.square(flow), axis=0)
     some = squared > 0
     return jnp.where(some, jnp.sqrt(jnp.where(some, squared, 1)), 0)
@@ -52,14 +52,14 @@ def flow_length(flow: Points) -> Weights:
 
 @checked
 def upper_limit(intensity: Weights, weights: Weights, sigmas: Scalar | float, *, robust: bool = True) -> Scalar:
-    """What points at rest stay below: mean and so many standard deviations of their motion (equations 7 and 8).
+    """Compute the limit for points at rest: the mean of their motion plus standard deviations (equations 7 and 8).
 
     Args:
         intensity: `(n,)` motion of each point, not negative; what is not finite does not count.
-        weights: `(n,)` how much each counts, not negative, 0 for what may move.
+        weights: `(n,)` weight of each point, not negative; 0 for points on movable objects.
         sigmas: Standard deviations above the mean; 3 in the paper.
-        robust: Median and 1.4826 times the median absolute deviation instead: one wrong match in fifty doubles the
-            standard deviation. Static.
+        robust: Whether to use the median and 1.4826 times the median absolute deviation instead, static. One wrong
+            match in fifty doubles the standard deviation.
 
     Returns:
         The limit; 0 where nothing counts.
@@ -70,7 +70,7 @@ def upper_limit(intensity: Weights, weights: Weights, sigmas: Scalar | float, *,
     counted = jnp.where(jnp.isfinite(intensity) & (weights >= 0), intensity, 0)
     total = jnp.sum(weights)
     mean = jnp.sum(weights * counted) / jnp.where(total > 0, total, 1)
-    # One less than there are, as in equation 8; of a single point nothing is known of how they spread.
+    # The count less one, as in equation 8; a single point says nothing about the spread.
     spread = jnp.sum(weights * jnp.square(counted - mean)) / jnp.where(total > 1, total - 1, 1)
     some = spread > 0
     return mean + sigmas * jnp.where(some, jnp.sqrt(jnp.where(some, spread, 1)), 0)
@@ -78,14 +78,14 @@ def upper_limit(intensity: Weights, weights: Weights, sigmas: Scalar | float, *,
 
 @checked
 def group_motion(flow: Points, moves: Weights, counts: Mask, group: Int[Array, " n"], num_groups: int) -> GroupMotion:
-    """How much of each group of points moves, and how far the whole of it has come on average.
+    """Compute the moving share of each group of points, and the length of its mean motion.
 
     Args:
         flow: `(3, n)` motion of each point, in any unit.
         moves: `(n,)` 1 for a point that moves, 0 for one at rest, or in between.
-        counts: `(n,)` which points are known.
-        group: `(n,)` number of each point's group, from 0; what is outside `0 .. num_groups - 1` is in none.
-        num_groups: How many groups there are, static.
+        counts: `(n,)` true for points that count.
+        group: `(n,)` group of each point, from 0; a number outside `0 .. num_groups - 1` means no group.
+        num_groups: Number of groups, static.
     """
     there = counts & (group >= 0) & (group < num_groups) & jnp.isfinite(flow).all(axis=0) & jnp.isfinite(moves)
     to = jnp.where(there, group, num_groups)

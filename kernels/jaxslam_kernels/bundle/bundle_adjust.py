@@ -53,7 +53,7 @@ _MAX_DAMPING = 1e6
 
 
 class BundleStatus(IntEnum):
-    """What an adjustment is worth. Poses and points are finite whatever it says."""
+    """Quality of an adjustment. Poses and points are finite for every status."""
 
     OK = 0
     NOT_CONVERGED = 1
@@ -66,15 +66,15 @@ class BundleStatus(IntEnum):
 
 
 class BundleAdjustment(NamedTuple):
-    """Adjusted poses and points and what they are worth.
+    """Adjusted poses and points with their quality.
 
     Attributes:
         poses: `wxyz_xyz` of T_world_cam; the identity where the initial one was not finite.
         X_world: Points in meters; the origin where the initial one was not finite.
-        initial_cost: `½ Σ w ρ(s)` before.
-        cost: The same after.
+        initial_cost: Cost `½ Σ w ρ(s)` before the adjustment.
+        cost: The same cost after it.
         status: A `BundleStatus`.
-        num_steps: Steps tried.
+        num_steps: Number of steps tried.
         determined: Points whose observations leave no direction free.
         used: Observations that have weight, a slot of their own, and lie in front of the camera.
         robust_weights: `ρ'(s)` in [0, 1] of every observation, whatever its weight; 0 where it has no value.
@@ -112,22 +112,22 @@ def bundle_adjust(
     tolerance: Scalar | float = 1e-6,
     max_steps: int = 20,
 ) -> BundleAdjustment:
-    """Finds the poses and points that explain all observations together.
+    """Find the poses and points that explain all observations together.
 
     Hold at least one pose fixed (two, without depths): otherwise the whole can move freely, see
     `BundleStatus.DEGENERATE`. A pose or point that nothing sees stays where it is; an observation of a pose or point
     that is not finite does not count.
 
     Args:
-        poses: Where to start, `wxyz_xyz` of T_world_cam.
-        X_world: Where the points start, meters.
-        observations: What is seen.
+        poses: Initial poses, `wxyz_xyz` of T_world_cam.
+        X_world: Initial points, meters.
+        observations: Observations of the points in the cameras.
         fixed_poses: Poses that do not move.
         fixed_points: Points that do not move; `None` for none.
         point_weights: Factor of all observations of a point, not negative; `None` for one each. A point of weight 0
             stays where it starts and has no influence; the derivative by its weight is the limit from above.
-        lenses: Where a lens of each camera's own starts (focal length, k1, k2); the observations then are pixels from
-            the principal point, see `Observations`. `None` for ideal cameras.
+        lenses: Initial lens of each camera (focal length, k1, k2), estimated with the poses; the observations are then
+            pixels from the principal point, see `Observations`. `None` for ideal cameras.
         fixed_lenses: Lenses that do not change; `None` for none.
         two_sided: Whether a point behind a camera is seen too, where its line of sight meets the image, static. Data
             sets whose residuals ignore the side need it, as Bundle Adjustment in the Large.
@@ -162,7 +162,7 @@ def bundle_adjust(
 
 
 class Solution(NamedTuple):
-    """Where the solver ended, a constant for differentiation."""
+    """Result of the solver, a constant for differentiation."""
 
     cameras: Cameras
     X_world: Points
@@ -235,7 +235,7 @@ def _where_free(problem: BundleProblem, new: Cameras, old: Cameras) -> Cameras:
 
 
 def _on_grid(values: Float[Array, " m"], slot: Int[Array, " m"], problem: BundleProblem) -> Plane:
-    """What belongs to observations, in their slots; 0 elsewhere."""
+    """Scatter values of observations to their slots; 0 elsewhere."""
     k, n = problem.weights.shape
     return jnp.zeros(k * n + 1, values.dtype).at[slot].set(values)[:-1].reshape(k, n)
 
@@ -358,7 +358,7 @@ def _usable(cameras: Cameras, X_world: Points, observations: Observations) -> tu
 def _predicted_decrease(
     equations: BundleEquations, tangents: Float[Array, "k c"], shifts: Points, damping: Scalar
 ) -> Scalar:
-    """What the quadratic model promises of a damped step."""
+    """Decrease of the cost that the quadratic model predicts for a damped step."""
     slope = jnp.sum(equations.camera_gradient * tangents) + jnp.sum(equations.point_gradient * shifts)
     camera_diagonal = jnp.diagonal(equations.camera_hessian, axis1=1, axis2=2)
     point_diagonal = jnp.diagonal(equations.point_hessian).T

@@ -45,7 +45,7 @@ _OFF_PLANE = 1e-6
 
 
 class Observations(NamedTuple):
-    """Which camera sees which point where, `m` slots. A camera sees a point at most once.
+    """Observations of points in cameras, `m` slots. A camera observes a point at most once.
 
     Attributes:
         camera: Row of the pose.
@@ -106,11 +106,11 @@ class BundleProblem(NamedTuple):
     Attributes:
         xy, depth, precision: As in `Observations`, with precision 0 for a missing depth.
         weights: Factor of each slot's cost, those of the point and of the observation multiplied.
-        known: Which slots hold an observation.
+        known: True for slots that hold an observation.
         scale: Scale of the robust loss, in standard deviations.
-        free_pose: Which poses may move.
-        free_point: Which points may move.
-        free_lens: Which lenses may change; `None` without lenses.
+        free_pose: True for poses that may move.
+        free_point: True for points that may move.
+        free_lens: True for lenses that may change; `None` without lenses.
         two_sided: Whether points behind a camera count; `None` if not.
     """
 
@@ -127,7 +127,7 @@ class BundleProblem(NamedTuple):
 
 
 def free_cameras(problem: BundleProblem) -> Bool[Array, "k c"]:
-    """Which numbers of the cameras may change; one column for all without lenses."""
+    """Tell which parameters of the cameras may change; a single column stands for all of them without lenses."""
     if problem.free_lens is None:
         return problem.free_pose[:, None]
     return jnp.repeat(jnp.stack([problem.free_pose, problem.free_lens], axis=1), np.array([6, 3]), axis=1)
@@ -140,7 +140,7 @@ def bundle_problem(
     free_pose: Bool[Array, " k"],
     free_point: Mask,
 ) -> tuple[BundleProblem, Int[Array, " m"]]:
-    """Spreads the observations over the grid; also the slot of each, `k n` for those without one.
+    """Spread the observations over the grid; also the slot of each, `k n` for those without one.
 
     Of several observations of a point by a camera the last one of positive weight has the slot.
     """
@@ -282,10 +282,10 @@ class BundleEquations(NamedTuple):
     """A quadratic model of the cost: gradients, and the blocks of a Hessian that no two points share.
 
     Attributes:
-        camera_gradient: Along the right tangents of the poses, then by the lenses.
-        camera_hessian: Of each camera.
-        point_gradient: Along the points.
-        point_hessian: Of each point.
+        camera_gradient: Gradient along the right tangents of the poses, then by the lenses.
+        camera_hessian: Hessian block of each camera.
+        point_gradient: Gradient by the points.
+        point_hessian: Hessian block of each point.
         cross: Second derivatives by camera and point.
     """
 
@@ -356,9 +356,9 @@ class ExactBlocks(NamedTuple):
     """Blocks of the Hessian that every slot adds to, the curvature of projection and loss included.
 
     Attributes:
-        camera: Of the slot's camera.
-        cross: Of its camera and its point.
-        point: Of its point.
+        camera: Block of the slot's camera.
+        cross: Block that couples its camera and its point.
+        point: Block of its point.
     """
 
     camera: Float[Array, "k c c n"]
@@ -414,5 +414,5 @@ def _known(observations: Observations, k: int, n: int) -> Bool[Array, " m"]:
 
 
 def clean_weights(weights: Array) -> Array:
-    """What is not a weight is 0; a weight of 0 keeps its derivative, which says what letting it back in would do."""
+    """Replace invalid weights by 0; a weight of 0 keeps its derivative, the effect of letting it back in."""
     return jnp.where(jnp.isfinite(weights) & (weights >= 0), weights, 0.0)

@@ -1,4 +1,4 @@
-"""What a lens of each camera's own adds to bundle adjustment: a focal length and two radial coefficients to be found.
+"""Lens of each camera in bundle adjustment: a focal length and two radial coefficients that are estimated.
 
 With `(x, y)` the point's slopes and `r² = x² + y²`, the camera sees it at `f (1 + k1 r² + k2 r⁴) (x, y)` from the
 principal point. So the derivatives by all three lie along `(x, y)`, and the one by `(x, y)` is symmetric.
@@ -21,11 +21,11 @@ Plane = Float[Array, "k n"]
 
 
 class Cameras(NamedTuple):
-    """What is sought of the cameras, c = 6 numbers each, or 9 with a lens of their own.
+    """Estimated parameters of the cameras: c = 6 numbers each, or 9 with a lens of their own.
 
     Attributes:
-        poses: `wxyz_xyz` of T_world_cam.
-        lenses: `None` for ideal cameras.
+        poses: `(k, 7)` poses, `wxyz_xyz` of T_world_cam.
+        lenses: `(k, 3)` lenses; `None` for ideal cameras.
     """
 
     poses: Float[Array, "k 7"]
@@ -33,12 +33,12 @@ class Cameras(NamedTuple):
 
 
 class Bend(NamedTuple):
-    """What a lens does to every slope. Planes `(k, n)`.
+    """Effect of a lens on every slope. Planes `(k, n)`.
 
     Attributes:
-        seen: Where the point is seen.
-        across: Derivatives of that by the slopes: of u by x, of u by y and of v by x, of v by y.
-        by_lens: Its derivatives by focal length, k1 and k2, in units of the slopes.
+        seen: Image position of the point, pixels from the principal point.
+        across: Derivatives of that position by the slopes: of u by x, of u by y and of v by x, of v by y.
+        by_lens: Derivatives of that position by focal length, k1 and k2, in units of the slopes.
     """
 
     seen: tuple[Plane, Plane]
@@ -47,13 +47,13 @@ class Bend(NamedTuple):
 
 
 class LensPart(NamedTuple):
-    """What the normal equations of the lenses are made of. Planes `(k, n)`.
+    """Parts of the normal equations of the lenses. Planes `(k, n)`.
 
     Attributes:
-        by_lens: As in `Bend`.
+        by_lens: Derivatives of the image position by the lens, see `Bend`.
         pull: Derivative of the cost in units of `by_lens`.
-        information: Second derivative likewise,
-        cross: and that by the slopes over the depth.
+        information: Second derivative of the cost in units of `by_lens`.
+        cross: Second derivative of the cost by `by_lens` and by the slopes over the depth.
     """
 
     by_lens: tuple[Plane, Plane, Plane]
@@ -63,7 +63,7 @@ class LensPart(NamedTuple):
 
 
 def bend(lenses: Lenses, x: Plane, y: Plane) -> Bend:
-    """Slopes through each camera's lens."""
+    """Apply the lens of each camera to slopes."""
     f, k1, k2 = (lenses[:, i, None] for i in range(3))
     r2 = x * x + y * y
     factor = 1.0 + r2 * (k1 + r2 * k2)
@@ -77,30 +77,30 @@ def bend(lenses: Lenses, x: Plane, y: Plane) -> Bend:
 
 
 def lens_gradient(part: LensPart) -> Lenses:
-    """Of the cost by the lenses."""
+    """Gradient of the cost by the lenses."""
     return jnp.stack([jnp.sum(d * part.pull, axis=1) for d in part.by_lens], axis=1)
 
 
 def lens_hessian(part: LensPart) -> Float[Array, "k 3 3"]:
-    """Second derivative by each lens."""
+    """Hessian of the cost by each lens."""
     planes = jnp.stack(part.by_lens, axis=1)
     return jnp.einsum("kan,kbn->kab", planes * part.information[:, None, :], planes)
 
 
 def shift_cameras(cameras: Cameras, tangents: Float[Array, "k c"]) -> Cameras:
-    """Cameras after small steps, right to first order: for derivatives."""
+    """Move cameras by small steps, correct to first order: for derivatives."""
     moved = jax.vmap(lambda pose, tangent: tangent_basis(SE3(pose)) @ tangent)(cameras.poses, tangents[:, :6])
     return _with_lenses(cameras, cameras.poses + moved, tangents)
 
 
 def move_cameras(cameras: Cameras, tangents: Float[Array, "k c"]) -> Cameras:
-    """Cameras after steps of any size."""
+    """Move cameras by steps of any size."""
     poses = jax.vmap(lambda pose, tangent: retract(SE3(pose), tangent).wxyz_xyz)(cameras.poses, tangents[:, :6])
     return _with_lenses(cameras, poses, tangents)
 
 
 def usable_lenses(lenses: Lenses) -> tuple[Lenses, Bool[Array, " k"]]:
-    """Lenses that are finite and not blind; the others become a focal length of one."""
+    """Replace lenses that are not finite or have no positive focal length by a focal length of one."""
     usable = jnp.isfinite(lenses).all(axis=1) & (lenses[:, 0] > 0)
     return jnp.where(usable[:, None], lenses, jnp.array([1.0, 0.0, 0.0], lenses.dtype)[None, :]), usable
 

@@ -21,10 +21,10 @@ class Reduced(NamedTuple):
     """The equations after the points are eliminated, in units that give cameras and points a unit diagonal.
 
     Attributes:
-        units: Of the cameras; 0 for what is fixed or has nothing to go by.
+        units: Units of the camera parameters; 0 for those that are fixed or not observed.
         root: Lower triangular C of each point with `Cᵀ C = V⁻¹`; rows of 0 for directions that nothing determines.
         coupling: `B = units W Cᵀ` as a matrix, so that the Schur complement is `H - B Bᵀ`.
-        factor: Its Cholesky factor; not finite if it is not positive definite.
+        factor: Cholesky factor of the Schur complement; not finite if that is not positive definite.
     """
 
     units: Float[Array, "k c"]

@@ -26,10 +26,10 @@ class Idle(NamedTuple):
     """Free points none of whose observations has weight.
 
     Attributes:
-        mask: Which points are idle.
+        mask: True for idle points.
         rising: Those that a rising weight of the point would give observations: the others need more than one weight
             to rise, and any single observation can be fitted exactly, at no cost.
-        X_world: Where the points count, meters: idle ones that are rising at their own optimum, others where they are.
+        X_world: Positions for the cost, meters: rising idle points at their own optimum, all others unchanged.
     """
 
     mask: Mask

@@ -21,13 +21,13 @@ from jaxslam_kernels.types import Mask, Scalar
 
 
 class Clusters(NamedTuple):
-    """Which points belong together.
+    """Result of a clustering.
 
     Attributes:
-        label: `(n,)` the cluster of each point, from 0 to `num - 1` in the order of the clusters' first points; -1
+        label: `(n,)` cluster of each point, from 0 to `num - 1` in the order of the clusters' first points; -1
             for noise and for points that do not count.
-        core: `(n,)` points that have at least `min_points` neighbors, themselves included, within the radius.
-        num: How many clusters.
+        core: `(n,)` true for points that have at least `min_points` neighbors, themselves included, within the radius.
+        num: Number of clusters.
     """
 
     label: Int[Array, " n"]
@@ -46,9 +46,9 @@ def dbscan(
     Args:
         points: `(d, n)` coordinates in any unit, pixels or meters; d of 1 or more.
         mask: `(n,)` which of them count. One that is not finite does not count either.
-        radius: How far neighbors are apart at most, in the unit of the points, traced. Infinite: all points are
+        radius: Maximum distance of neighbors, in the unit of the points, traced. Infinite: all points are
             neighbors. Negative or NaN: none are, and all is noise.
-        min_points: How many neighbors, itself included, make a core point, traced. Below 1 it counts as 1.
+        min_points: Number of neighbors, the point included, that make a core point, traced. Below 1 it counts as 1.
 
     Returns:
         `Clusters`. A border point equally near to several core points, up to rounding, belongs to the first of them.

@@ -65,8 +65,8 @@ def kmeans(
         points: `(d, n)` coordinates in any unit; d of 1 or more.
         mask: `(n,)` which of them count. One that is not finite does not count either, nor one with a coordinate
             beyond the fourth root of the largest number (4e9 in single precision), whose squares might overflow.
-        num_clusters: How many centers, static. All of them are written out in the program: dozens, not thousands.
-        num_steps: How many steps, static.
+        num_clusters: Number of centers, static. All of them are written out in the program: dozens, not thousands.
+        num_steps: Number of steps, static.
         initial: `(d, k)` where to begin; `None` to draw all centers from the points.
         usable: `(k,)` which of the initial centers to begin with; the others are drawn. One that is not finite is
             drawn in any case. `None`: all.
@@ -132,11 +132,11 @@ class _Labeled(NamedTuple):
 def _lloyd(
     points: Float[Array, "d n"], counts: Mask, centers: Float[Array, "d k"], num_steps: int
 ) -> tuple[_Labeled, _Labeled]:
-    """What the last step begins with, and what it ends with.
+    """Run all steps; return labels and centers before and after the last one.
 
-    One time more is gone round, at first without any labels, which leaves all centers where they are. So labels are
-    computed in one place of the program, and in a loop, out of which XLA does not move them: else it computes them anew
-    for everything they are used for, which takes longer than ten steps.
+    The loop runs once more than there are steps, the first time without labels, which leaves all centers in place. The
+    labels are then computed in a single place of the program, inside a loop, from which XLA does not move them.
+    Otherwise it computes them again for every use, which takes longer than ten steps.
     """
 
     def step(_: Array, state: tuple[_Labeled, _Labeled]) -> tuple[_Labeled, _Labeled]:
@@ -228,7 +228,7 @@ def _draw(
 
 
 def _pick(target: Scalar, weights: Float[Array, " n"]) -> tuple[Int[Array, ""], Scalar]:
-    """Where a target falls on the line of stacked weights, and how far beyond the beginning of that one.
+    """Find the weight at a target of the cumulative sum of weights, and the distance from where that weight begins.
 
     Never on a weight of zero as long as another is positive, however the sums are rounded.
     """

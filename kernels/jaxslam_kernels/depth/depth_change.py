@@ -19,12 +19,12 @@ from jaxslam_kernels.types import DepthImage, Scalar
 
 
 class DepthChange(NamedTuple):
-    """What an earlier depth image says of each pixel of the present one.
+    """Comparison of each pixel of a depth image with an earlier depth image.
 
     Attributes:
-        same: Its surface was there already.
-        new: It was not: the earlier image saw past it.
-        then: Where in the earlier image it is, as `row * w + column`; a pixel of it in any case, even if it is neither.
+        same: True if the surface at the pixel was there in the earlier image.
+        new: True if it was not: the earlier image measured a depth beyond it.
+        then: Its pixel in the earlier image, as `row * w + column`; always a valid index, even if it is neither.
     """
 
     same: Bool[Array, "h w"]
@@ -47,10 +47,10 @@ def depth_change(
     """Compare two depth images of one camera.
 
     Args:
-        depth: The present one, meters; 0 or not a number where missing.
-        depth_then: The earlier one, of the same size.
-        T_then_now: From the present camera to the earlier one.
-        intrinsics: Of both; their distortion is left out.
+        depth: Current depth image, meters; 0 or NaN where depth is missing.
+        depth_then: Earlier depth image of the same size, meters.
+        T_then_now: Transform from the current camera to the earlier one.
+        intrinsics: Intrinsics of both images; their distortion is ignored.
         same_share: Differences of depth up to this share of the depth,
         same_m: and so many meters more, are none.
         new_share: The earlier depth must be greater by this share,

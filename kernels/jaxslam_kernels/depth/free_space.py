@@ -1,4 +1,4 @@
-"""Which points a depth image confirms, and which it sees past: those are gone, or never were.
+"""Free-space check of points by a depth image: which it confirms, and which it sees through.
 
 Source: free space between a depth camera and what it sees, as in occupancy mapping (Hornung et al., "OctoMap", 2013);
 here points are carried into the image, not rays into the map, so that the work is one look a point.
@@ -16,11 +16,11 @@ from jaxslam_kernels.types import DepthImage, Mask, Points, Scalar
 
 
 class Visibility(NamedTuple):
-    """What a depth image says of points; of one out of view or hidden, neither.
+    """Visibility of points in a depth image; both are false for a point out of view or occluded.
 
     Attributes:
-        there: The image has a surface where the point is.
-        past: It sees something clearly behind the point.
+        there: True if the image measures a surface at the point.
+        past: True if the image measures a surface clearly behind the point.
     """
 
     there: Mask
@@ -45,7 +45,7 @@ def classify_visibility(
         T_world_cam: Pose of the camera.
         depth: `(h, w)` meters; 0 or not a number where missing.
         least: `(h, w)` the least depth around each pixel, 0 where some is missing: outlines see nothing past.
-        intrinsics: Of the image.
+        intrinsics: Intrinsics of the image.
         same_share: A surface is where a point is if their depths differ by no more than this share,
         same_m: and so many meters; it is clearly behind if it is further than twice that.
     """

@@ -51,7 +51,7 @@ class VoxelGrid(NamedTuple):
     """Sums over the points in each voxel, a row each.
 
     Attributes:
-        table: Which row a voxel has.
+        table: Hash table from voxels to rows.
         sums: `(c, 8)` of the ways from its corner, in voxels; of colors; of counts; and last, no sum, how sure it is
             that there is something (log-odds, bounded): a voxel with less than 0 is free. A row lies together, against
             the custom of kernels: rows are visited in no order, and each visit is to one place in memory then.

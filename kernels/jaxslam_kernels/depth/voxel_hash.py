@@ -1,4 +1,4 @@
-"""Which points lie in the same cube of space: keys of voxels, and rows that a hash table gives them.
+"""Hash table of voxels: keys of the cubes in which points lie, and the row of each.
 
 All points are looked up at once, in rounds: in a round each point that has no row yet looks at one slot of the table,
 chosen by its key and the number of the round. Points of one voxel take the same way, so that they end in the same row
@@ -42,13 +42,13 @@ class HashTable(NamedTuple):
 
 
 class _Search(NamedTuple):
-    """Where a search stands.
+    """State of a search.
 
     Attributes:
-        slots: As of the table; `-2 - i` where point `i` waits for a row.
-        found: `(n,)` what stands in the slot that each point has found.
-        at: `(n,)` that slot.
-        open: `(n,)` points that have found none yet.
+        slots: Slots of the table; `-2 - i` where point `i` waits for a row.
+        found: `(n,)` content of the slot that each point has found.
+        at: `(n,)` index of that slot.
+        open: `(n,)` true for points that have not found a slot yet.
         round: Number of the next round.
     """
 

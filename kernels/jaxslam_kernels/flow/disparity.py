@@ -23,11 +23,11 @@ ROW_PLAN = FlowPlan(
 
 
 class Disparities(NamedTuple):
-    """Of points of the left image.
+    """Disparities of points of the left image.
 
     Attributes:
-        disparity: `(n,)` pixels; 0 where it was not found.
-        found: `(n,)` where it was, and the way back led to the point.
+        disparity: `(n,)` disparity in pixels; 0 where it was not found.
+        found: `(n,)` true where it was found and the search back ended at the point.
         residual: `(n,)` mean absolute difference of intensity over the window.
     """
 
@@ -61,7 +61,7 @@ def row_disparities(
         points: `(2, n)` pixels in the left image.
         guess: `(n,)` about what the disparity is, to twice as many pixels as the coarsest level is smaller.
         mask: `(n,)` which points to match; all if not given.
-        max_return_px: How far from the point the way back may end; the left-right check of stereo matching.
+        max_return_px: Maximum distance from the point at which the search back may end: the left-right check of stereo.
         expected_px: A match within so many pixels of its guess is taken without a way back, for guesses that come from
             elsewhere than these images.
         least: Smallest disparity that is one, pixels: smaller ones are those of points too far to tell.

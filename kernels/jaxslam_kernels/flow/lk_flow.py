@@ -22,7 +22,7 @@ DEFAULT_PLAN = FlowPlan()
 
 
 class FlowStatus(enum.IntEnum):
-    """What became of a point."""
+    """Outcome of tracking a point."""
 
     OK = 0
     MASKED = 1
@@ -39,7 +39,7 @@ class FlowStatus(enum.IntEnum):
 
 
 class Flow(NamedTuple):
-    """Where points went.
+    """Tracked points.
 
     Attributes:
         points: `(2, n)` positions in the current image; finite always, meaningful where `status` is `OK`.
@@ -55,7 +55,7 @@ class Flow(NamedTuple):
 
     @property
     def ok(self) -> Mask:
-        """Which points were tracked."""
+        """True for points that were tracked."""
         return self.status == FlowStatus.OK
 
 

@@ -40,7 +40,7 @@ class _Slopes(NamedTuple):
 
 
 class _Row(NamedTuple):
-    """As `Search`, of points in their rows: where they are, how far squared they last moved, and which still move."""
+    """`Search` along rows: positions, squared length of the last step, and which points still move."""
 
     u: Weights
     last_step: Weights
@@ -57,7 +57,7 @@ def settle_in_rows(
     once: Callable[[Callable[[], _Slopes]], _Slopes],
     coarsest: bool,
 ) -> Search:
-    """As `lk_search.iterate`, for points that stay in their rows; `once` runs the part that must not be fused."""
+    """Run `lk_search.iterate` for points that stay in their rows; `once` runs the part that must not be fused."""
     reach, position = _REACH if coarsest else _NEXT_REACH, search.position
     slopes = once(lambda: _slopes(template, position, level, border, Window(plan.window), reach))
     begin = _Row(position[0], search.last_step, search.active)
@@ -68,7 +68,7 @@ def settle_in_rows(
 def _slopes(
     template: Template, position: Pixels, level: Float[Array, "h w"], border: int, window: Window, reach: int
 ) -> _Slopes:
-    """What the template gradients sum up to around `position`, in its row."""
+    """Sum the template gradients around `position`, in its row."""
     side, num = window.side, 2 * reach + 2
     corner, fraction = patches.corner(patches.hold(position, level, border), border, window.half)
     strips = patches.cut(level, corner - jnp.array([[reach], [0]], corner.dtype), side + 1, side + num - 1)

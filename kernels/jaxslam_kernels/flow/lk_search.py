@@ -21,7 +21,7 @@ from jaxslam_kernels.types import Mask, Pixels, Scalar
 
 
 class LevelPlan(NamedTuple):
-    """How one pyramid level is searched; static.
+    """Settings of the search on one pyramid level; static.
 
     Attributes:
         window: Side of the window in pixels, odd.
@@ -39,7 +39,7 @@ class LevelPlan(NamedTuple):
 
 
 class FlowPlan(NamedTuple):
-    """How a flow is searched; static.
+    """Settings of optical flow; static.
 
     A large motion is found at the coarsest level, which therefore has the full window and many steps; the levels
     between only carry its result down, and a smaller window serves them as well. Measured against
@@ -78,7 +78,7 @@ class FlowPlan(NamedTuple):
 
 
 class Template(NamedTuple):
-    """What the search needs of the previous image, for each point.
+    """Template of each point from the previous image.
 
     Attributes:
         patch: Intensities over the window.
@@ -101,7 +101,7 @@ class Sight(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """Where the search ended.
+    """Result of the search.
 
     Attributes:
         position: `(2, n)` in the current image.
@@ -117,7 +117,7 @@ class Solution(NamedTuple):
 
 
 class Search(NamedTuple):
-    """Where points are, how far squared they last moved, and which still move."""
+    """Positions of points, squared length of their last step, and which points still move."""
 
     position: Pixels
     last_step: Float[Array, " n"]

@@ -31,7 +31,7 @@ _Once: TypeAlias = Callable[[Callable[[], Any]], Any]
 
 
 class PatchMatch(NamedTuple):
-    """Where patches were found.
+    """Result of patch alignment.
 
     Attributes:
         points: `(2, n)` pixel coordinates in the current image.
@@ -152,7 +152,7 @@ def _matched(
 
 
 def _there(position: Pixels, inputs: _Inputs, window: Window, border: int, once: _Once) -> Float[Array, "n l"]:
-    """What the current image shows around positions."""
+    """Sample the current image around positions."""
     sight = once(lambda: look(position, inputs.current, border, window))
     flat = patches.flattened(sight.cut)
     return patches.bilinear(flat, sight.fraction, window.stride, window.length)
@@ -180,7 +180,7 @@ def _correlation(patch: Float[Array, "n l"], there: Float[Array, "n l"], counts:
 
 
 def _solve(inputs: _Inputs, *, plan: LevelPlan, border: int, chunk: int) -> ConvergedPositions:
-    """Where the search ends, and the correlation there."""
+    """Final positions of the search, and the correlation there."""
     window = Window(plan.window)
 
     def search_chunk(inputs: _Inputs) -> ConvergedPositions:

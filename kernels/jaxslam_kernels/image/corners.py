@@ -57,14 +57,15 @@ def _window_mean(image: Image) -> Float[Array, "_h _w"]:
 
 @checked
 def grid_corners(score: Image, allowed: Bool[Array, "h w"], *, cell: int) -> Corners:
-    """The pixel of highest score in every `cell` x `cell` square of a score image.
+    """Find the pixel of highest score in every `cell` x `cell` square of a score image.
 
-    Of equals, the first in reading order. A choice, constant for a derivative: neither points nor scores have one.
+    Among equal scores it is the first in reading order. This choice is a constant for differentiation: neither points
+    nor scores have a derivative.
 
     Args:
         score: From `corner_score`; a score that is not a number counts as 0. Rows and columns past the last whole
             cell are left out.
-        allowed: Where a corner may be.
+        allowed: `(h, w)` true for pixels that may be a corner.
         cell: Side of a cell in pixels, static.
     """
     rows, columns = score.shape[0] // cell, score.shape[1] // cell
@@ -84,11 +85,11 @@ def grid_corners(score: Image, allowed: Bool[Array, "h w"], *, cell: int) -> Cor
 
 @checked
 def occupied_cells(points: Pixels, valid: Mask, shape: tuple[int, int], *, cell: int) -> Bool[Array, " c"]:
-    """Which cells of the grid of `grid_corners` already hold one of the valid points.
+    """Tell which cells of the grid of `grid_corners` already hold a valid point.
 
     Args:
         points: `(2, n)` pixel coordinates; one outside the grid or not a number is in no cell.
-        valid: `(n,)` which of them count.
+        valid: `(n,)` true for points that count.
         shape: Height and width of the score image, static.
         cell: Side of a cell in pixels, static; cell `k` of a row spans coordinates from `k * cell` to the next.
     """

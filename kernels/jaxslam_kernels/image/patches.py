@@ -53,7 +53,7 @@ class Window(NamedTuple):
         return index % self.stride - self.half, index // self.stride - self.half
 
     def columns(self) -> Bool[Array, " l"]:
-        """Which pixels of a flat patch belong to the window."""
+        """Tell which pixels of a flat patch belong to the window."""
         return self.offsets()[0] <= self.half
 
 
@@ -122,7 +122,7 @@ def gradients(patch: Float[Array, "n l"], window: Window) -> Float[Array, "n 2 m
 
 
 def in_image(position: Pixels, level: Float[Array, "h w"], border: int, window: Window) -> Bool[Array, "n l"]:
-    """Which pixels of the flat patches around `position` belong to the window and lie in the image."""
+    """Tell which pixels of the flat patches around `position` belong to the window and lie in the image."""
     _, high = bounds(level, border)
     columns, rows = window.offsets()
     u = position[0][:, None] + columns.astype(position.dtype)[None, :]

@@ -133,7 +133,7 @@ def _split(conic: _Conic) -> _Vector:
 
 
 def _intersect(lines: _Vector, conic: _Conic) -> _Vector:
-    """Where each of the two lines `(2, h)` meets the conic: `(4, h)` points, up to scale.
+    """Intersect each of the two lines `(2, h)` with the conic: `(4, h)` points, up to scale.
 
     The coordinate with the largest factor in the line is eliminated, `c = α a + β b`, and with a = 1 (distances are
     never 0) a quadratic in b remains. A negative discriminant counts as zero: `_polish` rejects what is not a root.
@@ -242,7 +242,7 @@ def _inner(a: _Conic, b: _Conic) -> Array:
 
 
 def _where_largest(sizes: Sequence[Array], choices: Sequence[Sequence[Array]]) -> tuple[Array, ...]:
-    """Of three choices, each a sequence of arrays, the one whose size is the largest, entry by entry."""
+    """Select, entry by entry, the largest of three choices, each a sequence of arrays."""
     first = (sizes[0] >= sizes[1]) & (sizes[0] >= sizes[2])
     second = sizes[1] >= sizes[2]
     return tuple(jnp.where(first, a, jnp.where(second, b, c)) for a, b, c in zip(*choices, strict=True))

@@ -41,8 +41,8 @@ class PnpResult(NamedTuple):
 
     Attributes:
         T_world_cam: The pose; the initial one (or the identity) if `status` says that none was found.
-        inliers: Which points agree with it. All false if none was found.
-        num_inliers: How many.
+        inliers: True for points that agree with the pose. All false if none was found.
+        num_inliers: Number of inliers.
         score: `Σ w (1 - min(e², 1))` with e the error in thresholds: the weight of the inliers, less for larger errors;
             `Σ w (1 - min(e, 1))²` if averaged.
         status: A `PoseStatus`.
@@ -81,9 +81,9 @@ def ransac_pnp(
     Args:
         key: Random key; the same key gives the same answer.
         X_world: Points in the world, meters. At least `SAMPLE_SIZE` usable ones, not all on a line.
-        uv: Where they are seen, pixels of the distorted image.
+        uv: Their image positions, pixels of the distorted image.
         intrinsics: The camera.
-        weights: How likely each point is to be drawn, and its part in the score; `None` for one each. The derivative by
+        weights: Weight of each point in the sampling and in the score; `None` for one each. The derivative by
             a weight of 0 is the limit from above.
         depth: Measured depths in meters, 0 or NaN where missing; `None` for pixels alone. They take part in the
             choice of the root, in the score and in the refinement.
@@ -92,7 +92,7 @@ def ransac_pnp(
         threshold_depth: Largest error of an inlier along the optical axis, meters. The two combine:
             `e² = (pixels / threshold_px)² + (depth / threshold_depth)² < 1`.
         min_inliers: Fewer than this is no consensus.
-        num_hypotheses: How many samples are drawn, static.
+        num_hypotheses: Number of samples, static.
         loss: The loss of the last refinement over the inliers, with a scale of half a threshold, static.
         max_steps: Bound on the steps of the last refinement, static.
         averaged: Whether the score is averaged over thresholds, see `score_poses`, static.
@@ -192,7 +192,7 @@ def score_poses(T_cam_world: _Transforms, problem: PoseProblem, averaged: bool =
 
 
 def _observed(problem: PoseProblem) -> tuple[Array, Array, Array, Array]:
-    """What `_squared_errors` compares with: points, directions, depths, and factors in units of the threshold."""
+    """Measurements for `_squared_errors`: points, directions, depths, and factors in units of the threshold."""
     return problem.X_world, problem.xy, problem.depth, problem.precision / problem.scale
 
 
@@ -235,7 +235,7 @@ def _improved(best: SE3, problem: PoseProblem, averaged: bool) -> SE3:
 
 
 def _consensus(T_world_cam: SE3, problem: PoseProblem, averaged: bool) -> tuple[Mask, Scalar]:
-    """Which points agree with a pose, and its score."""
+    """Find the points that agree with a pose, and score it."""
     T = _as_transform(T_world_cam)
     error = _squared_errors(T, *_observed(problem))
     return (error < 1.0) & (problem.weights > 0), score_poses(T, problem, averaged)[0]

@@ -32,7 +32,7 @@ FARTHEST_M = 1e9
 
 
 class PosePrior(NamedTuple):
-    """What is known of a pose beforehand, for example from a constant velocity.
+    """Prior knowledge of a pose, for example from a constant velocity.
 
     The cost is `½ eᵀ Λ e` with `e = (R_pᵀ (t - t_p), 2 sgn(q_w) q_xyz)`, where q is the rotation from the predicted
     to the sought pose: the right tangent, with `2 sin(θ/2)` in place of the angle θ, smooth everywhere below π.
@@ -57,7 +57,7 @@ class PoseProblem(NamedTuple):
         precision: Factors that whiten the three residuals: `fx / σ_px`, `fy / σ_px`, `1 / σ_depth` or 0.
         weights: Factor of each point's cost.
         scale: Scale of the robust loss, in standard deviations.
-        prior: What is known beforehand.
+        prior: Prior knowledge of the pose.
     """
 
     X_world: Points
@@ -225,7 +225,7 @@ def _quaternion_basis(T: SE3) -> Float[Array, "4 3"]:
 
 
 def positive(values: Array) -> Array:
-    """Where values are finite and above zero."""
+    """True for values that are finite and above zero."""
     return jnp.isfinite(values) & (values > 0)
 
 

@@ -45,7 +45,7 @@ UNKNOWN_VARIANCE = 1e6
 
 
 class PoseStatus(IntEnum):
-    """What an estimated pose is worth. Only `OK` and `NOT_CONVERGED` carry a new pose."""
+    """Quality of an estimated pose. Only `OK` and `NOT_CONVERGED` carry a new pose."""
 
     OK = 0
     NOT_CONVERGED = 1
@@ -69,7 +69,7 @@ class PoseRefinement(NamedTuple):
         residual_scale: Standard deviation of unit weight: how much larger the inliers' residuals are than the given
             deviations, `sqrt(Σ w ρ' s / Σ w ρ' k)` with k residuals a point; 0 without points.
         cost: `½ Σ w ρ(s)` plus the prior's share, at `T_world_cam`.
-        num_valid: How many points have weight and lie in front of the camera.
+        num_valid: Number of points that have weight and lie in front of the camera.
         status: A `PoseStatus`.
         num_steps: Evaluations of the cost.
         robust_weights: `ρ'(s)` in [0, 1] of every point, whatever its weight; 0 where it has no value.
@@ -88,7 +88,7 @@ class PoseRefinement(NamedTuple):
 
 
 class SolverReport(NamedTuple):
-    """How a solve went: the reweighted Hessian where it ended (up to scale), steps, and if it converged."""
+    """Result of a solve: the reweighted Hessian at the end (up to scale), steps, and whether it converged."""
 
     hessian: Float[Array, "6 6"]
     num_steps: Int[Array, ""]
@@ -117,9 +117,9 @@ def refine_pose(
     position, pixel and deviation are finite; its depth counts if positive and finite.
 
     Args:
-        T_world_cam: Where to start, near the answer.
+        T_world_cam: Initial pose, close to the solution.
         X_world: Points in the world, meters.
-        uv: Where they are seen, pixels of the distorted image.
+        uv: Their image positions, pixels of the distorted image.
         intrinsics: The camera.
         weights: Factor of each point's cost, `None` for one each. Points of weight 0 have no influence; the derivative
             by their weight is the limit from above.
@@ -217,7 +217,7 @@ def _optimum_shift_jvp(loss: Loss, primals: tuple, tangents: tuple) -> tuple[Arr
 
 
 class _Figures(NamedTuple):
-    """What is summed over all points at the final pose."""
+    """Sums over all points at the final pose."""
 
     cost: Scalar
     covariance: Float[Array, "6 6"]

@@ -81,7 +81,7 @@ class GraphEquations(NamedTuple):
     """Normal equations of the graph by blocks, of iteratively reweighted least squares.
 
     Attributes:
-        gradient: Of the cost, a tangent a node.
+        gradient: Gradient of the cost, one tangent per node.
         diagonal: `(k, d, d)`, the block of each node.
         coupling: `(m, d, d)`, rows of the source and columns of the target.
     """

@@ -68,7 +68,7 @@ _STEP_TOLERANCE = 1e-2  # of the conjugate gradients in a step
 
 
 class PoseGraphStatus(IntEnum):
-    """What the poses are worth. Only `OK`, `NOT_CONVERGED` and `DISCONNECTED` carry new ones."""
+    """Quality of the poses. Only `OK`, `NOT_CONVERGED` and `DISCONNECTED` carry new ones."""
 
     OK = 0
     NOT_CONVERGED = 1
@@ -110,7 +110,7 @@ class PoseGraph(NamedTuple):
 
 
 class _Graph(NamedTuple):
-    """What stays constant in a solve."""
+    """Constants of a solve."""
 
     problem: GraphProblem
     free: Bool[Array, " k"]
@@ -172,7 +172,7 @@ def optimize_pose_graph(
         max_steps: Bound on the steps, static.
         max_iterations: Bound on the iterations of conjugate gradients in a step, static.
         group_size: Nodes in a group of the preconditioner, static; see `suitable_group_size`.
-        elimination: Where the normal equations are solved, static. "host" calls back to SciPy from compiled code, and
+        elimination: Solver of the normal equations, static. "host" calls back to SciPy from compiled code, and
             then `rank`, `max_iterations` and `group_size` matter to derivatives only, or not at all.
 
     Returns:
@@ -263,7 +263,7 @@ def suitable_group_size(source: np.ndarray, target: np.ndarray, rank: np.ndarray
 
 
 def _anchored(problem: GraphProblem, fixed: Bool[Array, " k"]) -> Bool[Array, " k"]:
-    """Which nodes have a path to a fixed one: labels fall to the least of the neighbors' until they rest."""
+    """Find nodes with a path to a fixed node: labels fall to the smallest label of the neighbors until none changes."""
     k, used = fixed.shape[0], problem.weights > 0
     source, target = problem.source, problem.target
 
@@ -335,7 +335,7 @@ def _preconditioner(matrix: GraphMatrix, graph: _Graph, solver: _Solver) -> Call
 
 
 def _diagonal(equations: GraphEquations, graph: _Graph) -> Steps:
-    """What the damping is relative to: the diagonal of the Hessian, one for nodes that stay."""
+    """Scale of the damping: the diagonal of the Hessian, and one for fixed nodes."""
     diagonal = jnp.diagonal(equations.diagonal, axis1=1, axis2=2)
     largest = jnp.max(diagonal) if diagonal.size else 0.0
     floor = jnp.finfo(diagonal.dtype).eps * largest + jnp.finfo(diagonal.dtype).tiny * 1e8

@@ -31,7 +31,7 @@ _Vector: TypeAlias = Float[Array, "3"]
 
 
 class AlignmentStatus(enum.IntEnum):
-    """What an alignment is worth."""
+    """Quality of an alignment."""
 
     OK = 0
     ROTATION_UNDETERMINED = 1
@@ -83,8 +83,8 @@ class AbsoluteErrors(NamedTuple):
     Attributes:
         distances: `(n,)` meters between aligned estimate and reference, 0 where a pose does not count.
         statistics: Figures of the distances; `statistics.rmse` is what papers call the ATE.
-        alignment: What was applied to the estimate.
-        num_poses: How many poses count.
+        alignment: Alignment applied to the estimate.
+        num_poses: Number of poses that count.
     """
 
     distances: Weights
@@ -101,7 +101,7 @@ class RelativeErrors(NamedTuple):
         rotations: `(m,)` radians, 0 to pi.
         translation: Figures of the translations.
         rotation: Figures of the rotations.
-        num_pairs: How many pairs count.
+        num_pairs: Number of pairs that count.
     """
 
     translations: Float[Array, " m"]
@@ -142,7 +142,7 @@ def ate(
         estimate_xyz: `(3, n)` estimated positions, meters; `T_world_cam.translation().T` of a batch of poses.
         reference_xyz: `(3, n)` true positions, meters.
         weights: `(n,)` non-negative weights, of the alignment and of the statistics alike.
-        alignment: What to align, static.
+        alignment: Kind of alignment, static.
     """
     weights, (estimate_xyz, reference_xyz) = _usable(weights, estimate_xyz, reference_xyz)
     if alignment == "none":

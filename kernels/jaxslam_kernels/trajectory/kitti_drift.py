@@ -32,7 +32,7 @@ class SegmentErrors(NamedTuple):
         rotations: `(k, s)` radians a meter, 0 where there is no such segment.
         translation: Mean of the translations that count, 0 if none does; times 100 the `t_rel` of papers, percent.
         rotation: Mean of the rotations that count; as degrees times 100 the `r_rel` of papers, degrees per 100 m.
-        num_segments: How many segments count.
+        num_segments: Number of segments that count.
     """
 
     translations: _Segments

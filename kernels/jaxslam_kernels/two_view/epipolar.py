@@ -28,7 +28,7 @@ Matrices = Float[Array, "3 3 *batch"]
 
 @checked
 def epipolar_distances(F: Float[Array, "3 3"], uv_before: Pixels, uv_after: Pixels) -> Weights:
-    """How far each second point is from the epipolar line of the first, `|p2ᵀ F p1| / √(X² + Y²)`, `(X, Y, Z) = F p1`.
+    """Distance of each second point from the epipolar line of the first, `|p2ᵀ F p1| / √(X² + Y²)`, `(X, Y, Z) = F p1`.
 
     Source: the formula by which DS-SLAM (Yu et al., IROS 2018) and RTS-SLAM (Sensors 2026) tell moving points.
 
@@ -48,7 +48,7 @@ def epipolar_distances(F: Float[Array, "3 3"], uv_before: Pixels, uv_after: Pixe
 
 @checked
 def sampson_distances(F: Float[Array, "3 3"], uv_before: Pixels, uv_after: Pixels) -> Weights:
-    """How far both points have to move, to first order, until they satisfy F: `|p2ᵀ F p1| / |gradient|`, pixels.
+    """Sampson distance: how far both points must move, to first order, to satisfy F: `|p2ᵀ F p1| / |gradient|`, pixels.
 
     Symmetric in the two views, and one standard deviation for points with one of noise in each coordinate. Arguments
     and degenerate cases as in `epipolar_distances`.
@@ -78,8 +78,8 @@ def fundamental_of_poses(T_world_before: SE3, T_world_after: SE3, intrinsics: In
     Source: Hartley and Zisserman 2004, equation 9.12.
 
     Args:
-        T_world_before: Of the first view.
-        T_world_after: Of the second view.
+        T_world_before: Pose of the first view.
+        T_world_after: Pose of the second view.
         intrinsics: The camera; lens distortion is left out.
     """
     T_after_before = between(T_world_after, T_world_before)

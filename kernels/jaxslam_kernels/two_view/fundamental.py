@@ -29,7 +29,7 @@ _SIDEWAYS = 0.5**0.5 * np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0
 
 
 class FundamentalStatus(IntEnum):
-    """What a fundamental matrix is worth. Only `OK` and `NOT_CONVERGED` carry one that can be trusted."""
+    """Quality of a fundamental matrix. Only `OK` and `NOT_CONVERGED` carry one that can be trusted."""
 
     OK = 0
     NOT_CONVERGED = 1
@@ -48,8 +48,8 @@ class FundamentalResult(NamedTuple):
     Attributes:
         F: `p2ᵀ F p1 = 0` for pixels `p = (u, v, 1)`; unit norm, its largest entry positive, rank two. Zero if nothing
             was found.
-        inliers: Which matches agree with it. All false if nothing was found.
-        num_inliers: How many.
+        inliers: True for matches that agree with it. All false if nothing was found.
+        num_inliers: Number of inliers.
         score: `Σ w (1 - min(e², 1))` with e the Sampson distance in thresholds.
         status: A `FundamentalStatus`.
     """
@@ -86,14 +86,14 @@ def ransac_fundamental(
         key: Random key; the same key gives the same answer.
         uv_before: Pixels in the first view, without lens distortion.
         uv_after: Pixels in the second view.
-        weights: How likely each match is to be drawn, and its part in the score; `None` for one each. The derivative by
+        weights: Weight of each match in the sampling and in the score; `None` for one each. The derivative by
             a weight of 0 is the limit from above.
         threshold_px: Largest Sampson distance of an inlier, pixels: about two standard deviations of a coordinate.
-        num_hypotheses: How many samples are drawn, static.
-        num_improved: How many of the best hypotheses are improved, static: half of the time with 8. Over 60 scenes with
-            30 % wrong matches, 4 give a median error of 0.099 px and 8 one of 0.098. With 0 the best one is refined as
-            it is.
-        improving_steps: Bound on the steps of that, static.
+        num_hypotheses: Number of samples, static.
+        num_improved: Number of the best hypotheses to improve, static; with 8 this takes half of the time. Over 60
+            scenes with 30 % wrong matches, 4 give a median error of 0.099 px and 8 one of 0.098. With 0 the best one
+            is refined as it is.
+        improving_steps: Maximum number of steps of that improvement, static.
         initial: `(3, 3)` a matrix for pixels to be tried besides, of any scale; without effect where it is zero or not
             finite. Where it is good, few hypotheses and steps do.
         min_inliers: Fewer than this is no consensus.

@@ -50,7 +50,7 @@ class FramedMatrix(NamedTuple):
     Attributes:
         U: Orthonormal; the epipole of the second view in its last column.
         V: Orthonormal; the epipole of the first view in its last column.
-        S: Of unit norm.
+        S: Matrix of unit norm.
     """
 
     U: Matrix
@@ -80,9 +80,9 @@ def solve_matrix(
     """The optimum, the Hessian there up to scale and whether it converged; constant for differentiation.
 
     Args:
-        F: Where to start: rank two, unit norm, finite.
+        F: Initial matrix: rank two, unit norm, finite.
         views: The points.
-        loss: Of the squared Sampson distances in squared thresholds, static.
+        loss: Loss on the squared Sampson distances in squared thresholds, static.
         scale: Its scale in thresholds, static.
         max_steps: Bound on the evaluations of the cost, static.
     """
