@@ -127,7 +127,7 @@ def follow(
     return _follow_last(pyramids[-1], gray, uv, ok, depth, origin.spacing)
 
 
-@compiled(when="warm-up")
+@compiled(when="first use")  # `_follow_last` holds it; by itself only tests call it
 def as_objects(uv: Pixels, ok: Mask, depth: Float[Array, "h w"], spacing: Float[Array, ""]) -> MaskFlow:
     """Points with depth that lie close together, taken for one object.
 

@@ -98,7 +98,7 @@ class FrameMemory:
         Args:
             frame: The frame.
             dt_s: Time since the previous frame in seconds.
-            depth_follows: Whether the caller passes the depth to `hold_depth` before anything reads it.
+            depth_follows: Whether the frame has no depth yet; that of the arrays must be replaced before it is read.
         """
         to_gray(frame.image, out=self._image)
         if not depth_follows:
@@ -112,10 +112,6 @@ class FrameMemory:
             self._movable[:] = 0
         arrays: Any = (self._image, self._depth, ignore, *_times(frame, dt_s, np.float32), right, self._movable)
         return FrameArrays(*arrays)
-
-    def hold_depth(self, depth_m: np.ndarray) -> None:
-        """Set the depth `(h, w)` of the current frame, in meters."""
-        np.copyto(self._depth, depth_m)
 
     def with_movable(self, arrays: FrameArrays, labels: np.ndarray) -> FrameArrays:
         """Return the current arrays with the numbers `(h, w)` of movable objects."""

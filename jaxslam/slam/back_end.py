@@ -27,9 +27,9 @@ from jaxslam.mapping.local_map_tracking import keyframes_in_view, match_local_ma
 from jaxslam.mapping.local_mapping import LocalMapping, NewKeyframe, mapping_plan, with_new_keyframe
 from jaxslam.mapping.occlusion_states import PointStates, StateChanges
 from jaxslam.mapping.track_table import TrackId
+from jaxslam.runtime.compiled import compiled
 from jaxslam.runtime.preload import import_scipy
 from jaxslam.runtime.stage_timer import StageTimes
-from jaxslam.runtime.trace_cache import cached_trace
 from jaxslam.runtime.worker import Worker, close_all, make_worker
 from jaxslam.semantics import Detector
 from jaxslam.sensors.camera import Camera
@@ -42,7 +42,7 @@ from jaxslam.slam.tracker_map_sync import AnchoredPose, TrackerMapSync, pose_of,
 from jaxslam.tracking.state import TrackOutput, TrackPlan, TrackReason, TrackState, TrackStatus
 from jaxslam.tracking.state_updates import reset_at_pose
 
-_relocated = jax.jit(cached_trace(reset_at_pose), donate_argnums=0)
+_relocated = compiled(when="warm-up", donate="state")(reset_at_pose)
 
 _RECALL_EVERY = 10
 """Frames after which a tracker that only localizes gets other keyframes."""

@@ -9,7 +9,6 @@ import math
 from functools import partial
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from jaxslam_kernels.image.pyramid import Pyramid, build_pyramid
 from jaxtyping import Bool, Float
@@ -19,8 +18,8 @@ from jaxslam.masks.box_to_mask import dilated
 from jaxslam.masks.propagation import PYRAMID_LEVELS, follow, make_origin, predicted_mask
 from jaxslam.runtime.aligned_memory import aligned_array
 from jaxslam.runtime.compile_cache import SINGLE_THREAD
+from jaxslam.runtime.compiled import compiled
 from jaxslam.runtime.stage_timer import StageTimes
-from jaxslam.runtime.trace_cache import cached_trace
 from jaxslam.semantics import Detector
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.downscale import Downscaler, ImageGrid
@@ -34,7 +33,7 @@ _TRUSTED_FRAMES = 5
 WIDTH_PX = 320
 """Masks are made at about so many columns: one of a third of the image is carried on in 1.5 ms, at 640 in 5.4."""
 
-_pyramid = jax.jit(cached_trace(partial(build_pyramid, num_levels=PYRAMID_LEVELS)), compiler_options=SINGLE_THREAD)
+_pyramid = compiled(when="warm-up", options=SINGLE_THREAD)(partial(build_pyramid, num_levels=PYRAMID_LEVELS))
 
 
 class MaskSource(enum.IntEnum):

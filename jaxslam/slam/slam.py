@@ -1,44 +1,35 @@
 """`Slam`: what a robot calls with every frame, and what runs a whole recording."""
 
-import gc
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
-from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.config.schema import Config
-from jaxslam.datasets import Dataset, prefetch
-from jaxslam.datasets.realtime import in_real_time
+from jaxslam.datasets import Dataset
 from jaxslam.dense.coverage import SeenArea
 from jaxslam.dense.dense_map import DenseMap
 from jaxslam.dense.point_cloud import DenseCloud
-from jaxslam.dynamics.point_mask import mask_around, moving_points
-from jaxslam.errors import DatasetError, FrameError, JaxSlamError
-from jaxslam.geometry.se3 import IDENTITY, compose, retract
+from jaxslam.geometry.se3 import retract
 from jaxslam.map.npz_file import load_map, save_map
 from jaxslam.map.types import Map
 from jaxslam.masks.depth_instances import InstanceFinder
 from jaxslam.runtime.compile_cache import FAST_COMPILE, SINGLE_THREAD, enable_compile_cache
+from jaxslam.runtime.compiled import compiled
 from jaxslam.runtime.stage_timer import StageTimes
-from jaxslam.runtime.trace_cache import cached_trace
-from jaxslam.runtime.worker import Worker, make_worker
 from jaxslam.semantics import Detector
 from jaxslam.semantics.checked_detector import CheckedDetector
 from jaxslam.semantics.from_config import detector_of, key_detector_of, why_no_network
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame, check_frame
 from jaxslam.sensors.frame_arrays import FrameArrays, FrameMemory
-from jaxslam.sensors.stereo_depth import RoughDepth
-from jaxslam.slam.argument_checks import check_arguments, check_recording, warn_of_other_camera
+from jaxslam.slam.argument_checks import check_arguments, warn_of_other_camera
 from jaxslam.slam.back_end import BackEnd, LocalizedPose
 from jaxslam.slam.background_consistency import BackgroundConsistency
 from jaxslam.slam.call_guard import one_at_a_time, refuse_after_fork
@@ -47,8 +38,9 @@ from jaxslam.slam.frame_clock import FrameClock
 from jaxslam.slam.frame_result import FrameRecord, FrameResult, Rejected, frame_result
 from jaxslam.slam.input_checks import InputChecks
 from jaxslam.slam.input_warnings import InputWarnings
-from jaxslam.slam.mask_pipeline import FrameMask, MaskPipeline, MaskSource
-from jaxslam.slam.tracker_map_sync import AnchoredPose
+from jaxslam.slam.mask_stage import MaskStage
+from jaxslam.slam.pose_history import ConstantVelocity, PoseHistory, ordered_trajectory
+from jaxslam.slam.recording_run import run_recording
 from jaxslam.tracking.cue_registry import with_cue_params, with_cues
 from jaxslam.tracking.from_config import track_params, track_plan, with_dense_keyframes
 from jaxslam.tracking.state import TrackOutput, TrackParams, TrackPlan, TrackReason, TrackState, TrackStatus
@@ -57,8 +49,9 @@ from jaxslam.trajectory.trajectory import PathLike, Trajectory
 
 _log = logging.getLogger(__name__)
 
-_NEVER = 1e6
-"""Frames of loss: fewer than those a fresh state counts, which starts at once."""
+_RESTART_DISABLED = 1e6
+"""Value of `restart_after` with which the tracker never starts a new submap by itself. It must stay below the number
+of lost frames in a fresh state (2**20, `init_state`), which starts at once."""
 _PATIENT_S = 0.5
 """Seconds from one keyframe to the next for want of points, while mapping is behind. With the preset `ngd` at the rate
 of the camera there was one every tenth of a second, and the threads held each other up."""
@@ -66,18 +59,14 @@ _ALL_IS_NEW = 2.0
 """More than the whole of a keyframe's points: a frame that shows them all is kept too."""
 _MASKED = 0.95
 """Share of the picture under a mask beyond which that is why a frame is lost."""
-_PREDICTED_S = 1.0
-"""Longest time for which a constant velocity is believed."""
-
-_new_state = jax.jit(cached_trace(init_state), static_argnames=("height", "width", "plan"))
+_new_state = compiled(when="warm-up", static=("height", "width", "plan"))(init_state)
 """One program instead of some fifty."""
 
 
-_follow_points = jax.jit(cached_trace(follow_points), static_argnames="plan", compiler_options=SINGLE_THREAD)
+_follow_points = compiled(when="warm-up", static="plan", options=SINGLE_THREAD)(follow_points)
 
 
-@partial(jax.jit, static_argnames="plan", donate_argnums=0, compiler_options=FAST_COMPILE)
-@cached_trace
+@compiled(when="warm-up", static="plan", donate="state", options=FAST_COMPILE)
 def _track_followed(
     state: TrackState, frame: FrameArrays, followed: FlowResult, params: TrackParams, plan: TrackPlan
 ) -> tuple[TrackState, TrackOutput]:
@@ -147,7 +136,9 @@ class Slam:
             slam_map if slam_map is not None and len(slam_map.ids) else None,
             localize_only,
         )
-        params = track_params(camera, with_dense_keyframes(self.config))._replace(restart_after=jnp.float32(_NEVER))
+        params = track_params(camera, with_dense_keyframes(self.config))._replace(
+            restart_after=jnp.float32(_RESTART_DISABLED)
+        )
         self._params = with_cue_params(params, self.config.dynamics)
         # ORB-SLAM's local mapping does not accept keyframes either while it is busy.
         patient = max(_PATIENT_S, self.config.track.keyframe_weak_after_s)
@@ -157,10 +148,9 @@ class Slam:
         self._detector = _watched(detector or detector_of(self.config.semantics))
         self.without_network = None if self._detector is not None else why_no_network(self.config.semantics)
         self._key_detector = _watched(key_detector or key_detector_of(self.config))
-        self._rough_depth = RoughDepth(camera) if camera.is_stereo else None
         motion = self._plan.motion
         self._memory = FrameMemory(camera.height, camera.width, pairs=camera.is_stereo, movable=motion is not None)
-        self._objects = None if motion is None else InstanceFinder(camera, motion.num_objects)
+        self._instances = None if motion is None else InstanceFinder(camera, motion.num_objects)
         self._ready = False
         enable_compile_cache()
         self._begin()
@@ -214,8 +204,7 @@ class Slam:
                 state = self._fresh_state()
                 followed = _follow_points(state, nothing, self._params, self._plan)
                 jax.block_until_ready(_track_followed(state, nothing, followed, self._params, self._plan))
-                if self._masks is not None:
-                    self._masks.compile()
+                self._masks.compile()
                 back_end.result()
             self.compile_s = time.perf_counter() - began
             self._ready = True
@@ -242,45 +231,45 @@ class Slam:
         self._clock.check(frame.timestamp_ns, frame.depth_timestamp_ns)
         self.warm_up()
         began, watch = time.perf_counter(), self.times.stopwatch()
-        self._watch.look(frame)
+        self._input_checks.look(frame)
+
+        # 1. Take over what mapping and loop closing have corrected since the frame before.
         self._state, correction = self._back.update(self._state, self._frame)
         dt_s = self._clock.elapsed_s(frame.timestamp_ns)
         arrays = self._memory.hold(frame, dt_s, depth_follows=frame.depth_m is None)
         watch.ends("take over")
-        # Neither needs the other, and on two cores masks are ready before flow is; so is the rough depth of a pair.
-        if frame.depth_m is None:
-            self._beside.submit(("match pair", partial(self._match_pair, frame)), self._frame)
-        self._beside.submit(("masks", partial(self._mask_of, frame, arrays, correction)), self._frame)
-        followed = _follow_points(self._state, arrays, self._params, self._plan)
+
+        # 2. Optical flow; beside it, a worker computes the stereo depth and the mask.
+        self._masks.begin(self._frame, frame, arrays, correction)
+        flow = _follow_points(self._state, arrays, self._params, self._plan)
         watch.ends("flow")
-        mask: FrameMask = self._beside.flush()[-1]
-        mask = mask._replace(error=mask.error or self._back.latest_error())
-        arrays = self._masked(arrays, mask.mask, frame.dynamic_mask)
+
+        # 3. Mask: ignore pixels of movable objects.
+        arrays, mask = self._masks.result(frame, arrays)
         watch.ends("wait for mask")
-        output, placed, num_matched = self._advance(arrays, followed), None, 0
-        arrays, mask = self._without_movers(arrays, mask, followed, output)
+
+        # 4. Pose: dynamic cues, RANSAC PnP and refinement; what was found moving joins the mask.
+        output = self._advance(arrays, flow)
+        arrays, mask = self._masks.exclude_moving(arrays, mask, flow, output)
         watch.ends("pose")
-        if int(output.status) == TrackStatus.LOST:
-            output, placed = self._relocalize(arrays, output, dt_s)
-            num_matched = 0 if placed is None else placed.num_matched
-        elif self._needs_map_match(output):
-            self._state, output, num_matched = self._back.match_local_map(self._state, arrays, output)
-        share = None if int(output.status) == TrackStatus.LOST else self._back.update_occlusion(arrays, output)
+
+        # 5. Relocalize a lost frame, or match a weak one with the local map.
+        output, localized, num_matched = self._localize(arrays, output, dt_s)
+        lost = int(output.status) == TrackStatus.LOST
+        share = None if lost else self._back.update_occlusion(arrays, output)
         watch.ends("match with map")
-        if output.keyframe:
-            anchored = None if placed is None else placed.anchored
-            self._back.insert_keyframe(frame.timestamp_ns, frame.image, arrays, output, self._frame, anchored)
-        if self.dense_mapping is not None and int(output.status) != TrackStatus.LOST:
-            self.dense_mapping.frame_tracked(self._frame, frame.image, arrays, output)
-        tracked = self._in_submap(frame_result(frame.timestamp_ns, output, correction, num_matched, mask, share))
-        tracked = self._with_background_check(tracked, arrays)
+
+        # 6. Hand over: keyframe to the map, frame to the dense map and the detector.
+        self._hand_over_keyframe(frame, arrays, output, localized)
+        mask = mask._replace(error=mask.error or self._back.latest_error())
+        result = frame_result(frame.timestamp_ns, output, correction, num_matched, mask, share)
+        result = self._checked_by_background(self._in_submap(result), arrays)
         self._clock.advance(frame.timestamp_ns)
-        tracked = self._recorded(tracked, dt_s, float(arrays.depth_delay_s))
-        if self._masks is not None:
-            self._masks.submit_for_detection(self._frame, frame.image)
+        result = self._recorded(result, dt_s, float(arrays.depth_delay_s))
+        self._masks.submit_for_detection(self._frame, frame.image)
         self._frame += 1
         watch.ends("hand over")
-        return replace(tracked, track_ms=(time.perf_counter() - began) * 1e3, warnings=self._warnings.taken())
+        return replace(result, track_ms=(time.perf_counter() - began) * 1e3, warnings=self._warnings.taken())
 
     def run(
         self, dataset: Dataset, on_frame: Callable[[Frame | None, FrameResult | Rejected], None] | None = None
@@ -297,17 +286,7 @@ class Slam:
         Raises:
             DatasetError: If it is no recording, or one of another camera.
         """
-        check_recording(dataset, self.camera)
-        self.warm_up()
-        records: list[FrameRecord] = []
-        with _no_old_garbage():
-            for timestamp_ns, frame in zip(dataset.timestamps_ns, _frames_of(dataset, self.config), strict=True):
-                result = self._tracked_or_rejected(int(timestamp_ns), frame)
-                records.append(FrameRecord.of(result))
-                if on_frame is not None:
-                    on_frame(frame if isinstance(frame, Frame) else None, result)
-        self.finish()
-        return records
+        return run_recording(self, dataset, on_frame)
 
     @one_at_a_time
     def finish(self) -> None:
@@ -322,9 +301,7 @@ class Slam:
     def close(self) -> None:
         """End the threads, in two seconds at most; nothing can be tracked after that but from a `reset`."""
         self._back.close()
-        if self._masks is not None:
-            self._masks.close()
-        self._beside.close()
+        self._masks.close()
 
     def __enter__(self) -> "Slam":
         return self
@@ -368,7 +345,7 @@ class Slam:
     @property
     def online_trajectory(self) -> Trajectory:
         """Every pose that was in the map's frame when it was given out, as it was; frames that were lost have none."""
-        return _in_order([(given.timestamp_ns, given.T_world_cam) for given in self._given if given.in_map_frame])
+        return self._history.online()
 
     @property
     def trajectory(self) -> Trajectory:
@@ -376,28 +353,23 @@ class Slam:
 
         Poses in submaps that nothing links to it are left out; `trajectories` has them.
         """
-        return self.trajectories.get(self.map.world_submap) or _in_order([])
+        return self.trajectories.get(self.map.world_submap) or ordered_trajectory([])
 
     @property
     @one_at_a_time
     def trajectories(self) -> dict[int, Trajectory]:
         """Every pose as it is known now, in the frame of the submap it is in, by the number of the submap."""
-        by_submap: dict[int, list[tuple[int, np.ndarray]]] = {}
-        for given in self._given:
-            pose = given.timestamp_ns, self._back.pose(given.anchored)
-            by_submap.setdefault(self._back.submap_of(given.anchored), []).append(pose)
-        return {submap: _in_order(by_submap[submap]) for submap in sorted(by_submap)}
+        return self._history.by_submap(self._back.pose, self._back.submap_of)
 
     def _begin(self) -> None:
         self.times = StageTimes()
         self._warnings = InputWarnings()
         if self._detector is not None:
             self._detector.begin()
-        self._watch = InputChecks(self.camera, self._warnings, self._detector)
+        self._input_checks = InputChecks(self.camera, self._warnings, self._detector)
         if self._start_map is not None:
             warn_of_other_camera(self._start_map.camera, self.camera, self._warnings)
-        run, semantics, dynamics = self.config.run, self.config.semantics, self.config.dynamics
-        every = self._detector if semantics.frames == "every" else None
+        every = self._detector if self.config.semantics.frames == "every" else None
         self.dense_mapping = self._new_dense_mapping()
         self._back = BackEnd(
             self.camera,
@@ -410,29 +382,14 @@ class Slam:
             dense=self.dense_mapping,
             times=self.times,
         )
-        self._masks = (
-            None
-            if every is None and not dynamics.new_surfaces
-            else MaskPipeline(
-                self.camera,
-                every,
-                deterministic=run.in_turn,
-                latency_frames=semantics.latency_frames,
-                propagate=semantics.propagate,
-                new_surfaces=dynamics.new_surfaces,
-                farthest_m=float(self._params.sensor.max_depth_m),
-                dilate_px=semantics.dilate_px,
-                seed=run.seed,
-                times=self.times,
-            )
-        )
-        self._beside: Worker[tuple[str, Callable[[], Any]], Any] = make_worker(
-            self._do_beside,
-            "jaxslam-masks",
-            # Without either there is nothing to do beside flow.
-            deterministic=run.in_turn or (self._masks is None and self._rough_depth is None),
-            latency_frames=0,
-            urgent=True,
+        self._masks = MaskStage(
+            self.camera,
+            self.config,
+            self._memory,
+            every,
+            max_depth_m=float(self._params.sensor.max_depth_m),
+            instances=self._instances,
+            times=self.times,
         )
         self._state = self._fresh_state()
         if self._start_map is not None:
@@ -441,8 +398,7 @@ class Slam:
         self._clock = FrameClock(self.camera.fps, self._warnings)
         limits = float(self._params.sensor.min_depth_m), float(self._params.sensor.max_depth_m)
         self._background = None if self.camera.is_stereo else BackgroundConsistency(self.camera, *limits)
-        self._last_pose, self._last_twist, self._lost_s = np.array(IDENTITY), np.zeros(6), 0.0
-        self._given: list[_RecordedPose] = []
+        self._history, self._motion = PoseHistory(), ConstantVelocity()
         self._status = TrackStatus.OK
 
     def _new_dense_mapping(self) -> DenseMapping | None:
@@ -465,59 +421,6 @@ class Slam:
         # Committed from the beginning, as after any `cached_trace`: else all is compiled again when the first one is.
         return jax.device_put(state, *state.twist.devices())
 
-    def _tracked_or_rejected(self, timestamp_ns: int, frame: Frame | JaxSlamError | None) -> FrameResult | Rejected:
-        if frame is None:
-            late = FrameError("the next frame was there before there was time for this one")
-            return Rejected(timestamp_ns, late, TrackStatus.DROPPED)
-        try:
-            if not isinstance(frame, JaxSlamError):
-                return self.track(frame)
-            error = frame
-        except FrameError as unfit:
-            error = unfit
-        _log.warning("frame at %d ns rejected: %s", timestamp_ns, error)
-        return Rejected(timestamp_ns, error)
-
-    def _do_beside(self, job: tuple[str, Callable[[], Any]]) -> Any:
-        """A job of a stage, with the time it takes."""
-        stage, work = job
-        watch = self.times.stopwatch()
-        try:
-            return work()
-        finally:
-            watch.ends(stage)
-
-    def _match_pair(self, frame: Frame) -> None:
-        """Rough depth of a pair into the arrays held."""
-        assert self._rough_depth is not None
-        assert frame.right is not None
-        self._memory.hold_depth(self._rough_depth.of(frame.image, frame.right))
-
-    def _mask_of(self, frame: Frame, arrays: FrameArrays, correction: np.ndarray) -> FrameMask:
-        """What of a frame is to be left out because it may move."""
-        given = frame.dynamic_mask
-        if self._masks is None:
-            source = MaskSource.NONE if given is None else MaskSource.CALLER
-            return FrameMask(np.asarray(arrays.ignore), source, -1, "")
-        if not np.array_equal(correction, IDENTITY):
-            self._masks.apply_map_correction(correction)
-        gray, depth = np.asarray(arrays.image), np.asarray(arrays.depth)
-        mask = self._masks.mask_frame(self._frame, frame.image, gray, depth)
-        if given is not None:
-            mask = mask._replace(mask=mask.mask | given, source=mask.source or MaskSource.CALLER)
-        return mask
-
-    def _masked(self, arrays: FrameArrays, mask: np.ndarray, given: np.ndarray | None) -> FrameArrays:
-        """The frame without what may move; or with it, divided into things, if the tracker judges them.
-
-        What the caller has masked is left out in any case.
-        """
-        if self._objects is None:
-            return self._memory.ignoring(arrays, mask)
-        objects = self._objects.divided(mask if given is None else mask & ~given, np.asarray(arrays.depth))
-        arrays = self._memory.with_movable(arrays, objects.labels)
-        return self._memory.ignoring(arrays, objects.rest if given is None else objects.rest | given)
-
     def _advance(self, arrays: FrameArrays, followed: FlowResult) -> TrackOutput:
         params = self._params
         if self._back.is_behind:
@@ -527,21 +430,31 @@ class Slam:
         self._state, output = _track_followed(self._state, arrays, followed, params, self._plan)
         return jax.tree.map(np.asarray, output)  # as `device_get`, in a tenth of its time
 
-    def _without_movers(
-        self, arrays: FrameArrays, mask: FrameMask, followed: FlowResult, output: TrackOutput
-    ) -> tuple[FrameArrays, FrameMask]:
-        """The frame and its mask with what is said to move, regions, things and points: the map gets nothing of it."""
-        if self._objects is not None:  # what may move and stands still is out of the mask
-            mask = mask._replace(mask=np.array(arrays.ignore))
-        moving = None if output.moving is None else np.asarray(output.moving)
-        points, reach_px = moving_points(output.cue_results), self.config.dynamics.reach_px
-        if reach_px and points.any():
-            around = mask_around(np.asarray(followed.uv)[:, points], np.asarray(arrays.depth), reach_px)
-            moving = around if moving is None else moving | around
-        if moving is None or not moving.any():
-            return arrays, mask
-        mask = mask._replace(mask=mask.mask | moving, source=mask.source or MaskSource.CUES)
-        return self._memory.ignoring(arrays, mask.mask), mask
+    def _localize(
+        self, arrays: FrameArrays, output: TrackOutput, dt_s: float
+    ) -> tuple[TrackOutput, LocalizedPose | None, int]:
+        """Relocalize a frame that is lost, and match one that is weak with the local map.
+
+        Returns:
+            The output, the pose of a relocalization, and the number of map points that agree with it.
+        """
+        if int(output.status) == TrackStatus.LOST:
+            output, localized = self._relocalize(arrays, output, dt_s)
+            return output, localized, 0 if localized is None else localized.num_matched
+        if self._needs_map_match(output):
+            self._state, output, num_matched = self._back.match_local_map(self._state, arrays, output)
+            return output, None, num_matched
+        return output, None, 0
+
+    def _hand_over_keyframe(
+        self, frame: Frame, arrays: FrameArrays, output: TrackOutput, localized: LocalizedPose | None
+    ) -> None:
+        """Give a keyframe to the map, and every tracked frame to the dense map."""
+        if output.keyframe:
+            anchored = None if localized is None else localized.anchored
+            self._back.insert_keyframe(frame.timestamp_ns, frame.image, arrays, output, self._frame, anchored)
+        if self.dense_mapping is not None and int(output.status) != TrackStatus.LOST:
+            self.dense_mapping.frame_tracked(self._frame, frame.image, arrays, output)
 
     def _needs_map_match(self, output: TrackOutput) -> bool:
         """Whether a frame that was tracked is matched with the map too."""
@@ -553,17 +466,14 @@ class Slam:
         self, arrays: FrameArrays, lost: TrackOutput, dt_s: float
     ) -> tuple[TrackOutput, LocalizedPose | None]:
         """The frame once more, from where the map shows it; or from the pose held, if the settings say so."""
-        lost_s = self._lost_s + dt_s
-        predicted = (
-            retract(self._last_pose, self._last_twist * lost_s) if self._given and lost_s < _PREDICTED_S else None
-        )
+        predicted = self._motion.after(dt_s) if self._history else None
         placed, unknown = self._back.relocalize(arrays, predicted)
         self._unrecognized += unknown
         if placed is not None:
             self._state = self._back.reset_at_pose(self._state, placed.anchored)
         elif self._may_begin_submap and self._unrecognized > self.config.track.restart_after:
             self._state = self._back.start_submap(self._state, np.asarray(lost.T_world_cam.wxyz_xyz))
-        elif unknown and len(self.map.ids) and (self._status == TrackStatus.LOST or not self._given):
+        elif unknown and len(self.map.ids) and (self._status == TrackStatus.LOST or not self._history):
             # Nothing was followed into the frame: that is not why.
             return lost._replace(reason=np.int32(TrackReason.PLACE_NOT_IN_MAP)), None
         else:
@@ -580,7 +490,7 @@ class Slam:
     @property
     def _may_begin_submap(self) -> bool:
         """Whether a place that is not in the map may become a part of it."""
-        known = bool(self._given or len(self.map.ids))  # else the tracker starts by itself
+        known = bool(self._history or len(self.map.ids))  # else the tracker starts by itself
         return known and self.config.run.on_loss == "submap" and not self._localize_only
 
     def _in_submap(self, tracked: FrameResult) -> FrameResult:
@@ -592,12 +502,12 @@ class Slam:
         if tracked.status == TrackStatus.LOST and before != TrackStatus.LOST:
             _log.info("frame %d: lost: %s", self._frame, tracked.reason)
         elif tracked.status == TrackStatus.RELOCALIZED:
-            _log.info("frame %d: relocalized in submap %d after %.2f s", self._frame, submap, self._lost_s)
+            _log.info("frame %d: relocalized in submap %d after %.2f s", self._frame, submap, self._motion.lost_s)
         elif tracked.status == TrackStatus.STARTED:
             _log.info("frame %d: submap %d begins", self._frame, submap)
         return replace(tracked, submap=submap, in_map_frame=submap == self.map.world_submap)
 
-    def _with_background_check(self, tracked: FrameResult, arrays: FrameArrays) -> FrameResult:
+    def _checked_by_background(self, tracked: FrameResult, arrays: FrameArrays) -> FrameResult:
         """The result with what the background says of its pose, where too little has depth to have a vote there."""
         if self._background is None or tracked.status == TrackStatus.LOST:
             return tracked
@@ -615,65 +525,22 @@ class Slam:
     def _recorded(self, tracked: FrameResult, dt_s: float, depth_delay_s: float) -> FrameResult:
         """The result as it is given out, and remembered."""
         if tracked.status == TrackStatus.LOST:
-            self._lost_s += dt_s
-            self._last_pose = compose(tracked.correction, self._last_pose)
-            if self._masks is not None:
-                self._beside.submit(("masks", partial(self._masks.frame_lost, self._frame)), self._frame)
-            if self.config.run.on_loss == "predict":
-                ahead_s = min(self._lost_s, _PREDICTED_S)
-                tracked = replace(tracked, T_world_cam=retract(self._last_pose, self._last_twist * ahead_s))
-            return tracked
-        if self._masks is not None:
-            pose = retract(tracked.T_world_cam, tracked.twist * depth_delay_s)
-            when = self._frame, self._clock.continuous_ns(tracked.timestamp_ns) * 1e-9
-            moved_on = partial(self._masks.frame_tracked, *when, pose, _turn(tracked.twist))
-            self._beside.submit(("masks", moved_on), self._frame)
-        self._unrecognized, self._lost_s = 0, 0.0
-        self._last_pose, self._last_twist = tracked.T_world_cam, tracked.twist
+            self._motion.lost(dt_s, tracked.correction)
+            self._masks.frame_lost(self._frame)
+            return replace(tracked, T_world_cam=self._motion.now()) if self.config.run.on_loss == "predict" else tracked
+        when_depth_was_taken = retract(tracked.T_world_cam, tracked.twist * depth_delay_s)
+        time_s = self._clock.continuous_ns(tracked.timestamp_ns) * 1e-9
+        self._masks.frame_tracked(self._frame, time_s, when_depth_was_taken, _turn(tracked.twist))
+        self._unrecognized = 0
+        self._motion.tracked(tracked.T_world_cam, tracked.twist)
         self._back.localize(tracked.T_world_cam, self._frame)
         anchored = self._back.anchor(tracked.T_world_cam)
-        self._given.append(_RecordedPose(tracked.timestamp_ns, tracked.T_world_cam, anchored, tracked.in_map_frame))
+        self._history.add(tracked.timestamp_ns, tracked.T_world_cam, anchored, in_map_frame=tracked.in_map_frame)
         return tracked
 
 
 def _watched(detector: Detector | None) -> CheckedDetector | None:
     return None if detector is None else CheckedDetector(detector)
-
-
-class _RecordedPose(NamedTuple):
-    """A pose that was given out.
-
-    Attributes:
-        timestamp_ns: Time of its frame.
-        T_world_cam: `(7,)` as it was given out.
-        anchored: The same tied to a keyframe, with which it moves.
-        in_map_frame: As of `FrameResult`.
-    """
-
-    timestamp_ns: int
-    T_world_cam: np.ndarray
-    anchored: AnchoredPose
-    in_map_frame: bool
-
-
-def _in_order(stamped: Sequence[tuple[int, np.ndarray]]) -> Trajectory:
-    """Poses with their stamps as a trajectory; of a clock that was set back, in the order of time all the same."""
-    times_ns = np.array([time_ns for time_ns, _ in stamped], np.int64)
-    poses = np.array([pose for _, pose in stamped]).reshape(-1, 7)
-    poses[:, :4] /= np.linalg.norm(poses[:, :4], axis=1, keepdims=True)
-    order = np.argsort(times_ns, kind="stable")
-    return Trajectory(times_ns[order], poses[order])
-
-
-@contextmanager
-def _no_old_garbage() -> Iterator[None]:
-    """Have the garbage collector leave alone what was there before: to look through it all takes 0.3 s of a frame."""
-    gc.collect()
-    gc.freeze()
-    try:
-        yield
-    finally:
-        gc.unfreeze()
 
 
 def _awaiting_relocalization(state: TrackState) -> TrackState:
@@ -685,28 +552,3 @@ def _awaiting_relocalization(state: TrackState) -> TrackState:
 def _turn(twist: np.ndarray) -> float:
     """Angular speed, rad/s."""
     return float(np.linalg.norm(twist[3:]))
-
-
-class _ErrorsAsValues:
-    """A recording whose unreadable frames are errors as values."""
-
-    def __init__(self, dataset: Dataset) -> None:
-        self._dataset = dataset
-
-    def __len__(self) -> int:
-        return len(self._dataset)
-
-    def __getitem__(self, index: int) -> Frame | JaxSlamError:
-        try:
-            frame: object = self._dataset[index]
-        except (DatasetError, FrameError) as error:
-            return error
-        if not isinstance(frame, Frame):
-            return DatasetError(f"frame {index}: expected a jaxslam.Frame, got {type(frame).__name__}")
-        return frame
-
-
-def _frames_of(dataset: Dataset, config: Config) -> Iterator[Frame | JaxSlamError | None]:
-    """Every frame, or why there is none: it cannot be read, or it came late (`None`)."""
-    frames = prefetch(_ErrorsAsValues(dataset), ahead=config.run.prefetch_frames)
-    return in_real_time(frames, dataset.timestamps_ns) if config.run.realtime else frames

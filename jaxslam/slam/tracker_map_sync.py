@@ -6,14 +6,13 @@ known poses, and frames and keyframes still on their way to the map hang on thos
 
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
 from jaxslam.geometry.se3 import IDENTITY, angle, between, compose, inverse, to_local, transform
 from jaxslam.map.types import NONE, Map, has, surviving_keyframes
 from jaxslam.mapping.local_mapping import NewKeyframe, TrackedObservations
+from jaxslam.runtime.compiled import compiled
 from jaxslam.runtime.padding import padded
-from jaxslam.runtime.trace_cache import cached_trace
 from jaxslam.sensors.frame_arrays import FrameArrays
 from jaxslam.slam.keyframe_reload import MapKeyframe
 from jaxslam.tracking.state import TrackOutput, TrackPlan, TrackState, TrackStatus
@@ -22,9 +21,9 @@ from jaxslam.tracking.state_updates import apply_map_correction, drop_points, lo
 _MIN_MOVE_M, _MIN_TURN = 1e-6, 1e-6
 """A correction below both is none."""
 
-_carried = jax.jit(cached_trace(apply_map_correction), donate_argnums=0)
-_reloaded = jax.jit(cached_trace(load_keyframe), donate_argnums=0)
-_forgotten = jax.jit(cached_trace(drop_points), donate_argnums=0)
+_carried = compiled(when="warm-up", donate="state")(apply_map_correction)
+_reloaded = compiled(when="warm-up", donate="state")(load_keyframe)
+_forgotten = compiled(when="warm-up", donate="state")(drop_points)
 _AT_ONCE = 1024
 """Points forgotten in one call."""
 
