@@ -1,29 +1,12 @@
 """`jaxslam compare`: several presets on one recording, several times each, in one table."""
 
-import json
-import statistics
-from collections import Counter
 from dataclasses import dataclass
-from typing import Any
 
-from jaxslam.benchmark.reports.markdown import table
-from jaxslam.benchmark.suites.aggregate import shown_label
-from jaxslam.cli.console import console, make_table, plain_console, print_json
+from jaxslam.cli.console import print_json
 from jaxslam.cli.run import OfRecording
-from jaxslam.cli.tracking_run import number, track
-from jaxslam.config.loading import presets
 from jaxslam.errors import ConfigError, nearest
-from jaxslam.io.atomic_files import write_atomically
-from jaxslam.runtime.compile_cache import prefer_one_thread
-from jaxslam.semantics.from_config import network_files, preset_needs_network
-from jaxslam.slam.slam import Slam
 
-_COLUMNS = (
-    *("preset", "tracked", "dropped", "matched poses", "ATE, m", "from - to", "ATE Sim(3), m"),
-    *("RPE, m/s", "RPE, deg/s", "mean ms", "median ms", "p95 ms"),
-)
-_ERRORS = ("preset", "ATE, m", "from - to", "ATE Sim(3), m", "RPE, m/s", "RPE, deg/s")
-_COVERAGE_AND_TIMES = tuple(column for column in _COLUMNS if column not in _ERRORS[1:])
+# Heavy modules are imported where a command runs: `--help` needs none of them.
 
 
 @dataclass(frozen=True)
@@ -37,6 +20,10 @@ class Compare(OfRecording):
 
     def main(self) -> None:
         """Run the command."""
+        from jaxslam.cli.compare_run import check_networks, compare_presets, print_tables, write_tables  # noqa: PLC0415
+        from jaxslam.config.loading import presets  # noqa: PLC0415
+        from jaxslam.runtime.compile_cache import prefer_one_thread  # noqa: PLC0415
+
         if self.runs < 1:
             raise ConfigError(f"--runs: expected at least 1, got {self.runs}")
         chosen = tuple(dict.fromkeys(self.presets))
@@ -44,91 +31,11 @@ class Compare(OfRecording):
             if preset not in presets():
                 raise ConfigError(f"--presets: unknown preset '{preset}'{nearest(preset, presets())}")
         dataset, out = self.opened(), self.folder()
-        for preset in chosen:
-            network_files(self.settings(preset).semantics)  # an error now, not after other presets
+        check_networks(self, chosen)
         prefer_one_thread()  # nothing else computes while a recording is tracked
-        rows: list[dict[str, Any]] = []
-        for preset in chosen:
-            summaries = []
-            for seed in range(self.runs):
-                console.print(f"{preset}, run {seed + 1} of {self.runs}")
-                slam = Slam(dataset.camera, self.settings(preset, f"run.seed={seed}"))
-                folder = out / preset / str(seed)
-                summaries.append(track(dataset, slam, preset, folder, quiet=True))
-            rows.append(figures(preset, summaries))
-        lines = [line for row in rows for line in remarks(row)]
+        rows = compare_presets(self, chosen, dataset, out)
         if self.json:
             print_json(rows)
         else:
-            print_tables(dataset.name, rows, lines)
-        write_atomically(out / "comparison.json", (json.dumps(rows, indent=2) + "\n").encode())
-        text = table(_COLUMNS, [_cells(row) for row in rows]) + "".join(f"\n- {line}\n" for line in lines)
-        write_atomically(out / "comparison.md", text.encode())
-        console.print(f"Table in {out}: comparison.md, comparison.json; results of each run in {out}/PRESET/SEED")
-
-
-def figures(preset: str, summaries: list[dict[str, Any]]) -> dict[str, Any]:
-    """The figures of a preset over its runs; those of accuracy over the runs that could be evaluated."""
-    ates = [summary["ate_rmse_m"] for summary in summaries if summary["ate_rmse_m"] is not None]
-    problems = [summary["evaluation_problem"] for summary in summaries if summary["ate_rmse_m"] is None]
-    evaluations = [summary["evaluation"] for summary in summaries if summary["evaluation"] is not None]
-    without = next(
-        (summary["without_network"] for summary in summaries if summary["without_network"] is not None), None
-    )
-    known = lambda name: [evaluation[name] for evaluation in evaluations if evaluation[name] is not None]
-    similar = [summary["ate_sim3_rmse_m"] for summary in summaries if summary["ate_sim3_rmse_m"] is not None]
-    times = [summary["track_ms"] for summary in summaries if summary["track_ms"] is not None]
-    middle = lambda values: statistics.median(values) if values else None
-    return {
-        "preset": preset,
-        "without_network": without,
-        "lacks_network": without is not None and preset_needs_network(preset),
-        "runs": len(summaries),
-        "tracked_percent": min(summary["tracked_percent"] for summary in summaries),
-        "dropped_percent": max(summary["dropped_percent"] for summary in summaries),
-        "ate_rmse_m": middle(ates),
-        "ate_rmse_m_of_runs": ates,
-        "ate_sim3_rmse_m": middle(similar),
-        **{name: middle(known(name)) for name in ("rpe_trans_m_per_s", "rpe_rot_deg_per_s")},
-        "num_matched": min((evaluation["num_matched"] for evaluation in evaluations), default=None),
-        "evaluation_problems": problems,
-        "notes": list(dict.fromkeys(note for evaluation in evaluations for note in evaluation["notes"])),
-        **{f"track_ms_{name}": middle([time[name] for time in times]) for name in ("mean", "median", "p95")},
-    }
-
-
-def _cells(row: dict[str, Any]) -> list[str]:
-    ates = row["ate_rmse_m_of_runs"]
-    return [
-        shown_label(row["preset"], lacks_network=row["lacks_network"]),
-        f"{row['tracked_percent']:.1f} %",
-        f"{row['dropped_percent']:.1f} %",
-        number(row["num_matched"], 0),
-        number(row["ate_rmse_m"], 4),
-        f"{min(ates):.4f} - {max(ates):.4f}" if ates else "-",
-        number(row["ate_sim3_rmse_m"], 4),
-        number(row["rpe_trans_m_per_s"], 4),
-        number(row["rpe_rot_deg_per_s"], 3),
-        *(number(row[f"track_ms_{name}"], 1) for name in ("mean", "median", "p95")),
-    ]
-
-
-def remarks(row: dict[str, Any]) -> list[str]:
-    """Why a preset ran without a network, why runs have no ATE, and what the evaluations say about their figures."""
-    missing = Counter(row["evaluation_problems"])
-    why = row["without_network"]
-    lines = [] if why is None else [f"{row['preset']}: without a network ({why})"]
-    lines += [f"{row['preset']}: no ATE of {count} runs: {problem}" for problem, count in missing.items()]
-    return lines + [f"{row['preset']}: note: {note}" for note in row["notes"]]
-
-
-def print_tables(title: str, rows: list[dict[str, Any]], lines: list[str]) -> None:
-    """Print two tables, since one with all columns would not fit 80 columns, and what there is to say about them."""
-    for name, columns in ((title, _ERRORS), ("", _COVERAGE_AND_TIMES)):
-        table = make_table(name, *columns, wrap_first=True)
-        for row in rows:
-            cells = dict(zip(_COLUMNS, _cells(row), strict=True))
-            table.add_row(*(cells[column] for column in columns))
-        console.print(table)
-    for line in lines:
-        plain_console.print(line)
+            print_tables(dataset.name, rows)
+        write_tables(rows, out)

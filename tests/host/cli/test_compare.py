@@ -7,7 +7,7 @@ import pytest
 from made_results import done
 from small_scene import HEIGHT, SETTINGS, WIDTH
 
-from jaxslam.cli.compare import figures, remarks
+from jaxslam.cli.compare_run import figures, remarks
 from jaxslam.cli.entry_point import main
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset, write_tum
 

@@ -14,7 +14,7 @@ from tiny_recording import CAMERA, write_recording
 from jaxslam.benchmark.kernels.registry import chosen
 from jaxslam.cli.bench_batch import clips_table
 from jaxslam.cli.bench_kernels import case_table
-from jaxslam.cli.compare import figures, print_tables
+from jaxslam.cli.compare_run import figures, print_tables
 from jaxslam.cli.console import console, make_table, messages_for, plain_console, print_json, text_column
 from jaxslam.cli.entry_point import main
 from jaxslam.cli.shared_options import WithJson
@@ -59,9 +59,15 @@ class TestTable:
 
     def test_of_presets_with_long_names(self, capsys: pytest.CaptureFixture[str]) -> None:
         times: Any = {"mean": 12.3, "median": 12.1, "p95": 123.4}
-        run = done(track_ms=times, without_network="why", ate_rmse_m=12.3456, ate_sim3_rmse_m=12.3456)
+        run = done(
+            track_ms=times,
+            without_network="why",
+            ate_rmse_m=12.3456,
+            ate_sim3_rmse_m=12.3456,
+            evaluation={"notes": ["[odd]"]},
+        )
         rows = [figures(preset, [run, run]) for preset in ("static", "rts-semantics-epipolar")]
-        print_tables("walking [xyz]", rows, ["ngd: note: [odd]"])
+        print_tables("walking [xyz]", rows)
         out = capsys.readouterr().out
         assert all(len(line) <= WIDTH for line in rows_of(out))
         assert CUT not in out

@@ -12,6 +12,7 @@ from types import ModuleType
 import pytest
 
 import jaxslam
+from jaxslam.cli.command_table import COMMANDS
 
 PACKAGE = Path(jaxslam.__file__).parent
 HEAVY = ("jax", "numpy", "scipy", "matplotlib", "onnxruntime", "cv2", "equinox", "tyro", "rich")
@@ -51,13 +52,29 @@ def test_listing_commands_loads_nothing_heavy(words: list[str]) -> None:
     assert not loaded_after(CALL.format(words=words)) & set(HEAVY)
 
 
-@pytest.mark.parametrize(
-    "name", ["demo", "run", "eval", "doctor", "export", "models list", "models get", "models check", "data list"]
-)
-def test_help_of_a_command_loads_no_jax(name: str) -> None:
-    loaded = loaded_after(CALL.format(words=[*name.split(), "--help"]))
-    assert "tyro" in loaded
-    assert not loaded & {"jax", *LATE}
+HELP_OF_ALL = """
+import contextlib, io, json, sys
+from jaxslam.cli import main
+loaded, seen = {{}}, set()
+for words in {commands!r}:
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said), contextlib.suppress(SystemExit):
+        main([*words, "--help"])
+    assert "usage: jaxslam " + " ".join(words) in " ".join(said.getvalue().split()), words
+    loaded[" ".join(words)] = sorted(set(sys.modules).intersection({late!r}) - seen)
+    seen.update(sys.modules)
+print(json.dumps(loaded), file=sys.stderr)
+"""
+
+
+def test_help_of_a_command_loads_no_jax() -> None:
+    """One process prints the help of all commands, and reports what each loads that those before it did not."""
+    code = HELP_OF_ALL.format(commands=[command.words for command in COMMANDS], late=("jax", "tyro", *LATE))
+    done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    loaded = json.loads(done.stderr)
+    assert set(loaded) == {command.name for command in COMMANDS}
+    assert {module for modules in loaded.values() for module in modules} == {"tyro"}, loaded
 
 
 INDEXES = sorted(PACKAGE.rglob("__init__.pyi"))
