@@ -18,6 +18,8 @@ from jaxslam.trajectory.evaluation import Evaluation
 
 _COLUMNS = ("timestamp_s", *(field.name for field in fields(FrameRecord) if field.name != "timestamp_ns"))
 _ERROR_COLUMNS = ("timestamp_s", "x_m", "y_m", "z_m", "true_x_m", "true_y_m", "true_z_m", "error_m")
+_EARLIER_NAMES = {"num_looked_up": "num_keyframe_matches"}
+"""Columns that had another name when the file was written, each with its present name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,6 +119,7 @@ def _read(path: Path, columns: Sequence[str]) -> list[list[str]]:
             head, *rows = csv.reader(file)
     except (OSError, ValueError) as problem:
         raise TrajectoryError(f"{path}: cannot be read: {problem}") from None
-    if tuple(head) != tuple(columns) or any(len(row) != len(columns) for row in rows):
+    names = tuple(_EARLIER_NAMES.get(name, name) for name in head)
+    if names != tuple(columns) or any(len(row) != len(columns) for row in rows):
         raise TrajectoryError(f"{path}: expected the columns {', '.join(columns)}, got {', '.join(head)}")
     return rows

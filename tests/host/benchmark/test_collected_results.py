@@ -14,10 +14,12 @@ from small_scene import clip
 from tiny_recording import write_recording
 
 from jaxslam.benchmark.reference_flow import flow_time_ms
+from jaxslam.benchmark.reports.markdown import markdown_report
 from jaxslam.benchmark.suites.collected_results import ALWAYS, Collected, read_results
 from jaxslam.benchmark.suites.job import Job
 from jaxslam.benchmark.suites.provenance import changes, identities
 from jaxslam.benchmark.suites.suite import Sequence as Clip
+from jaxslam.benchmark.suites.suite import Suite
 from jaxslam.cli.entry_point import main
 from jaxslam.errors import BenchmarkError, DatasetError
 from jaxslam.sensors.frame import Frame
@@ -34,6 +36,15 @@ sequences:
 
 def job(seed: int = 0, *, settings: tuple[str, ...] = ("semantics.model=null",)) -> Job:
     return Job(Clip("tiny", "tiny", camera="tum_fr1"), "static", "", settings, seed)
+
+
+def test_results_with_earlier_names_are_read(tmp_path: Path) -> None:
+    """Results written when the status was spelled RELOCALISED load, and have a row in the report."""
+    earlier = done(status_counts={"OK": 926, "RELOCALISED": 1}, relocalised=1)
+    (tmp_path / "results.json").write_text(json.dumps([earlier]))
+    assert read_results(tmp_path) == [earlier]
+    suite = Suite("crowd", "", (Clip("crowd", "crowd"),))
+    assert "| static | 1 of 1 |" in markdown_report(suite, read_results(tmp_path), {})
 
 
 class TestIdentity:

@@ -86,6 +86,14 @@ class TestTables:
         np.testing.assert_allclose(read_track_ms(out / "frames.csv"), [float(row["track_ms"]) for row in rows])
         assert [float(row["timestamp_s"]) for row in rows] == sorted(float(row["timestamp_s"]) for row in rows)
 
+    def test_earlier_names_are_read(self, out: Path, tmp_path: Path) -> None:
+        """A table written before `num_keyframe_matches` and `RELOCALIZED` had these names."""
+        text = (out / "frames.csv").read_text()
+        earlier = text.replace("num_keyframe_matches", "num_looked_up", 1).replace(",LOST,", ",RELOCALISED,", 1)
+        assert earlier.count("num_looked_up") == earlier.count("RELOCALISED") == 1
+        (tmp_path / "frames.csv").write_text(earlier)
+        np.testing.assert_array_equal(read_track_ms(tmp_path / "frames.csv"), read_track_ms(out / "frames.csv"))
+
     def test_errors(self, out: Path) -> None:
         errors, poses = read_errors(out / "errors.csv"), read_tum(out / "trajectory.txt")
         np.testing.assert_array_equal(errors.timestamps_ns, poses.timestamps_ns)
