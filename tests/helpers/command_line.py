@@ -1,6 +1,8 @@
-"""Commands as a shell would call them, and what they say when they cannot."""
+"""Call commands as a shell would, and read what they print."""
 
+import json
 from collections.abc import Callable
+from typing import Any, NoReturn
 
 import pytest
 
@@ -26,3 +28,18 @@ def failing(*command: str, code: int = 1) -> Fails:
         return lines[0].removeprefix("error: ")
 
     return fails
+
+
+def printed_json(capsys: pytest.CaptureFixture[str]) -> tuple[Any, str]:
+    """Read what a command with `--json` has printed.
+
+    Returns:
+        The only JSON document on standard output, in which NaN and infinity are not allowed, and the messages on
+        standard error.
+    """
+
+    def not_json(text: str) -> NoReturn:
+        raise AssertionError(f"expected null for a figure that is not finite, got {text}")
+
+    out, err = capsys.readouterr()
+    return json.loads(out, parse_constant=not_json), err

@@ -1,5 +1,6 @@
 """`track_clips` and `jaxslam bench batch`: clips at once are what each is alone, and figures are what they say."""
 
+import contextlib
 import inspect
 import io
 import json
@@ -30,6 +31,7 @@ fails = failing("bench", "batch")
 
 FRAMES, SAME_M = 4, 1e-4
 FILES = {"batch.json", "batch.md", "batch.png"}
+PRINTED = "printed.json"
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -46,10 +48,12 @@ def small_programs() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the command leaves behind."""
+    """What the command leaves behind; what it prints is in a file beside this folder."""
     folder = tmp_path_factory.mktemp("batch") / "out"
-    size = f"{WIDTH}x{HEIGHT}"
-    main(["bench", "batch", "--clips", "2", "--frames", str(FRAMES), "--size", size, "--out", str(folder)])
+    size, options = f"{WIDTH}x{HEIGHT}", ["--clips", "2", "--frames", str(FRAMES), "--out", str(folder), "--json"]
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        main(["bench", "batch", "--size", size, *options])
+    (folder.parent / PRINTED).write_text(printed.getvalue())
     return folder
 
 
@@ -127,6 +131,9 @@ class TestTrackClips:
 
 
 class TestCommand:
+    def test_prints_its_figures_alone(self, out: Path, content: dict[str, Any]) -> None:
+        assert json.loads((out.parent / PRINTED).read_text()) == content
+
     def test_figures(self, content: dict[str, Any]) -> None:
         assert content["size"] == [WIDTH, HEIGHT]
         assert (content["frames"], content["rounds"], content["different"]) == (FRAMES, 3, 2)
@@ -171,7 +178,7 @@ class TestCommand:
         [
             (("--clips", "0"), "--clips: expected numbers of at least 1, got 0"),
             (("--clips", "4", "-1"), "--clips: expected numbers of at least 1, got 4 -1"),
-            (("--frames", "1"), "--frames: expected at least 3, to be aligned with the truth, got 1"),
+            (("--frames", "1"), "--frames: expected at least 3, to align them with the ground truth, got 1"),
             (("--rounds", "0"), "--rounds: expected at least 1, got 0"),
             (("--size", "320"), "--size: expected WIDTHxHEIGHT of 64 to 8192 pixels each, got '320'"),
             (("--size", "32x240"), "--size: expected WIDTHxHEIGHT of 64 to 8192 pixels each, got '32x240'"),

@@ -1,5 +1,6 @@
 """`jaxslam bench kernels`: rows that are what they say, the same results on both sides, other libraries missing."""
 
+import contextlib
 import importlib.metadata
 import io
 import json
@@ -26,6 +27,7 @@ from jaxslam.runtime.machine import machine
 
 fails = failing("bench", "kernels")
 
+PRINTED = "printed.json"
 MEASURED, ROUNDS = ("image_pyramid", "lk_flow", "dbscan"), 6
 SMALL = (
     "corners", "pose_refine", "bundle_adjust", "pose_graph", "alignment", "cue_clusters", "cue_epipolar_trajectory",
@@ -36,11 +38,13 @@ SMALL = (
 
 @pytest.fixture(scope="module")
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the command leaves behind."""
+    """What the command leaves behind; what it prints is in a file beside this folder."""
     folder = tmp_path_factory.mktemp("kernels") / "out"
-    with pytest.MonkeyPatch.context() as patch:
+    options = ["--quick", "--rounds", str(ROUNDS), "--only", *MEASURED, "--out", str(folder), "--json"]
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as printed:
         patch.setenv("NPROC", "1")  # as the command does, but undone
-        main(["bench", "kernels", "--quick", "--rounds", str(ROUNDS), "--only", *MEASURED, "--out", str(folder)])
+        main(["bench", "kernels", *options])
+    (folder.parent / PRINTED).write_text(printed.getvalue())
     return folder
 
 
@@ -50,6 +54,9 @@ def content(out: Path) -> dict[str, Any]:
 
 
 class TestResults:
+    def test_are_printed_alone(self, out: Path, content: dict[str, Any]) -> None:
+        assert json.loads((out.parent / PRINTED).read_text()) == content
+
     def test_of_every_size(self, content: dict[str, Any]) -> None:
         assert [(row["kernel"], row["size"]) for row in content["rows"] if row["backend"] == "cpu"] == [
             (case.name, size) for case in chosen(MEASURED) for size in case.sizes[:2]

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import failing
+from command_line import failing, printed_json
 from small_scene import SETTINGS
 
 from jaxslam.benchmark.reports.html import html_report
@@ -188,13 +188,15 @@ class TestGoingOn:
     def test_nothing_twice(self, out: Path, capsys: pytest.CaptureFixture[str]) -> None:
         before = times_of(sorted(out.rglob("result.json")))
         kept = (out / "results.json").read_text()
-        main(["bench", suite_file(out.parent), "--out", str(out), "--resume"])
+        main(["bench", suite_file(out.parent), "--out", str(out), "--resume", "--json"])
         assert times_of(sorted(out.rglob("result.json"))) == before
         assert (out / "results.json").read_text() == kept
-        assert "4 runs, 0 failed" in capsys.readouterr().out
+        results, messages = printed_json(capsys)
+        assert results == json.loads(kept)
+        assert "4 runs, 0 failed" in messages
 
     def test_not_by_mistake(self, out: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        assert "--resume goes on" in fails(capsys, suite_file(out.parent), "--out", str(out))
+        assert "--resume keeps them" in fails(capsys, suite_file(out.parent), "--out", str(out))
 
     def test_what_differs_is_run_again(self, mine: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         """That alone, and it is said why; other presets and seeds stay in the report."""
@@ -210,9 +212,9 @@ class TestGoingOn:
         now = times_of(sorted(mine.rglob("result.json")))
         assert [path for path in now if now[path] != before[path]] == [config.parent / "result.json", result]
         out = capsys.readouterr().out
-        assert "room, default, seed 0: run anew: track.probation_frames was 9.0, is 8.0" in out
-        assert "room, default, seed 1: run anew: result.json is not as the run wrote it" in out
-        assert "In the report too: 2 runs of earlier calls." in out
+        assert "room, default, seed 0: run again: track.probation_frames was 9.0, is 8.0" in out
+        assert "room, default, seed 1: run again: result.json is not as the run wrote it" in out
+        assert "Also in the report: 2 runs of earlier calls." in out
         results = json.loads((mine / "results.json").read_text())
         assert [(run["label"], run["seed"]) for run in results] == [
             ("static", 0), ("static", 1), ("default", 0), ("default", 1)
@@ -316,9 +318,8 @@ def command(out: Path, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
 class TestGate:
     def test_nothing_is_worse(self, command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
         main([*command, "--json"])
-        out, err = capsys.readouterr()
+        told, err = printed_json(capsys)
         assert "Nothing is worse" in err
-        told = json.loads(out)
         assert (told["worse"], told["results"][0]["status"]) == ([], "done")
 
     @pytest.mark.parametrize(("figure", "factor"), [("ate_rmse_m", 0.95), ("time_of_flows", 1 / 1.5)])

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+from command_line import printed_json
 from made_results import done
 from small_scene import HEIGHT, SETTINGS, WIDTH
 
@@ -47,8 +48,8 @@ def test_a_table(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
         "- static: without a network (semantics.model is null)",
         "- ngd: without a network (yolox-nano not on this machine)",
     ]
-    printed, told = capsys.readouterr()
-    assert json.loads(printed) == rows
+    printed, told = printed_json(capsys)
+    assert printed == rows
     assert "ngd, run 2 of 2" in told
     seeds = [(tmp_path / "ngd" / seed / "config.yaml").read_text().count(f"seed: {seed}\n") for seed in "01"]
     assert seeds == [1, 1]

@@ -6,13 +6,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from command_line import printed_json
 from made_results import done
 from rich.console import Console
 from rich.progress import Progress
 from tiny_recording import CAMERA, write_recording
 
 from jaxslam.benchmark.kernels.registry import chosen
-from jaxslam.cli.bench_batch import clips_table
+from jaxslam.cli import bench_kernels, compare_run, tracking_run
+from jaxslam.cli.bench import Bench
+from jaxslam.cli.bench_batch import Batch, clips_table
 from jaxslam.cli.bench_kernels import case_table
 from jaxslam.cli.compare_run import figures, print_tables
 from jaxslam.cli.console import console, make_table, messages_for, plain_console, print_json, text_column
@@ -20,6 +23,40 @@ from jaxslam.cli.entry_point import main
 from jaxslam.cli.shared_options import WithJson
 
 WIDTH, CUT = 80, "…"
+NAN = float("nan")
+CLIPS_ROW: dict[str, Any] = {
+    "clips": 64,
+    "way": "32 threads of 16",
+    "threads": 1,
+    "frames_per_s": 1206.3,
+    "cores": 31.98,
+    "compile_s": 123.4,
+    "frames_per_s_per_core": 104.1,
+    "loop_frames_per_s": 72.3,
+    "ratio_to_loop": 22.9,
+    "peak_rss_mb": 12345.0,
+    "peak_device_mb": None,
+    "ate_rmse_m": 0.01234,
+    "ate_rmse_m_of_clips": [0.2],
+    "off_alone_m": 1e-5,
+    "same_statuses": True,
+}
+KERNEL_ROW: dict[str, Any] = {
+    "kernel": "bundle_adjust",
+    "size": 12,
+    "label": "12 keyframes, 1500 points",
+    "backend": "cpu",
+    "device": "cpu",
+    "compile_s": 3.0,
+    "ours_ms": 12345.0,
+    "ours_p95_ms": 12345.0,
+    "theirs_ms": 12345.0,
+    "theirs_p95_ms": 12345.0,
+    "ratio": 0.00123,
+    "difference": 0.000123,
+    "agrees": False,
+    "problem": "",
+}
 
 
 @pytest.fixture(autouse=True)
@@ -76,17 +113,7 @@ class TestTable:
         assert "rts-semantics-epipolar" in out
 
     def test_of_clips(self, capsys: pytest.CaptureFixture[str]) -> None:
-        row: dict[str, Any] = {
-            **{"clips": 64, "way": "32 threads of 16", "frames_per_s": 1206.3, "cores": 31.98, "compile_s": 123.4},
-            **{
-                "frames_per_s_per_core": 104.1,
-                "loop_frames_per_s": 72.3,
-                "ratio_to_loop": 22.9,
-                "peak_rss_mb": 12345.0,
-            },
-            **{"peak_device_mb": None, "ate_rmse_m": 0.01234, "ate_rmse_m_of_clips": [0.2], "off_alone_m": 1e-5},
-        }
-        console.print(clips_table([row | {"same_statuses": same} for same in (True, False)]))
+        console.print(clips_table([CLIPS_ROW | {"same_statuses": same} for same in (True, False)]))
         out = capsys.readouterr().out
         assert all(len(line) <= WIDTH for line in rows_of(out))
         assert CUT not in out
@@ -95,12 +122,7 @@ class TestTable:
 
     def test_of_kernels(self, capsys: pytest.CaptureFixture[str]) -> None:
         (case,) = chosen(("bundle_adjust",))
-        row: dict[str, Any] = {
-            **{"kernel": case.name, "label": "12 keyframes, 1500 points", "backend": "cpu", "compile_s": 3.0},
-            **{"ours_ms": 12345.0, "ours_p95_ms": 12345.0, "theirs_ms": 12345.0, "theirs_p95_ms": 12345.0},
-            **{"ratio": 0.00123, "difference": 0.000123, "agrees": False, "problem": ""},
-        }
-        console.print(case_table(case, [row]))
+        console.print(case_table(case, [KERNEL_ROW]))
         out = capsys.readouterr().out
         assert all(len(line) <= WIDTH for line in rows_of(out))
         assert CUT not in out
@@ -168,6 +190,53 @@ class TestJson:
         assert stop.value.code == 1
         assert json.loads(out)["errors"] == 1
         assert err.startswith("error: ")
+
+    def test_of_run_and_compare(
+        self, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    ) -> None:
+        """The summary of a run, and a row for each preset; here, tracking itself is left out."""
+        recording = write_recording(tmp_path / "walk")
+        CAMERA.save(recording / "camera.yaml")
+
+        def track(*_: Any, **__: Any) -> dict[str, Any]:
+            console.print("tracking")
+            return done(ate_rmse_m=NAN, evaluation={"rpe_trans_m_per_s": NAN})
+
+        for module in (tracking_run, compare_run):
+            monkeypatch.setattr(module, "track", track)
+        main(["run", str(recording), "--json"])
+        summary, messages = printed_json(capsys)
+        assert messages == "tracking\n"
+        assert summary == done(ate_rmse_m=None, evaluation={"rpe_trans_m_per_s": None})
+        main(["compare", str(recording), "--presets", "static", "--out", str(tmp_path), "--json"])
+        (row,), messages = printed_json(capsys)
+        assert messages.startswith("static, run 1 of 1\ntracking\n")
+        assert (row["preset"], row["ate_rmse_m"], row["rpe_trans_m_per_s"]) == ("static", None, None)
+        assert row["num_matched"] == 927
+
+    def test_of_benchmarks(
+        self, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    ) -> None:
+        """The results of a suite, and the figures of clips and kernels; here, measuring itself is left out."""
+
+        def results(*_: Any, **__: Any) -> list[dict[str, Any]]:
+            plain_console.print("running")
+            return [done(ate_rmse_m=NAN)]
+
+        monkeypatch.setattr(Bench, "results", results)
+        main(["bench", "smoke", "--json"])
+        (run,), messages = printed_json(capsys)
+        assert messages == "running\n"
+        assert {name: run[name] for name in done()} == done(ate_rmse_m=None)
+        for command, measuring, row, options in (
+            ("batch", Batch, CLIPS_ROW, []),
+            ("kernels", bench_kernels, KERNEL_ROW, ["--only", KERNEL_ROW["kernel"]]),
+        ):
+            monkeypatch.setattr(measuring, "_measured", lambda *_, row=row: [row | {"compile_s": NAN}])
+            main(["bench", command, *options, "--out", str(tmp_path), "--json"])
+            document, messages = printed_json(capsys)
+            assert document["rows"] == [row | {"compile_s": None}]
+            assert messages.startswith(f"Table and plot: {tmp_path / command}.md")
 
 
 def test_figures_that_are_not_finite_are_null(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,5 +1,6 @@
 """Losses and what comes after: the same world again, the policies, and a map kept in a file."""
 
+import json
 import subprocess
 import sys
 from dataclasses import replace
@@ -7,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import failing
+from command_line import failing, printed_json
 from replay import BLACK, CONFIG, HOLD, PREDICT, SUBMAP, Order, Played
 from room_round import FPS, FRAMES, TRACK, room
 from small_map import same
@@ -260,16 +261,21 @@ class TestCommandLine:
         assert f"Map in {map_file}" in capsys.readouterr().out
         before = map_file.read_bytes()
         out = tmp_path / "two"
-        main(["run", str(written), "--map", str(map_file), "--localize-only", "--out", str(out), *settings])
-        assert "RELOCALIZED 1" in capsys.readouterr().out
+        main(["run", str(written), "--map", str(map_file), "--localize-only", "--out", str(out), "--json", *settings])
+        summary, messages = printed_json(capsys)
+        assert summary == json.loads((out / "summary.json").read_text())
+        assert summary["status_counts"]["RELOCALIZED"] == 1
+        assert "Tracking" in messages
         assert map_file.read_bytes() == before
         one, two = (read_trajectory(tmp_path / name / "trajectory.txt") for name in ("one", "two"))
         assert len(one) == len(two) == 40
         assert np.linalg.norm(one.T_world_cam[:, 4:] - two.T_world_cam[:, 4:], axis=1).max() < 0.03
         names = {"--ply": "m.ply", "--colmap": "model", "--trajectory": "k.txt"}
         chosen = [part for option, name in names.items() for part in (option, str(tmp_path / name))]
-        main(["export", str(map_file), *chosen])
-        assert len(read_trajectory(tmp_path / "k.txt")) == len(load_map(map_file).ids)
+        main(["export", str(map_file), *chosen, "--json"])
+        figures, _ = printed_json(capsys)
+        assert figures["keyframes"] == len(read_trajectory(tmp_path / "k.txt")) == len(load_map(map_file).ids)
+        assert figures["files"] == [str(tmp_path / name) for name in names.values()]
         assert (tmp_path / "m.ply").read_bytes().startswith(b"ply")
         assert any(tmp_path.joinpath("model").rglob("cameras.txt"))
 
