@@ -1,8 +1,9 @@
 """Runs the fenced blocks of a documentation page in order, in one folder, as a reader would.
 
 Every block runs in a process of its own: commands with JAX's strict rules, as all tests, and Python with JAX's
-defaults. `.venv` is the environment of the tests. Of the two set-up lines of the README only what follows `pip install`
-runs here: `test_wheel` installs, and `.ci/run` runs the second line itself.
+defaults unless the caller asks for the strict rules too. `.venv` is the environment of the tests. Of the two set-up
+lines of the README only what follows `pip install` runs here: `test_wheel` installs, and `.ci/run` runs the second
+line itself.
 """
 
 import os
@@ -77,10 +78,14 @@ def set_up(folder: Path) -> None:
     (folder / ".venv").symlink_to(sys.prefix)
 
 
-def run_block(block: Block, folder: Path) -> str:
+def run_block(block: Block, folder: Path, python: Mapping[str, str] = readers_jax.ENVIRONMENT) -> str:
     """Run a block in a folder, or write it there if it is a file; returns what it printed.
 
-    A YAML block is a file whose name stands in its first line, behind `# `.
+    Args:
+        block: The block. A YAML block is a file whose name stands in its first line, behind `# `.
+        folder: Folder to run it in.
+        python: Environment variables of Python blocks, on top of those of the tests. With none, Python has the strict
+            rules and loads the programs that commands before it compiled.
     """
     if block.language == "yaml":
         name = block.text.partition("\n")[0].removeprefix("# ")
@@ -88,7 +93,7 @@ def run_block(block: Block, folder: Path) -> str:
         (folder / name).write_text(block.text, encoding="utf-8")
         return ""
     if block.language == "python":
-        return _run([sys.executable, "-W", "error", "-c", block.text], folder, block.place, readers_jax.ENVIRONMENT)
+        return _run([sys.executable, "-W", "error", "-c", block.text], folder, block.place, python)
     assert block.language == "bash", f"{block.place}: expected bash, python or yaml, got '{block.language}'"
     command = SET_UP.sub("", block.text)
     if command.strip() == ".venv/bin/pytest":
