@@ -15,7 +15,7 @@ from jaxslam_kernels.robust import loss_value
 from jaxslam_kernels.se3 import to_camera
 from jaxslam_kernels.types import Mask, Scalar, Weights
 
-from jaxslam.dynamics.cue import CueInput, CueResult, threshold_evidence
+from jaxslam.dynamics.cue import CueInput, CueResult, SettingsCue, threshold_evidence
 from jaxslam.dynamics.regions import RegionCueResult, Regions, mean_of_regions, of_points
 
 
@@ -97,3 +97,6 @@ def _robust_errors(scene: CueInput, params: ClusterParams) -> tuple[Weights, Mas
     known = scene.followed & jnp.isfinite(scene.uv).all(axis=0) & (X_cam[2] > 0)
     apart = jnp.where(known[None, :], scene.uv - project(scene.intrinsics, X_cam), 0)
     return loss_value(jnp.sum(jnp.square(apart), axis=0), params.robust_px, "geman_mcclure"), known
+
+
+CUE = SettingsCue("clusters", lambda section: make_cluster_cue(section.as_published), ClusterParams, needs_regions=True)

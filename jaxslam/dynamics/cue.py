@@ -79,6 +79,23 @@ Cue: TypeAlias = Callable[[CueInput, Any], CueResult]
 """A pure function of the measurements and of its own parameters, a pytree. `TrackPlan.cues` accepts any of them."""
 
 
+class SettingsCue(NamedTuple):
+    """A cue that settings can choose; the module that defines it as `CUE` is found by its name, `..._cue.py`.
+
+    Attributes:
+        name: Name of the cue in `dynamics.cues`, and of the section of `dynamics` that holds its settings.
+        make: Function from that section to the cue.
+        params: Class of the parameters. Each field is a setting of the section, except `temperature`, which all cues
+            share.
+        needs_regions: Whether the cue classifies regions of the depth image.
+    """
+
+    name: str
+    make: Callable[[Any], Cue]
+    params: Callable[..., Any]
+    needs_regions: bool = False
+
+
 def threshold_evidence(evidence: Weights, known: Mask, temperature: Scalar) -> CueResult:
     """Classify points by comparing their evidence with the threshold, which is 1.
 

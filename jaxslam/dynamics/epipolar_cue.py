@@ -14,7 +14,7 @@ from jaxslam_kernels.two_view.epipolar import epipolar_distances, fundamental_of
 from jaxslam_kernels.two_view.fundamental import FundamentalResult, FundamentalStatus, ransac_fundamental
 from jaxslam_kernels.types import Mask, Scalar
 
-from jaxslam.dynamics.cue import CueInput, CueResult, threshold_evidence
+from jaxslam.dynamics.cue import CueInput, CueResult, SettingsCue, threshold_evidence
 
 
 class EpipolarParams(NamedTuple):
@@ -82,3 +82,6 @@ def _matrix(scene: CueInput, judged: Mask, params: EpipolarParams, num_hypothese
 def _clear_of_border(scene: CueInput, border_px: Scalar) -> Mask:
     low, high = border_px, (scene.size - 1)[:, None] - border_px
     return ((scene.uv_before >= low) & (scene.uv_before <= high) & (scene.uv >= low) & (scene.uv <= high)).all(axis=0)
+
+
+CUE = SettingsCue("epipolar", lambda section: make_epipolar_cue(section.num_hypotheses), EpipolarParams)

@@ -11,7 +11,7 @@ from jaxslam_kernels.camera import Intrinsics, back_project
 from jaxslam_kernels.se3 import between, to_camera, to_world
 from jaxslam_kernels.types import Mask, Pixels, Points, Scalar, Weights
 
-from jaxslam.dynamics.cue import CueInput, CueResult, threshold_evidence
+from jaxslam.dynamics.cue import CueInput, CueResult, SettingsCue, threshold_evidence
 
 
 class TrajectoryParams(NamedTuple):
@@ -69,3 +69,6 @@ def _length(way: Points) -> Weights:
     squared = jnp.sum(jnp.square(way), axis=0)
     some = squared > 0
     return jnp.where(some, jnp.sqrt(jnp.where(some, squared, 1)), 0)
+
+
+CUE = SettingsCue("trajectory", lambda _: trajectory_cue, TrajectoryParams)

@@ -1,44 +1,30 @@
 """The cues that settings can name, and their parameters as the settings have them."""
 
+import functools
+import importlib
+import pkgutil
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
+from jaxslam import dynamics
 from jaxslam.config.cue_sections import MotionConfig
 from jaxslam.config.schema import DynamicsConfig
-from jaxslam.dynamics.cluster_cue import ClusterParams, make_cluster_cue
-from jaxslam.dynamics.cue import Cue
-from jaxslam.dynamics.epipolar_cue import EpipolarParams, make_epipolar_cue
+from jaxslam.dynamics.cue import SettingsCue
 from jaxslam.dynamics.object_motion import MotionParams, MotionPlan
 from jaxslam.dynamics.regions import RegionPlan
-from jaxslam.dynamics.scene_flow_cue import TrajectoryParams, trajectory_cue
 from jaxslam.runtime.floating_dtype import floating_dtype
 from jaxslam.tracking.state import TrackParams, TrackPlan
 
 
-class _Known(NamedTuple):
-    """A cue of settings, and what has the names of its parameters, each of which is a setting or the temperature.
-
-    Attributes:
-        cue: Makes it of the settings of all cues.
-        params: The class of its parameters.
-        needs_regions: Whether it judges regions.
-    """
-
-    cue: Callable[[DynamicsConfig], Cue]
-    params: Callable[..., Any]
-    needs_regions: bool = False
-
-
-_KNOWN = {
-    "trajectory": _Known(lambda _: trajectory_cue, TrajectoryParams),
-    "epipolar": _Known(lambda config: make_epipolar_cue(config.epipolar.num_hypotheses), EpipolarParams),
-    "clusters": _Known(
-        lambda config: make_cluster_cue(config.clusters.as_published), ClusterParams, needs_regions=True
-    ),
-}
+@functools.cache
+def _known() -> dict[str, SettingsCue]:
+    """Collect the cues that the modules `..._cue.py` of `jaxslam.dynamics` define, by name."""
+    modules = [module.name for module in pkgutil.iter_modules(dynamics.__path__) if module.name.endswith("_cue")]
+    cues: list[SettingsCue] = [importlib.import_module(f"{dynamics.__name__}.{name}").CUE for name in modules]
+    return {cue.name: cue for cue in cues}
 
 
 def with_cues(plan: TrackPlan, config: DynamicsConfig, *, pairs: bool = False) -> TrackPlan:
@@ -46,12 +32,12 @@ def with_cues(plan: TrackPlan, config: DynamicsConfig, *, pairs: bool = False) -
 
     The depth of pairs is found at half the size, and so are its regions.
     """
-    chosen, clusters = [_KNOWN[name] for name in config.cues], config.clusters
+    chosen, clusters = [_known()[name] for name in config.cues], config.clusters
     step_px = 2 * clusters.step_px if pairs else clusters.step_px
     regions = RegionPlan(clusters.num_regions, step_px, clusters.num_steps, clusters.recover_frames)
     needed = config.balance_regions or any(known.needs_regions for known in chosen)
     return plan._replace(
-        cues=tuple(known.cue(config) for known in chosen),
+        cues=tuple(known.make(getattr(config, known.name)) for known in chosen),
         regions=regions if needed else None,
         balance_regions=config.balance_regions,
         motion=_motion_plan(config.motion),
@@ -70,7 +56,7 @@ def with_cue_params(params: TrackParams, config: DynamicsConfig, dtype: DTypeLik
         TypeError: If `dtype` is no floating-point type, or is float64 while `jax_enable_x64` is off.
     """
     dtype = jnp.result_type(params.pixel_sigma) if dtype is None else floating_dtype(dtype)
-    cues = tuple(_params_of(getattr(config, name), _KNOWN[name].params, config, dtype) for name in config.cues)
+    cues = tuple(_params_of(getattr(config, name), _known()[name].params, config, dtype) for name in config.cues)
     motion = _params_of(config.motion, MotionParams, config, dtype) if config.motion.enabled else None
     return params._replace(cues=cues, motion=motion)
 

@@ -1,7 +1,7 @@
 """Cues to what moves: limits, their smooth forms, derivatives; each cue on points at rest and points that move."""
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import jax
 import jax.numpy as jnp
@@ -13,9 +13,11 @@ from hypothesis import strategies as st
 from jax.test_util import check_grads
 from jaxslam_kernels.se3 import retract, to_camera, to_world
 
+from jaxslam.config.schema import DynamicsConfig
 from jaxslam.dynamics.cue import CueResult, combine_cues, threshold_evidence
 from jaxslam.dynamics.occlusion import PointState, next_states, occluded_share, occlusion_weights
 from jaxslam.dynamics.scene_flow_cue import TrajectoryParams, trajectory_cue
+from jaxslam.tracking.cue_registry import _known
 
 EVIDENCE = st.lists(st.floats(0, 100, width=32), min_size=1, max_size=20)
 
@@ -158,3 +160,13 @@ class TestOcclusion:
         assert float(jax.grad(total)(jnp.array(3.0))) == 2
         assert float(occluded_share(states, jnp.array([True, True, True, False]))) == pytest.approx(1 / 3)
         assert float(occluded_share(states, jnp.zeros(4, bool))) == 0
+
+
+def test_every_cue_of_the_settings_is_found() -> None:
+    """The names that `dynamics.cues` accepts are those of the modules `..._cue.py`, each with its section."""
+    (names, _) = get_args(get_type_hints(DynamicsConfig)["cues"])
+    assert set(get_args(names)) == set(_known())
+    for name, cue in _known().items():
+        section = getattr(DynamicsConfig(), name)
+        assert callable(cue.make(section))
+        assert {field for field in cue.params._fields if field != "temperature"} <= vars(section).keys()
