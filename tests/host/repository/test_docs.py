@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from doc_blocks import DOCS, PAGES, README, ROOT, anchors, blocks, code_spans, links, prose, run_block, set_up
 from result_files import FILES, MASK_FILES
+from test_layers import LAYERS
 
 from jaxslam import Camera, TrackParams, TrackPlan, TrackReason, TrackStatus
 from jaxslam.cli.command_table import ExitCode, find_command
@@ -30,6 +31,7 @@ _BRITISH = re.compile(
 _NOT_BRITISH = re.compile(r"\b(?:precise|promise[sd]?|otherwise|noise|raise[sd]?|likewise|rise[sd]?|arise[sd]?)\b")
 _OTHERS_NAMES = ("tree_serialise_leaves",)
 _SETTING = re.compile(r"^(?:track|mapping|semantics|dynamics|dense|run)(?:\.\w+)+(?==|$)")
+_PATH = re.compile(r"[\w.-]*/[\w./-]+|\w+\.(?:py|md|yaml)")
 _WITH_BLOCKS = [page for page in PAGES if blocks(page)]
 
 
@@ -110,7 +112,26 @@ def test_links_lead_somewhere(page: Path) -> None:
         assert not anchor or anchor in anchors(other), link
 
 
-@pytest.mark.parametrize("page", [README, *PAGES], ids=lambda page: f"{page.parent.name}-{page.stem}")
+@pytest.mark.parametrize("span", [span for span in dict.fromkeys(code_spans(CONTRIBUTING)) if _PATH.fullmatch(span)])
+def test_path_in_contributing_exists(span: str) -> None:
+    """A path starts at the root or in a package, or is a file's name alone; with NAME in it, its folder must exist."""
+    path = Path(span)
+    if "NAME" in path.name:
+        path = path.parent
+    alone = len(path.parts) == 1 and any((ROOT / "jaxslam").rglob(path.name))
+    assert alone or any((ROOT / base / path).exists() for base in (".", "jaxslam", "kernels"))
+
+
+def test_contributing_lists_every_package() -> None:
+    """The table has the packages in the order of their layers, behind the kernels with all their chapters."""
+    rows = dict(re.findall(r"^\| `([\w/]+)` \| (.*) \|$", prose(CONTRIBUTING), re.MULTILINE))
+    kernels, *packages = rows
+    assert packages == LAYERS
+    chapters = {path.parent.name for path in (ROOT / kernels).glob("*/__init__.py")}
+    assert set(re.findall(r"`(\w+)`", rows[kernels])) == chapters
+
+
+@pytest.mark.parametrize("page", [README, CONTRIBUTING, *PAGES], ids=lambda page: f"{page.parent.name}-{page.stem}")
 def test_spelling_is_american(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     for name in _OTHERS_NAMES:
@@ -118,7 +139,7 @@ def test_spelling_is_american(page: Path) -> None:
     assert not [word for word in _BRITISH.findall(text) if not _NOT_BRITISH.fullmatch(word)]
 
 
-@pytest.mark.parametrize("page", [README, *PAGES], ids=lambda page: f"{page.parent.name}-{page.stem}")
+@pytest.mark.parametrize("page", [README, CONTRIBUTING, *PAGES], ids=lambda page: f"{page.parent.name}-{page.stem}")
 def test_commands_in_the_text_exist(page: Path) -> None:
     """A command between backticks has the words of a command, and its options are options of that command."""
     for span in code_spans(page):
