@@ -18,7 +18,7 @@ class Doctor(WithJson):
     recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
     """Folder of the recording."""
     dataset: str = "auto"
-    """Kind of the recording: auto, tum, bonn."""
+    """Kind of the recording, such as tum or kitti; auto recognizes it."""
     camera: str | None = None
     """Known camera or camera file."""
 

@@ -85,7 +85,7 @@ class OfRecording(WithJson):
     recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
     """Folder of the recording."""
     dataset: str = "auto"
-    """Kind of the recording: auto, tum, bonn, kitti, euroc, tartanair, tartanair_stereo, folder."""
+    """Kind of the recording, such as tum or kitti; auto recognizes it."""
     camera: str | None = None
     """Known camera or camera file (jaxslam, ORB-SLAM2, ORB-SLAM3, Kalibr), of both cameras if a pair is unrectified."""
     config: Path | None = None

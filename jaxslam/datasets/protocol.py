@@ -89,6 +89,7 @@ class Loader:
             neither tells.
         open: Function that opens a folder with its camera.
         rectifies: Whether `open` also takes a stereo pair that is not rectified.
+        files: Files and folders that a recording of this kind has, for the message about a folder without any.
     """
 
     kind: str
@@ -96,3 +97,4 @@ class Loader:
     camera: Callable[[Path], Camera | RectifiedPair | None]
     open: Callable[[Path, Any], Dataset]
     rectifies: bool = False
+    files: str = ""

@@ -60,10 +60,10 @@ def _loader(folder: Path, kind: str) -> Loader:
         return _loaders()[kind]
     best = max(_loaders().values(), key=lambda loader: loader.fit(folder))
     if best.fit(folder) is Fit.NO:
+        files = "; ".join(dict.fromkeys(loader.files for loader in _loaders().values() if loader.files))
         raise DatasetError(
-            f"{folder}: expected a recording of kind {' or '.join(dataset_kinds())} (rgb.txt and depth.txt;"
-            " calib.txt, times.txt, image_0 and image_1; mav0/cam0 and mav0/cam1; pose_left.txt and image_left;"
-            " or folders left and right, or rgb and depth), got a folder without those files"
+            f"{folder}: expected a recording of kind {' or '.join(dataset_kinds())} ({files}),"
+            " got a folder without those files"
         )
     return best
 

@@ -21,4 +21,4 @@ def _camera(_: Path) -> Camera:
     return Camera.load("bonn")
 
 
-LOADER = Loader("bonn", _fit, _camera, TumDataset)
+LOADER = Loader("bonn", _fit, _camera, TumDataset, files="rgb.txt and depth.txt")

@@ -128,4 +128,6 @@ def _camera(_: Path) -> None:
     return None
 
 
-LOADER = Loader("folder", _fit, _camera, FolderDataset, rectifies=True)
+LOADER = Loader(
+    "folder", _fit, _camera, FolderDataset, rectifies=True, files="folders left and right, or rgb and depth"
+)

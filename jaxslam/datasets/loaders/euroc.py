@@ -135,4 +135,4 @@ def _fit(folder: Path) -> Fit:
     return Fit.LAYOUT if there else Fit.NO
 
 
-LOADER = Loader("euroc", _fit, _camera, EurocDataset, rectifies=True)
+LOADER = Loader("euroc", _fit, _camera, EurocDataset, rectifies=True, files="mav0/cam0 and mav0/cam1")

@@ -107,4 +107,4 @@ def _fit(folder: Path) -> Fit:
     return Fit.LAYOUT if (folder / _POSES).is_file() and (folder / _LEFT).is_dir() else Fit.NO
 
 
-LOADER = Loader("tartanair", _fit, _camera, TartanAirDataset)
+LOADER = Loader("tartanair", _fit, _camera, TartanAirDataset, files="pose_left.txt and image_left")

@@ -15,4 +15,4 @@ def _camera(_: Path) -> Camera:
     return tartanair_camera(stereo=True)
 
 
-LOADER = Loader("tartanair_stereo", _fit, _camera, TartanAirDataset)
+LOADER = Loader("tartanair_stereo", _fit, _camera, TartanAirDataset, files="pose_left.txt and image_left")

@@ -106,4 +106,4 @@ def _camera(folder: Path) -> Camera | None:
     return Camera.load(f"tum_fr{match[1]}") if match else None
 
 
-LOADER = Loader("tum", _fit, _camera, TumDataset)
+LOADER = Loader("tum", _fit, _camera, TumDataset, files="rgb.txt and depth.txt")

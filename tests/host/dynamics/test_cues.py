@@ -1,7 +1,7 @@
 """Cues to what moves: limits, their smooth forms, derivatives; each cue on points at rest and points that move."""
 
 from collections.abc import Iterator
-from typing import Any, get_args, get_type_hints
+from typing import Any, cast, get_args, get_type_hints
 
 import jax
 import jax.numpy as jnp
@@ -167,6 +167,6 @@ def test_every_cue_of_the_settings_is_found() -> None:
     (names, _) = get_args(get_type_hints(DynamicsConfig)["cues"])
     assert set(get_args(names)) == set(_known())
     for name, cue in _known().items():
-        section = getattr(DynamicsConfig(), name)
+        section, params_class = getattr(DynamicsConfig(), name), cast(Any, cue.params)
         assert callable(cue.make(section))
-        assert {field for field in cue.params._fields if field != "temperature"} <= vars(section).keys()
+        assert {field for field in params_class._fields if field != "temperature"} <= vars(section).keys()
