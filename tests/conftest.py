@@ -84,6 +84,13 @@ def data_dir() -> Path:
     return _folder("JAXSLAM_DATA")
 
 
+@pytest.fixture
+def float64():
+    """JAX's float64 during a test; a module asks for it with `pytestmark = pytest.mark.usefixtures("float64")`."""
+    with jax.enable_x64(True):
+        yield
+
+
 @pytest.fixture(autouse=True)
 def _number_of_threads_stays():
     """What a command sets for its own process is not told to the tests after it."""

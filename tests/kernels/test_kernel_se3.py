@@ -21,10 +21,7 @@ def hat(tangent):
     return np.block([[np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]), tangent[:3, None]], [np.zeros((1, 4))]])
 
 
-@pytest.fixture(autouse=True)
-def float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 class TestTransform:

@@ -45,10 +45,7 @@ ORDERS = {
 }
 
 
-@pytest.fixture(autouse=True)
-def _x64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 @jax.custom_jvp

@@ -1,6 +1,5 @@
 """Regions of a depth image, and the cue that judges them: what moves as a whole, known to a network or not."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -32,10 +31,7 @@ PLAN = RegionPlan(num_regions=6, step_px=4, num_steps=3)
 INTRINSICS = (130.0, 130.0, 79.0, 59.0)
 
 
-@pytest.fixture(autouse=True)
-def x64() -> Iterator[None]:
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def box_before_wall(shift_px: int = 0) -> np.ndarray:

@@ -1,6 +1,5 @@
 """Cues to what moves: limits, their smooth forms, derivatives; each cue on points at rest and points that move."""
 
-from collections.abc import Iterator
 from typing import Any, cast, get_args, get_type_hints
 
 import jax
@@ -22,10 +21,7 @@ from jaxslam.tracking.cue_registry import _known
 EVIDENCE = st.lists(st.floats(0, 100, width=32), min_size=1, max_size=20)
 
 
-@pytest.fixture(autouse=True)
-def x64() -> Iterator[None]:
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def params(*, as_published: bool = False, temperature: float = 0.0) -> TrajectoryParams:

@@ -1,6 +1,5 @@
 """The epipolar cue: points off the lines of those at rest, and motions that determine no lines."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -20,10 +19,7 @@ MOTION: Any = (0.02, -0.08, 0.06, 0.01, 0.02, -0.01)
 cue = jax.jit(make_epipolar_cue())
 
 
-@pytest.fixture(autouse=True)
-def x64() -> Iterator[None]:
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def ideal(given: CueInput) -> CueInput:
