@@ -58,12 +58,18 @@ def pytest_collection_finish() -> None:
 _LONGEST = (
     "test_readme",
     "test_bench",
+    "test_step",
     "test_pose_graph",
     "test_notebooks",
     "test_back_end",
+    "test_keyframe_semantics",
     "test_cues_in_tracker",
     "test_dask_executor",
+    "test_step_gradient",
+    "test_zero_weights",
 )
+"""Files that take a minute or more. The first two compile the trackers of 640x480 and of small scenes, one each, which
+most of the others then load."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -23,7 +23,7 @@ from small_scene import HEIGHT, PLAN, TRACK, WIDTH, at, clip, new_state, params,
 
 from jaxslam import FlowPlan
 from jaxslam.config.loading import load_config
-from jaxslam.config.schema import Config, DynamicsConfig, SemanticsConfig
+from jaxslam.config.schema import Config, SemanticsConfig
 from jaxslam.semantics import Detections, no_detections
 from jaxslam.sensors import measurement
 from jaxslam.sensors.frame_arrays import FrameArrays
@@ -397,8 +397,7 @@ class TestHeldToMap:
     def test_which_frames(self, which: str) -> None:
         """Matching begins as soon as the map has a keyframe."""
         track = replace(TRACK, match_map=which, keyframe_after_s=0.3)
-        alone = {"semantics": SemanticsConfig(model=None), "dynamics": DynamicsConfig(cues=(), balance_regions=False)}
-        results = slam_results(Config(track=track, **alone))
+        results = slam_results(Config(track=track, semantics=SemanticsConfig(model=None)))
         assert {result.status for result in results[1:]} == {TrackStatus.OK}
         matched = np.array([result.num_matched > 0 for result in results])
         kept = np.array([result.is_keyframe for result in results])
