@@ -13,12 +13,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax import lax
 from jaxslam_kernels.clustering.dbscan import Clusters, dbscan
+from quick_compile import quick_compile
 from sklearn.cluster import DBSCAN
 
 N = 40
 SEEDS = st.integers(0, 2**32 - 1)
 
-_dbscan = jax.jit(lambda points, mask, radius, q: dbscan(points, mask, radius=radius, min_points=q))
+_dbscan = quick_compile(lambda points, mask, radius, q: dbscan(points, mask, radius=radius, min_points=q))
 
 
 @pytest.fixture
@@ -164,7 +165,7 @@ def test_a_long_chain_takes_few_steps(monkeypatch):
         steps.append(count)
         return state
 
-    @jax.jit
+    @quick_compile
     def compute(points):
         return dbscan(points, jnp.ones(500, bool), radius=1.0, min_points=3), steps
 
@@ -187,9 +188,9 @@ def _loss(points, mask, radius, min_points):
     return _spread(points, mask, dbscan(points, mask, radius=radius, min_points=min_points))
 
 
-_gradient_at_labels = jax.jit(jax.grad(_spread))
-_value_and_gradient = jax.jit(jax.value_and_grad(_loss, argnums=(0, 2)))
-_jvp = jax.jit(lambda points, direction, *rest: jax.jvp(lambda p: _loss(p, *rest), (points,), (direction,)))
+_gradient_at_labels = quick_compile(jax.grad(_spread))
+_value_and_gradient = quick_compile(jax.value_and_grad(_loss, argnums=(0, 2)))
+_jvp = quick_compile(lambda points, direction, *rest: jax.jvp(lambda p: _loss(p, *rest), (points,), (direction,)))
 
 
 @pytest.mark.parametrize(
@@ -216,7 +217,9 @@ def test_vmap_equals_loop():
     points = np.stack([_blobs(seed, dtype=np.float32) for seed in range(3)])
     masks = np.random.default_rng(0).uniform(size=(3, N)) < 0.9
     radii, least = np.array([0.7, 1.5, np.inf], np.float32), np.array([2, 4, 3], np.int32)
-    batched = jax.jit(jax.vmap(lambda p, m, r, q: dbscan(p, m, radius=r, min_points=q)))(points, masks, radii, least)
+    batched = quick_compile(jax.vmap(lambda p, m, r, q: dbscan(p, m, radius=r, min_points=q)))(
+        points, masks, radii, least
+    )
     for k in range(3):
         one = _clusters(points[k], radii[k], least[k], masks[k])
         assert one.num > 0
@@ -225,7 +228,7 @@ def test_vmap_equals_loop():
 
 def test_single_trace():
     compute = lambda points, mask, radius, q: dbscan(points, mask, radius=radius, min_points=q)
-    traced = jax.jit(eqx.debug.assert_max_traces(compute, max_traces=1))
+    traced = quick_compile(eqx.debug.assert_max_traces(compute, max_traces=1))
     for seed in range(3):
         mask = np.arange(N) > seed
         traced(_blobs(seed, dtype=np.float32), mask, 0.5 + seed, seed)

@@ -13,6 +13,7 @@ from jaxlie import SE3
 from jaxslam_kernels.camera import MIN_DEPTH, Intrinsics, make_intrinsics
 from jaxslam_kernels.depth.depth_change import DepthChange, depth_change
 from jaxslam_kernels.se3 import between, compose, retract
+from quick_compile import quick_compile
 from scipy.spatial.transform import Rotation
 
 H, W, F = 24, 32, 40.0
@@ -22,7 +23,7 @@ LIMITS = {"same_share": 0.03, "same_m": 0.02, "new_share": 0.05, "new_m": 0.15}
 BOX = (slice(8, 15), slice(10, 17))
 """Rows and columns of a box 2 m away as the camera at rest sees it, before a wall 4 m away."""
 
-_change = jax.jit(depth_change)
+_change = quick_compile(depth_change)
 
 
 @pytest.fixture
@@ -325,11 +326,11 @@ def _loss(images, T_then_now, tangent, camera, limits):
     return _sum_of(images, depth_change(depth, depth_then, retract(T_then_now, tangent), camera, **limits))
 
 
-_gradient_at_change = jax.jit(jax.grad(_sum_of))
-_value_and_gradient = jax.jit(jax.value_and_grad(_loss, argnums=(0, 2, 3, 4)))
+_gradient_at_change = quick_compile(jax.grad(_sum_of))
+_value_and_gradient = quick_compile(jax.value_and_grad(_loss, argnums=(0, 2, 3, 4)))
 
 
-@jax.jit
+@quick_compile
 def _jvp(T, point, direction):
     loss = lambda images, tangent, camera, limits: _loss(images, T, tangent, camera, limits)
     return jax.jvp(loss, point, direction)[1]
@@ -372,8 +373,8 @@ def test_vmap_equals_loop(x64):
     poses = [_random_pose(seed) for seed in range(3)]
     cameras = [_camera(np.float64, fx=F + seed, cy=CY - seed) for seed in range(3)]
     T, camera = (jax.tree.map(lambda *parts: jnp.stack(parts), *parts) for parts in (poses, cameras))
-    batched = jax.jit(jax.vmap(depth_change))(now, then, T, camera)
-    several = jax.jit(jax.vmap(depth_change, in_axes=(None, 0, 0, None)))(now[0], then, T, cameras[0])
+    batched = quick_compile(jax.vmap(depth_change))(now, then, T, camera)
+    several = quick_compile(jax.vmap(depth_change, in_axes=(None, 0, 0, None)))(now[0], then, T, cameras[0])
     for k in range(3):
         one = _compare(now[k], then[k], poses[k], cameras[k])
         other = _compare(now[0], then[k], poses[k], cameras[0])
@@ -383,7 +384,7 @@ def test_vmap_equals_loop(x64):
 
 
 def test_single_trace():
-    traced = jax.jit(eqx.debug.assert_max_traces(depth_change, max_traces=1))
+    traced = quick_compile(eqx.debug.assert_max_traces(depth_change, max_traces=1))
     for seed in range(3):
         images, T = _images(seed, np.float32), _random_pose(seed, np.float32)
         traced(*images, T, _camera(fx=F + seed), same_m=0.01 * seed, new_share=0.1 * seed)

@@ -9,6 +9,7 @@ from flow_cases import all_finite
 from jaxlie import SE3
 from jaxslam_kernels.camera import make_intrinsics
 from jaxslam_kernels.depth.free_space import classify_visibility
+from quick_compile import quick_compile
 
 HEIGHT, WIDTH, N = 40, 60, 900
 INTRINSICS = make_intrinsics(50.0, 50.0, 30.0, 20.0)
@@ -22,7 +23,7 @@ def _run(X, pose, depth, least):
     )
 
 
-_see = jax.jit(assert_max_traces(_run, max_traces=1))
+_see = quick_compile(assert_max_traces(_run, max_traces=1))
 
 
 def _case(seed=0):
@@ -67,14 +68,14 @@ def test_gradient():
     """All that comes out is yes or no: nothing flows back, and that is finite."""
     X, pose, depth, least, _ = _case()
     total = lambda *inputs: jnp.sum(jnp.where(_run(*inputs).past, 1.0, 0.0))
-    gradients = jax.jit(jax.grad(total, (0, 1, 2, 3)))(X, pose, depth, least)
+    gradients = quick_compile(jax.grad(total, (0, 1, 2, 3)))(X, pose, depth, least)
     assert all_finite(gradients)
     assert not any(np.any(gradient) for gradient in gradients)
 
 
 def test_vmap_equals_loop():
     cases = [_case(seed)[:4] for seed in range(3)]
-    batched = jax.jit(jax.vmap(_run))(*(np.stack(arrays) for arrays in zip(*cases, strict=True)))
+    batched = quick_compile(jax.vmap(_run))(*(np.stack(arrays) for arrays in zip(*cases, strict=True)))
     for index, case in enumerate(cases):
         for one, expected in zip(batched, _see(*case), strict=True):
             np.testing.assert_array_equal(one[index], expected)
@@ -94,4 +95,4 @@ def test_degenerate(which):
     assert not np.any(seen.past & (which != 2))
     assert not np.any(seen.there & (which != 3))
     total = lambda X, *rest: jnp.sum(jnp.where(_run(X, *rest).there, 1.0, 0.0))
-    assert all_finite(jax.jit(jax.grad(total))(*inputs))
+    assert all_finite(quick_compile(jax.grad(total))(*inputs))

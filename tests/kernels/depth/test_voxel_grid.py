@@ -22,14 +22,15 @@ from jaxslam_kernels.depth.voxel_grid import (
     with_cloud,
 )
 from jaxslam_kernels.depth.voxel_hash import NO_ROW, empty_table, find_rows, key_corners, voxel_keys
+from quick_compile import quick_compile, quick_compile_nested
 
 N, CAPACITY = 600, 512
 VOXEL_M = np.float32(0.1)
 
-_reduce = jax.jit(assert_max_traces(partial(reduced_cloud, capacity=CAPACITY), max_traces=1))
-_add = jax.jit(with_cloud)
-_change = jax.jit(changed)
-_all = jax.jit(partial(centroids, size=CAPACITY))
+_reduce = quick_compile(assert_max_traces(partial(reduced_cloud, capacity=CAPACITY), max_traces=1))
+_add = quick_compile(with_cloud)
+_change = quick_compile(changed)
+_all = quick_compile(partial(centroids, size=CAPACITY))
 
 
 def _cloud(seed=0, dtype: type = np.float32):
@@ -141,13 +142,13 @@ class TestGrid:
         again, same = _add(grid, X, color, one, one, VOXEL_M)
         np.testing.assert_array_equal(rows, same)
         np.testing.assert_allclose(again.sums[:, 6], 2 * grid.sums[:, 6])
-        voxels = jax.jit(partial(reduced_cloud, capacity=50))(X, color, np.ones(N, bool), VOXEL_M)
+        voxels = quick_compile(partial(reduced_cloud, capacity=50))(X, color, np.ones(N, bool), VOXEL_M)
         assert int(voxels.num) == len(_groups(X, color, np.ones(N, bool)))
 
     def test_rows_by_a_dictionary(self):
         """Keys that come in many turns, most of them again: each has one row, and no two share one."""
         rng, table, known = np.random.default_rng(0), empty_table(4000), {}
-        look = jax.jit(find_rows)
+        look = quick_compile(find_rows)
         for _ in range(12):
             keys = rng.integers(0, 60, (2, N)).astype(np.uint32)
             table, rows, left_out = look(table, keys, np.ones(N, bool))
@@ -166,12 +167,12 @@ def test_gradient():
         rng = np.random.default_rng(1)
         weights = rng.normal(size=(2, 3, CAPACITY))
 
-        @jax.jit
+        @quick_compile_nested
         def loss(X, color):
             voxels = reduced_cloud(X, color, jnp.asarray(mask), jnp.float64(0.1), capacity=CAPACITY)
             return jnp.sum(weights[0] * voxels.X) + jnp.sum(weights[1] * voxels.color)
 
-        reverse = jax.jit(jax.grad(loss, (0, 1)))(X, color)
+        reverse = quick_compile(jax.grad(loss, (0, 1)))(X, color)
         for which in range(2):
             direction = [np.zeros_like(X), np.zeros_like(X)]
             direction[which] = rng.normal(size=X.shape)
@@ -185,7 +186,7 @@ def test_gradient():
 def test_vmap_equals_loop():
     clouds = [_cloud(seed) for seed in range(3)]
     stacked = [np.stack(arrays) for arrays in zip(*clouds, strict=True)]
-    batched = jax.jit(jax.vmap(partial(reduced_cloud, capacity=CAPACITY), (0, 0, 0, None)))(*stacked, VOXEL_M)
+    batched = quick_compile(jax.vmap(partial(reduced_cloud, capacity=CAPACITY), (0, 0, 0, None)))(*stacked, VOXEL_M)
     for index, cloud in enumerate(clouds):
         alone = _reduce(*cloud, VOXEL_M)
         for one, expected in zip(batched, alone, strict=True):
@@ -209,7 +210,7 @@ class TestDegenerate:
             assert not np.any(voxels.counts)
             assert all_finite(voxels)
             total = lambda *inputs: jnp.sum(reduced_cloud(*inputs, capacity=CAPACITY).X)
-            assert all_finite(jax.jit(jax.grad(total))(points, color, wanted, VOXEL_M))
+            assert all_finite(quick_compile(jax.grad(total))(points, color, wanted, VOXEL_M))
 
     def test_grid_of_nothing(self):
         X, color, _ = _cloud()

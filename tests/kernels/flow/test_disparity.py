@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from jaxslam_kernels.flow.disparity import ROW_PLAN, Disparities, row_disparities
 from jaxslam_kernels.flow.lk_search import LevelPlan
 from jaxslam_kernels.image.pyramid import build_pyramid
-from quick_compile import quick_compile
+from quick_compile import quick_compile, quick_compile_nested
 from skimage.data import stereo_motorcycle
 
 from jaxslam.benchmark.kernels.scenes.image_warps import corners, picture
@@ -32,8 +32,8 @@ def _run(plan=ROW_PLAN, **options):
     return disparities
 
 
-_match = jax.jit(assert_max_traces(_run(), max_traces=1))
-_exact = jax.jit(_run(EXACT))
+_match = quick_compile(assert_max_traces(_run(), max_traces=1))
+_exact = quick_compile_nested(_run(EXACT))
 
 
 def _loss(weights, run, *inputs):
@@ -91,7 +91,7 @@ class TestMatchesReference:
         theirs = matcher.compute(left, right)[row, column] / 16
         guess = true[row, column] + np.random.default_rng(0).uniform(-2, 2, points.shape[1])
         known = true[row, column] > 0
-        found = jax.jit(_run())(left, right, points, guess.astype(np.float32), known)
+        found = quick_compile(_run())(left, right, points, guess.astype(np.float32), known)
         both = np.asarray(found.found) & (theirs > 0)
         ours, opencv = (np.abs(disparity[both] - true[row, column][both]) for disparity in (found.disparity, theirs))
         assert np.mean(np.asarray(found.found)[known]) > 0.75
@@ -123,7 +123,7 @@ class TestMatchesReference:
         left, right, points, guess, mask = _pair()
         right[40:90, 50:110] = picture(WIDTH, HEIGHT)[::-1, ::-1][40:90, 50:110]
         both, one = (
-            jax.jit(_run(expected_px=expected_px))(left, right, points, guess, mask) for expected_px in (0.0, 1.0)
+            quick_compile(_run(expected_px=expected_px))(left, right, points, guess, mask) for expected_px in (0.0, 1.0)
         )
         returned, found = np.asarray(both.found), np.asarray(one.found)
         assert np.all(found[returned])
@@ -163,7 +163,7 @@ class TestGradient:
 
 def test_vmap_equals_loop():
     pairs = [_pair(seed=seed) for seed in range(2)]
-    batched = jax.jit(jax.vmap(_run()))(*(np.stack(arrays) for arrays in zip(*pairs, strict=True)))
+    batched = quick_compile(jax.vmap(_run()))(*(np.stack(arrays) for arrays in zip(*pairs, strict=True)))
     for index, pair in enumerate(pairs):
         for one, expected in zip(batched, _match(*pair), strict=True):
             np.testing.assert_allclose(one[index], expected, atol=1e-4)

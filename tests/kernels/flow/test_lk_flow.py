@@ -79,7 +79,7 @@ class TestMatchesReference:
         """Motions of up to 25 pixels: at least as many points within a pixel as OpenCV, and as close."""
         image = picture(320, 240)
         points = corners(image, 300, distance=5)
-        track_far = jax.jit(flow_of(lk_flow, 4))
+        track_far = quick_compile(flow_of(lk_flow, 4))
         ours, theirs = [], []
         for seed, shift_px in enumerate((0, 2, 5, 8, 12, 16, 20, 25)):
             known = warp(image, shift_px, seed)

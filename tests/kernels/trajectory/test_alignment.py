@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from jax.test_util import check_grads
 from jaxlie import SE3
 from jaxslam_kernels.trajectory.alignment import AlignmentStatus, align, ate, nearest_rotation, rpe
+from quick_compile import quick_compile_nested
 from scipy.spatial.transform import Rotation
 
 N = 12
@@ -52,12 +53,12 @@ def _flat(alignment):
     return jnp.concatenate([T.rotation().as_matrix().ravel(), T.translation(), alignment.scale[None]])
 
 
-_align = {kind: jax.jit(partial(align, with_scale=kind == "sim3")) for kind in ("se3", "sim3")}
-_ate = {kind: jax.jit(partial(ate, alignment=kind)) for kind in ("none", "se3", "sim3")}
-_fit = jax.jit(lambda x, y, w: _flat(align(x, y, w, with_scale=True)))
+_align = {kind: quick_compile_nested(partial(align, with_scale=kind == "sim3")) for kind in ("se3", "sim3")}
+_ate = {kind: quick_compile_nested(partial(ate, alignment=kind)) for kind in ("none", "se3", "sim3")}
+_fit = quick_compile_nested(lambda x, y, w: _flat(align(x, y, w, with_scale=True)))
 
 
-@jax.jit
+@quick_compile_nested
 def _fit_and_gradients(x, y, w):
     """Everything at once, for the finiteness of all of it; a NaN in any derivative reaches the sum."""
     fit = lambda x, y, w: _flat(align(x, y, w, with_scale=True)).sum()
@@ -70,24 +71,24 @@ def _fit_and_gradients(x, y, w):
     )
 
 
-_rpe = jax.jit(lambda P, Q, i, j, mask: rpe(SE3(P), SE3(Q), i, j, mask))
+_rpe = quick_compile_nested(lambda P, Q, i, j, mask: rpe(SE3(P), SE3(Q), i, j, mask))
 _FIRST, _SECOND = np.arange(N - 2, dtype=np.int32), np.arange(2, N, dtype=np.int32)
 _PAIRS = (_FIRST, _SECOND, np.ones(N - 2, bool))
 
 
-@jax.jit
+@quick_compile_nested
 def _rpe_loss(P, Q, i, j, mask):
     errors = rpe(SE3(P), SE3(Q), i, j, mask)
     return errors.translation.rmse + errors.rotation.rmse + errors.rotation.median
 
 
-@jax.jit
+@quick_compile_nested
 def _rpe_outputs(P, Q):
     errors = rpe(SE3(P), SE3(Q), jnp.asarray(_FIRST), jnp.asarray(_SECOND), jnp.arange(N - 2) % 3 > 0)
     return errors.translations, errors.rotations, errors.translation.std, errors.rotation.median
 
 
-_rpe_gradient = jax.jit(jax.grad(_rpe_loss, argnums=(0, 1)))
+_rpe_gradient = quick_compile_nested(jax.grad(_rpe_loss, argnums=(0, 1)))
 
 
 def _finite(tree):
@@ -161,14 +162,14 @@ class TestAlign:
 
     def test_second_derivative(self, x64):
         matrix, direction = _umeyama(_cloud(5), _cloud(6), ONES, False)[0] + 0.3, _cloud(7)[:, :3]
-        slope = jax.jit(jax.grad(lambda m: jnp.sum(nearest_rotation(m) * direction)))
+        slope = quick_compile_nested(jax.grad(lambda m: jnp.sum(nearest_rotation(m) * direction)))
         check_grads(slope, (matrix,), order=1, modes=("fwd", "rev"), eps=1e-6, rtol=1e-6, atol=1e-6)
 
     def test_gradient_of_a_straight_line(self, x64):
         """What the line determines has a derivative; the roll about it has derivative zero."""
         direction, axis = np.array([1.0, 2.0, 3.0]) / np.sqrt(14), np.array([0.3, -1.0, 0.5])
         line = np.outer(direction, np.linspace(-1, 1, N))
-        turned = jax.jit(
+        turned = quick_compile_nested(
             lambda angle: _align["se3"](
                 jnp.asarray(line) + angle * jnp.asarray(np.cross(axis, line.T).T), jnp.asarray(line), jnp.ones(N)
             ).T_reference_estimate.rotation()
@@ -181,12 +182,12 @@ class TestAlign:
     def test_vmap_equals_loop(self, x64):
         x, y = np.stack([_cloud(s) for s in range(3)]), np.stack([_cloud(s) for s in range(3, 6)])
         w = np.stack([ONES, 2 * ONES, np.linspace(0, 1, N)])
-        batched = jax.jit(jax.vmap(_fit))(x, y, w)
+        batched = quick_compile_nested(jax.vmap(_fit))(x, y, w)
         for k in range(3):
             np.testing.assert_allclose(batched[k], _fit(x[k], y[k], w[k]), atol=1e-12)
 
     def test_single_trace(self):
-        fit = jax.jit(eqx.debug.assert_max_traces(partial(align, with_scale=True), max_traces=1))
+        fit = quick_compile_nested(eqx.debug.assert_max_traces(partial(align, with_scale=True), max_traces=1))
         for seed in range(3):
             fit(*(np.float32(a) for a in (_cloud(seed), _cloud(seed + 1), ONES)))
 
@@ -289,23 +290,27 @@ class TestAte:
             return jnp.stack(errors.statistics), errors.distances
 
         arguments = (_cloud(0), _cloud(1), np.linspace(1.0, 2.0, N))
-        check_grads(jax.jit(figures), arguments, order=1, modes=("fwd", "rev"), eps=1e-6, rtol=1e-6, atol=1e-6)
+        check_grads(
+            quick_compile_nested(figures), arguments, order=1, modes=("fwd", "rev"), eps=1e-6, rtol=1e-6, atol=1e-6
+        )
 
     def test_vmap_equals_loop(self, x64):
         x, y = np.stack([_cloud(s) for s in range(3)]), np.stack([_cloud(s) for s in range(3, 6)])
-        batched = jax.jit(jax.vmap(lambda x, y: ate(x, y, jnp.ones(N)).statistics.median))(x, y)
+        batched = quick_compile_nested(jax.vmap(lambda x, y: ate(x, y, jnp.ones(N)).statistics.median))(x, y)
         for k in range(3):
             np.testing.assert_allclose(batched[k], _ate["se3"](x[k], y[k], ONES).statistics.median, rtol=1e-12)
 
     def test_single_trace(self):
-        compute = jax.jit(eqx.debug.assert_max_traces(partial(ate, alignment="none"), max_traces=1))
+        compute = quick_compile_nested(eqx.debug.assert_max_traces(partial(ate, alignment="none"), max_traces=1))
         for seed in range(3):
             compute(*(np.float32(a) for a in (_cloud(seed), _cloud(seed + 1), ONES)))
 
     def test_degenerate(self, x64):
         """A perfect estimate has error and gradient zero, not NaN; without poses the figures are zero."""
         x, y, w = _degenerate("perfect")
-        for gradient in jax.jit(jax.grad(lambda *a: sum(ate(*a, alignment="none").statistics), (0, 1, 2)))(x, y, w):
+        for gradient in quick_compile_nested(jax.grad(lambda *a: sum(ate(*a, alignment="none").statistics), (0, 1, 2)))(
+            x, y, w
+        ):
             np.testing.assert_array_equal(gradient, 0)
         np.testing.assert_allclose(_ate["sim3"](x, y, w).statistics, 0, atol=1e-14)
         empty = _ate["sim3"](*_degenerate("all NaN"))
@@ -401,13 +406,15 @@ class TestRpe:
 
     def test_vmap_equals_loop(self, x64):
         P, Q = np.stack([_poses(s) for s in range(3)]), np.stack([_poses(s) for s in range(3, 6)])
-        batched = jax.jit(jax.vmap(lambda P, Q: rpe(SE3(P), SE3(Q), *(jnp.asarray(a) for a in _PAIRS))))(P, Q)
+        batched = quick_compile_nested(jax.vmap(lambda P, Q: rpe(SE3(P), SE3(Q), *(jnp.asarray(a) for a in _PAIRS))))(
+            P, Q
+        )
         for k in range(3):
             single = _rpe(P[k], Q[k], *_PAIRS)
             jax.tree.map(lambda a, b: np.testing.assert_allclose(a[k], b, atol=1e-12), batched, single)  # noqa: B023
 
     def test_single_trace(self):
-        compute = jax.jit(eqx.debug.assert_max_traces(_rpe_loss, max_traces=1))
+        compute = quick_compile_nested(eqx.debug.assert_max_traces(_rpe_loss, max_traces=1))
         for seed in range(3):
             compute(_poses(seed).astype(np.float32), _poses(seed + 1).astype(np.float32), *_PAIRS)
 

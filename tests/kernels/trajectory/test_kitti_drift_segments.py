@@ -11,26 +11,27 @@ from jax.test_util import check_grads
 from jaxlie import SE3
 from jaxslam_kernels.trajectory.kitti_drift import segment_errors
 from kitti_drift import kitti_drift
+from quick_compile import quick_compile_nested
 from scipy.spatial.transform import Rotation
 
 N, STEP = 41, 3
 LENGTHS = np.array([2.0, 5.0, 9.0, 1000.0])
 ALL = np.ones(N, bool)
 
-_jitted = jax.jit(lambda P, Q, mask, lengths: segment_errors(SE3(P), SE3(Q), mask, lengths, step=STEP))
+_jitted = quick_compile_nested(lambda P, Q, mask, lengths: segment_errors(SE3(P), SE3(Q), mask, lengths, step=STEP))
 
 
 def _errors(P, Q, mask, lengths):
     return jax.tree.map(np.asarray, _jitted(P, Q, mask, lengths))
 
 
-@jax.jit
+@quick_compile_nested
 def _loss(P, Q, mask, lengths):
     errors = segment_errors(SE3(P), SE3(Q), mask, lengths, step=STEP)
     return errors.translation + errors.rotation
 
 
-_gradient = jax.jit(jax.grad(_loss, argnums=(0, 1)))
+_gradient = quick_compile_nested(jax.grad(_loss, argnums=(0, 1)))
 
 
 @pytest.fixture
@@ -100,7 +101,7 @@ class TestSegmentErrors:
         Q = _drive(5, 1500)
         Q[:, 4:] *= 2
         P, lengths = _drifting(Q, 6, 0.001), np.arange(1, 9) * 100.0
-        compute = jax.jit(lambda P, Q, mask, lengths: segment_errors(SE3(P), SE3(Q), mask, lengths))
+        compute = quick_compile_nested(lambda P, Q, mask, lengths: segment_errors(SE3(P), SE3(Q), mask, lengths))
         errors = compute(P, Q, np.ones(1500, bool), lengths)
         translations, rotations, count = kitti_drift(P, Q, lengths, 10)
         assert errors.num_segments == count
@@ -116,20 +117,24 @@ class TestSegmentErrors:
             errors = segment_errors(SE3(P), SE3(Q), jnp.asarray(mask), jnp.asarray(LENGTHS), step=STEP)
             return errors.translation, errors.rotation, errors.translations, errors.rotations
 
-        check_grads(jax.jit(outputs), (P, Q), order=1, modes=("fwd", "rev"), eps=1e-4 * noise, rtol=1e-4, atol=1e-4)
+        check_grads(
+            quick_compile_nested(outputs), (P, Q), order=1, modes=("fwd", "rev"), eps=1e-4 * noise, rtol=1e-4, atol=1e-4
+        )
 
     def test_vmap_equals_loop(self, x64):
         Q = np.stack([_drive(s) for s in range(3)])
         P = np.stack([_drifting(q, s) for s, q in enumerate(Q)])
         masks = np.stack([ALL, np.arange(N) % 4 > 0, np.arange(N) < 30])
-        batched = jax.jit(jax.vmap(lambda P, Q, mask: _jitted(P, Q, mask, jnp.asarray(LENGTHS))))(P, Q, masks)
+        batched = quick_compile_nested(jax.vmap(lambda P, Q, mask: _jitted(P, Q, mask, jnp.asarray(LENGTHS))))(
+            P, Q, masks
+        )
         for k in range(3):
             single = _errors(P[k], Q[k], masks[k], LENGTHS)
             jax.tree.map(lambda a, b: np.testing.assert_allclose(a[k], b, atol=1e-12), batched, single)  # noqa: B023
 
     def test_single_trace(self):
         """Poses, masks and lengths are values."""
-        compute = jax.jit(eqx.debug.assert_max_traces(_loss, max_traces=1))
+        compute = quick_compile_nested(eqx.debug.assert_max_traces(_loss, max_traces=1))
         for seed in range(3):
             Q = _drive(seed)
             arrays = (a.astype(np.float32) for a in (_drifting(Q, seed), Q))
