@@ -13,12 +13,13 @@ import numpy as np
 import pytest
 from command_line import failing
 from tiny_recording import CAMERA, write_recording
+from trajectory_files import write_pair
 
 import jaxslam
 from jaxslam.cli.command_table import COMMANDS, Command, ExitCode
 from jaxslam.cli.entry_point import main
 from jaxslam.runtime.machine import cpu_model
-from jaxslam.trajectory.trajectory import Trajectory, write_tum
+from jaxslam.trajectory.trajectory import Trajectory
 
 fails = failing()
 
@@ -34,10 +35,9 @@ def trajectories(tmp_path: Path) -> tuple[str, str]:
     stamps = np.arange(60, dtype=np.int64) * 33_000_000 + 10**15
     poses = np.zeros((60, 7))
     poses[:, 0], poses[:, 4], poses[:, 5] = 1, np.linspace(0, 2, 60), np.sin(np.linspace(0, 6, 60))
-    write_tum(tmp_path / "truth.txt", Trajectory(stamps, poses))
-    poses[::2, 6] += 0.01
-    write_tum(tmp_path / "estimate.txt", Trajectory(stamps, poses))
-    return str(tmp_path / "estimate.txt"), str(tmp_path / "truth.txt")
+    shifted = poses.copy()
+    shifted[::2, 6] += 0.01
+    return write_pair(tmp_path, Trajectory(stamps, shifted), Trajectory(stamps, poses))
 
 
 class TestHelp:

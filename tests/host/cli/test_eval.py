@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import failing
+from trajectory_files import write_pair
 
 from jaxslam.cli.entry_point import main
 from jaxslam.trajectory.evaluation import evaluate
@@ -24,11 +25,7 @@ def pair(data_dir: Path) -> tuple[Trajectory, Trajectory]:
 
 @pytest.fixture
 def files(pair: tuple[Trajectory, Trajectory], tmp_path: Path) -> tuple[str, str]:
-    (tmp_path / "truth").mkdir()
-    paths = tmp_path / "estimate.txt", tmp_path / "truth" / "groundtruth.txt"
-    for path, trajectory in zip(paths, pair, strict=True):
-        write_tum(path, trajectory)
-    return str(paths[0]), str(paths[1])
+    return write_pair(tmp_path, *pair)
 
 
 def printed(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
