@@ -14,6 +14,7 @@ import numpy as np
 from jaxslam.errors import MapFileError
 from jaxslam.geometry.se3 import inverse, rotate
 from jaxslam.io.atomic_files import write_atomically
+from jaxslam.io.ply_file import write_ply_points
 from jaxslam.map.types import Keyframe, Map, observations_at, point_submaps, points_at, rows
 from jaxslam.sensors.camera import Camera
 from jaxslam.trajectory.trajectory import Trajectory, write_tum
@@ -24,16 +25,6 @@ _UNKNOWN_GRAY = 128
 _KEYFRAME_RGB = (255, 128, 0)
 _COLMAP_CENTER = 0.5
 """What COLMAP calls the center of the top-left pixel; ours is 0."""
-
-_VERTEX = np.dtype(
-    [
-        *((axis, "<f4") for axis in "xyz"),
-        *((channel, "u1") for channel in ("red", "green", "blue")),
-        ("weight", "<f4"),
-        ("observations", "<f4"),  # COLMAP reads no integers
-    ]
-)
-_PLY_TYPES = {"<f4": "float", "|u1": "uchar"}
 
 
 def write_ply(path: PathLike, slam_map: Map, submap: int | None = None, *, keyframes: bool = False) -> None:
@@ -49,21 +40,15 @@ def write_ply(path: PathLike, slam_map: Map, submap: int | None = None, *, keyfr
         MapFileError: If the file cannot be written, there is no such submap, or an image cannot be decoded.
     """
     part = one_submap(slam_map, submap)
-    vertices = np.zeros(len(part.points.ids), _VERTEX)
-    vertices["x"], vertices["y"], vertices["z"] = part.points.X_world
-    vertices["red"] = vertices["green"] = vertices["blue"] = _grays(part)
-    vertices["weight"] = part.points.weight
-    vertices["observations"] = _counts(part.points.ids, part.observations.point)
+    points, colors = part.points.X_world.T, np.repeat(_grays(part)[:, None], 3, axis=1)
+    weights, observations = part.points.weight, _counts(part.points.ids, part.observations.point)
     if keyframes:
-        centers = np.zeros(len(part.ids), _VERTEX)
-        centers["x"], centers["y"], centers["z"] = part.T_world_cam[:, 4:].T
-        centers["red"], centers["green"], centers["blue"] = _KEYFRAME_RGB
-        centers["weight"] = 1
-        centers["observations"] = _counts(part.ids, part.observations.keyframe)
-        vertices = np.concatenate([vertices, centers])
-    properties = [f"property {_PLY_TYPES[_VERTEX[name].str]} {name}" for name in _VERTEX.names or ()]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}", *properties, "end_header\n"]
-    write_atomically(path, "\n".join(header).encode() + vertices.tobytes(), MapFileError)
+        centers = part.T_world_cam[:, 4:]
+        points = np.concatenate([points, centers])
+        colors = np.concatenate([colors, np.full((len(centers), 3), _KEYFRAME_RGB, np.uint8)])
+        weights = np.concatenate([weights, np.ones(len(centers))])
+        observations = np.concatenate([observations, _counts(part.ids, part.observations.keyframe)])
+    write_ply_points(path, points, colors, weight=weights, observations=observations)
 
 
 def write_colmap(folder: PathLike, slam_map: Map, submap: int | None = None) -> None:

@@ -119,14 +119,14 @@ def _bar(text: str, color: tuple[int, int, int]) -> np.ndarray:
 
 
 def _sheet(pictures: Sequence[np.ndarray]) -> bytes:
-    """PNG of pictures in rows of four."""
+    """Encode pictures in rows of four as a PNG."""
+    from skimage.util import montage  # noqa: PLC0415 - used once, at the end of a run
+
     columns = min(len(pictures), _SHEET_COLUMNS)
-    rows = -(-len(pictures) // columns)
-    blank = [np.full_like(pictures[0], 255)] * (rows * columns - len(pictures))
-    tiles = [*pictures, *blank]
-    lines = [np.concatenate(tiles[row * columns : (row + 1) * columns], axis=1) for row in range(rows)]
+    shape = -(-len(pictures) // columns), columns
     file = io.BytesIO()
-    Image.fromarray(np.concatenate(lines)).save(file, "PNG", compress_level=PNG_LEVEL)
+    sheet = montage(np.stack(pictures), fill=(255, 255, 255), grid_shape=shape, channel_axis=-1)
+    Image.fromarray(sheet).save(file, "PNG", compress_level=PNG_LEVEL)
     return file.getvalue()
 
 
