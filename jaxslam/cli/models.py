@@ -14,9 +14,9 @@ from jaxslam.errors import ModelError
 from jaxslam.io.download import download, sha256_of
 from jaxslam.semantics.model_zoo import (
     DEFAULT_MODEL,
-    KNOWN_MODELS,
     KnownModel,
     known_model,
+    known_models,
     local_file,
     models_dir,
 )
@@ -31,12 +31,12 @@ class ListModels(WithJson):
 
     def main(self) -> None:
         """Run the command."""
-        files = {model.name: local_file(model) for model in KNOWN_MODELS.values()}
+        files = {model.name: local_file(model) for model in known_models().values()}
         if self.json:
-            print_json([_listed(model, files[model.name]) for model in KNOWN_MODELS.values()])
+            print_json([_listed(model, files[model.name]) for model in known_models().values()])
             return
         table = make_table("Known models", "name", "size", "license", "adapter", "here", left=5)
-        for model in KNOWN_MODELS.values():
+        for model in known_models().values():
             size = "-" if model.size_bytes is None else f"{model.size_bytes / 1e6:.1f} MB"
             mark = " (default)" if model.name == DEFAULT_MODEL else ""
             absent = "no" if model.url else "to be made"
@@ -85,7 +85,7 @@ def _listed(model: KnownModel, file: Path | None) -> dict[str, Any]:
 
 
 def _print_details() -> None:
-    for model in KNOWN_MODELS.values():
+    for model in known_models().values():
         plain_console.print(f"\n{model.name}: {model.about}; {model.page}")
         plain_console.print(f"  {model.url or model.how}")
         if model.sha256 is not None:

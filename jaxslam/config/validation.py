@@ -6,11 +6,12 @@ import math
 import numbers
 import reprlib
 import types
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal, TypeAlias, Union, get_args, get_origin, get_type_hints
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, dataclass
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from jaxslam.errors import ConfigError, JaxSlamError
+from jaxslam.io.yaml_files import check_keys, checked_mapping
 
 _Args: TypeAlias = tuple[Any, ...]
 _PLAIN: dict[Any, str] = {int: "an integer", float: "a finite number", bool: "true or false", str: "text"}
@@ -54,9 +55,9 @@ Share = Range(at_least=0, at_most=1)
 class ValidatedConfig:
     """Base class of dataclasses that refuse a field of the wrong type or out of range, however they are built.
 
-    Annotations may be `int`, `float`, `bool`, `str`, `Literal`, `tuple`, another dataclass, a union of these
-    or `None`, each optionally `Annotated` with a `Range`. Where the annotation says so, lists become tuples and
-    integers become floats, so that equal settings compare and hash equal.
+    Annotations may be `int`, `float`, `bool`, `str`, `Any`, `Literal`, `tuple`, `Mapping`, another dataclass, a union
+    of these or `None`, each optionally `Annotated` with a `Range`. Where the annotation says so, lists become tuples
+    and integers become floats, so that equal settings compare and hash equal.
     """
 
     _error: ClassVar[type[JaxSlamError]] = ConfigError
@@ -66,6 +67,9 @@ class ValidatedConfig:
         for name, hint in field_hints(type(self)).items():
             value = checked_value(hint, getattr(self, name), f"{type(self).__name__}.{name}", self._error)
             object.__setattr__(self, name, value)
+
+
+_Record = TypeVar("_Record", bound=ValidatedConfig)
 
 
 class _MismatchError(ValueError):
@@ -100,15 +104,56 @@ def checked_value(hint: Any, value: object, key: str, error: type[JaxSlamError] 
         raise error(f"{key}: expected {_expected(hint)}, got {reprlib.repr(value)}") from None
 
 
+def from_mapping(cls: type[_Record], content: object, place: str) -> _Record:
+    """Build a validated dataclass from what a file holds, together with the dataclasses in its fields.
+
+    Args:
+        cls: The class to build.
+        content: A mapping from names of fields to their values. A field that is a dataclass, or a list or mapping of
+            dataclasses, is given as a mapping, or as lists or mappings of mappings.
+        place: File and section that the content comes from, as errors name it.
+
+    Raises:
+        JaxSlamError: Of the class that `cls` raises, if the content is no mapping, a key is unknown or missing, or a
+            value has the wrong type or is out of range. The message names the place, the key, what was expected and
+            what was given.
+    """
+    error, hints = cls._error, field_hints(cls)
+    given = checked_mapping(content, place, error)
+    fields = dataclasses.fields(cls)
+    needed = [field.name for field in fields if field.default is MISSING and field.default_factory is MISSING]
+    check_keys(given, hints, needed, place, error)
+    values = {key: _built(hints[key], value, f"{place}: {key}", error) for key, value in given.items()}
+    try:
+        return cls(**values)
+    except JaxSlamError as problem:
+        raise error(f"{place}: {problem}") from None
+
+
 def section_of(hint: Any) -> type[Any] | None:
     """Find the dataclass in an annotation such as `X` or `X | None`; `None` if there is none."""
     choices = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
     return next((c for c in choices if isinstance(c, type) and dataclasses.is_dataclass(c)), None)
 
 
+def _built(hint: Any, value: object, place: str, error: type[JaxSlamError]) -> Any:
+    """Check the value of a field as `checked_value` does, and build the dataclasses in it."""
+    section, args = section_of(hint), get_args(hint)
+    if section is not None and not (dataclasses.is_dataclass(value) or (value is None and args)):
+        return from_mapping(section, value, place)
+    if get_origin(hint) is tuple and args[-1] is Ellipsis and isinstance(value, list | tuple):
+        return tuple(_built(args[0], item, f"{place}[{index}]", error) for index, item in enumerate(value))
+    if get_origin(hint) is Mapping:
+        given = checked_mapping(value, place, error)
+        return {key: _built(args[1], item, f"{place}: {key}", error) for key, item in given.items()}
+    return checked_value(hint, value, place, error)
+
+
 def _converted(hint: Any, value: object) -> Any:
     if convert := _CONVERTERS.get(get_origin(hint)):
         return convert(get_args(hint), value)
+    if hint is Any:
+        return value
     if hint in _PLAIN:
         return _plain(hint, value)
     if isinstance(hint, type) and (hint is types.NoneType or dataclasses.is_dataclass(hint)):
@@ -149,12 +194,19 @@ def _tuple(args: _Args, value: object) -> tuple[Any, ...]:
     return tuple(_converted(hint, item) for hint, item in zip(hints, value, strict=True))
 
 
+def _mapping(args: _Args, value: object) -> dict[Any, Any]:
+    if not isinstance(value, Mapping):
+        raise _MismatchError
+    return {_converted(args[0], key): _converted(args[1], item) for key, item in value.items()}
+
+
 _CONVERTERS: dict[Any, Callable[[_Args, object], Any]] = {
     Annotated: _in_ranges,
     Literal: _choice,
     Union: _first_that_fits,
     types.UnionType: _first_that_fits,
     tuple: _tuple,
+    Mapping: _mapping,
 }
 
 
@@ -175,6 +227,8 @@ def _expected(hint: Any) -> str:
     args = get_args(hint)
     if describe := _DESCRIPTIONS.get(get_origin(hint)):
         return describe(args)
+    if hint is Any:
+        return "any value"
     return _PLAIN.get(hint) or ("null" if hint is types.NoneType else f"a {hint.__name__}")
 
 
@@ -194,4 +248,5 @@ _DESCRIPTIONS: dict[Any, Callable[[_Args], str]] = {
     Union: lambda args: " or ".join(map(_expected, args)),
     types.UnionType: lambda args: " or ".join(map(_expected, args)),
     tuple: _expected_list,
+    Mapping: lambda args: f"a mapping, each value {_expected(args[1])}",
 }

@@ -6,42 +6,30 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import platformdirs
 
-from jaxslam.config.loading import configs_dir
-from jaxslam.config.validation import Range, ValidatedConfig, field_hints
+from jaxslam.config.catalog import CatalogEntry, read_catalog
+from jaxslam.config.validation import Range
 from jaxslam.errors import DatasetError, JaxSlamError
-from jaxslam.io.yaml_files import check_keys, read_yaml
 
 _DEPTH = 3
-_NEEDED = ("dataset", "kind", "license", "page", "about")
 _MARKS = ("rgb.txt", "times.txt", "mav0/cam0/data.csv", "pose_left.txt")
 """Files of which one is in every recording of the layouts of TUM, KITTI, EuRoC and TartanAir."""
 _SHORTENED = ((re.compile(r"\Argbd_dataset_freiburg"), "fr"), (re.compile(r"\Argbd_bonn_"), "bonn_"))
-_NAME = re.compile(r"[a-z0-9_]+\Z")
-_SHA256 = re.compile(r"[0-9a-f]{64}\Z")
 
 
-@dataclass(frozen=True)
-class Recording(ValidatedConfig):
-    """A public recording.
+@dataclass(frozen=True, kw_only=True)
+class Recording(CatalogEntry):
+    """A public recording. Its name is also that of its unpacked folder; `kitti_05` is KITTI's `sequences/05`.
 
     Attributes:
-        name: What commands call it, and the name of its folder when unpacked (KITTI's `kitti_05`: `sequences/05`).
-        dataset: What it is part of.
-        kind: Which loader opens it.
-        license: As its page words it.
-        page: Who made it.
-        about: What is to be seen.
-        url: Where its archive is published, .tgz or .zip; `None` if it cannot be had alone.
-        size_bytes: Of that archive, if known.
-        sha256: Of that archive, if known.
-        typical_size: Of the archives of the dataset, in words, where the size of this one is not known.
-        how: How to come by it, where there is no `url`.
-        frames: How many frames the whole recording has, if that is known: its pairs of images, or its color images,
-            of which a few have no depth image taken at the same time.
+        dataset: Name of the dataset that the recording belongs to.
+        kind: Name of the loader that opens the recording.
+        typical_size: Size of the archives of the dataset in words, for recordings without `size_bytes`.
+        frames: Number of frames of the whole recording: pairs of stereo images, or color images, of which a few have no
+            depth image taken at the same time; `None` if unknown.
 
     Raises:
         DatasetError: If a field has the wrong type or cannot be right.
@@ -49,29 +37,15 @@ class Recording(ValidatedConfig):
 
     _error: ClassVar[type[JaxSlamError]] = DatasetError
 
-    name: str
     dataset: str
     kind: Literal["tum", "bonn", "kitti"]
-    license: str
-    page: str
-    about: str
-    url: str | None = None
-    size_bytes: Annotated[int, Range(above=0)] | None = None
-    sha256: str | None = None
     typical_size: str = "-"
-    how: str = ""
     frames: Annotated[int, Range(at_least=1)] | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not _NAME.match(self.name):
-            raise DatasetError(f"name: expected small letters, digits and _, got {self.name!r:.80}")
-        if self.url is None and not self.how:
-            raise DatasetError("url: expected an address, or `how` to come by it, got neither")
-        if self.url is not None and not (self.url.startswith("http") and self.url.endswith((".tgz", ".zip"))):
-            raise DatasetError(f"url: expected http, and .tgz or .zip at the end, got {self.url!r:.80}")
-        if self.sha256 is not None and not _SHA256.match(self.sha256):
-            raise DatasetError(f"sha256: expected 64 small hexadecimal digits, got {self.sha256!r:.80}")
+        if self.url is not None and not self.url.endswith((".tgz", ".zip")):
+            raise DatasetError(f"url: expected .tgz or .zip at the end, got {self.url!r:.80}")
 
     @property
     def archive(self) -> str:
@@ -80,25 +54,15 @@ class Recording(ValidatedConfig):
 
 
 def known_recordings(path: Path | None = None) -> dict[str, Recording]:
-    """The catalog, by name.
+    """Read the catalog of recordings: recordings by name.
 
     Args:
-        path: The file; the packaged one if not given.
+        path: The file; by default `configs/recordings.yaml`.
 
     Raises:
-        DatasetError: If it is unreadable, or an entry is incomplete, has an unknown key or stands twice.
+        DatasetError: If the file is unreadable, or an entry is incomplete, has an unknown key or is listed twice.
     """
-    path = path or configs_dir() / "recordings.yaml"
-    groups = read_yaml(path, DatasetError)
-    if not isinstance(groups, list):
-        raise DatasetError(f"{path}: expected a list of datasets, got {type(groups).__name__}")
-    known: dict[str, Recording] = {}
-    for number, group in enumerate(groups, 1):
-        for recording in _of_group(group, f"{path}: dataset {number}"):
-            if recording.name in known:
-                raise DatasetError(f"{path}: {recording.name}: stands twice")
-            known[recording.name] = recording
-    return known
+    return read_catalog(Recording, "recordings", path)
 
 
 def known_recording(name: str) -> Recording:
@@ -143,26 +107,6 @@ def found_recordings(root: str | os.PathLike[str] | None = None) -> dict[str, Pa
         for folder in _recordings_below(place):
             found.setdefault(name_of(folder), folder)
     return found
-
-
-def _of_group(group: object, where: str) -> Iterator[Recording]:
-    shared = _mapping(group, where)
-    entries = _mapping(shared.pop("recordings", None), f"{where}: recordings")
-    for name, entry in entries.items():
-        fields: dict[str, Any] = shared | _mapping(entry, f"{where}: {name}") | {"name": name}
-        check_keys(fields, field_hints(Recording), _NEEDED, f"{where}: {name}", DatasetError)
-        if isinstance(fields.get("url"), str):
-            fields["url"] = fields["url"].replace("{name}", name)
-        try:
-            yield Recording(**fields)
-        except DatasetError as problem:
-            raise DatasetError(f"{where}: {name}: {problem}") from None
-
-
-def _mapping(value: object, where: str) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise DatasetError(f"{where}: expected `key: value` lines, got {type(value).__name__}")
-    return {str(key): content for key, content in value.items()}
 
 
 def _meant(name: str, known: list[str]) -> str:

@@ -1,6 +1,7 @@
 """Reading YAML: plain safe YAML, strict about duplicate keys, tolerant of OpenCV's dialect."""
 
 import re
+import reprlib
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
@@ -124,10 +125,22 @@ def read_mapping(path: Path, error: type[JaxSlamError]) -> dict[str, Any]:
         JaxSlamError: Of class `error`, naming the file, if it is missing, no text, no YAML or no mapping.
     """
     content = read_yaml(path, error)
-    if content is None:
-        return {}
-    if not isinstance(content, dict):
-        raise error(f"{path}: expected `key: value` lines, got {type(content).__name__}")
+    return {} if content is None else checked_mapping(content, str(path), error)
+
+
+def checked_mapping(content: object, place: str, error: type[JaxSlamError]) -> dict[str, Any]:
+    """Return a mapping with its keys as text.
+
+    Args:
+        content: What was read.
+        place: File and section of the content, as errors name it.
+        error: Class of the error to raise.
+
+    Raises:
+        JaxSlamError: Of class `error`, naming `place`, if the content is no mapping.
+    """
+    if not isinstance(content, Mapping):
+        raise error(f"{place}: expected `key: value` lines, got {reprlib.repr(content)}")
     return {str(key): value for key, value in content.items()}
 
 

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import jax
 import pytest
 
-from jaxslam.semantics import model_zoo as known_models
+from jaxslam.semantics import model_zoo
 
 COMPILED = "/jax/core/compile/backend_compile_duration"
 
@@ -37,7 +37,7 @@ def _networks_hidden(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]
 def _hide_networks(patch: pytest.MonkeyPatch, cache: Path) -> None:
     patch.delenv("JAXSLAM_MODELS", raising=False)
     # Only there: what is compiled stays in the user's own cache.
-    patch.setattr(known_models, "platformdirs", SimpleNamespace(user_cache_dir=lambda *_, **__: str(cache)))
+    patch.setattr(model_zoo, "platformdirs", SimpleNamespace(user_cache_dir=lambda *_, **__: str(cache)))
 
 
 @pytest.fixture

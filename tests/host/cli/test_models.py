@@ -17,10 +17,9 @@ from jaxslam.cli import models as models_command
 from jaxslam.cli import models_check
 from jaxslam.cli.entry_point import main
 from jaxslam.errors import DownloadError
-from jaxslam.semantics import Detections, no_detections
-from jaxslam.semantics import model_zoo as known_models
+from jaxslam.semantics import Detections, model_zoo, no_detections
 from jaxslam.semantics.adapters import ADAPTERS
-from jaxslam.semantics.model_zoo import KNOWN_MODELS, known_model
+from jaxslam.semantics.model_zoo import known_model, known_models
 from jaxslam.semantics.prompted import PROMPT_ADAPTERS
 from jaxslam.visualization.draw_detections import draw_detections
 
@@ -66,13 +65,13 @@ class TestHelp:
 
 class TestTable:
     def test_adapters_exist(self) -> None:
-        assert {model.adapter for model in KNOWN_MODELS.values()} <= {*ADAPTERS, *PROMPT_ADAPTERS, "in_context"}
+        assert {model.adapter for model in known_models().values()} <= {*ADAPTERS, *PROMPT_ADAPTERS, "in_context"}
 
     def test_lists_them_all(self, capsys: pytest.CaptureFixture[str], models_cache: Path) -> None:
         (models_cache / "FastestDet.onnx").write_bytes(CONTENT)
         main(["models", "list"])
         out = capsys.readouterr().out
-        assert all(name in out for name in KNOWN_MODELS)
+        assert all(name in out for name in known_models())
         assert "(default)" in out
         assert f"fastestdet: {models_cache / 'FastestDet.onnx'}" in out
         assert "SHA-256" not in out
@@ -80,7 +79,7 @@ class TestTable:
     def test_details(self, capsys: pytest.CaptureFixture[str]) -> None:
         main(["models", "list", "--details"])
         out = capsys.readouterr().out
-        for model in KNOWN_MODELS.values():
+        for model in known_models().values():
             assert (model.url or model.how) in out
             assert model.page in out
             assert (model.sha256 or "") in out
@@ -116,7 +115,7 @@ class TestGet:
     def test_without_a_known_hash_prints_the_one_it_has(
         self, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setitem(KNOWN_MODELS, "yolox-nano", replace(known_model("yolox-nano"), sha256=None))
+        monkeypatch.setitem(known_models(), "yolox-nano", replace(known_model("yolox-nano"), sha256=None))
         main(["models", "get", "yolox-nano"])
         assert f"SHA-256 {HASH}, which nobody has checked" in capsys.readouterr().out
 
@@ -142,13 +141,13 @@ class TestGet:
         main(["models", "get", "yolox-nano", "--force"])
         assert f"JAXSLAM_MODELS says: {tmp_path / 'yolox_nano.onnx'}" in capsys.readouterr().out
 
-    @pytest.mark.parametrize("name", [model.name for model in KNOWN_MODELS.values() if model.url is None])
+    @pytest.mark.parametrize("name", [model.name for model in known_models().values() if model.url is None])
     def test_what_must_be_made(
         self, capsys: pytest.CaptureFixture[str], models_cache: Path, served: list[dict[str, Any]], name: str
     ) -> None:
         message = fails(capsys, "get", name)
-        assert KNOWN_MODELS[name].how in message
-        assert str(models_cache / KNOWN_MODELS[name].file) in message
+        assert known_models()[name].how in message
+        assert str(models_cache / known_models()[name].file) in message
         assert not served
 
     def test_misspelt(self, capsys: pytest.CaptureFixture[str]) -> None:
@@ -264,7 +263,7 @@ class TestCheck:
         if not MODELS:
             pytest.skip("JAXSLAM_MODELS is not set: no networks here")
         monkeypatch.setenv("JAXSLAM_MODELS", MODELS)
-        files = {model.adapter: known_models.local_file(model) for model in KNOWN_MODELS.values()}
+        files = {model.adapter: model_zoo.local_file(model) for model in known_models().values()}
         for adapter, file in files.items():
             if file is not None:
                 assert models_check.load_detector(file).adapter == adapter

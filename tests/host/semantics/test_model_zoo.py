@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from jaxslam.errors import ModelError
-from jaxslam.semantics.model_zoo import DEFAULT_MODEL, KNOWN_MODELS, find_model, is_known, known_model, local_file
+from jaxslam.semantics.model_zoo import DEFAULT_MODEL, find_model, is_known, known_model, known_models, local_file
 
 pytestmark = pytest.mark.usefixtures("models_cache")
 
@@ -26,9 +26,9 @@ def touch(path: Path) -> Path:
 
 
 class TestTable:
-    @pytest.mark.parametrize("name", KNOWN_MODELS)
+    @pytest.mark.parametrize("name", known_models())
     def test_entry_is_complete(self, name: str) -> None:
-        model = KNOWN_MODELS[name]
+        model = known_models()[name]
         assert model.name == name
         assert model.file.endswith(".onnx")
         assert model.page.startswith("https://")
@@ -45,15 +45,15 @@ class TestTable:
         assert model.license == "Apache-2.0"
 
     def test_nothing_under_agpl_is_downloaded(self) -> None:
-        restricted = [model for model in KNOWN_MODELS.values() if model.license.startswith("AGPL")]
+        restricted = [model for model in known_models().values() if model.license.startswith("AGPL")]
         assert restricted
         assert all(model.url is None and "AGPL-3.0" in model.how for model in restricted)
 
     def test_segmenters_come_in_pairs(self) -> None:
-        pairs = {name.removesuffix("-encoder") for name in KNOWN_MODELS if name.endswith("-encoder")}
-        assert pairs == {name.removesuffix("-decoder") for name in KNOWN_MODELS if name.endswith("-decoder")}
+        pairs = {name.removesuffix("-encoder") for name in known_models() if name.endswith("-encoder")}
+        assert pairs == {name.removesuffix("-decoder") for name in known_models() if name.endswith("-decoder")}
         for pair in pairs:
-            encoder, decoder = (KNOWN_MODELS[f"{pair}-{part}"] for part in ("encoder", "decoder"))
+            encoder, decoder = (known_models()[f"{pair}-{part}"] for part in ("encoder", "decoder"))
             assert encoder.adapter == decoder.adapter
             assert decoder.name in encoder.about
             assert encoder.name in decoder.about

@@ -196,7 +196,7 @@ class TestUnreadable:
         [
             ("width: [640", "some_camera.yaml:1: not readable as YAML"),
             (OWN + "fx: 3\n", "some_camera.yaml:9: not readable as YAML: 'fx' stands twice"),
-            ("- 640\n- 480\n", "expected `key: value` lines, got list"),
+            ("- 640\n- 480\n", "expected `key: value` lines, got [640, 480]"),
             ("", "missing 'width', 'height'"),
             ("fx: !!python/object:os.system ls\n", "not readable as YAML"),
             ("fx: \0\n", "not readable as YAML"),
