@@ -2,15 +2,15 @@
 
 import shlex
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColumn, TransferSpeedColumn
 
-from jaxslam.cli.console import make_table, plain_console, print_json, text_column
+from jaxslam.cli.console import make_table, plain_console, print_json
+from jaxslam.cli.fetch import byte_progress, fetch
 from jaxslam.cli.shared_options import WithJson
 from jaxslam.datasets.catalog import (
     Recording,
@@ -22,7 +22,7 @@ from jaxslam.datasets.catalog import (
 )
 from jaxslam.errors import DatasetError
 from jaxslam.io.archive import unpack
-from jaxslam.io.download import download, sha256_of
+from jaxslam.io.download import sha256_of
 
 _UNPACKED_PER_ARCHIVE = 1.2
 """Images hardly get smaller in an archive: two of TUM unpack to 1.07 and 1.08 times its size."""
@@ -112,19 +112,14 @@ def _print_next(recording: Recording, folder: Path) -> None:
 
 
 def _fetch_and_unpack(recording: Recording, url: str, archive: Path, target: Path) -> None:
-    columns = (
-        text_column("{task.description}"),
-        BarColumn(),
-        DownloadColumn(),
-        TransferSpeedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=plain_console) as progress:
-        was_there = archive.is_file()
-        if was_there:
+    with byte_progress() as progress:
+        if archive.is_file():
             _check(recording, archive)
         else:
-            _download(recording, url, archive, progress)
+            space: Callable[[int, int], None] = lambda done, total: _require_space(
+                archive.parent, total - done + _UNPACKED_PER_ARCHIVE * total
+            )
+            fetch(recording, url, archive, progress, title="Downloading", require_space=space)
         _require_space(target.parent, _UNPACKED_PER_ARCHIVE * archive.stat().st_size)
         task = progress.add_task("Unpacking", total=None)
         try:
@@ -136,24 +131,6 @@ def _fetch_and_unpack(recording: Recording, url: str, archive: Path, target: Pat
             )
         except DatasetError as failure:
             raise DatasetError(f"{failure}. To begin anew, delete {archive}") from failure
-
-
-def _download(recording: Recording, url: str, archive: Path, progress: Progress) -> None:
-    """Fetch the archive; as soon as its size is known, there must be space for it and what it holds."""
-    task = progress.add_task("Downloading", total=recording.size_bytes)
-    checked = False
-
-    def show(done: int, total: int | None) -> None:
-        nonlocal checked
-        if total is not None and not checked:
-            checked = True
-            _require_space(archive.parent, total - done + _UNPACKED_PER_ARCHIVE * total)
-        progress.update(task, completed=done, total=total)
-
-    if recording.size_bytes is not None:
-        part = archive.with_name(f"{archive.name}.part")
-        show(part.stat().st_size if part.is_file() else 0, recording.size_bytes)
-    download(url, archive, sha256=recording.sha256, size=recording.size_bytes, progress=show)
 
 
 def _check(recording: Recording, archive: Path) -> None:

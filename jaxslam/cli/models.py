@@ -1,17 +1,16 @@
 """`jaxslam models list` and `get`: the networks that can be had."""
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColumn, TransferSpeedColumn
 
-from jaxslam.cli.console import make_table, plain_console, print_json, text_column
+from jaxslam.cli.console import make_table, plain_console, print_json
+from jaxslam.cli.fetch import byte_progress, fetch
 from jaxslam.cli.shared_options import WithJson
 from jaxslam.errors import ModelError
-from jaxslam.io.download import download, sha256_of
+from jaxslam.io.download import sha256_of
 from jaxslam.semantics.model_zoo import (
     DEFAULT_MODEL,
     KnownModel,
@@ -70,7 +69,8 @@ class GetModel:
         target = models_dir() / model.file
         if model.url is None:
             raise ModelError(f"{model.name} cannot be downloaded; {model.how}. Then place the file at {target}")
-        _download(model, model.url, target)
+        with byte_progress() as progress:
+            fetch(model, model.url, target, progress, title=model.name)
         checked = "as expected" if model.sha256 else "which nobody has checked: no published one is known"
         plain_console.print(f"{model.name}: {target}, {model.license}, see {model.page}")
         plain_console.print(f"SHA-256 {sha256_of(target)}, {checked}")
@@ -91,11 +91,3 @@ def _print_details() -> None:
         if model.sha256 is not None:
             plain_console.print(f"  SHA-256 {model.sha256}")
     plain_console.print()
-
-
-def _download(model: KnownModel, url: str, target: Path) -> None:
-    columns = (text_column(model.name), BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=plain_console) as progress:
-        task = progress.add_task("download", total=model.size_bytes)
-        show: Callable[[int, int | None], None] = lambda done, total: progress.update(task, completed=done, total=total)
-        download(url, target, sha256=model.sha256, size=model.size_bytes, progress=show)

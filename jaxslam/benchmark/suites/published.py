@@ -8,15 +8,15 @@ import dataclasses
 import functools
 import math
 import re
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias, get_args
 
 from jaxslam.config.loading import configs_dir
-from jaxslam.config.validation import Range, ValidatedConfig, checked_value, field_hints
+from jaxslam.config.validation import Range, ValidatedConfig, checked_value, field_hints, from_mapping
 from jaxslam.errors import ConfigError, nearest
-from jaxslam.io.yaml_files import check_keys, read_mapping
+from jaxslam.io.yaml_files import check_keys, checked_mapping, read_mapping
 
 Metric: TypeAlias = Literal[
     "ate_rmse_m",
@@ -37,7 +37,6 @@ Verdict: TypeAlias = Literal["better", "in range", "worse"]
 _COLLECTION = "Collection of best figures"
 _POSITIVE = Annotated[float, Range(above=0)]
 _SEQUENCE = re.compile(r"rgbd_dataset_freiburg[123]_[a-z0-9_]+|rgbd_bonn_[a-z0-9_]+|kitti_\d\d")
-_TABLE_KEYS = ("source", "system", "variant", "sensor", "alignment", "note", "metric", "figures")
 
 
 @dataclass(frozen=True)
@@ -72,23 +71,21 @@ class Figure(ValidatedConfig):
 
 
 @dataclass(frozen=True)
-class PublishedSystem(ValidatedConfig):
-    """One file: a paper and the figures in it.
+class _Paper(ValidatedConfig):
+    """A paper, without its figures.
 
     Attributes:
-        name: The system.
-        title: Of the paper.
-        authors: Their family names.
-        venue: Where it appeared.
-        year: When; `None` if the paper does not say.
-        link: DOI or page; `None` if the paper has none.
-        sensor: What the system is fed with, unless a figure says otherwise.
-        alignment: What is fitted before measuring, unless a figure says otherwise.
-        alignment_stated: Whether the paper says so.
-        protocol: Which frames and how many runs, as far as the paper says.
+        name: Name of the system.
+        title: Title of the paper.
+        authors: Family names of the authors.
+        venue: Conference or journal.
+        year: Year of publication; `None` if the paper does not say.
+        link: DOI or web page; `None` if the paper has none.
+        sensor: Sensor of the system, unless a table names another.
+        alignment: Alignment of trajectories before errors are measured, unless a table names another.
+        alignment_stated: Whether the paper states the alignment.
+        protocol: Frames and number of runs, as far as the paper states them.
         source: Where in the paper the figures are.
-        figures: All of them: of the system, of its variants, and of other systems.
-        overall: Name and number of figures that belong to no sequence; the unit ends the name.
     """
 
     name: str
@@ -102,6 +99,50 @@ class PublishedSystem(ValidatedConfig):
     alignment_stated: bool
     protocol: str
     source: str
+
+
+@dataclass(frozen=True)
+class PublishedTable(ValidatedConfig):
+    """One table of a data file.
+
+    Attributes:
+        source: Table or section of the paper.
+        figures: Figures by sequence: `{metric: value}`, or a number where the table has a `metric`.
+        system: System that the figures belong to, if it is not the paper's own.
+        variant: Part of the system that ran, in an ablation; `None` for the whole system.
+        sensor: Sensor; `None` for that of the paper.
+        alignment: Alignment; `None` for that of the paper.
+        note: Reservation about the figures; empty if there is none.
+        metric: Metric of all figures; `None` if each sequence names its metrics.
+    """
+
+    source: str
+    figures: Mapping[str, Any]
+    system: str | None = None
+    variant: str | None = None
+    sensor: Sensor | None = None
+    alignment: Alignment | None = None
+    note: str = ""
+    metric: Metric | None = None
+
+
+@dataclass(frozen=True)
+class _PaperFile(_Paper):
+    """A data file as it is written; `overall` holds figures by name."""
+
+    tables: tuple[PublishedTable, ...]
+    overall: Mapping[str, _POSITIVE] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class PublishedSystem(_Paper):
+    """A paper and the figures in it.
+
+    Attributes:
+        figures: All figures: those of the system, of its variants, and of other systems.
+        overall: Name and value of each figure that belongs to no sequence; the name ends with the unit.
+    """
+
     figures: tuple[Figure, ...] = ()
     overall: tuple[tuple[str, _POSITIVE], ...] = ()
 
@@ -143,22 +184,15 @@ def read_published(path: Path) -> PublishedSystem:
         ConfigError: If it is unreadable, a key is unknown, missing or holds the wrong type, or a figure is not
             positive or stands twice.
     """
-    raw = read_mapping(path, ConfigError)
-    hints = field_hints(PublishedSystem)
-    heads = [key for key in hints if key not in ("figures", "overall")]
-    check_keys(raw, (*heads, "overall", "tables"), (*heads, "tables"), str(path), ConfigError)
-    head = {key: checked_value(hints[key], raw[key], f"{path}: {key}") for key in heads}
-    if not isinstance(raw["tables"], list):
-        raise ConfigError(f"{path}: tables: expected a list, got {raw['tables']!r}")
-    figures = [
+    file = from_mapping(_PaperFile, read_mapping(path, ConfigError), str(path))
+    figures = tuple(
         figure
-        for number, table in enumerate(raw["tables"], 1)
-        for figure in _figures(_mapping(table, f"{path}: tables: {number}"), head, f"{path}: tables: {number}")
-    ]
+        for number, table in enumerate(file.tables)
+        for figure in _figures(table, file, f"{path}: tables[{number}]: figures")
+    )
     _check_unique(figures, path)
-    overall = _mapping(raw.get("overall", {}), f"{path}: overall")
-    numbers = tuple((key, checked_value(_POSITIVE, value, f"{path}: overall: {key}")) for key, value in overall.items())
-    return PublishedSystem(**head, figures=tuple(figures), overall=numbers)
+    head = {name: getattr(file, name) for name in field_hints(_Paper)}
+    return PublishedSystem(**head, figures=figures, overall=tuple(file.overall.items()))
 
 
 def published_for(sequence: str, metric: str = "ate_rmse_m", *, variants: bool = False) -> list[Figure]:
@@ -214,31 +248,31 @@ def verdict(ours_best: float, ours_worst: float, published: float) -> Verdict:
     return "better" if ours_worst < published else "worse"
 
 
-def _figures(table: Mapping[str, Any], head: Mapping[str, Any], place: str) -> list[Figure]:
-    check_keys(table, _TABLE_KEYS, ("source", "figures"), place, ConfigError)
-    hints = field_hints(Figure)
-    given = {
-        key: checked_value(hints[key], table[key], f"{place}: {key}")
-        for key in ("source", "system", "variant", "sensor", "alignment", "note", "metric")
-        if key in table
-    }
-    shared = {key: head[key] for key in ("sensor", "alignment", "alignment_stated")} | given
-    system = shared.setdefault("system", head["name"])
-    if system != head["name"]:
-        shared["reported_by"] = head["name"]
-    metric = shared.pop("metric", None)
-    return [
-        Figure(sequence=sequence, metric=name, value=value, **shared)
-        for sequence, row in _mapping(table["figures"], f"{place}: figures").items()
-        for name, value in _checked_row(sequence, row, metric, f"{place}: figures: {sequence}").items()
-    ]
+def _figures(table: PublishedTable, file: _Paper, place: str) -> Iterator[Figure]:
+    """Make a figure of every number in a table."""
+    system = table.system or file.name
+    for sequence, row in table.figures.items():
+        for metric, value in _checked_row(sequence, row, table.metric, f"{place}: {sequence}").items():
+            yield Figure(
+                system=system,
+                sequence=sequence,
+                metric=metric,
+                value=value,
+                sensor=table.sensor or file.sensor,
+                alignment=table.alignment or file.alignment,
+                alignment_stated=file.alignment_stated,
+                source=table.source,
+                reported_by=None if system == file.name else file.name,
+                variant=table.variant,
+                note=table.note,
+            )
 
 
 def _checked_row(sequence: str, row: object, metric: str | None, place: str) -> dict[Any, float]:
     """Metrics and figures of one sequence; `row` is a lone figure where the table gives the metric."""
     if not _SEQUENCE.fullmatch(sequence):
         raise ConfigError(f"{place}: expected the folder of a recording of TUM or Bonn, or kitti_NN, got '{sequence}'")
-    numbers = {metric: row} if metric else _mapping(row, place)
+    numbers = {metric: row} if metric else checked_mapping(row, place, ConfigError)
     check_keys(numbers, get_args(Metric), (), place, ConfigError)
     return {name: checked_value(_POSITIVE, value, f"{place}: {name}") for name, value in numbers.items()}
 
@@ -260,12 +294,6 @@ def _joined(group: list[Figure]) -> Figure:
         reported_by=", ".join(dict.fromkeys(str(figure.reported_by) for figure in group)),
         note=" ".join(filter(None, dict.fromkeys(figure.note for figure in group))),
     )
-
-
-def _mapping(value: object, place: str) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise ConfigError(f"{place}: expected `key: value` lines, got {value!r}")
-    return {str(key): item for key, item in value.items()}
 
 
 def _check_unique(figures: Iterable[Figure], path: Path) -> None:

@@ -19,6 +19,7 @@ from command_line import failing
 from tiny_recording import write_recording
 
 from jaxslam.cli import data as data_command
+from jaxslam.cli import fetch
 from jaxslam.cli.entry_point import main
 from jaxslam.datasets import catalog as recordings
 from jaxslam.datasets import open_dataset
@@ -111,7 +112,7 @@ def serve(monkeypatch: pytest.MonkeyPatch, site: Site) -> Serve:
     """Have a recording come from the server, with fields changed; nothing is tried twice."""
     known = recordings.known_recordings()
     monkeypatch.setattr(recordings, "known_recordings", lambda: known)
-    monkeypatch.setattr(data_command, "download", partial(download, waits_s=()))
+    monkeypatch.setattr(fetch, "download", partial(download, waits_s=()))
 
     def change(name: str, **fields: Any) -> Recording:
         ending = (known[name].url or "")[-4:]

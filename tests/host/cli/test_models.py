@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 from command_line import failing
 
-from jaxslam.cli import models as models_command
-from jaxslam.cli import models_check
+from jaxslam.cli import fetch, models_check
 from jaxslam.cli.entry_point import main
 from jaxslam.errors import DownloadError
 from jaxslam.semantics import Detections, model_zoo, no_detections
@@ -96,7 +95,7 @@ class TestGet:
             progress(len(CONTENT), len(CONTENT))
             path.write_bytes(CONTENT)
 
-        monkeypatch.setattr(models_command, "download", give)
+        monkeypatch.setattr(fetch, "download", give)
         return asked
 
     def test_into_the_cache(
@@ -157,7 +156,7 @@ class TestGet:
         def refuse(*_: Any, **__: Any) -> None:
             raise DownloadError("no connection")
 
-        monkeypatch.setattr(models_command, "download", refuse)
+        monkeypatch.setattr(fetch, "download", refuse)
         assert fails(capsys, "get", "yolox-nano") == "no connection"
 
 
