@@ -118,8 +118,17 @@ def from_mapping(cls: type[_Record], content: object, place: str) -> _Record:
             value has the wrong type or is out of range. The message names the place, the key, what was expected and
             what was given.
     """
-    error, hints = cls._error, field_hints(cls)
-    given = checked_mapping(content, place, error)
+    return _record(cls, content, place, cls._error)
+
+
+def section_of(hint: Any) -> type[Any] | None:
+    """Find the dataclass in an annotation such as `X` or `X | None`; `None` if there is none."""
+    choices = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
+    return next((c for c in choices if isinstance(c, type) and dataclasses.is_dataclass(c)), None)
+
+
+def _record(cls: type[_Record], content: object, place: str, error: type[JaxSlamError]) -> _Record:
+    given, hints = checked_mapping(content, place, error), field_hints(cls)
     fields = dataclasses.fields(cls)
     needed = [field.name for field in fields if field.default is MISSING and field.default_factory is MISSING]
     check_keys(given, hints, needed, place, error)
@@ -130,17 +139,11 @@ def from_mapping(cls: type[_Record], content: object, place: str) -> _Record:
         raise error(f"{place}: {problem}") from None
 
 
-def section_of(hint: Any) -> type[Any] | None:
-    """Find the dataclass in an annotation such as `X` or `X | None`; `None` if there is none."""
-    choices = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
-    return next((c for c in choices if isinstance(c, type) and dataclasses.is_dataclass(c)), None)
-
-
 def _built(hint: Any, value: object, place: str, error: type[JaxSlamError]) -> Any:
     """Check the value of a field as `checked_value` does, and build the dataclasses in it."""
     section, args = section_of(hint), get_args(hint)
     if section is not None and not (dataclasses.is_dataclass(value) or (value is None and args)):
-        return from_mapping(section, value, place)
+        return _record(section, value, place, error)
     if get_origin(hint) is tuple and args[-1] is Ellipsis and isinstance(value, list | tuple):
         return tuple(_built(args[0], item, f"{place}[{index}]", error) for index, item in enumerate(value))
     if get_origin(hint) is Mapping:

@@ -11,15 +11,16 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
 from jaxslam.benchmark.suites.aggregate import by_sequence
-from jaxslam.benchmark.suites.baseline import reading_baseline
+from jaxslam.benchmark.suites.baseline import read_baseline
 from jaxslam.benchmark.suites.plan import plan_differences
 from jaxslam.benchmark.suites.run_names import run_folder
-from jaxslam.errors import BenchmarkError
+from jaxslam.config.validation import Range, ValidatedConfig
+from jaxslam.errors import BenchmarkError, JaxSlamError
 from jaxslam.io.atomic_files import write_atomically
 
 MAX_MEAN, MAX_RECORDING = 1.04, 1.15
@@ -29,7 +30,7 @@ _NO_NETWORK = "none"
 
 
 @dataclass(frozen=True)
-class Measured:
+class Measured(ValidatedConfig):
     """The runs of one recording.
 
     Attributes:
@@ -41,12 +42,19 @@ class Measured:
         network_sha256: Hash of the network that looked at frames; `none` where none did.
     """
 
+    _error: ClassVar[type[JaxSlamError]] = BenchmarkError
+
     frames: int
     tracked: int
-    ates_m: tuple[float, ...]
+    ates_m: tuple[Annotated[float, Range(above=0)], ...]
     trajectories_sha256: tuple[str, ...]
     data_sha256: str
     network_sha256: str
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.ates_m:
+            raise BenchmarkError("ates_m: expected the error of at least one seed, got none")
 
     @property
     def median_m(self) -> float:
@@ -60,7 +68,7 @@ class Measured:
 
 
 @dataclass(frozen=True)
-class AccuracyBaseline:
+class AccuracyBaseline(ValidatedConfig):
     """What the ruler compares with.
 
     Attributes:
@@ -72,6 +80,8 @@ class AccuracyBaseline:
         sequences: What each recording is (part, camera or rendered room), from `plan.fingerprint`.
         recordings: What was measured, by name of the sequence.
     """
+
+    _error: ClassVar[type[JaxSlamError]] = BenchmarkError
 
     commit: str
     reason: str
@@ -181,12 +191,10 @@ def load_accuracy_baseline(path: Path) -> AccuracyBaseline:
     Raises:
         BenchmarkError: If it is missing, is no baseline, or one that nothing can be compared with.
     """
-    with reading_baseline(path, "bench accuracy --update"):
-        content = json.loads(path.read_text())
-        recordings = {name: _of_json(name, entry) for name, entry in content.pop("recordings").items()}
-        baseline = AccuracyBaseline(recordings=recordings, **content)
-        if not recordings or not recordings.keys() <= baseline.sequences.keys():
-            raise BenchmarkError(f"recordings: expected at least one, each in `sequences`, got {list(recordings)}")
+    baseline = read_baseline(AccuracyBaseline, path, "bench accuracy --update")
+    names = list(baseline.recordings)
+    if not names or not baseline.recordings.keys() <= baseline.sequences.keys():
+        raise BenchmarkError(f"{path}: recordings: expected at least one, each in `sequences`, got {names}")
     return baseline
 
 
@@ -272,12 +280,3 @@ def _log_ratios(runs: Measured, random: np.random.Generator) -> np.ndarray:
 def _interval(log_ratios: np.ndarray) -> tuple[float, float]:
     low, high = np.exp(np.percentile(log_ratios, _PERCENT))
     return float(low), float(high)
-
-
-def _of_json(name: str, entry: Mapping[str, Any]) -> Measured:
-    fields: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in entry.items()}
-    runs = Measured(**fields)
-    ates = np.array(runs.ates_m, float)
-    if not (ates.size and np.isfinite(ates).all() and (ates > 0).all()):
-        raise ValueError(f"{name}: ates_m: expected positive numbers, got {list(runs.ates_m)}")
-    return runs

@@ -1,16 +1,15 @@
 """What a suite once showed, in a file: figures to keep to, and the plan of the runs that gave them."""
 
 import json
-import math
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, ClassVar, TypeVar
 
 from jaxslam.benchmark.suites.aggregate import row_name
 from jaxslam.benchmark.suites.plan import plan_differences
-from jaxslam.errors import BenchmarkError
+from jaxslam.config.validation import Range, ValidatedConfig, from_mapping
+from jaxslam.errors import BenchmarkError, JaxSlamError
 from jaxslam.io.atomic_files import write_atomically
 
 ATE = "ate_rmse_m"
@@ -19,23 +18,26 @@ _AGAIN = "--of SUITE --update REASON makes a new one"
 
 
 @dataclass(frozen=True)
-class Baseline:
-    """What a suite once showed.
+class Baseline(ValidatedConfig):
+    """Figures of a suite that later runs are compared with.
 
     Attributes:
         suite: Name of the suite, or its file.
-        presets: With what it was run.
-        runs: How often each.
-        reason: Why these figures are the ones to keep to.
-        machine: On which they were measured.
-        versions: Of the libraries that computed them.
-        noise: By label, the standard deviation of errors over seeds, as a share of them; none where there was one run.
-        rows: Figures by sequence and label.
-        plan: What was run, from `jaxslam.benchmark.suites.plan.fingerprint`.
+        presets: Presets that the suite was run with.
+        runs: Number of runs of each sequence and preset.
+        reason: Reason why these are the figures to compare with.
+        machine: Machine that the figures were measured on.
+        versions: Versions of the libraries that computed the figures.
+        noise: Standard deviation of the errors over seeds by label, as a share of the error; empty for a single run.
+        rows: Figures by name within each row; a row is a sequence and a label.
+        plan: Sequences, presets and runs, from `jaxslam.benchmark.suites.plan.fingerprint`.
 
     Raises:
-        BenchmarkError: If there are no rows, or one has a figure that is not finite, or no ATE.
+        BenchmarkError: If a field has the wrong type, there are no rows, a figure is not finite, a row has no ATE, or
+            the rows are not those of the plan.
     """
+
+    _error: ClassVar[type[JaxSlamError]] = BenchmarkError
 
     suite: str
     presets: tuple[str, ...]
@@ -43,22 +45,19 @@ class Baseline:
     reason: str
     machine: str
     versions: str
-    noise: Mapping[str, float]
+    noise: Mapping[str, Annotated[float, Range(at_least=0)]]
     rows: Mapping[str, Mapping[str, float]]
-    plan: Mapping[str, Any]
+    plan: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not self.rows:
             raise BenchmarkError("rows: expected figures of at least one sequence, got none")
         for row, figures in self.rows.items():
             if ATE not in figures:
                 raise BenchmarkError(f"rows: {row}: expected {ATE}, got none: without ground truth nothing is compared")
-            for figure, value in figures.items():
-                if not math.isfinite(value):
-                    raise BenchmarkError(f"rows: {row}: {figure}: expected a finite number, got {value}")
-        for label, share in self.noise.items():
-            if not math.isfinite(share) or share < 0:
-                raise BenchmarkError(f"noise: {label}: expected a finite number >= 0, got {share}")
+        if not {"sequences", "presets", "runs"} <= self.plan.keys():
+            raise BenchmarkError(f"plan: expected what was run, got {sorted(self.plan) or 'none'}; {_AGAIN}")
         self._check_plan()
 
     def _check_plan(self) -> None:
@@ -69,45 +68,35 @@ class Baseline:
 
 
 def load_baseline(path: Path) -> Baseline:
-    """The baseline in a file.
+    """Read a baseline.
 
     Raises:
-        BenchmarkError: If it is missing, no baseline, or one that nothing can be held to.
+        BenchmarkError: If the file is missing, is no baseline, or is one that nothing can be compared with.
     """
-    with reading_baseline(path, "bench gate --update"):
-        content = json.loads(path.read_text())
-        presets = tuple(str(preset) for preset in content["presets"])
-        rows = {str(row): {str(k): float(v) for k, v in figures.items()} for row, figures in content["rows"].items()}
-        suite, reason, machine, versions = (str(content[key]) for key in ("suite", "reason", "machine", "versions"))
-        noise = {str(label): float(share) for label, share in content["noise"].items()}
-        return Baseline(suite, presets, int(content["runs"]), reason, machine, versions, noise, rows, _plan_of(content))
+    return read_baseline(Baseline, path, "bench gate --update")
 
 
-@contextmanager
-def reading_baseline(path: Path, written_by: str) -> Iterator[None]:
-    """Turn what goes wrong while a baseline is read into errors that name the file.
+_Record = TypeVar("_Record", bound=ValidatedConfig)
+
+
+def read_baseline(cls: type[_Record], path: Path, written_by: str) -> _Record:
+    """Read a baseline of either kind.
 
     Args:
-        path: The file.
+        cls: Class of the baseline.
+        path: JSON file of the baseline.
         written_by: Command that writes such files.
 
     Raises:
-        BenchmarkError: If the file is missing, is no baseline, or one that nothing can be compared with.
+        BenchmarkError: If the file is missing, is no baseline, or is one that nothing can be compared with.
     """
     try:
-        yield
+        content = json.loads(path.read_text())
     except OSError as problem:
         raise BenchmarkError(f"{path}: expected a baseline, cannot be read: {problem.strerror}") from None
-    except BenchmarkError as problem:
-        raise BenchmarkError(f"{path}: {problem}") from None
-    except (ValueError, KeyError, TypeError, AttributeError) as problem:
+    except ValueError as problem:
         raise BenchmarkError(f"{path}: expected a baseline as `{written_by}` writes it, got {problem!r}") from None
-
-
-def _plan_of(content: Mapping[str, Any]) -> dict[str, Any]:
-    if "plan" not in content:
-        raise BenchmarkError(f"plan: expected what was run, got a baseline that does not say it; {_AGAIN}")
-    return {key: content["plan"][key] for key in ("sequences", "presets", "runs")}
+    return from_mapping(cls, content, str(path))
 
 
 def save_baseline(path: Path, baseline: Baseline) -> None:

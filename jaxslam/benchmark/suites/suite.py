@@ -20,18 +20,19 @@ variants:                            # every preset with each of these settings 
 Settings of the command line beat those of a suite and its variants.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from jaxslam.config.loading import configs_dir, load_config, presets, updated
+from jaxslam.config.loading import configs_dir, load_config, presets
 from jaxslam.config.schema import Config
-from jaxslam.config.validation import Range, ValidatedConfig
+from jaxslam.config.validation import Range, ValidatedConfig, from_mapping
 from jaxslam.datasets.catalog import name_of
 from jaxslam.datasets.synthetic import SyntheticConfig
 from jaxslam.errors import BenchmarkError, JaxSlamError, nearest
-from jaxslam.io.yaml_files import read_mapping
+from jaxslam.io.yaml_files import checked_mapping, read_mapping
 from jaxslam.semantics.from_config import SCENE
 
 _Positive = Range(at_least=1)
@@ -84,26 +85,52 @@ class Sequence(ValidatedConfig):
 
 
 @dataclass(frozen=True)
-class Suite:
-    """What is run.
+class Suite(ValidatedConfig):
+    """Sequences, and the settings that each of them is run with.
 
     Attributes:
-        name: Of its file.
-        about: One line.
-        sequences: What is tracked.
-        presets: With what.
-        runs: How often each sequence that does not say it itself, with the seeds 0, 1, 2, ...
-        settings: `key=value` of all runs.
-        variants: More settings by name; every preset is run with each, and not without.
-        ablation: Whether published figures of parts of systems are shown too.
+        name: Name of the suite's file.
+        about: Description in one line.
+        sequences: Sequences to track.
+        presets: Presets; every sequence is run with each.
+        runs: Number of runs of a sequence that does not give its own number, with the seeds 0, 1, 2, ...
+        settings: Settings `key=value` of all runs.
+        variants: Further settings by name. Every preset is run with each variant, and not without one.
+        ablation: Whether reports also show published figures of parts of systems.
+
+    Raises:
+        BenchmarkError: If a field has the wrong type, or two sequences have the same name.
     """
+
+    _error: ClassVar[type[JaxSlamError]] = BenchmarkError
 
     name: str
     about: str
     sequences: tuple[Sequence, ...]
     presets: tuple[str, ...] = ("default",)
-    runs: int = 1
+    runs: Annotated[int, _Positive] = 1
     settings: tuple[str, ...] = ()
+    variants: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    ablation: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, count in Counter(sequence.name for sequence in self.sequences).items():
+            if count > 1:
+                raise BenchmarkError(f"sequences: '{name}' is listed twice; give one of them another `name`")
+
+
+@dataclass(frozen=True)
+class _SuiteFile(ValidatedConfig):
+    """A suite as its file holds it, with the keys that the module describes."""
+
+    _error: ClassVar[type[JaxSlamError]] = BenchmarkError
+
+    sequences: tuple[Any, ...]
+    about: str = ""
+    presets: tuple[str, ...] = ("default",)
+    runs: Annotated[int, _Positive] = 1
+    set: tuple[str, ...] = ()
     variants: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     ablation: bool = False
 
@@ -131,9 +158,10 @@ def load_suite(name_or_path: str) -> Suite:
     elif not path.is_file():
         hint = nearest(name_or_path, suites())
         raise BenchmarkError(f"suite: expected a known one, a YAML file or a folder, got '{name_or_path}'{hint}")
-    content = read_mapping(path, BenchmarkError)
+    file = from_mapping(_SuiteFile, read_mapping(path, BenchmarkError), str(path))
+    sequences = [_sequence(entry, f"{path}: sequences[{index}]", path) for index, entry in enumerate(file.sequences)]
     try:
-        return _suite(path.stem, content, path.parent)
+        return _suite(file, path.stem, tuple(sequences))
     except JaxSlamError as error:
         raise BenchmarkError(f"{path}: {error}") from None
 
@@ -167,41 +195,14 @@ def _suite_of_folder(folder: Path) -> Suite:
     )
 
 
-def _suite(name: str, content: Mapping[str, Any], folder: Path) -> Suite:
-    known = ("about", "presets", "runs", "set", "sequences", "variants", "ablation")
-    for key in content:
-        if key not in known:
-            raise BenchmarkError(f"{key}: unknown key{nearest(key, known)}")
-    runs = content.get("runs", 1)
-    if isinstance(runs, bool) or not isinstance(runs, int) or runs < 1:
-        raise BenchmarkError(f"runs: expected an integer >= 1, got {runs!r}")
-    sequences = content.get("sequences")
-    if not isinstance(sequences, list) or not sequences:
+def _suite(file: _SuiteFile, name: str, sequences: tuple[Sequence, ...]) -> Suite:
+    if not sequences:
         raise BenchmarkError("sequences: expected a list of at least one")
-    made = tuple(_sequence(f"sequences[{index}]", entry, folder) for index, entry in enumerate(sequences))
-    names = [sequence.name for sequence in made]
-    for name_of_one in names:
-        if names.count(name_of_one) > 1:
-            raise BenchmarkError(f"sequences: '{name_of_one}' stands twice; give one of them another `name`")
-    variants = content.get("variants", {})
-    if not isinstance(variants, Mapping):
-        raise BenchmarkError(f"variants: expected names with lists of settings, got {variants!r}")
-    ablation = content.get("ablation", False)
-    if not isinstance(ablation, bool):
-        raise BenchmarkError(f"ablation: expected true or false, got {ablation!r}")
-    suite = Suite(
-        name,
-        str(content.get("about", "")),
-        made,
-        checked_presets(_texts("presets", content.get("presets", ["default"]))),
-        runs,
-        _texts("set", content.get("set", [])),
-        {str(key): _texts(f"variants.{key}", value) for key, value in variants.items()},
-        ablation,
-    )
+    chosen = checked_presets(file.presets)
+    suite = Suite(name, file.about, sequences, chosen, file.runs, file.set, file.variants, file.ablation)
     for variant in suite.variants.values() or [()]:
         for preset in suite.presets:
-            check_masks(made, load_config(preset, overrides=(*suite.settings, *variant)))  # now, not after hours
+            check_masks(sequences, load_config(preset, overrides=(*suite.settings, *variant)))  # now, not after hours
     return suite
 
 
@@ -216,27 +217,10 @@ def check_masks(sequences: Iterable[Sequence], config: Config) -> None:
         raise BenchmarkError(f"semantics.model: '{SCENE}' expected rendered rooms, got the recording {recordings[0]}")
 
 
-def _sequence(place: str, entry: object, folder: Path) -> Sequence:
-    known = ("name", "recording", "room", "start", "stop", "every", "camera", "sensor", "runs")
-    if not isinstance(entry, Mapping):
-        raise BenchmarkError(f"{place}: expected `recording: NAME` or `room: ...`, got {entry!r}")
-    fields = dict(entry)
-    for key in fields:
-        if key not in known:
-            raise BenchmarkError(f"{place}.{key}: unknown key{nearest(str(key), known)}")
-    if "room" in fields:
-        if not isinstance(fields["room"], Mapping):
-            raise BenchmarkError(f"{place}.room: expected settings of the rendered room, got {fields['room']!r}")
-        fields["room"] = updated(SyntheticConfig(), fields["room"], f"{place}.room")
-    if "name" not in fields and "recording" not in fields:
-        raise BenchmarkError(f"{place}: expected a name, got none")
-    fields.setdefault("name", fields.get("recording"))
-    if isinstance(camera := fields.get("camera"), str) and (folder / camera).is_file():
-        fields["camera"] = str((folder / camera).absolute())  # not where the run happens to be
-    return Sequence(**fields)
-
-
-def _texts(place: str, value: object) -> tuple[str, ...]:
-    if not isinstance(value, list) or not all(isinstance(text, str) for text in value):
-        raise BenchmarkError(f"{place}: expected a list of texts, got {value!r}")
-    return tuple(value)
+def _sequence(entry: object, place: str, file: Path) -> Sequence:
+    fields = checked_mapping(entry, place, BenchmarkError)
+    if "recording" in fields:
+        fields.setdefault("name", fields["recording"])
+    if isinstance(camera := fields.get("camera"), str) and (file.parent / camera).is_file():
+        fields["camera"] = str((file.parent / camera).absolute())  # not where the run happens to be
+    return from_mapping(Sequence, fields, place)

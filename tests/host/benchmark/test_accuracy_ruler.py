@@ -116,9 +116,9 @@ class TestFile:
         ("recordings", "message"),
         [
             ({}, r"recordings: expected at least one, each in `sequences`, got \[\]"),
-            ({"a": {"ates_m": [0.1]}}, "expected a baseline as `bench accuracy --update` writes it"),
-            ({"a": {**vars(runs()), "ates_m": [float("nan")]}}, "a: ates_m: expected positive numbers"),
-            ({"a": {**vars(runs()), "ates_m": []}}, "a: ates_m: expected positive numbers"),
+            ({"a": {"ates_m": [0.1]}}, "recordings: a: missing 'frames', 'tracked'"),
+            ({"a": {**vars(runs()), "ates_m": [float("nan")]}}, r"a: ates_m\[0\]: expected a finite number > 0"),
+            ({"a": {**vars(runs()), "ates_m": []}}, "a: ates_m: expected the error of at least one seed"),
         ],
     )
     def test_that_is_none(self, tmp_path: Path, recordings: dict[str, Any], message: str) -> None:

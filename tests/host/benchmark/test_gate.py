@@ -138,12 +138,19 @@ class TestFile:
         assert load_baseline(tmp_path / "baseline.json") == baseline()
 
     @pytest.mark.parametrize(
-        "text", ["", "[]", "{}", '{"suite": "smoke", "presets": 3}', '{"rows": {"a": {"b": "c"}}}']
+        ("text", "message"),
+        [
+            ("", "expected a baseline as `bench gate --update` writes it"),
+            ("[]", r"expected `key: value` lines, got \[\]"),
+            ("{}", "missing 'suite', 'presets', 'runs'"),
+            ('{"suite": "smoke", "presets": 3}', "missing 'runs', 'reason'"),
+            ('{"rows": {"a": {"b": "c"}}}', "missing 'suite'"),
+        ],
     )
-    def test_damaged(self, tmp_path: Path, text: str) -> None:
+    def test_damaged(self, tmp_path: Path, text: str, message: str) -> None:
         path = tmp_path / "baseline.json"
         path.write_text(text)
-        with pytest.raises(BenchmarkError, match="expected a baseline"):
+        with pytest.raises(BenchmarkError, match=rf"baseline\.json: {message}"):
             load_baseline(path)
         with pytest.raises(BenchmarkError, match="cannot be read"):
             load_baseline(tmp_path / "nowhere.json")
@@ -196,7 +203,7 @@ class TestFile:
         path.write_text("{}")
         assert Gate(baseline=path, update="so", of="smoke").before(path) is None
         for gate in (Gate(baseline=path, update="so"), Gate(baseline=path, of="smoke")):
-            with pytest.raises(BenchmarkError, match="expected a baseline"):
+            with pytest.raises(BenchmarkError, match=r"baseline\.json: missing 'suite', 'presets'"):
                 gate.before(path)
 
     def test_without_ground_truth(self) -> None:
