@@ -11,7 +11,7 @@ from jax.typing import DTypeLike
 from jaxslam_kernels.camera import Intrinsics, make_intrinsics
 
 from jaxslam.config.loading import configs_dir
-from jaxslam.config.validation import Range, ValidatedConfig
+from jaxslam.config.validation import Range, ValidatedConfig, from_mapping
 from jaxslam.errors import CameraError, JaxSlamError, nearest
 from jaxslam.io.atomic_files import write_atomically
 from jaxslam.sensors.camera_formats import read_camera_fields
@@ -104,11 +104,7 @@ class Camera(ValidatedConfig):
         elif not path.is_file():
             hint = nearest(str(source), known_cameras())
             raise CameraError(f"camera: expected a known name or a YAML file, got '{source}'{hint}")
-        fields = read_camera_fields(path, [field.name for field in dataclasses.fields(cls)])
-        try:
-            return cls(**fields)
-        except CameraError as error:
-            raise CameraError(f"{path}: {error}") from None
+        return from_mapping(cls, read_camera_fields(path), str(path))
 
     def save(self, path: str | Path) -> None:
         """Write jaxslam's own camera file, which `load` reads back to an equal camera.

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from jaxslam.errors import CameraError, nearest, one_line
+from jaxslam.errors import CameraError
 from jaxslam.io.yaml_files import read_mapping
 
 NEEDED = ("width", "height", "fx", "fy", "cx", "cy")
@@ -36,15 +36,14 @@ def is_pair(raw: Mapping[str, Any]) -> bool:
     return any(key in ("left", "right", "cam0", "cam1") or key.startswith("Camera2.") for key in raw)
 
 
-def read_camera_fields(path: Path, fields: list[str]) -> dict[str, Any]:
-    """Read the values of a camera file, under the names of `Camera`'s fields; `Camera` checks their types.
+def read_camera_fields(path: Path) -> dict[str, Any]:
+    """Read the values of a camera file, under the names of `Camera`'s fields; `Camera` checks them.
 
     Args:
         path: The file. Its keys tell its format.
-        fields: The names of `Camera`'s fields.
 
     Raises:
-        CameraError: If the file is unreadable, lacks a required key, or has an unknown one (jaxslam's format only).
+        CameraError: If the file is unreadable, or lacks a required key of ORB-SLAM's formats.
     """
     raw = read_mapping(path, CameraError)
     if is_pair(raw):
@@ -54,16 +53,8 @@ def read_camera_fields(path: Path, fields: list[str]) -> dict[str, Any]:
     elif any(key.startswith("Camera.") for key in raw):
         values = _orb_slam(raw, _ORB_SLAM2, path)
     else:
-        values = _own(raw, fields, path)
+        values = raw
     return {"name": path.stem} | values
-
-
-def _own(raw: Mapping[str, Any], fields: list[str], path: Path) -> dict[str, Any]:
-    for key in raw:
-        if key not in fields:
-            raise CameraError(f"{path}: unknown key '{one_line(key, 40)}'{nearest(key, fields)}")
-    _check_needed(raw, {field: field for field in NEEDED}, path)
-    return dict(raw)
 
 
 def _orb_slam(raw: Mapping[str, Any], keys: Mapping[str, str], path: Path) -> dict[str, Any]:

@@ -15,15 +15,14 @@ from typing import Any
 
 import numpy as np
 
-from jaxslam.config.validation import field_hints
+from jaxslam.config.validation import from_mapping
 from jaxslam.errors import CameraError
 from jaxslam.geometry.se3 import inverse
 from jaxslam.geometry.so3 import quaternions
-from jaxslam.io.yaml_files import check_keys, read_mapping
+from jaxslam.io.yaml_files import read_mapping
 from jaxslam.sensors.stereo_rig import Lens, LensModel, Rig
 
 _PINHOLE = ("fx", "fy", "cx", "cy")
-_OWN = ("name", "left", "right", "T_left_right", "fps", "far_depth_baselines")
 _LENS_OF_ORB_SLAM3: dict[str, tuple[LensModel, str]] = {
     "PinHole": ("radtan", "k1 k2 p1 p2 k3"),
     "KannalaBrandt8": ("equidistant", "k1 k2 k3 k4"),
@@ -57,9 +56,9 @@ def read_rig(path: Path) -> Rig:
         read = _own
     try:
         fields: dict[str, Any] = {"name": path.stem} | read(raw)
-        return Rig(**fields)
     except CameraError as error:
         raise CameraError(f"{path}: {error}") from None
+    return from_mapping(Rig, fields, str(path))
 
 
 def lens_of_kalibr(raw: Mapping[str, Any], place: str) -> Lens:
@@ -135,17 +134,9 @@ def numbers(raw: Mapping[str, Any], key: str, place: str, count: int | None = No
 
 
 def _own(raw: Mapping[str, Any]) -> dict[str, Any]:
-    check_keys(raw, _OWN, ("left", "right", "T_left_right"), "rig", CameraError)
-    fields = dict(raw)
-    for side in ("left", "right"):
-        if not isinstance(raw[side], dict):
-            raise CameraError(f"{side}: expected `key: value` lines, got {raw[side]!r:.80}")
-        check_keys(raw[side], field_hints(Lens), ("width", "height", *_PINHOLE), side, CameraError)
-        try:
-            fields[side] = Lens(**raw[side])
-        except CameraError as error:
-            raise CameraError(f"{side}: {error}") from None
-    return fields | {"T_left_right": tuple(transform_of(raw["T_left_right"], "T_left_right").tolist())}
+    if "T_left_right" not in raw:
+        return dict(raw)  # refused with all other keys that are missing
+    return {**raw, "T_left_right": tuple(transform_of(raw["T_left_right"], "T_left_right").tolist())}
 
 
 def _of_orb_slam3(raw: Mapping[str, Any]) -> dict[str, Any]:

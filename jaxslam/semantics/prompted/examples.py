@@ -17,20 +17,20 @@ A folder holds one for each class, named as it is, with pairs of images `NAME.pn
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from jaxslam.config.validation import checked_value
+from jaxslam.config.validation import ValidatedConfig, from_mapping
 from jaxslam.errors import ConfigError
 from jaxslam.io.yaml_files import check_keys, read_mapping
 from jaxslam.semantics.prompted.prompt import Prompt, prompt
 from jaxslam.semantics.prompted.segmenter import PromptSegmenter
 from jaxslam.sensors.image_files import read_color, read_gray
 
-_KEYS = ("label", "image", "mask", "boxes", "points", "not_points")
 _MASK = "_mask"
 _IMAGES = (".png", ".jpg", ".jpeg")
 
@@ -53,6 +53,42 @@ class Example(NamedTuple):
     prompts: tuple[Prompt, ...]
 
 
+@dataclass(frozen=True)
+class _Row(ValidatedConfig):
+    """One example as a file holds it, with the keys that the module describes."""
+
+    label: str
+    image: str | None = None
+    mask: str | None = None
+    boxes: tuple[tuple[float, float, float, float], ...] | None = None
+    points: tuple[tuple[float, float], ...] | None = None
+    not_points: tuple[tuple[float, float], ...] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        given = [key for key in ("boxes", "points", "not_points") if getattr(self, key)]
+        if not self.label.strip():
+            raise ConfigError(f"label: expected the name of a class, got {self.label!r}")
+        if self.mask is not None and (self.image is None or given):
+            got = "no image" if self.image is None else given[0]
+            raise ConfigError(f"mask: expected an image, and neither boxes nor points, beside it, got {got}")
+        for left, top, right, bottom in self.boxes or ():
+            if not (right > left and bottom > top):
+                got = [left, top, right, bottom]
+                raise ConfigError(f"boxes: expected left, top, right, bottom, in this order, got {got}")
+        if self.mask is None and not (self.boxes or self.points):
+            raise ConfigError("expected a mask, boxes or points of the object, got none")
+        if (self.points or self.not_points) and len(self.boxes or ()) > 1:
+            raise ConfigError(f"boxes: expected one at most with points, got {len(self.boxes or ())}")
+
+    def prompts(self) -> tuple[Prompt, ...]:
+        """Return one prompt for each box, or one prompt of all points with at most one box."""
+        boxes, on, beside = self.boxes or (), self.points or (), self.not_points or ()
+        if not on and not beside:
+            return tuple(prompt(self.label, box=box) for box in boxes)
+        return (prompt(self.label, box=boxes[0] if boxes else None, on=on, beside=beside),)
+
+
 def read_examples(path: Path) -> list[Example]:
     """The examples of a YAML file, or of a folder.
 
@@ -67,7 +103,10 @@ def read_examples(path: Path) -> list[Example]:
     rows = content["examples"]
     if not isinstance(rows, list) or not rows:
         raise ConfigError(f"{path}: examples: expected a list of one or more, got {rows!r}")
-    return [_of_row(row, path.parent, f"{path}: examples[{number}]") for number, row in enumerate(rows)]
+    origins = [f"{path}: examples[{number}]" for number in range(len(rows))]
+    return [
+        _of_row(from_mapping(_Row, row, origin), path.parent, origin) for row, origin in zip(rows, origins, strict=True)
+    ]
 
 
 def with_masks(examples: Sequence[Example], segmenter: PromptSegmenter | None) -> list[Example]:
@@ -113,20 +152,11 @@ def _image_of(mask: Path) -> Path:
     return images[0]
 
 
-def _of_row(row: object, folder: Path, origin: str) -> Example:
-    if not isinstance(row, dict):
-        raise ConfigError(f"{origin}: expected keys such as label and image, got {row!r}")
-    check_keys(row, _KEYS, ("label",), origin, ConfigError)
-    label, image, mask = (checked_value(str | None, row.get(key), f"{origin}: {key}") for key in _KEYS[:3])
-    if not label or not label.strip():
-        raise ConfigError(f"{origin}: label: expected the name of a class, got {label!r}")
-    asked = [key for key in ("boxes", "points", "not_points") if row.get(key)]
-    if mask is not None:
-        if image is None or asked:
-            got = "no image" if image is None else asked[0]
-            raise ConfigError(f"{origin}: mask: expected an image, and neither boxes nor points, beside it, got {got}")
-        return _with_mask(folder / mask, folder / image, label, origin)
-    prompts = _prompts(row, label, origin)
+def _of_row(row: _Row, folder: Path, origin: str) -> Example:
+    label, image = row.label, row.image
+    if row.mask is not None and image is not None:
+        return _with_mask(folder / row.mask, folder / image, label, origin)
+    prompts = row.prompts()
     if image is None:
         return Example(origin, label, None, None, prompts)
     pixels = read_color(folder / image)
@@ -145,24 +175,3 @@ def _with_mask(mask: Path, image: Path, label: str, origin: str) -> Example:
     if not gray.any():
         raise ConfigError(f"{origin}: mask: expected white on the thing, got a black picture")
     return Example(origin, label, pixels, gray > gray.max() // 2, ())
-
-
-def _prompts(row: dict[str, Any], label: str, origin: str) -> tuple[Prompt, ...]:
-    """Boxes, each a thing of its own; or points, with one box at most."""
-    boxes = _rows(row, "boxes", tuple[float, float, float, float], origin)
-    on, beside = (_rows(row, key, tuple[float, float], origin) for key in ("points", "not_points"))
-    for left, top, right, bottom in boxes:
-        if not (right > left and bottom > top):
-            got = [left, top, right, bottom]
-            raise ConfigError(f"{origin}: boxes: expected left, top, right, bottom, in this order, got {got}")
-    if not boxes and not on:
-        raise ConfigError(f"{origin}: expected a mask, boxes or points of the thing, got none")
-    if not on and not beside:
-        return tuple(prompt(label, box=box) for box in boxes)
-    if len(boxes) > 1:
-        raise ConfigError(f"{origin}: boxes: expected one at most with points, got {len(boxes)}")
-    return (prompt(label, box=boxes[0] if boxes else None, on=on, beside=beside),)
-
-
-def _rows(row: dict[str, Any], key: str, each: Any, origin: str) -> tuple[tuple[float, ...], ...]:
-    return checked_value(tuple[each, ...] | None, row.get(key), f"{origin}: {key}") or ()

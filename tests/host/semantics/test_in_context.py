@@ -130,14 +130,17 @@ class TestFile:
         [
             ("", "examples.yaml: missing 'examples'"),
             ("examples: []", r"examples: expected a list of one or more, got \[\]"),
-            ("examples: [3]", r"examples\[0\]: expected keys such as label and image, got 3"),
+            ("examples: [3]", r"examples\[0\]: expected `key: value` lines, got 3"),
             ("examples: [{image: red.png, mask: red_mask.png}]", r"examples\[0\]: missing 'label'"),
             ("examples: [{label: a, mark: b}]", r"examples\[0\]: unknown key 'mark' \(did you mean 'mask'"),
             ("examples: [{label: '', points: [[1, 2]]}]", "label: expected the name of a class, got ''"),
-            ("examples: [{label: 3, points: [[1, 2]]}]", "label: expected text or null, got 3"),
-            ("examples: [{label: a}]", "expected a mask, boxes or points of the thing, got none"),
-            ("examples: [{label: a, image: red.png}]", "expected a mask, boxes or points of the thing, got none"),
-            ("examples: [{label: a, not_points: [[1, 2]]}]", "expected a mask, boxes or points of the thing, got none"),
+            ("examples: [{label: 3, points: [[1, 2]]}]", "label: expected text, got 3"),
+            ("examples: [{label: a}]", "expected a mask, boxes or points of the object, got none"),
+            ("examples: [{label: a, image: red.png}]", "expected a mask, boxes or points of the object, got none"),
+            (
+                "examples: [{label: a, not_points: [[1, 2]]}]",
+                "expected a mask, boxes or points of the object, got none",
+            ),
             ("examples: [{label: a, mask: red_mask.png}]", "mask: expected an image, .* beside it, got no image"),
             (
                 "examples: [{label: a, image: red.png, mask: red_mask.png, points: [[1, 2]]}]",

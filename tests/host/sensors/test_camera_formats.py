@@ -215,7 +215,7 @@ class TestUnreadable:
             Camera.load(tmp_path / "image.yaml")
 
     def test_bad_value_names_file_and_field(self, tmp_path: Path) -> None:
-        with pytest.raises(CameraError, match=r"some_camera.yaml: Camera.fy: expected a finite number > 0, got 'far'"):
+        with pytest.raises(CameraError, match=r"some_camera.yaml: fy: expected a finite number > 0, got 'far'"):
             load(tmp_path, OWN.replace("524", "far"))
 
 
