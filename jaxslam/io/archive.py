@@ -1,4 +1,4 @@
-"""Unpacking an archive from the web: only files and folders, only inside the target, all of it or nothing."""
+"""Unpack archives from the web: only files and folders, only inside the target, all of them or none."""
 
 import gzip
 import os
@@ -15,7 +15,7 @@ from typing import IO, TypeAlias
 from jaxslam.errors import DatasetError
 
 MAX_UNPACKED_BYTES = 64 * 10**9
-"""What unpacks to more than this is taken for a bomb."""
+"""Size limit of an unpacked archive; a larger one is taken for a decompression bomb."""
 
 _MAX_MEMBERS = 1_000_000
 _CHUNK_BYTES = 1 << 20
@@ -23,28 +23,19 @@ _JUNK = "__MACOSX"
 _DAMAGE = (tarfile.TarError, zipfile.BadZipFile, gzip.BadGzipFile, zlib.error, EOFError)
 
 Progress: TypeAlias = Callable[[int, int], None]
-"""Is told the bytes of the archive that are unpacked, and those there are."""
-
-
-@dataclass(frozen=True)
-class _Member:
-    """One entry of an archive."""
-
-    name: str
-    size: int
-    content: IO[bytes] | None
-    """`None` for a folder."""
-    read_bytes: int
-    """How far the archive has been read where this entry begins."""
+"""Function that is called with the bytes of the archive that are unpacked, and the bytes of the whole archive."""
 
 
 @dataclass
 class _Budget:
-    """What may still be unpacked."""
+    """Limits of what may still be unpacked."""
 
     whole: int
+    """Bytes that the archive may unpack to."""
     left: int
+    """Bytes that may still be unpacked."""
     members: int = _MAX_MEMBERS
+    """Files and folders that may still be unpacked."""
 
     def take(self, count: int) -> None:
         self.left -= count
@@ -65,23 +56,24 @@ def unpack(
     max_bytes: int = MAX_UNPACKED_BYTES,
     progress: Progress | None = None,
 ) -> None:
-    """Unpack the one folder that an archive holds, and put it in its place once it is whole.
+    """Unpack the one folder that an archive holds, and move it to the target once it is complete.
 
-    All checksums of the archive are compared. What is unpacked grows in `.TARGET.unpacking` beside the target; nothing
-    of it stays if it fails or is interrupted, and the next call removes what a killed one left. Nothing is done with
-    owners and permissions. One process at a time for a target.
+    All checksums of the archive are compared. The files are unpacked into `.TARGET.unpacking` beside the target; that
+    folder is removed if unpacking fails or is interrupted, and the next call removes one that a killed process left.
+    Owners are ignored, and so are permissions other than those that tarfile's `data` filter keeps. Only one process may
+    unpack to a target at a time.
 
     Args:
         archive: A .tgz or .zip file, recognized by its content.
-        target: What the folder becomes; must not be there yet. Folders above it are made.
-        holds: Files that must be in the folder.
-        max_bytes: Of all files when unpacked.
-        progress: Called after each file.
+        target: New path of the folder, which must not exist yet. Its parents are created.
+        holds: Names of files that must be in the folder.
+        max_bytes: Size limit of all unpacked files together, in bytes.
+        progress: Function that is called after each file.
 
     Raises:
-        DatasetError: If the archive is damaged, too large when unpacked, holds anything but files and folders, or
-            anything that would lie outside the target; if it is another one than expected; if it cannot be read, or
-            the target not be written.
+        DatasetError: If the archive is damaged, too large when unpacked, holds anything other than files and folders,
+            holds a path outside the target, or is not the expected archive; if it cannot be read, or the target cannot
+            be written.
     """
     source, place = Path(archive), Path(target)
     growing = place.with_name(f".{place.name}.unpacking")
@@ -112,57 +104,51 @@ def _extract(source: Path, folder: Path, budget: _Budget, progress: Progress | N
     total = source.stat().st_size
     if progress is not None:
         progress(0, total)
-    for member in _members(source, budget):
-        budget.take_member()
-        place = _place(folder, member.name)
-        if member.content is None:
-            place.mkdir(parents=True, exist_ok=True)
-        else:
-            _copy(member, member.content, place, budget)
+    for read_bytes in _extracted(source, folder, budget):
         if progress is not None:
-            progress(member.read_bytes, total)
+            progress(read_bytes, total)
     if progress is not None:
         progress(total, total)
 
 
-def _members(source: Path, budget: _Budget) -> Iterator[_Member]:
+def _extracted(source: Path, folder: Path, budget: _Budget) -> Iterator[int]:
+    """Extract all members; after each, yield how many bytes of the archive have been read."""
     with source.open("rb") as file:
         start = file.read(4)
         file.seek(0)
         if start.startswith(b"\x1f\x8b"):
-            yield from _tar_members(file, budget)
+            yield from _extracted_tar(file, folder, budget)
         elif start.startswith(b"PK"):
-            yield from _zip_members(file, budget)
+            yield from _extracted_zip(file, folder, budget)
         else:
             raise DatasetError("expected a .tgz or .zip archive, got something else")
 
 
-def _tar_members(file: IO[bytes], budget: _Budget) -> Iterator[_Member]:
+def _extracted_tar(file: IO[bytes], folder: Path, budget: _Budget) -> Iterator[int]:
     with gzip.GzipFile(fileobj=file) as unzipped:
         with tarfile.open(fileobj=unzipped, mode="r|", bufsize=_CHUNK_BYTES) as archive:
             for entry in archive:
                 if not (entry.isfile() or entry.isdir()):
                     raise DatasetError(f"expected files and folders only, got the link or device '{entry.name}'")
-                content = archive.extractfile(entry) if entry.isfile() else None
-                yield _Member(entry.name, entry.size, content, file.tell())
-        # The checksum stands at the very end, behind what tar looks at.
+                _check_member(folder, entry.name, entry.size, budget, is_folder=entry.isdir())
+                archive.extract(entry, folder, filter="data")
+                yield file.tell()
+        # The checksum is at the very end of the file, behind what tarfile reads.
         while rest := unzipped.read(_CHUNK_BYTES):
             budget.take(len(rest))
 
 
-def _zip_members(file: IO[bytes], budget: _Budget) -> Iterator[_Member]:
+def _extracted_zip(file: IO[bytes], folder: Path, budget: _Budget) -> Iterator[int]:
     done = 0
     with zipfile.ZipFile(file) as archive:
         if sum(entry.file_size for entry in archive.infolist()) > budget.left:
             budget.take(budget.left + 1)
         for entry in archive.infolist():
             _check_zip_entry(entry)
-            if entry.is_dir():
-                yield _Member(entry.filename, 0, None, done)
-            else:
-                with archive.open(entry) as content:
-                    yield _Member(entry.filename, entry.file_size, content, done)
+            _check_member(folder, entry.filename, entry.file_size, budget, is_folder=entry.is_dir())
+            archive.extract(entry, folder)
             done += entry.compress_size
+            yield done
 
 
 def _check_zip_entry(entry: zipfile.ZipInfo) -> None:
@@ -175,26 +161,23 @@ def _check_zip_entry(entry: zipfile.ZipInfo) -> None:
         raise DatasetError(f"'{entry.filename}': expected the usual compression, got type {entry.compress_type}")
 
 
-def _place(folder: Path, name: str) -> Path:
-    """Where an entry goes; as no links are made, only its name could lead it elsewhere."""
+def _check_member(folder: Path, name: str, size: int, budget: _Budget, *, is_folder: bool) -> None:
+    """Refuse a member that is too large, outside the folder or already unpacked.
+
+    No links are made, so that only the name of a member could place it outside the folder. tarfile and zipfile would
+    change such a name to one inside, and would overwrite the earlier of two files.
+    """
+    budget.take_member()
     path, as_windows = PurePosixPath(name), PureWindowsPath(name)
-    inside = not (path.is_absolute() or as_windows.drive or ".." in path.parts or "\\" in name or "\0" in name)
-    if not inside:
+    if path.is_absolute() or as_windows.drive or ".." in path.parts or "\\" in name or "\0" in name:
         raise DatasetError(f"expected files inside one folder, got '{name}'")
-    return folder / path
-
-
-def _copy(member: _Member, content: IO[bytes], place: Path, budget: _Budget) -> None:
-    budget.take(member.size)
-    place.parent.mkdir(parents=True, exist_ok=True)
-    with place.open("xb") as file:  # a second one of that name is refused
-        shutil.copyfileobj(content, file, _CHUNK_BYTES)
-    if (length := place.stat().st_size) != member.size:
-        raise DatasetError(f"'{member.name}': expected {member.size} bytes, got {length}")
+    if not is_folder and (folder / path).exists():
+        raise DatasetError(f"expected every file once, got '{name}' twice")
+    budget.take(size)
 
 
 def _folder_of_interest(folder: Path, name: str, holds: Sequence[str]) -> Path:
-    """The folder of that name, else the only one, else all of it."""
+    """Choose the folder with the given name, or else the only folder, or else the whole content."""
     entries = [entry for entry in folder.iterdir() if entry.name != _JUNK and not entry.name.startswith(".")]
     chosen = folder
     if (folder / name).is_dir():

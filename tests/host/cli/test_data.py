@@ -382,7 +382,7 @@ class TestFailures:
             raise KeyboardInterrupt
 
         with monkeypatch.context() as patch:
-            patch.setattr("jaxslam.io.archive.shutil.copyfileobj", stop)
+            patch.setattr("jaxslam.io.archive.tarfile.TarFile.extract", stop)
             with pytest.raises(SystemExit) as end:
                 main(["data", "get", TUM])
         assert end.value.code == 130

@@ -234,7 +234,7 @@ class TestDamaged:
         with zipfile.ZipFile(tmp_path / "a", "w") as archive:
             archive.writestr("walk/rgb.txt", b"one")
             archive.writestr("walk/rgb.txt", b"two")
-        refused(tmp_path / "a", target, "rgb.txt")
+        refused(tmp_path / "a", target, "expected every file once, got 'walk/rgb.txt' twice")
 
     def test_password(self, tmp_path: Path, target: Path) -> None:
         archive = zipped(tmp_path / "a", {"walk/rgb.txt": b"color"})
@@ -263,11 +263,12 @@ class TestStopped:
         assert contents(target) == FILES
 
     def test_disk_full(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, target: Path) -> None:
-        def full(*_: Any) -> None:
+        def full(*_: Any, **__: Any) -> None:
             raise OSError(errno.ENOSPC, "No space left on device")
 
-        monkeypatch.setattr(module.shutil, "copyfileobj", full)
-        refused(tgz(tmp_path / "a"), target, "cannot be unpacked: [Errno 28] No space left on device")
+        archive = tgz(tmp_path / "a")
+        monkeypatch.setattr(tarfile, "copyfileobj", full)
+        refused(archive, target, "cannot be unpacked: [Errno 28] No space left on device")
 
     def test_already_there(self, tmp_path: Path, target: Path) -> None:
         target.mkdir(parents=True)
