@@ -1,15 +1,15 @@
-"""The errors jaxslam raises at its edge: every one is a `JaxSlamError` and prints as one line."""
+"""Errors that jaxslam raises for bad input: each is a `JaxSlamError` and prints as one line."""
 
 import reprlib
 from collections.abc import Iterable
 
 
 class JaxSlamError(Exception):
-    """Bad input or a bad setting; the message names the field, what was expected and what came."""
+    """Bad input or a bad setting; the message names the field, the expected value and the given one."""
 
 
 class FrameError(JaxSlamError):
-    """A frame that cannot be used: wrong type, shape, or a time that goes backwards."""
+    """A frame that cannot be used: it has a wrong type or shape, or its time goes backwards."""
 
 
 class ConfigError(JaxSlamError):
@@ -25,36 +25,36 @@ class DatasetError(JaxSlamError):
 
 
 class TrajectoryError(JaxSlamError):
-    """A trajectory file that is unreadable, or two trajectories that cannot be compared."""
+    """A trajectory file that cannot be read or written, or two trajectories that cannot be compared."""
 
 
 class MapFileError(JaxSlamError):
-    """A map file that is missing, damaged, of another format or version, or that cannot be written."""
+    """A map file that is missing, damaged, of another format or version, or cannot be written."""
 
 
 class ModelError(JaxSlamError):
-    """A network that is missing, damaged, or of a kind that is not supported."""
+    """A network file that is missing, damaged or of an unsupported kind."""
 
 
 class MissingModelError(ModelError):
-    """A known network that the settings need and that is not on this machine; the message says how to get it."""
+    """A known network that the settings require but that is not installed; the message says how to get it."""
 
 
 class DownloadError(JaxSlamError):
-    """A file that cannot be fetched, or is not the one expected; the message says where to place it by hand."""
+    """A file that cannot be downloaded or has an unexpected checksum; the message says where to place it by hand."""
 
 
 class BenchmarkError(JaxSlamError):
-    """A suite, a baseline or the results of a benchmark that are missing, damaged or do not fit together."""
+    """A benchmark suite, baseline or result that is missing, damaged or inconsistent with the others."""
 
 
 def brief_repr(value: object) -> str:
-    """A value in one short line for a message, whatever it is."""
+    """Format any value as one short line for an error message."""
     return " ".join(reprlib.repr(value).split())
 
 
 def nearest(name: str, valid: Iterable[str]) -> str:
-    """A hint for a misspelt name: ` (did you mean 'x'?)` or, when nothing is close, the valid names."""
+    """Return a hint for a misspelled name: ` (did you mean 'x'?)` or, if no valid name is close, all valid names."""
     import difflib  # noqa: PLC0415 - used only where a name is wrong
 
     choices = sorted(valid)
@@ -65,6 +65,6 @@ def nearest(name: str, valid: Iterable[str]) -> str:
 
 
 def one_line(text: object, most: int = 160) -> str:
-    """What a file or another library says, as a part of an error message: in one line and not longer than `most`."""
+    """Format a text, such as another library's message, as one line of at most `most` characters."""
     line = " ".join(str(text).split())
     return line if len(line) <= most else f"{line[: most - 3]}..."

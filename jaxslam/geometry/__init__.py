@@ -1,1 +1,1 @@
-"""Rotations and rigid motions of many poses at once, in NumPy, for the host."""
+"""Batched rotations and rigid transforms in NumPy, for host code."""

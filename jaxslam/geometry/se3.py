@@ -1,6 +1,7 @@
-"""Rigid transforms of many poses at once on the host, in NumPy float64: `wxyz_xyz`, as everywhere.
+"""Batched rigid transforms on the host, in NumPy float64, stored as `wxyz_xyz` like everywhere in jaxslam.
 
-jaxlie's are for compiled code, where float64 needs a setting of the whole process.
+Compiled code uses jaxlie instead. jaxlie would compute in float64 only with `jax_enable_x64`, which applies to the
+whole process.
 """
 
 import math
@@ -10,15 +11,16 @@ import numpy as np
 from jaxslam.geometry.so3 import matrices, multiply
 
 IDENTITY = np.array([1.0, 0, 0, 0, 0, 0, 0])
+"""The identity transform, `(7,)` `wxyz_xyz`."""
 
 
 def rotate(T: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """`(..., 3)` vectors turned by the rotations of `(..., 7)` transforms."""
+    """Rotate `(..., 3)` vectors by the rotations of `(..., 7)` transforms."""
     return np.einsum("...ij,...j->...i", matrices(T[..., :4]), vectors)
 
 
 def compose(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """`(..., 7)` products of `(..., 7)` transforms, `second` acting first: `T_a_c` of `T_a_b` and `T_b_c`."""
+    """Compose `(..., 7)` transforms, `second` acting first: return `T_a_c` for `T_a_b` and `T_b_c`."""
     if first.ndim == second.ndim == 1:
         return _compose_one(first.tolist(), second.tolist())
     rotation = multiply(first[..., :4], second[..., :4])
@@ -27,7 +29,7 @@ def compose(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def _compose_one(first: list[float], second: list[float]) -> np.ndarray:
-    """The same of two single ones: NumPy's calls would take ten times as long as the arithmetic."""
+    """Compose two single transforms in plain Python: NumPy's calls would take ten times as long as the arithmetic."""
     w, x, y, z, t, u, v = first
     a, b, c, d, e, f, g = second
     rotation = (
@@ -37,7 +39,7 @@ def _compose_one(first: list[float], second: list[float]) -> np.ndarray:
         w * d + x * c - y * b + z * a,
     )
     length = math.hypot(*rotation)
-    # A vector turned: v + 2 w (q x v) + 2 q x (q x v).
+    # The rotated vector is v + 2 w (q x v) + 2 q x (q x v).
     i, j, k = 2 * (y * g - z * f), 2 * (z * e - x * g), 2 * (x * f - y * e)
     shifted = (
         e + w * i + y * k - z * j + t,
@@ -48,7 +50,7 @@ def _compose_one(first: list[float], second: list[float]) -> np.ndarray:
 
 
 def inverse(T: np.ndarray) -> np.ndarray:
-    """`(..., 7)` inverses of `(..., 7)` transforms."""
+    """Invert `(..., 7)` transforms."""
     if T.ndim == 1:
         w, x, y, z, *shift = T.tolist()
         turned_back = _compose_one([w, -x, -y, -z, 0, 0, 0], [1, 0, 0, 0, *shift])
@@ -58,27 +60,31 @@ def inverse(T: np.ndarray) -> np.ndarray:
 
 
 def between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """`(..., 7)` transforms from `second` to `first`: `T_a_b` of `T_world_a` and `T_world_b`."""
+    """Return the `(..., 7)` relative transforms from `second` to `first`: `T_a_b` for `T_world_a` and `T_world_b`."""
     return compose(inverse(first), second)
 
 
 def transform(T: np.ndarray, X: np.ndarray) -> np.ndarray:
-    """`(3, n)` points carried over by one transform `(7,)`."""
+    """Transform `(3, n)` points by one `(7,)` transform: `X_a` for `T_a_b` and `X_b`, meters."""
     return matrices(T[:4]) @ X + T[4:, None]
 
 
 def to_local(T: np.ndarray, X: np.ndarray) -> np.ndarray:
-    """`(3, n)` points in the axes of `T`, a transform `(7,)` that carries those into the axes of the points."""
+    """Transform `(3, n)` points by the inverse of one `(7,)` transform: `X_b` for `T_a_b` and `X_a`, meters."""
     return matrices(T[:4]).T @ (X - T[4:, None])
 
 
 def angle(T: np.ndarray) -> np.ndarray:
-    """`(...,)` angles of the rotations of `(..., 7)` transforms, radians."""
+    """Return the `(...,)` rotation angles of `(..., 7)` transforms, radians, 0 to pi."""
     return 2 * np.arctan2(np.linalg.norm(T[..., 1:4], axis=-1), np.abs(T[..., 0]))
 
 
 def retract(T: np.ndarray, tangent: np.ndarray) -> np.ndarray:
-    """`(7,)` transform after a small motion in its own axes: translation, then rotation vector, each by itself."""
+    """Retract a `(6,)` tangent vector at a `(7,)` transform: the product of `T` and the small motion.
+
+    The tangent holds a translation (meters) and a rotation vector (radians), both in the local axes of `T`. The two are
+    applied separately, so this is the retraction of SO(3) x R^3 and not the exponential map of SE(3).
+    """
     turn = np.linalg.norm(tangent[3:])
     axis = np.sinc(turn / (2 * np.pi)) * 0.5 * tangent[3:]
     return compose(T, np.concatenate([[np.cos(turn / 2)], axis, tangent[:3]]))

@@ -1,13 +1,14 @@
-"""Rotations of many poses at once on the host, in NumPy float64: unit quaternions, wxyz, and matrices.
+"""Batched rotations on the host, in NumPy float64: unit quaternions (wxyz) and rotation matrices.
 
-jaxlie's are for compiled code, where float64 needs a setting of the whole process.
+Compiled code uses jaxlie instead. jaxlie would compute in float64 only with `jax_enable_x64`, which applies to the
+whole process.
 """
 
 import numpy as np
 
 
 def matrices(wxyz: np.ndarray) -> np.ndarray:
-    """`(..., 3, 3)` rotation matrices of `(..., 4)` unit quaternions."""
+    """Convert `(..., 4)` unit quaternions to `(..., 3, 3)` rotation matrices."""
     w, x, y, z = np.moveaxis(wxyz, -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -18,7 +19,7 @@ def matrices(wxyz: np.ndarray) -> np.ndarray:
 
 
 def axis_rotation(axis: int, angle: np.ndarray) -> np.ndarray:
-    """`(..., 4)` unit quaternions of rotations by `(...,)` radians about coordinate axis 0, 1 or 2."""
+    """Return the `(..., 4)` unit quaternions that rotate by `(...,)` radians about coordinate axis 0, 1 or 2."""
     half = 0.5 * np.asarray(angle, np.float64)
     quaternion = np.zeros((*half.shape, 4))
     quaternion[..., 0] = np.cos(half)
@@ -27,7 +28,7 @@ def axis_rotation(axis: int, angle: np.ndarray) -> np.ndarray:
 
 
 def multiply(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """`(..., 4)` Hamilton products of `(..., 4)` quaternions: `second` acts first."""
+    """Return the Hamilton products of `(..., 4)` quaternions: `second` acts first."""
     w, x, y, z = np.moveaxis(first, -1, 0)
     a, b, c, d = np.moveaxis(second, -1, 0)
     return np.stack(
@@ -42,7 +43,7 @@ def multiply(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def quaternions(M: np.ndarray) -> np.ndarray:
-    """`(n, 4)` unit quaternions, w not negative, of the rotations nearest to `(n, 3, 3)` matrices.
+    """Convert `(n, 3, 3)` matrices to the `(n, 4)` unit quaternions of the nearest rotations, with w not negative.
 
     Source: Bar-Itzhack, "New Method for Extracting the Quaternion from a Rotation Matrix", 2000, version 3.
     """
@@ -57,7 +58,12 @@ def quaternions(M: np.ndarray) -> np.ndarray:
 
 
 def slerp(first: np.ndarray, second: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """`(n, 4)` unit quaternions a `share` `(n,)` of the way from `first` to `second`, the shorter way round.
+    """Interpolate between `(n, 4)` unit quaternions along the shorter arc.
+
+    Args:
+        first: `(n, 4)` unit quaternions returned where `share` is 0.
+        second: `(n, 4)` unit quaternions returned, up to sign, where `share` is 1.
+        share: `(n,)` fractions of the arc from `first` to `second`.
 
     Source: Shoemake, "Animating Rotation with Quaternion Curves", SIGGRAPH 1985.
     """
@@ -66,7 +72,7 @@ def slerp(first: np.ndarray, second: np.ndarray, share: np.ndarray) -> np.ndarra
     angle = 2 * np.arctan2(apart, np.linalg.norm(second + first, axis=1, keepdims=True))
 
     def weight(part: np.ndarray) -> np.ndarray:
-        """`sin(part * angle) / sin(angle)`, and its limit where the angle is 0."""
+        """Return `sin(part * angle) / sin(angle)`, or its limit where the angle is 0."""
         return part * np.sinc(part * angle / np.pi) / np.sinc(angle / np.pi)
 
     return weight(1 - share[:, None]) * first + weight(share[:, None]) * second

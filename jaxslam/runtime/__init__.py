@@ -1,1 +1,1 @@
-"""How code runs: compile and trace caches, aligned memory, padding, workers, stage times, the machine."""
+"""Run-time support: compile and trace caches, aligned memory, padding, workers, stage timer, machine description."""

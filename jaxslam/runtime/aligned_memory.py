@@ -1,4 +1,4 @@
-"""Memory that XLA computes on in place."""
+"""Aligned arrays, which XLA reads in place instead of copying them."""
 
 import math
 
@@ -9,10 +9,10 @@ _ALIGNMENT = 64  # bytes
 
 
 def aligned_array(shape: tuple[int, ...], dtype: DTypeLike) -> np.ndarray:
-    """An array, of whatever values, that begins at a multiple of 64 bytes.
+    """Allocate an uninitialized array whose address is a multiple of 64 bytes.
 
-    XLA computes on such arrays in place, in the calling thread; others it copies in a thread of its own, where the
-    call then waits for what other threads have XLA do.
+    XLA computes on such an array in place, in the calling thread. It copies any other array in a thread of its own, and
+    the call then waits behind the work that other threads have given to XLA.
     """
     size = math.prod(shape) * np.dtype(dtype).itemsize
     room = np.empty(size + _ALIGNMENT, np.uint8)

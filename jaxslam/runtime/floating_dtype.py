@@ -1,4 +1,4 @@
-"""The floating-point type of state, parameters and frames: one for all three, float32 unless said otherwise."""
+"""The one floating-point type of the tracker's state, parameters and frames: float32 by default."""
 
 import jax
 import jax.numpy as jnp
@@ -6,10 +6,10 @@ from jax.typing import DTypeLike
 
 
 def floating_dtype(dtype: DTypeLike) -> jnp.dtype:
-    """A floating-point type that JAX can compute in now, however it was named: `"float64"`, `np.float64`, ...
+    """Convert `dtype`, such as `"float64"` or `np.float64`, to a floating-point type that JAX can currently compute in.
 
     Raises:
-        TypeError: If it is no floating-point type, or is float64 while `jax_enable_x64` is off.
+        TypeError: If `dtype` is not a floating-point type, or is float64 while `jax_enable_x64` is off.
     """
     chosen = jnp.dtype(dtype)
     if not jnp.issubdtype(chosen, jnp.floating):

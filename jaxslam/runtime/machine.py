@@ -1,4 +1,4 @@
-"""What a process computes with: versions of packages, the processor, its memory, the commit of jaxslam."""
+"""Describe the machine and software of this process: package versions, processor, peak memory, jaxslam commit."""
 
 import platform
 import subprocess
@@ -18,7 +18,7 @@ _WINDOWS_COUNTERS = (
 
 
 def machine() -> dict[str, Any]:
-    """What computed: versions of packages, the processor, cores and threads of this process, the commit."""
+    """Return the package versions, the processor, the cores and threads of this process, and the jaxslam commit."""
     return {
         "versions": {"python": platform.python_version(), **{name: version(name) for name in _PACKAGES}},
         "cpu": cpu_model(),
@@ -30,7 +30,7 @@ def machine() -> dict[str, Any]:
 
 
 def peak_rss_mb() -> float:
-    """The most memory this process has had, megabytes."""
+    """Return the peak resident memory of this process, megabytes."""
     if sys.platform == "win32":
         return _peak_working_set_mb()
     import resource  # noqa: PLC0415 - POSIX only
@@ -40,7 +40,7 @@ def peak_rss_mb() -> float:
 
 
 def _peak_working_set_mb() -> float:
-    """The peak working set of this process, megabytes, as Windows counts it (`GetProcessMemoryInfo`)."""
+    """Return the peak working set of this process on Windows (`GetProcessMemoryInfo`), megabytes."""
     import ctypes  # noqa: PLC0415 - used on Windows only
     from ctypes import wintypes  # noqa: PLC0415
 
@@ -61,7 +61,7 @@ def _peak_working_set_mb() -> float:
 
 
 def cpu_model() -> str:
-    """The name of the processor; its architecture where the system tells no name."""
+    """Return the name of the processor, or its architecture if the system does not report a name."""
     info = Path("/proc/cpuinfo")
     if info.is_file():
         for line in info.read_text().splitlines():
@@ -71,14 +71,17 @@ def cpu_model() -> str:
 
 
 def _vectors() -> str:
-    """The widest instructions of the processor that matter to rounding and speed; its architecture if unknown."""
+    """Return the widest vector instruction set of the processor, or its architecture if the flags are unknown.
+
+    Rounding and speed depend on it.
+    """
     info = Path("/proc/cpuinfo")
     flags = set(info.read_text().split()) if info.is_file() else set()
     return next((name for name in ("avx512f", "avx2", "avx", "sse4_2") if name in flags), platform.machine())
 
 
 def _commit() -> str | None:
-    """The commit of the checkout jaxslam runs from, `+` behind it if the checkout has changes; `None` if installed."""
+    """Return the commit of the checkout, with `+` appended if it has changes; `None` outside a checkout."""
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return None

@@ -1,11 +1,11 @@
-"""Imports that `import jaxslam` leaves out, made before the first frame instead of in the middle of a run."""
+"""Import heavy libraries before the first frame: `import jaxslam` skips them, and they must not delay a later frame."""
 
 
 def import_scipy() -> None:
     """Import the parts of SciPy that the map uses.
 
-    They take a third of the time of `import jax`, which a step or a trajectory alone does not need; the functions that
-    use them import them again, which costs nothing then.
+    They take a third of the time of `import jax`, and code that only tracks or only reads trajectories does not need
+    them. The functions that use SciPy import it again, which costs nothing by then.
     """
     import scipy.sparse.csgraph  # noqa: PLC0415
     import scipy.sparse.linalg  # noqa: PLC0415

@@ -1,4 +1,4 @@
-"""How long each stage of tracking takes, frame by frame, and each job of the threads beside it."""
+"""Record the duration of each tracking stage of each frame, and of each background job."""
 
 import time
 from array import array
@@ -13,21 +13,21 @@ _Made = TypeVar("_Made")
 
 
 class StageTimes:
-    """Keeps every time: eight bytes a stage and frame, 6 MB an hour at 30 frames a second.
+    """Every recorded duration of every stage; any thread may add to it.
 
-    Any thread may add to it.
+    It takes eight bytes per stage and frame: 6 MB an hour at 30 frames a second.
     """
 
     def __init__(self) -> None:
-        """Begin with nothing."""
+        """Create a record without durations."""
         self._ms: dict[str, array[float]] = {}
 
     def add(self, stage: str, seconds: float) -> None:
-        """Take in how long a stage took."""
+        """Record that a stage took so many seconds."""
         self._ms.setdefault(stage, array("d")).append(1e3 * seconds)
 
     def timed(self, stage: str, work: Callable[[_Given], _Made]) -> Callable[[_Given], _Made]:
-        """The same function, whose every call is a stage; one that raises is one too."""
+        """Wrap a function so that the duration of every call, also of one that raises, is recorded under `stage`."""
 
         def measured(given: _Given) -> _Made:
             began = time.perf_counter()
@@ -39,24 +39,24 @@ class StageTimes:
         return measured
 
     def stopwatch(self) -> "Stopwatch":
-        """A stopwatch that runs from now on."""
+        """Start a stopwatch that records into this object."""
         return Stopwatch(self)
 
     @property
     def ms(self) -> Mapping[str, Float[np.ndarray, " times"]]:
-        """Milliseconds of every time a stage was gone through, in the order in which stages were first seen."""
+        """All durations of each stage, milliseconds, with the stages in the order of their first record."""
         return {stage: np.array(times) for stage, times in self._ms.items()}
 
 
 class Stopwatch:
-    """Divides the time of one frame among its stages."""
+    """Stopwatch that divides the time of one frame among its stages."""
 
     def __init__(self, times: StageTimes) -> None:
-        """Start."""
+        """Start the first stage."""
         self._times, self._since = times, time.perf_counter()
 
     def ends(self, stage: str) -> None:
-        """What was done since the last stage ended was this one."""
+        """End the current stage: record the time since the previous stage ended under this name."""
         now = time.perf_counter()
         self._times.add(stage, now - self._since)
         self._since = now
