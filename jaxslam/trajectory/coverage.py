@@ -1,4 +1,4 @@
-"""How much of a recording a trajectory covers: which frames have a pose, and where poses are missing."""
+"""Coverage of a recording by a trajectory: the share of frames with a pose, and the time spans without poses."""
 
 from typing import NamedTuple
 
@@ -12,18 +12,20 @@ _LOST_AFTER_INTERVALS = 3.0
 
 
 class Coverage(NamedTuple):
-    """Which part of a recording has estimated poses.
+    """The part of a recording that has estimated poses.
 
     Attributes:
-        num_frames: How many frames the recording has; `None` if they are not known.
-        coverage_percent: Share of the frames that have a pose; `None` if they are not known.
-        lost_spans_ns: `(k, 2)` begin and end of the times without poses, nanoseconds. Where frames are known, each run
-            of frames without a pose, from the last frame that has one to the next that has one, or to the first or
-            last frame of all. Where they are not known, or none has a pose, the gaps between poses longer than three
-            times their median interval, within the time span of the reference.
+        num_frames: Number of frames of the recording; `None` if the frames are not known.
+        coverage_percent: Share of the frames that have a pose, percent; `None` if the frames are not known.
+        lost_spans_ns: `(k, 2)` start and end of the time spans without poses, nanoseconds. If the frames are known, a
+            span is a run of frames without a pose: it reaches from the last frame that has a pose to the next frame
+            that has one, or to the first or last frame of the recording. If the frames are not known or none has a
+            pose, the spans are the gaps between poses longer than three times their median interval, within the time
+            span of the reference.
         pose_interval_s: Median time between successive poses of the estimate, seconds; `None` with a single pose.
-        longest_gap_s: The longest such time, seconds; `None` with a single pose.
-        span_percent: Share of the reference's time span that lies between the first and the last estimated pose.
+        longest_gap_s: Longest time between successive poses of the estimate, seconds; `None` with a single pose.
+        span_percent: Share of the reference's time span that lies between the first and the last estimated pose,
+            percent.
     """
 
     num_frames: int | None
@@ -41,18 +43,19 @@ def coverage_of(
     max_gap_s: float,
     frames_offset_s: float = 0.0,
 ) -> Coverage:
-    """The part of a recording that an estimate covers.
+    """Compute the part of a recording that an estimate covers.
 
     Args:
-        estimate_ns: Stamps of the estimated poses, at least one, in the order of time.
-        reference_ns: Stamps of the true poses, at least one, in the order of time.
-        frames_ns: Stamps of the recording's frames, if they are known.
-        max_gap_s: Largest difference of stamps at which a pose belongs to a frame, seconds.
-        frames_offset_s: How much later than the clock of the frames that of the estimate may be, seconds. Frames are
-            matched with and without this offset, and the better match counts: they may be on either clock.
+        estimate_ns: `(n,)` timestamps of the estimated poses in increasing order, at least one, nanoseconds.
+        reference_ns: `(m,)` timestamps of the true poses in increasing order, at least one, nanoseconds.
+        frames_ns: `(f,)` timestamps of the recording's frames, nanoseconds; `None` if they are not known.
+        max_gap_s: Largest difference of timestamps at which a pose belongs to a frame, seconds.
+        frames_offset_s: Time by which the clock of the estimate may be ahead of the clock of the frames, seconds.
+            Frames are matched with and without this offset, because they may be on either clock, and the better match
+            counts.
 
     Raises:
-        TrajectoryError: If `frames_ns` is no list of stamps.
+        TrajectoryError: If `frames_ns` is not a list of timestamps.
     """
     intervals = np.diff(np.unique(estimate_ns)) * 1e-9
     known = (float(np.median(intervals)), float(intervals.max())) if len(intervals) else (None, None)
@@ -68,7 +71,7 @@ def coverage_of(
 
 
 def _checked(frames_ns: np.ndarray) -> Int[np.ndarray, " f"]:
-    """The stamps in order, each once."""
+    """Validate the timestamps of frames, and return them sorted without duplicates."""
     frames_ns = np.asarray(frames_ns)
     if frames_ns.ndim != 1 or not frames_ns.size or frames_ns.dtype.kind not in "iu":
         raise TrajectoryError(
@@ -78,7 +81,7 @@ def _checked(frames_ns: np.ndarray) -> Int[np.ndarray, " f"]:
 
 
 def _runs_without(frames_ns: Int[np.ndarray, " f"], matched: Int[np.ndarray, " k"]) -> Int[np.ndarray, "r 2"]:
-    """Begin and end of each run of frames that are not matched, as in `Coverage`."""
+    """Return the start and end of each run of frames without a match, as in `Coverage`."""
     without = np.pad(~np.isin(np.arange(len(frames_ns)), matched), 1)
     steps = np.diff(without.astype(np.int8))
     first, after = np.flatnonzero(steps == 1), np.flatnonzero(steps == -1)
@@ -86,7 +89,7 @@ def _runs_without(frames_ns: Int[np.ndarray, " f"], matched: Int[np.ndarray, " k
 
 
 def _gaps(estimate_ns: Int[np.ndarray, " n"], reference_ns: Int[np.ndarray, " m"]) -> Int[np.ndarray, "k 2"]:
-    """Begin and end of the long gaps between poses within the time span of the reference."""
+    """Return the start and end of the long gaps between poses within the time span of the reference."""
     begin, end = reference_ns[[0, -1]]
     inside = estimate_ns[(estimate_ns >= begin) & (estimate_ns <= end)]
     stamps = np.concatenate([[begin], inside, [end]])

@@ -1,7 +1,7 @@
-"""How far an estimated trajectory is from the true one: ATE, RPE, drift as KITTI measures it, and coverage.
+"""Evaluate an estimated trajectory against ground truth: ATE, RPE, KITTI drift, and coverage.
 
-Figures are computed in float64 whatever JAX is set to, and depend on nothing but the two trajectories and the
-settings. Source: Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012; for KITTI's figures
+Figures are computed in float64 whatever JAX is set to, and depend only on the two trajectories and the settings.
+Source: Sturm et al., "A Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012; for KITTI's figures
 see `jaxslam_kernels.trajectory.kitti_drift`.
 """
 
@@ -22,12 +22,14 @@ from jaxslam_kernels.trajectory.alignment import (
     rpe,
 )
 from jaxslam_kernels.trajectory.kitti_drift import KITTI_LENGTHS_M, KITTI_STEP, SegmentErrors, segment_errors
+from jaxtyping import Float, Int
 
 from jaxslam.errors import TrajectoryError, nearest
 from jaxslam.geometry.so3 import matrices
+from jaxslam.geometry.types import Pose
 from jaxslam.runtime.compile_cache import FAST_COMPILE
 from jaxslam.runtime.compiled import compiled
-from jaxslam.trajectory.coverage import coverage_of
+from jaxslam.trajectory.coverage import Coverage, coverage_of
 from jaxslam.trajectory.evaluation_figures import ALIGNMENT_NAMES, Evaluation
 from jaxslam.trajectory.evaluation_notes import (
     Matches,
@@ -54,29 +56,30 @@ def evaluate(
     align: AlignmentKind = "se3",
     max_gap_s: float = 0.02,
     rpe_delta_s: float = 1.0,
-    frames_ns: np.ndarray | None = None,
+    frames_ns: Int[np.ndarray, " f"] | None = None,
     time_offset_s: float | Literal["auto"] = 0.0,
 ) -> Evaluation:
-    """Compare an estimated trajectory with the true one.
+    """Evaluate an estimated trajectory against ground truth.
 
-    Poses are matched by time (`trajectory.associate`), never interpolated. A straight line or a camera that stands
-    still leaves the rotation of the alignment open but not the errors: the figures are right and a note says so.
-    With `align='sim3'` RPE and KITTI's figures are those of the scaled estimate.
+    Poses are matched by time (`trajectory.associate`), never interpolated. A straight path or a camera at rest leaves
+    the rotation of the alignment undetermined but not the errors: the figures are right, and a note reports it.
+    With `align='sim3'` the RPE and KITTI's figures are computed for the scaled estimate.
 
     Args:
         estimate: Estimated poses, in any world frame.
         reference: True poses of the same camera.
-        align: What to fit before positions are compared: `none`, `se3` (metric sensors) or `sim3` (monocular).
-        max_gap_s: Largest difference of stamps that counts as the same time, seconds.
+        align: Alignment to fit before positions are compared: `none`, `se3` (metric sensors) or `sim3` (monocular).
+        max_gap_s: Largest difference of timestamps that counts as the same time, seconds.
         rpe_delta_s: Time over which drift is measured, seconds.
-        frames_ns: `(f,)` int64 stamps of the frames of the recording, nanoseconds, for the coverage. They may be on the
-            clock of the estimate, with `time_offset_s` added or not. Without them the coverage is not known.
-        time_offset_s: What to add to the stamps of the estimate, seconds, where its clock differs from that of the
-            reference; `auto` estimates it by `estimate_time_offset`.
+        frames_ns: `(f,)` int64 timestamps of the frames of the recording, nanoseconds, from which the coverage is
+            computed. They may be on the clock of the estimate with or without `time_offset_s` added. Without them the
+            coverage is not known.
+        time_offset_s: Time to add to the timestamps of the estimate, seconds, if its clock differs from the clock of
+            the reference. `auto` estimates it (`estimate_time_offset`).
 
     Raises:
-        TrajectoryError: If a setting is wrong, nothing matches, too little matches to align, or the time offset cannot
-            be estimated.
+        TrajectoryError: If a setting is wrong, no poses match, too few poses match to align them, or the time offset
+            cannot be estimated.
     """
     _check_settings(align, max_gap_s, rpe_delta_s, time_offset_s)
     _check_not_empty(estimate, reference)
@@ -84,56 +87,120 @@ def evaluate(
     if time_offset_s == "auto":
         offset = estimate_time_offset(estimate, reference, align)
         time_offset_s, notes = offset.seconds, on_doubtful_offset(offset)
+    settings = _Settings(align, max_gap_s, rpe_delta_s, time_offset_s)
     estimate = estimate.shifted(time_offset_s)
-    index_est, index_ref = associate(estimate.timestamps_ns, reference.timestamps_ns, max_gap_s)
-    if not len(index_est):
-        raise TrajectoryError(_no_match(estimate, reference, max_gap_s, time_offset_s))
-    _check_alignable(estimate, reference, len(index_est), align, max_gap_s)
-    matches = Matches(estimate.select(index_est), reference.T_world_cam[index_ref])
-    matched, truth = matches
-    later = PosePairs.later_by(matched.timestamps_ns, rpe_delta_s)
-    successive = PosePairs.successive(matched.timestamps_ns)
-    errors = _errors(matches, later, align)
-    if (beyond := len(matched) - int(errors.absolute[align].num_poses)) > 0:
-        raise TrajectoryError(f"{beyond} matched poses are more than {MAX_DISTANCE:g} m from the origin")
-    coverage = coverage_of(estimate.timestamps_ns, reference.timestamps_ns, frames_ns, max_gap_s, time_offset_s)
-    if len(matched) < _FEWEST_TO_ALIGN:
-        notes += (f"fewer than {_FEWEST_TO_ALIGN} matches: no alignment",)
-    else:
-        notes += (
-            *_notes_on_alignment(errors),
-            *on_counts(estimate, reference, len(matched), max_gap_s),
-            *on_rotations(matches, later, np.asarray(errors.per_second.rotations)[later.first]),
-            *on_pairs(later, successive, rpe_delta_s, frames_ns),
-            *on_frames(coverage.num_frames, coverage.coverage_percent, max_gap_s),
-            *on_time_offset(estimate, reference, align, time_offset_s),
-        )
-    fitted = errors.absolute[align].alignment
-    T, scale = np.asarray(fitted.T_reference_estimate.wxyz_xyz), float(fitted.scale)
+    compared = _compare(estimate, reference, settings, frames_ns)
+    matched, truth = compared.matches
+    errors, later, successive = compared.errors, compared.later, compared.successive
+    T, scale, distances_m = _alignment(errors.absolute[align])
     return Evaluation(
-        align=align,
-        max_gap_s=max_gap_s,
-        rpe_delta_s=rpe_delta_s,
-        time_offset_s=time_offset_s,
+        **settings._asdict(),
         num_estimate=len(estimate),
         num_reference=len(reference),
         num_matched=len(matched),
-        **coverage._asdict(),
+        **compared.coverage._asdict(),
         **_absolute_figures(errors, align),
         **_relative_figures(errors, later, successive),
         **_kitti_figures(errors.per_length),
-        notes=notes,
+        notes=(*notes, *_notes(estimate, reference, compared, settings, frames_ns)),
         timestamps_ns=matched.timestamps_ns,
         positions_m=scale * matched.positions @ matrices(T[None, :4])[0].T + T[4:],
         reference_m=truth[:, 4:],
-        errors_m=np.asarray(errors.absolute[align].distances[: len(matched)]),
+        errors_m=distances_m[: len(matched)],
         T_reference_estimate=T,
         scale=scale,
     )
 
 
+class _Settings(NamedTuple):
+    """The arguments of `evaluate` that its result repeats.
+
+    Attributes:
+        align: The alignment that is fitted before positions are compared.
+        max_gap_s: Largest difference of timestamps that counts as the same time, seconds.
+        rpe_delta_s: Time between the two poses of a pair of the RPE per second, seconds.
+        time_offset_s: Time added to the timestamps of the estimate, seconds.
+    """
+
+    align: AlignmentKind
+    max_gap_s: float
+    rpe_delta_s: float
+    time_offset_s: float
+
+
+class _Compared(NamedTuple):
+    """The matched poses of two trajectories with their errors.
+
+    Attributes:
+        matches: Poses of both trajectories at the same times.
+        later: Pairs of the RPE per second.
+        successive: Pairs of the RPE per frame.
+        errors: Absolute and relative errors of the matched poses.
+        coverage: The part of the recording that has estimated poses.
+    """
+
+    matches: Matches
+    later: PosePairs
+    successive: PosePairs
+    errors: "_Errors"
+    coverage: Coverage
+
+
+def _compare(
+    estimate: Trajectory, reference: Trajectory, settings: _Settings, frames_ns: Int[np.ndarray, " f"] | None
+) -> _Compared:
+    """Match the poses of two trajectories by time and compute their errors, as in `evaluate`."""
+    align, max_gap_s, rpe_delta_s, added_s = settings
+    index_est, index_ref = associate(estimate.timestamps_ns, reference.timestamps_ns, max_gap_s)
+    if not len(index_est):
+        raise TrajectoryError(_no_match(estimate, reference, max_gap_s, added_s))
+    _check_alignable(estimate, reference, len(index_est), align, max_gap_s)
+    matches = Matches(estimate.select(index_est), reference.T_world_cam[index_ref])
+    later = PosePairs.later_by(matches.estimate.timestamps_ns, rpe_delta_s)
+    successive = PosePairs.successive(matches.estimate.timestamps_ns)
+    errors = _errors(matches, later, align)
+    if (beyond := len(index_est) - int(errors.absolute[align].num_poses)) > 0:
+        raise TrajectoryError(f"{beyond} matched poses are more than {MAX_DISTANCE:g} m from the origin")
+    coverage = coverage_of(estimate.timestamps_ns, reference.timestamps_ns, frames_ns, max_gap_s, added_s)
+    return _Compared(matches, later, successive, errors, coverage)
+
+
+def _notes(
+    estimate: Trajectory,
+    reference: Trajectory,
+    compared: _Compared,
+    settings: _Settings,
+    frames_ns: Int[np.ndarray, " f"] | None,
+) -> tuple[str, ...]:
+    """Return the reservations about the figures of an evaluation."""
+    matches, later, successive, errors, coverage = compared
+    if len(matches.estimate) < _FEWEST_TO_ALIGN:
+        return (f"fewer than {_FEWEST_TO_ALIGN} matches: no alignment",)
+    return (
+        *_notes_on_alignment(errors),
+        *on_counts(estimate, reference, len(matches.estimate), settings.max_gap_s),
+        *on_rotations(matches, later, np.asarray(errors.per_second.rotations)[later.first]),
+        *on_pairs(later, successive, settings.rpe_delta_s, frames_ns),
+        *on_frames(coverage.num_frames, coverage.coverage_percent, settings.max_gap_s),
+        *on_time_offset(estimate, reference, settings.align, settings.time_offset_s),
+    )
+
+
+def _alignment(absolute: AbsoluteErrors) -> tuple[Pose, float, Float[np.ndarray, " capacity"]]:
+    """Return the fitted `T_reference_estimate`, the scale, and the padded distances after alignment, meters."""
+    fitted = absolute.alignment
+    return np.asarray(fitted.T_reference_estimate.wxyz_xyz), float(fitted.scale), np.asarray(absolute.distances)
+
+
 class _Errors(NamedTuple):
-    """What the kernels compute, padded; in NumPy once it is back."""
+    """The errors that the kernels compute, padded; NumPy arrays once they are back on the host.
+
+    Attributes:
+        absolute: Distances between matched positions and their statistics, by the name of the alignment.
+        per_second: Errors of the pairs of the RPE per second.
+        per_frame: Errors of the pairs of the RPE per frame.
+        per_length: Errors of KITTI's segments.
+    """
 
     absolute: dict[str, AbsoluteErrors]
     per_second: RelativeErrors
@@ -142,7 +209,7 @@ class _Errors(NamedTuple):
 
 
 def _errors(matches: Matches, later: PosePairs, align: AlignmentKind) -> _Errors:
-    """Errors of matched poses, padded to a capacity from a short ladder, so that few lengths compile anew."""
+    """Compute the errors of matched poses, padded to one of a few capacities so that few lengths compile anew."""
     count, capacity = len(matches.estimate), _SMALLEST_CAPACITY
     while capacity < count:
         capacity *= 4
@@ -162,7 +229,7 @@ def _errors(matches: Matches, later: PosePairs, align: AlignmentKind) -> _Errors
 
 @compiled(when="first use", options=FAST_COMPILE)
 def _padded_errors(P: jax.Array, Q: jax.Array, mask: jax.Array, later: jax.Array, scaled: jax.Array) -> _Errors:
-    """All alignments at once: one compilation serves them all."""
+    """Compute the errors with every alignment at once, so that one compilation serves them all."""
     x, y, weights = P[:, 4:].T, Q[:, 4:].T, mask.astype(P.dtype)
     absolute = {kind: ate(x, y, weights, alignment=kind) for kind in ALIGNMENT_NAMES}
     P = P.at[:, 4:].multiply(jnp.where(scaled, absolute["sim3"].alignment.scale, 1.0))
@@ -233,7 +300,7 @@ def _check_not_empty(estimate: Trajectory, reference: Trajectory) -> None:
 
 
 def _no_match(estimate: Trajectory, reference: Trajectory, max_gap_s: float, added_s: float) -> str:
-    """What to say when no pose is matched."""
+    """Return the error message if no poses match."""
     spans = f"the estimate's ({_span(estimate)}) and the reference's ({_span(reference)})"
     reasons = [why_nothing_matches(estimate, reference, added_s), *on_swapped_arguments(estimate, reference)]
     return f"no stamps within {max_gap_s * 1e3:g} ms of each other among {spans}: {'; '.join(reasons)}"

@@ -1,4 +1,4 @@
-"""The figures of an evaluation, as text and for JSON."""
+"""The figures of an evaluation, printable and ready for JSON."""
 
 from dataclasses import dataclass, fields
 from typing import Any
@@ -6,7 +6,9 @@ from typing import Any
 import numpy as np
 from jaxslam_kernels.trajectory.alignment import AlignmentKind
 from jaxslam_kernels.trajectory.kitti_drift import KITTI_LENGTHS_M
+from jaxtyping import Float64, Int
 
+from jaxslam.geometry.types import Pose, Positions, Timestamps
 from jaxslam.trajectory.pose_pairs import spacing
 
 ALIGNMENT_NAMES: dict[AlignmentKind, str] = {
@@ -18,61 +20,68 @@ ALIGNMENT_NAMES: dict[AlignmentKind, str] = {
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Figures of one estimate against one reference. `str()` prints them, `summary()` is for JSON.
+    """Figures of one estimate against one reference: `str()` formats them, and `summary()` returns them for JSON.
 
-    All are over the matched poses. The RMSE of the distances is what papers call the ATE. A relative figure is the
-    RMSE over pairs of matched poses; pairs bridge losses too, so that a wrong relocalization counts.
+    All figures are over the matched poses. The RMSE of the distances is what papers call the ATE. A relative figure
+    is the RMSE over pairs of matched poses. Pairs also bridge the times when tracking was lost, so that a wrong
+    relocalization counts.
 
     Attributes:
-        align: What was aligned: `none`, `se3` or `sim3`.
-        max_gap_s: Stamps further apart than this do not match.
-        rpe_delta_s: Pairs of the RPE per second: each pose with the first pose at least this much later.
-        time_offset_s: What was added to the stamps of the estimate before poses were matched, seconds.
-        num_estimate: Poses of the estimate.
-        num_reference: Poses of the reference.
-        num_matched: Pairs of poses at the same time, one to one.
-        num_frames: Frames of the recording; `None` if they are not known.
-        coverage_percent: Share of these frames that have an estimated pose; `None` if they are not known. The poses
-            alone do not tell how many frames there were.
+        align: The alignment that was fitted: `none`, `se3` or `sim3`.
+        max_gap_s: Largest difference of timestamps at which poses match, seconds.
+        rpe_delta_s: Shortest time between the two poses of a pair of the RPE per second, seconds. Each pose is paired
+            with the first pose at least this much later.
+        time_offset_s: Time added to the timestamps of the estimate before poses were matched, seconds.
+        num_estimate: Number of poses of the estimate.
+        num_reference: Number of poses of the reference.
+        num_matched: Number of pairs of poses at the same time, matched one to one.
+        num_frames: Number of frames of the recording; `None` if the frames are not known.
+        coverage_percent: Share of the frames that have an estimated pose, percent; `None` if the frames are not known,
+            because the poses alone do not tell how many frames there were.
         pose_interval_s: Median time between successive poses of the estimate, seconds; `None` with a single pose.
-        longest_gap_s: The longest such time, seconds; `None` with a single pose.
-        span_percent: Share of the reference's time span that lies between the first and the last estimated pose.
-        ate_rmse_m: Root of the mean square distance after alignment.
-        ate_mean_m: Mean distance.
-        ate_median_m: Median distance.
-        ate_max_m: Largest distance.
-        ate_std_m: Standard deviation of the distances.
-        ate_sim3_rmse_m: RMSE with a scale fitted too; `None` with fewer than three matches.
-        sim3_scale: That scale, by which the estimate is multiplied.
-        rpe_trans_m_per_s: RPE per second: the error of the motion between the poses of a pair, divided by the time
-            between them, which is longer than `rpe_delta_s` where poses are sparse or missing; `None` without pairs.
-        rpe_rot_deg_per_s: The same for the angle.
-        rpe_pairs: How many such pairs there are.
-        rpe_pair_s_median: Median time between the poses of such a pair, seconds; `None` without pairs.
-        rpe_pair_s_min: The shortest such time, seconds.
-        rpe_pair_s_max: The longest such time, seconds.
-        rpe_trans_m_per_frame: RPE per frame: the error of the motion from one matched pose to the next, whatever the
-            time between them; `None` with a single match.
-        rpe_rot_deg_per_frame: The same for the angle.
-        rpe_frame_pairs: How many such pairs there are.
-        rpe_frame_s_median: Median time between the poses of such a pair, seconds; `None` without pairs.
-        rpe_frame_s_min: The shortest such time, seconds.
-        rpe_frame_s_max: The longest such time, seconds.
-        kitti_trans_percent: KITTI's `t_rel`: the error of the motion over a segment of 100, 200, ... or 800 m of the
-            true path, divided by that length; the mean of all. `None` if the path of the matched poses is too short for
-            any. A segment begins at every 10th matched pose, as it does at every 10th frame in the benchmark: with gaps
-            fewer begin there.
-        kitti_rot_deg_per_100m: KITTI's `r_rel`, the same for the angle.
-        kitti_segments: How many such segments there are.
+        longest_gap_s: Longest time between successive poses of the estimate, seconds; `None` with a single pose.
+        span_percent: Share of the reference's time span that lies between the first and the last estimated pose,
+            percent.
+        ate_rmse_m: ATE: the root mean square distance after alignment, meters.
+        ate_mean_m: Mean distance after alignment, meters.
+        ate_median_m: Median distance after alignment, meters.
+        ate_max_m: Largest distance after alignment, meters.
+        ate_std_m: Standard deviation of the distances after alignment, meters.
+        ate_sim3_rmse_m: Root mean square distance after a Sim(3) alignment, meters; `None` with fewer than three
+            matches.
+        sim3_scale: Scale of the Sim(3) alignment, by which the estimate is multiplied; `None` with fewer than three
+            matches.
+        rpe_trans_m_per_s: Translational RPE per second, m/s: the error of the motion between the poses of a pair,
+            divided by the time between them. That time is longer than `rpe_delta_s` if poses are sparse or missing.
+            `None` without pairs.
+        rpe_rot_deg_per_s: Rotational RPE per second, degrees/s; `None` without pairs.
+        rpe_pairs: Number of pairs of the RPE per second.
+        rpe_pair_s_median: Median time between the poses of a pair of the RPE per second, seconds; `None` without
+            pairs.
+        rpe_pair_s_min: Shortest time between the poses of a pair of the RPE per second, seconds; `None` without pairs.
+        rpe_pair_s_max: Longest time between the poses of a pair of the RPE per second, seconds; `None` without pairs.
+        rpe_trans_m_per_frame: Translational RPE per frame, meters: the error of the motion from one matched pose to
+            the next, whatever the time between them. `None` with a single match.
+        rpe_rot_deg_per_frame: Rotational RPE per frame, degrees; `None` with a single match.
+        rpe_frame_pairs: Number of pairs of the RPE per frame.
+        rpe_frame_s_median: Median time between the poses of a pair of the RPE per frame, seconds; `None` without
+            pairs.
+        rpe_frame_s_min: Shortest time between the poses of a pair of the RPE per frame, seconds; `None` without pairs.
+        rpe_frame_s_max: Longest time between the poses of a pair of the RPE per frame, seconds; `None` without pairs.
+        kitti_trans_percent: KITTI's `t_rel`, percent: the mean over all segments of the translational error of the
+            motion, divided by the length of the segment. A segment is 100, 200, ... or 800 m of the true path. `None`
+            if the path of the matched poses is too short for any segment. A segment starts at every 10th matched
+            pose; the benchmark starts one at every 10th frame, so gaps leave fewer segments here.
+        kitti_rot_deg_per_100m: KITTI's `r_rel`, degrees per 100 m: the same mean of the rotational error; `None`
+            without segments.
+        kitti_segments: Number of segments of KITTI's figures.
         notes: Reservations about the figures, in words.
-        timestamps_ns: `(m,)` stamps of the matched poses of the estimate, `time_offset_s` included.
-        positions_m: `(m, 3)` their positions, aligned.
-        reference_m: `(m, 3)` the positions they should have.
-        errors_m: `(m,)` the distances.
-        lost_spans_ns: `(k, 2)` begin and end of the times without estimated poses. Where frames are known, each run of
-            frames without a pose, from the last frame that has one to the next that has one, or to the first or last
-            frame of all. Where they are not known, or none has a pose, gaps longer than three times the median interval
-            of the estimate, within the time span of the reference.
+        timestamps_ns: `(m,)` timestamps of the matched poses of the estimate with `time_offset_s` added, nanoseconds.
+        positions_m: `(m, 3)` aligned positions of the matched poses of the estimate, in the frame of the reference,
+            meters.
+        reference_m: `(m, 3)` positions of the matched poses of the reference, meters.
+        errors_m: `(m,)` distances between the two positions of each match, meters.
+        lost_spans_ns: `(k, 2)` start and end of the time spans without estimated poses, nanoseconds, as in `Coverage`.
         T_reference_estimate: `(7,)` alignment, `wxyz_xyz`, applied after the scale.
         scale: Scale applied to the estimate; 1 unless `align` is `sim3`.
     """
@@ -112,28 +121,28 @@ class Evaluation:
     kitti_rot_deg_per_100m: float | None
     kitti_segments: int
     notes: tuple[str, ...]
-    timestamps_ns: np.ndarray
-    positions_m: np.ndarray
-    reference_m: np.ndarray
-    errors_m: np.ndarray
-    lost_spans_ns: np.ndarray
-    T_reference_estimate: np.ndarray
+    timestamps_ns: Timestamps
+    positions_m: Positions
+    reference_m: Positions
+    errors_m: Float64[np.ndarray, " m"]
+    lost_spans_ns: Int[np.ndarray, "k 2"]
+    T_reference_estimate: Pose
     scale: float
 
     @property
     def title(self) -> str:
-        """What was done, in one line."""
+        """One line that names the alignment and the settings."""
         shift = f", {self.time_offset_s:+.5g} s added to the stamps of the estimate" if self.time_offset_s else ""
         return f"ATE w.r.t. translation ({ALIGNMENT_NAMES[self.align]}, gap {self.max_gap_s * 1e3:g} ms{shift})"
 
     @property
     def rpe_spacing(self) -> str:
-        """How many pairs the RPE per second has and how far they are apart, in words."""
+        """Number and time spacing of the pairs of the RPE per second, in words."""
         return spacing(self.rpe_pairs, self.rpe_pair_s_median, self.rpe_pair_s_min, self.rpe_pair_s_max)
 
     @property
     def rpe_frame_spacing(self) -> str:
-        """How many pairs the RPE per frame has and how far they are apart, in words."""
+        """Number and time spacing of the pairs of the RPE per frame, in words."""
         return spacing(self.rpe_frame_pairs, self.rpe_frame_s_median, self.rpe_frame_s_min, self.rpe_frame_s_max)
 
     def summary(self) -> dict[str, Any]:
@@ -176,7 +185,7 @@ class Evaluation:
 
     @property
     def _coverage(self) -> str:
-        """What is known of the coverage, in words."""
+        """The coverage as far as it is known, in words."""
         if self.coverage_percent is not None:
             return f"{self.coverage_percent:.1f} % of {self.num_frames} frames covered"
         unknown = "coverage unknown without the frames of the recording"

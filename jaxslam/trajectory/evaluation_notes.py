@@ -1,4 +1,4 @@
-"""Reservations about the figures of an evaluation, in words, and the likely causes of bad ones."""
+"""Notes of an evaluation: reservations about its figures, and the likely causes of bad ones."""
 
 from typing import NamedTuple
 
@@ -13,21 +13,21 @@ from jaxslam.trajectory.time_offset import TimeOffset, estimate_time_offset
 from jaxslam.trajectory.trajectory import Trajectory
 
 _SAME_FRAME_RAD = 0.05
-"""RPE over a second up to which nobody need wonder about the frames of the bodies."""
+"""RPE per second, radians, up to which the frames of the two bodies are taken as the same."""
 _EXPLAINED = 0.2
-"""Share of the RPE that may remain where a cause is named for it."""
+"""Largest share of the RPE that may remain after correcting a cause for the note to name that cause."""
 _SWAPPED_RATIO = 2.0
-"""From how many times as many poses, at as many times the rate, the estimate looks like ground truth."""
+"""The estimate looks like ground truth if it has this many times as many poses at this many times the rate."""
 _FEW_MATCHED = 0.75
-"""Share of the estimated poses below which a note says how many are matched."""
+"""Share of matched estimated poses below which a note gives their number."""
 _FAR_FROM_DELTA = 0.1
-"""Share of the time asked for by which that of a pair may be longer without a note."""
+"""Share of the requested time by which the time of a pair may be longer without a note."""
 _BRIDGED_INTERVALS = 3.0
 _CLEARLY_BETTER = 0.8
-"""Share of the errors that may remain with a time offset that is worth naming."""
+"""Largest share of the errors that may remain with a time offset for a note to name the offset."""
 _SMALLEST_OFFSET_S = 0.01
 _MIN_ATE = 1e-4
-"""Share of the size of the path below which an ATE is too small to look for a cause of it."""
+"""ATE, as a share of the size of the path, below which no cause is looked for."""
 
 _Wxyz = Float[np.ndarray, "n 4"]
 
@@ -37,7 +37,7 @@ class Matches(NamedTuple):
 
     Attributes:
         estimate: The matched poses of the estimate.
-        true: `(n, 7)` those of the reference, `wxyz_xyz`.
+        true: `(n, 7)` matched poses of the reference, `wxyz_xyz`.
     """
 
     estimate: Trajectory
@@ -45,7 +45,7 @@ class Matches(NamedTuple):
 
 
 def on_counts(estimate: Trajectory, reference: Trajectory, matches: int, max_gap_s: float) -> tuple[str, ...]:
-    """Whether few poses are matched, or the two files look as if one stood for the other."""
+    """Note if few poses are matched, or if the estimate and the reference look swapped."""
     notes: list[str] = []
     if matches < _FEW_MATCHED * len(estimate):
         notes.append(
@@ -56,7 +56,7 @@ def on_counts(estimate: Trajectory, reference: Trajectory, matches: int, max_gap
 
 
 def on_swapped_arguments(estimate: Trajectory, reference: Trajectory) -> tuple[str, ...]:
-    """Whether there are so many more estimated poses than true ones that one file seems to stand for the other."""
+    """Note if there are so many more estimated than true poses that the two files look swapped."""
     intervals = [_median_interval_s(trajectory.timestamps_ns) for trajectory in (estimate, reference)]
     if len(estimate) < _SWAPPED_RATIO * len(reference) or not 0 < _SWAPPED_RATIO * intervals[0] < intervals[1]:
         return ()
@@ -67,7 +67,7 @@ def on_swapped_arguments(estimate: Trajectory, reference: Trajectory) -> tuple[s
 
 
 def on_frames(num_frames: int | None, coverage_percent: float | None, max_gap_s: float) -> tuple[str, ...]:
-    """Whether the frames seem to be those of another recording."""
+    """Note if the frames seem to belong to another recording."""
     if coverage_percent != 0:
         return ()
     return (
@@ -79,13 +79,13 @@ def on_frames(num_frames: int | None, coverage_percent: float | None, max_gap_s:
 def on_pairs(
     later: PosePairs, successive: PosePairs, delta_s: float, frames_ns: Int[np.ndarray, " f"] | None
 ) -> tuple[str, ...]:
-    """Whether pairs of the RPE are further apart than its name says.
+    """Note if the pairs of an RPE are further apart in time than its name says.
 
     Args:
         later: Pairs of the RPE per second.
         successive: Pairs of the RPE per frame.
-        delta_s: The time that was asked for, seconds.
-        frames_ns: Stamps of the frames of the recording, if they are known.
+        delta_s: Requested time between the poses of a pair of the RPE per second, seconds.
+        frames_ns: `(f,)` timestamps of the frames of the recording, nanoseconds; `None` if they are not known.
     """
     notes: list[str] = []
     usual_s, median_s = (pairs.times()["median"] or 0.0 for pairs in (successive, later))
@@ -105,16 +105,16 @@ def on_pairs(
 
 
 def on_rotations(matches: Matches, pairs: PosePairs, error_rad: Float[np.ndarray, " m"]) -> tuple[str, ...]:
-    """What explains large errors of rotation: a swapped order of quaternions, or another body on the camera.
+    """Note the cause of large rotational errors: a swapped order of quaternions, or another body on the camera.
 
-    Bonn RGB-D Dynamic has ground truth of markers on the camera: it turns by the same angles as the camera, about axes
-    that another constant rotation maps to those of the camera. Figures stay those of the poses as given, as in the
-    literature.
+    Bonn RGB-D Dynamic has the ground truth of markers on the camera: they rotate by the same angles as the camera, but
+    about axes that differ from the camera's by a constant rotation. The figures are still computed from the poses as
+    given, as in the literature.
 
     Args:
         matches: The matched poses.
         pairs: Pairs of the RPE per second.
-        error_rad: `(m,)` errors of the rotation of these pairs, radians.
+        error_rad: `(m,)` rotational errors of these pairs, radians.
     """
     rms = _rms(error_rad)
     if rms < _SAME_FRAME_RAD:
@@ -142,13 +142,13 @@ def on_rotations(matches: Matches, pairs: PosePairs, error_rad: Float[np.ndarray
 def on_time_offset(
     estimate: Trajectory, reference: Trajectory, align: AlignmentKind, added_s: float
 ) -> tuple[str, ...]:
-    """Whether a constant offset between the stamps explains much of the errors.
+    """Note if a constant offset between the clocks explains much of the errors.
 
     Args:
-        estimate: The estimated poses, with `added_s` in their stamps.
+        estimate: The estimated poses, with `added_s` added to their timestamps.
         reference: The true poses.
-        align: What is fitted before positions are compared.
-        added_s: What has been added to the stamps of the estimate, seconds.
+        align: Alignment that is fitted before positions are compared.
+        added_s: Time that was added to the timestamps of the estimate, seconds.
     """
     offset = _time_offset(estimate, reference, align)
     if offset is None or abs(offset.seconds) < _SMALLEST_OFFSET_S or not _explains(offset, reference):
@@ -161,7 +161,7 @@ def on_time_offset(
 
 
 def on_doubtful_offset(offset: TimeOffset) -> tuple[str, ...]:
-    """Whether the rotations contradict an offset that was estimated from the positions."""
+    """Note if the rotations contradict an offset that was estimated from the positions."""
     if offset.with_it.turn_rad * _CLEARLY_BETTER <= offset.without_it.turn_rad:
         return ()
     return (
@@ -171,12 +171,12 @@ def on_doubtful_offset(offset: TimeOffset) -> tuple[str, ...]:
 
 
 def why_nothing_matches(estimate: Trajectory, reference: Trajectory, added_s: float) -> str:
-    """The likeliest reason: another unit, another time, or stamps that fall between each other.
+    """Return the likeliest reason why no poses match: another unit, another time, or interleaved timestamps.
 
     Args:
-        estimate: The estimated poses, with `added_s` in their stamps.
+        estimate: The estimated poses, with `added_s` added to their timestamps.
         reference: The true poses.
-        added_s: What has been added to the stamps of the estimate, seconds.
+        added_s: Time that was added to the timestamps of the estimate, seconds.
     """
     estimate_ns, reference_ns = estimate.timestamps_ns, reference.timestamps_ns
     ratio = abs(float(estimate_ns[-1])) / max(abs(float(reference_ns[-1])), 1.0)
@@ -199,7 +199,7 @@ def why_nothing_matches(estimate: Trajectory, reference: Trajectory, added_s: fl
 
 
 def _bridging(pairs: PosePairs, limit_s: float, error: str) -> str:
-    """How many pairs are further apart than a limit, in words; empty if none is."""
+    """Describe the pairs whose poses are further apart in time than a limit; empty if there are none."""
     longer = pairs.seconds[pairs.seconds > limit_s]
     if not len(longer):
         return ""
@@ -216,7 +216,7 @@ def _swapped_order(name: str, remaining: np.ndarray, error_rad: np.ndarray, pair
 
 
 def _time_offset(estimate: Trajectory, reference: Trajectory, align: AlignmentKind) -> TimeOffset | None:
-    """The offset between the stamps; `None` where it cannot be estimated."""
+    """Estimate the offset between the clocks; `None` if it cannot be estimated."""
     try:
         return estimate_time_offset(estimate, reference, align)
     except TrajectoryError:
@@ -224,7 +224,7 @@ def _time_offset(estimate: Trajectory, reference: Trajectory, align: AlignmentKi
 
 
 def _explains(offset: TimeOffset, reference: Trajectory) -> bool:
-    """Whether an offset makes the positions and the rotations agree clearly better, and it matters."""
+    """Return whether an offset clearly reduces the errors of positions and rotations, and the ATE is not negligible."""
     (ate, turn), (ate_without, turn_without) = offset.with_it, offset.without_it
     size = np.sqrt(np.var(reference.positions, axis=0).sum())
     better = ate < _CLEARLY_BETTER * ate_without and turn < _CLEARLY_BETTER * turn_without
@@ -232,12 +232,12 @@ def _explains(offset: TimeOffset, reference: Trajectory) -> bool:
 
 
 def _reordered(wxyz: _Wxyz) -> _Wxyz:
-    """The quaternions that four columns hold if they are qw qx qy qz and were read as qx qy qz qw."""
+    """Reorder quaternions that were read as qx qy qz qw although the file has qw qx qy qz."""
     return wxyz[:, [1, 2, 3, 0]]
 
 
 def _turns(wxyz: _Wxyz, pairs: PosePairs) -> Float[np.ndarray, "m 3"]:
-    """Rotation vectors from the first to the second pose of each pair, in the axes of the first, radians."""
+    """Return the rotation vector from the first to the second pose of each pair, in the frame of the first, radians."""
     inverse = wxyz[pairs.first] * np.array([1.0, -1, -1, -1])
     turned = multiply(inverse, wxyz[pairs.second])
     turned = np.where(turned[:, :1] < 0, -turned, turned)
@@ -246,7 +246,7 @@ def _turns(wxyz: _Wxyz, pairs: PosePairs) -> Float[np.ndarray, "m 3"]:
 
 
 def _differ_about_axes(estimate: _Wxyz, true: _Wxyz, pairs: PosePairs) -> float:
-    """RMS difference of the turns of two bodies, radians, after the constant rotation between their axes that fits."""
+    """Return the RMS difference of the rotation vectors of two bodies after fitting a constant rotation, radians."""
     a, b = _turns(estimate, pairs), _turns(true, pairs)
     U, _, Vt = np.linalg.svd(a.T @ b)
     R = (Vt.T * np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])) @ U.T
@@ -254,11 +254,11 @@ def _differ_about_axes(estimate: _Wxyz, true: _Wxyz, pairs: PosePairs) -> float:
 
 
 def _rms(values: np.ndarray) -> float:
-    """Root of the mean square of numbers, or of the lengths of vectors; 0 if there is none."""
+    """Return the root mean square of numbers or of the lengths of vectors; 0 if there are none."""
     return float(np.sqrt(np.sum(np.square(values)) / max(len(values), 1)))
 
 
 def _median_interval_s(timestamps_ns: Int[np.ndarray, " n"]) -> float:
-    """Median time between different stamps, seconds; 0 with a single one."""
+    """Return the median time between distinct timestamps, seconds; 0 with a single one."""
     intervals = np.diff(np.unique(timestamps_ns))
     return float(np.median(intervals)) * 1e-9 if len(intervals) else 0.0

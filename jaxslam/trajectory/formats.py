@@ -1,4 +1,4 @@
-"""The rows of trajectory files as they stand there: TUM, KITTI, and the ground truth of EuRoC."""
+"""Read the rows of trajectory files: TUM, KITTI, and the ground truth of EuRoC."""
 
 import os
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ PathLike: TypeAlias = str | os.PathLike[str]
 NOT_FINITE = "holds a number that is not finite"
 
 _Rows: TypeAlias = Sequence[tuple[int, list[str]]]
-"""The line number and the words of every line that counts."""
+"""The line number and the words of every line with data."""
 
 _LONGEST_YEARS = 30
 _TUM_COLUMNS, _KITTI_COLUMNS, _EUROC_COLUMNS = 8, 12, 8
@@ -26,14 +26,14 @@ _TUM_COLUMNS, _KITTI_COLUMNS, _EUROC_COLUMNS = 8, 12, 8
 
 @dataclass(frozen=True, eq=False)
 class PoseRows:
-    """The poses of a file in the order of its rows, which need not be that of time.
+    """The poses of a file in the order of its rows, which need not be the order of time.
 
     Attributes:
-        path: The file.
-        kind: Its format.
-        lines: `(n,)` the number of the line each pose stands in, from 1.
-        timestamps_ns: `(n,)` int64 nanoseconds; `None` for KITTI, whose rows have no stamps.
-        T_world_cam: `(n, 7)` `qw qx qy qz x y z`, meters; quaternions as the file has them, not checked.
+        path: Path of the file.
+        kind: Format of the file.
+        lines: `(n,)` line number of each pose, from 1.
+        timestamps_ns: `(n,)` int64 timestamps, nanoseconds; `None` for KITTI, whose rows have no timestamps.
+        T_world_cam: `(n, 7)` `qw qx qy qz x y z`, meters; quaternions are not checked or normalized.
     """
 
     path: Path
@@ -110,7 +110,7 @@ def read_euroc_rows(path: PathLike) -> PoseRows:
 
 
 def read_times(path: PathLike) -> Int[np.ndarray, " n"]:
-    """`(n,)` int64 nanoseconds of a file of one stamp in seconds a line, as KITTI's `times.txt`.
+    """Read a file of one timestamp in seconds per line, such as KITTI's `times.txt`; return `(n,)` int64 nanoseconds.
 
     Raises:
         TrajectoryError: If the file is missing, unreadable or empty, or a line is not one number.
@@ -121,15 +121,15 @@ def read_times(path: PathLike) -> Int[np.ndarray, " n"]:
 
 
 def text_rows(path: PathLike, error: type[JaxSlamError], *, commas: bool = False) -> list[tuple[int, list[str]]]:
-    """The number and the words of every line that is neither empty nor a comment.
+    """Read the number and the words of every line that is neither empty nor a comment.
 
     Args:
-        path: The file.
+        path: Path of the file.
         error: Class of the error to raise.
         commas: Whether words are separated by commas instead of spaces.
 
     Raises:
-        JaxSlamError: Of class `error`, if the file cannot be read.
+        JaxSlamError: An `error`, if the file cannot be read.
     """
     split = (lambda line: [word.strip() for word in line.split(",")]) if commas else str.split
     rows = ((number, split(line)) for number, line in enumerate(_text(path, error).split("\n"), 1))
@@ -151,7 +151,7 @@ def _is_euroc(path: PathLike) -> bool:
 
 
 def _pose_rows(path: PathLike, *, commas: bool = False) -> _Rows:
-    """The lines that count, at least one."""
+    """Read the lines with data, at least one."""
     rows = text_rows(path, TrajectoryError, commas=commas)
     if not rows:
         raise TrajectoryError(f"{path}: holds no poses")
@@ -178,7 +178,7 @@ def _lines(rows: _Rows) -> Int[np.ndarray, " n"]:
 
 
 def _table(path: PathLike, rows: _Rows, columns: int, meaning: str) -> Float[np.ndarray, "n columns"]:
-    """All words as floats, `(n, columns)`."""
+    """Convert all words to floats, `(n, columns)`."""
     values: list[list[float]] = []
     for number, words in rows:
         if len(words) != columns:
@@ -198,7 +198,7 @@ def _table(path: PathLike, rows: _Rows, columns: int, meaning: str) -> Float[np.
 
 
 def _stamps(path: PathLike, rows: _Rows) -> Int[np.ndarray, " n"]:
-    """`(n,)` int64 nanoseconds of the first words."""
+    """Convert the first word of each row, in seconds, to `(n,)` int64 nanoseconds."""
     stamps = np.array([nanoseconds(words[0], f"{path}:{number}", TrajectoryError) for number, words in rows])
     years = np.ptp(stamps / 1e9) / 31_557_600
     if years > _LONGEST_YEARS:

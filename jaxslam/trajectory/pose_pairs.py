@@ -1,4 +1,4 @@
-"""Pairs of poses of a trajectory whose motion is compared, and how far they are apart in time."""
+"""Pairs of poses of one trajectory, over which relative errors are computed."""
 
 from typing import NamedTuple
 
@@ -7,12 +7,12 @@ from jaxtyping import Float, Int
 
 
 class PosePairs(NamedTuple):
-    """Pairs of poses, each with the time between its two.
+    """Pairs of poses of one trajectory.
 
     Attributes:
         first: `(m,)` indices of the earlier poses.
         second: `(m,)` indices of the later poses.
-        seconds: `(m,)` time from the earlier to the later pose, positive.
+        seconds: `(m,)` times from the earlier to the later pose, positive, seconds.
     """
 
     first: Int[np.ndarray, " m"]
@@ -24,21 +24,21 @@ class PosePairs(NamedTuple):
 
     @classmethod
     def later_by(cls, timestamps_ns: Int[np.ndarray, " n"], delta_s: float) -> "PosePairs":
-        """Each pose with the first one at least this much later, where there is one.
+        """Pair each pose with the first pose at least `delta_s` later, if there is one.
 
         Args:
-            timestamps_ns: Stamps of the poses, strictly increasing.
-            delta_s: The least time between the two poses of a pair, seconds.
+            timestamps_ns: `(n,)` timestamps of the poses, strictly increasing, nanoseconds.
+            delta_s: Shortest time between the two poses of a pair, seconds.
         """
         second = np.searchsorted(timestamps_ns, timestamps_ns + round(delta_s * 1e9))
         return cls._of(timestamps_ns, np.flatnonzero(second < len(timestamps_ns)), second)
 
     @classmethod
     def successive(cls, timestamps_ns: Int[np.ndarray, " n"]) -> "PosePairs":
-        """Each pose with the next one.
+        """Pair each pose with the next pose.
 
         Args:
-            timestamps_ns: Stamps of the poses, strictly increasing.
+            timestamps_ns: `(n,)` timestamps of the poses, strictly increasing, nanoseconds.
         """
         index = np.arange(len(timestamps_ns))
         return cls._of(timestamps_ns, index[:-1], index + 1)
@@ -49,23 +49,23 @@ class PosePairs(NamedTuple):
         return cls(first, second, (timestamps_ns[second] - timestamps_ns[first]) * 1e-9)
 
     def rmse_per_second(self, errors: Float[np.ndarray, " m"]) -> float | None:
-        """The RMSE of errors of the pairs, each divided by the time between its two poses; `None` without pairs."""
+        """Compute the RMSE of `(m,)` errors, each divided by the time of its pair; `None` without pairs."""
         return float(np.sqrt(np.mean(np.square(errors / self.seconds)))) if len(self) else None
 
     def times(self) -> dict[str, float | None]:
-        """The `median`, `min` and `max` of the times between two poses of a pair, seconds; `None` without pairs."""
+        """Return the `median`, `min` and `max` of the times of the pairs, seconds; each `None` without pairs."""
         measures = {"median": np.median, "min": np.min, "max": np.max}
         return {name: float(measure(self.seconds)) if len(self) else None for name, measure in measures.items()}
 
 
 def spacing(pairs: int, median_s: float | None, least_s: float | None, most_s: float | None) -> str:
-    """How many pairs there are and how far they are apart, in words.
+    """Describe the number of pairs and the times between their poses.
 
     Args:
-        pairs: How many there are.
-        median_s: Median time between two poses of a pair, seconds; `None` without pairs, as the next two.
-        least_s: The shortest such time, seconds.
-        most_s: The longest such time, seconds.
+        pairs: Number of pairs.
+        median_s: Median time between the two poses of a pair, seconds; `None` without pairs.
+        least_s: Shortest time between the two poses of a pair, seconds; `None` without pairs.
+        most_s: Longest time between the two poses of a pair, seconds; `None` without pairs.
     """
     count = "1 pair" if pairs == 1 else f"{pairs} pairs"
     if median_s is None or least_s is None or most_s is None:

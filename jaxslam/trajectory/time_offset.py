@@ -1,4 +1,4 @@
-"""The constant offset between the clocks of two trajectories, estimated from how the camera moves."""
+"""Estimate the constant offset between the clocks of two trajectories from the motion of the camera."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -12,25 +12,26 @@ from jaxslam.geometry.se3 import angle, between
 from jaxslam.trajectory.trajectory import Trajectory
 
 OFFSET_RANGE_S = 1.0
-"""Offsets are searched up to this many seconds to either side."""
+"""Default largest offset that is tried, in either direction, seconds."""
 
 _FIRST_STEP_S, _LAST_STEP_S = 0.02, 2e-5
-"""Steps of the first and of the last search; each search is ten times as fine as the one before."""
+"""Steps between the offsets of the first and the last search, seconds; each search is ten times finer."""
 _TURN_S = 0.2
-"""The shortest time over which angles are compared: long enough that they exceed the noise of motion capture."""
+"""Shortest time over which rotation angles are compared, seconds: long enough that they exceed the noise of motion
+capture."""
 _MAX_SAMPLES, _FEWEST_SAMPLES = 1000, 10
 _LARGEST_SHARE_OF_TIME = 0.25
 _BRIDGED_INTERVALS = 3.0
-"""Nothing is interpolated between poses that are more than this many median intervals apart."""
+"""Poses more than this many median intervals apart are not interpolated."""
 
 
 class Disagreement(NamedTuple):
-    """How far two trajectories differ with one time offset.
+    """Errors between two trajectories with one time offset.
 
     Attributes:
-        ate_m: The RMSE of the aligned positions, meters. Positions are interpolated.
-        turn_rad: The RMS difference of the angles by which the two turn within 0.2 s, or within one interval of the
-            sparser one if that is longer, radians.
+        ate_m: RMSE of the aligned positions, meters. Positions are interpolated.
+        turn_rad: RMS difference of the angles by which the two trajectories rotate within 0.2 s, or within one
+            interval of the sparser trajectory if that is longer, radians.
     """
 
     ate_m: float
@@ -38,19 +39,24 @@ class Disagreement(NamedTuple):
 
 
 class _Disagreements(NamedTuple):
-    """The same with each of `k` offsets; infinite where too few samples have a partner."""
+    """Errors between two trajectories with each of `k` time offsets; infinite if too few samples have a partner.
+
+    Attributes:
+        ate_m: `(k,)` RMSE of the aligned positions, meters.
+        turn_rad: `(k,)` RMS difference of the rotation angles, radians.
+    """
 
     ate_m: Float[np.ndarray, " k"]
     turn_rad: Float[np.ndarray, " k"]
 
 
 class TimeOffset(NamedTuple):
-    """An offset between two clocks and how well the trajectories agree with and without it.
+    """An offset between two clocks, and the errors with and without it.
 
     Attributes:
-        seconds: The time to add to the stamps of the estimate.
-        with_it: How far the trajectories differ with the offset.
-        without_it: How far they differ without it.
+        seconds: Time to add to the timestamps of the estimate, seconds.
+        with_it: Errors between the trajectories with the offset.
+        without_it: Errors between the trajectories without the offset.
     """
 
     seconds: float
@@ -65,19 +71,19 @@ def estimate_time_offset(
 
     Up to 1000 poses of the trajectory with the longer intervals are compared with the other one, which is interpolated,
     but never across its gaps. Offsets 20 ms apart are tried first, then finer ones around the best, down to 0.02 ms.
-    The angles turned are compared too, as a check: they depend neither on the alignment nor on which body on the camera
-    was tracked, and drift, which an offset may seem to explain, hardly changes them.
+    Rotation angles are compared too, as a check: they depend neither on the alignment nor on the tracked body on the
+    camera, and drift, which an offset can seem to explain, hardly changes them.
 
     Args:
         estimate: Estimated poses.
         reference: True poses.
-        align: What to fit at each offset before positions are compared: `none`, `se3` or `sim3`.
-        range_s: The largest offset to try, seconds. At most a quarter of the time that both trajectories share is
-            tried, so that most poses still have a partner.
+        align: Alignment to fit at each offset before positions are compared: `none`, `se3` or `sim3`.
+        range_s: Largest offset to try, seconds. The range is limited to a quarter of the time that both trajectories
+            share, so that most poses still have a partner.
 
     Raises:
-        TrajectoryError: If the trajectories share too few poses, or if the best offset lies at the end of the range,
-            as it does when positions do not depend on it.
+        TrajectoryError: If the trajectories share too few poses, or if the best offset is at the end of the range, as
+            it is if the positions do not depend on the offset.
     """
     comparison = _Comparison.of(estimate, reference, align)
     limit_s = min(range_s, _LARGEST_SHARE_OF_TIME * _shared_s(estimate, reference))
@@ -101,13 +107,13 @@ def estimate_time_offset(
 
 @dataclass(frozen=True)
 class _Course:
-    """What is compared of a trajectory, over time.
+    """Positions and rotation angles of one trajectory over time.
 
     Attributes:
-        seconds: `(n,)` times, strictly increasing.
-        values: `(n, 4)` positions, meters, and the angle turned from each time to a fixed time later, radians; NaN
-            where there is no pose then.
-        bridged: `(n - 1,)` which steps are gaps.
+        seconds: `(n,)` times, strictly increasing, seconds.
+        values: `(n, 4)` positions (meters) and, in the last column, the angle by which the camera rotates within a
+            fixed time from then on (radians). The angle is NaN if there is no pose at its end.
+        bridged: `(n - 1,)` mask of the intervals that are gaps.
     """
 
     seconds: Float[np.ndarray, " n"]
@@ -116,7 +122,13 @@ class _Course:
 
     @classmethod
     def of(cls, trajectory: Trajectory, base_ns: int, turn_ns: int) -> "_Course":
-        """The course of a trajectory of two poses at least, each stamp once; times are since `base_ns`."""
+        """Compute the course of a trajectory of at least two poses without duplicate timestamps.
+
+        Args:
+            trajectory: The trajectory.
+            base_ns: Time from which `seconds` count, nanoseconds.
+            turn_ns: Time within which the rotation angle is measured, nanoseconds.
+        """
         stamps, later_ns = trajectory.timestamps_ns, trajectory.timestamps_ns + turn_ns
         turned = angle(between(trajectory.T_world_cam, trajectory.at(later_ns).T_world_cam))
         steps = np.diff(stamps)
@@ -128,7 +140,7 @@ class _Course:
         return cls((stamps - base_ns) * 1e-9, np.column_stack([trajectory.positions, turned]), bridged)
 
     def at(self, seconds: Float[np.ndarray, "k m"]) -> Float[np.ndarray, "k m 4"]:
-        """The values at other times, linear between poses; NaN outside and in gaps."""
+        """Interpolate the values linearly at other times; NaN before the first pose, after the last, and in gaps."""
         after = np.clip(np.searchsorted(self.seconds, seconds), 1, len(self.seconds) - 1)
         start, end = self.seconds[after - 1], self.seconds[after]
         share = ((seconds - start) / (end - start))[..., None]
@@ -139,14 +151,14 @@ class _Course:
 
 @dataclass(frozen=True)
 class _Comparison:
-    """Samples of the sparser of two trajectories beside the other one, which is interpolated.
+    """Samples of the sparser of two trajectories, and the course of the other one, which is interpolated.
 
     Attributes:
-        seconds: `(n,)` times of the samples.
-        values: `(n, 4)` what is compared at these times, as in `_Course`.
-        other: The course that is interpolated.
-        samples_are_true: Whether the samples are of the reference and the estimate is interpolated.
-        align: What to fit.
+        seconds: `(n,)` times of the samples, seconds.
+        values: `(n, 4)` positions and rotation angles of the samples, as in `_Course`.
+        other: Course of the trajectory that is interpolated.
+        samples_are_true: Whether the samples are from the reference and the estimate is interpolated.
+        align: Alignment to fit at each offset.
     """
 
     seconds: Float[np.ndarray, " n"]
@@ -157,7 +169,11 @@ class _Comparison:
 
     @classmethod
     def of(cls, estimate: Trajectory, reference: Trajectory, align: AlignmentKind) -> "_Comparison":
-        """Choose the samples."""
+        """Choose the samples from the sparser trajectory.
+
+        Raises:
+            TrajectoryError: If a trajectory has a single pose.
+        """
         pair = [t.select(np.unique(t.timestamps_ns, return_index=True)[1]) for t in (estimate, reference)]
         if min(len(trajectory) for trajectory in pair) < 2:
             raise TrajectoryError("the time offset cannot be estimated: a single pose does not move")
@@ -170,7 +186,7 @@ class _Comparison:
         return cls(samples.seconds[chosen], samples.values[chosen], other, samples_are_true, align)
 
     def at(self, offsets_s: Float[np.ndarray, " k"]) -> _Disagreements:
-        """Both errors with each offset."""
+        """Compute both errors with each of `(k,)` offsets, seconds."""
         sign = -1.0 if self.samples_are_true else 1.0
         other = self.other.at(self.seconds[None] + sign * offsets_s[:, None])
         known = np.isfinite(other[..., 0])
@@ -184,7 +200,7 @@ class _Comparison:
 
 
 def _rms(values: Float[np.ndarray, "k n"]) -> Float[np.ndarray, " k"]:
-    """The root of the mean square along the rows, of what is finite in them; 0 if nothing is."""
+    """Return the root mean square of the finite values of each row; 0 for a row without finite values."""
     finite = np.isfinite(values)
     return np.sqrt(np.sum(np.where(finite, values, 0.0) ** 2, axis=1) / np.maximum(finite.sum(axis=1), 1))
 
@@ -200,7 +216,7 @@ def _aligned_rmse(
     known: Bool[np.ndarray, "k n"],
     align: AlignmentKind,
 ) -> Float[np.ndarray, " k"]:
-    """The RMSE after the best alignment, which itself is not computed (Umeyama, PAMI 1991, eq. 33)."""
+    """Compute the RMSE after the best alignment without computing the alignment (Umeyama, PAMI 1991, eq. 33)."""
     weights = known / np.maximum(known.sum(axis=1, keepdims=True), 1)
     if align == "none":
         return np.sqrt(np.sum(weights * np.sum((estimate - reference) ** 2, axis=2), axis=1))

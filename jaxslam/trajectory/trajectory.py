@@ -1,14 +1,15 @@
-"""Trajectories: poses over time, matched by time, read from and written to the files of the field."""
+"""Trajectories: timestamped poses, their association by time, and reading and writing TUM, KITTI and EuRoC files."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from jaxslam.errors import TrajectoryError
 from jaxslam.geometry.se3 import between
 from jaxslam.geometry.so3 import matrices, slerp
+from jaxslam.geometry.types import Poses, Positions, Timestamps
 from jaxslam.io.atomic_files import write_atomically
 from jaxslam.io.timestamps import decimal_seconds
 from jaxslam.trajectory.formats import (
@@ -27,19 +28,19 @@ _KITTI_RATE_HZ = 10.0
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Camera poses in the world in the order of time. Arrays are copied and read-only.
+    """Camera poses in the world in the order of time; its arrays are read-only copies.
 
     Attributes:
-        timestamps_ns: `(n,)` int64 nanoseconds, never decreasing.
+        timestamps_ns: `(n,)` int64 timestamps, never decreasing, nanoseconds.
         T_world_cam: `(n, 7)` float64 `qw qx qy qz x y z` (jaxlie's order), meters; quaternions of unit length.
-            Given quaternions may be up to 5 % off and are normalized.
+            Quaternions are normalized; the length of a given one may differ from 1 by up to 5 %.
 
     Raises:
         TrajectoryError: If a shape, a type, a number, a quaternion or the order of time is wrong.
     """
 
-    timestamps_ns: np.ndarray
-    T_world_cam: np.ndarray
+    timestamps_ns: Timestamps
+    T_world_cam: Poses
 
     def __post_init__(self) -> None:
         stamps, poses = np.array(self.timestamps_ns), np.array(self.T_world_cam, np.float64)
@@ -61,25 +62,30 @@ class Trajectory:
         return len(self.timestamps_ns)
 
     @property
-    def positions(self) -> np.ndarray:
+    def positions(self) -> Positions:
         """`(n, 3)` positions of the camera in the world, meters."""
         return self.T_world_cam[:, 4:]
 
-    def select(self, index: np.ndarray) -> "Trajectory":
-        """The poses at these indices, or where this mask is true."""
+    def select(self, index: Int[np.ndarray, " k"] | Bool[np.ndarray, " n"]) -> "Trajectory":
+        """Select the poses at some indices, or where a mask is true."""
         return Trajectory(self.timestamps_ns[index], self.T_world_cam[index])
 
     def shifted(self, seconds: float) -> "Trajectory":
-        """The same poses with this time added to their stamps, seconds; rounded to nanoseconds."""
+        """Add a time in seconds, rounded to nanoseconds, to all timestamps."""
         if not seconds:
             return self  # quaternions normalized once more would differ in the last digit
         return Trajectory(self.timestamps_ns + round(seconds * 1e9), self.T_world_cam)
 
-    def at(self, timestamps_ns: np.ndarray) -> "Trajectory":
-        """Poses at other times: linear in position, spherical in rotation, held before the first and after the last.
+    def at(self, timestamps_ns: Int[np.ndarray, " m"]) -> "Trajectory":
+        """Interpolate the poses at other times: positions linearly, rotations by slerp.
+
+        Times before the first pose get the first pose, and times after the last pose get the last one.
+
+        Args:
+            timestamps_ns: `(m,)` times in increasing order, nanoseconds.
 
         Raises:
-            TrajectoryError: If there is no pose at all.
+            TrajectoryError: If the trajectory is empty.
         """
         if not len(self):
             raise TrajectoryError("no pose to interpolate: the trajectory is empty")
@@ -94,20 +100,22 @@ class Trajectory:
         return Trajectory(timestamps_ns, np.hstack([slerp(first[:, :4], second[:, :4], share), positions]))
 
 
-def associate(first_ns: np.ndarray, second_ns: np.ndarray, max_gap_s: float = 0.02) -> tuple[np.ndarray, np.ndarray]:
-    """Match stamps of two clocks that agree: nearest first, one to one, never interpolated.
+def associate(
+    first_ns: Int[np.ndarray, " n"], second_ns: Int[np.ndarray, " m"], max_gap_s: float = 0.02
+) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+    """Match the timestamps of two synchronized clocks one to one, nearest first.
 
     The pair with the smallest gap is matched, then the smallest among the rest, and so on, as in `associate.py` of
-    the TUM benchmark. Of two equal gaps at one stamp, the one where the first list's stamp is the earlier wins; of
-    equal stamps in one list only the first can be matched. A few passes of `O(n)` after sorting.
+    the TUM benchmark. Of two equal gaps at one timestamp, the one wins whose timestamp from the first list is earlier.
+    Of equal timestamps in one list only the first can be matched. Takes a few `O(n)` passes after sorting.
 
     Args:
-        first_ns: `(n,)` int64 nanoseconds, in any order.
-        second_ns: `(m,)` int64 nanoseconds, in any order.
+        first_ns: `(n,)` timestamps in any order, nanoseconds.
+        second_ns: `(m,)` timestamps in any order, nanoseconds.
         max_gap_s: Largest gap that counts as the same time, seconds.
 
     Returns:
-        Indices into the first and into the second list, `(k,)` each, in the order of time.
+        `(k,)` indices into the first list and `(k,)` indices into the second list, in the order of time.
     """
     (stamps_1, index_1), (stamps_2, index_2) = (np.unique(s, return_index=True) for s in (first_ns, second_ns))
     stamps = np.concatenate([stamps_1, stamps_2]).astype(np.int64)
@@ -143,7 +151,7 @@ def read(path: PathLike) -> Trajectory:
 def read_tum(path: PathLike) -> Trajectory:
     """Read `timestamp tx ty tz qx qy qz qw` rows: seconds, meters, `T_world_cam`; `#` begins a comment.
 
-    Stamps are read as exact decimals, not as floats, which would round epoch seconds to 0.2 microseconds.
+    Timestamps are read as exact decimals, not as floats, which would round epoch seconds to 0.2 microseconds.
 
     Raises:
         TrajectoryError: If the file is missing or unreadable, or a row is wrong; the message names file and line.
@@ -152,11 +160,12 @@ def read_tum(path: PathLike) -> Trajectory:
 
 
 def read_kitti(path: PathLike, times: PathLike | None = None) -> Trajectory:
-    """Read rows of the upper 3 x 4 of `T_world_cam`, row-major, one a frame.
+    """Read rows of the upper 3 x 4 matrix of `T_world_cam`, row-major, one row per frame.
 
     Args:
         path: The file of poses. Matrices are replaced by the nearest rotations.
-        times: A file of one stamp in seconds a row, as KITTI's `times.txt`; without it frames are 0.1 s apart.
+        times: A file of one timestamp in seconds per row, such as KITTI's `times.txt`. Without it frames are 0.1 s
+            apart.
 
     Raises:
         TrajectoryError: If a file is missing or unreadable, a row is wrong, or the files differ in length.
@@ -171,7 +180,7 @@ def read_kitti(path: PathLike, times: PathLike | None = None) -> Trajectory:
 
 
 def read_euroc(path: PathLike) -> Trajectory:
-    """Read the ground truth of EuRoC, `nanoseconds, x, y, z, qw, qx, qy, qz, ...`: poses of the body, the IMU.
+    """Read the ground truth of EuRoC, `nanoseconds, x, y, z, qw, qx, qy, qz, ...`: poses of the IMU, not of a camera.
 
     Raises:
         TrajectoryError: If the file is missing or unreadable, or a row is wrong; the message names file and line.
@@ -180,12 +189,12 @@ def read_euroc(path: PathLike) -> Trajectory:
 
 
 def of_rows(rows: PoseRows, timestamps_ns: Int[np.ndarray, " n"] | None = None) -> Trajectory:
-    """The trajectory that the rows of a file hold, which must be in the order of time.
+    """Convert the rows of a file, which must be in the order of time, to a trajectory.
 
     Args:
-        rows: What the file holds.
-        timestamps_ns: The stamps of the rows, nanoseconds. By default those of the file, and for KITTI, which has none,
-            0.1 s apart.
+        rows: Rows of the file.
+        timestamps_ns: `(n,)` timestamps of the rows, nanoseconds. By default they are the timestamps of the file; for
+            KITTI, which has none, they are 0.1 s apart.
 
     Raises:
         TrajectoryError: If a row cannot be right; the message names file and line.
@@ -212,18 +221,18 @@ def write_tum(path: PathLike, trajectory: Trajectory) -> None:
     write_atomically(path, "".join(lines).encode(), TrajectoryError)
 
 
-def write_kitti(path: PathLike, trajectory: Trajectory, frames_ns: np.ndarray | None = None) -> int:
-    """Write rows of the upper 3 x 4 of `T_world_cam`, one a frame; the file appears whole or not at all.
+def write_kitti(path: PathLike, trajectory: Trajectory, frames_ns: Int[np.ndarray, " m"] | None = None) -> int:
+    """Write rows of the upper 3 x 4 matrix of `T_world_cam`, one per frame; the file appears whole or not at all.
 
-    The format has no stamps, so a frame without a pose needs a row too: its pose is interpolated (`Trajectory.at`).
+    The format has no timestamps, so a frame without a pose needs a row too: its pose is interpolated (`Trajectory.at`).
 
     Args:
-        path: Where to write.
-        trajectory: The poses, written as they are; KITTI's own begin with the identity.
-        frames_ns: `(m,)` stamps of all frames; by default those of the trajectory.
+        path: Path of the file to write.
+        trajectory: The poses, written as they are. KITTI's own files start with the identity.
+        frames_ns: `(m,)` timestamps of all frames, nanoseconds; by default the timestamps of the trajectory.
 
     Returns:
-        How many rows were filled in by interpolation.
+        Number of interpolated rows.
 
     Raises:
         TrajectoryError: If the file cannot be written, or frames are given and there is no pose.
@@ -238,19 +247,20 @@ def write_kitti(path: PathLike, trajectory: Trajectory, frames_ns: np.ndarray | 
     return filled
 
 
-def write_kitti_frames(path: PathLike, trajectory: Trajectory, frames_ns: np.ndarray) -> int:
-    """Write what KITTI's development kit reads: a row for every frame, in the axes of the first.
+def write_kitti_frames(path: PathLike, trajectory: Trajectory, frames_ns: Int[np.ndarray, " m"]) -> int:
+    """Write the file that KITTI's development kit reads: a row for every frame, relative to the first frame.
 
-    A frame without a pose of its own (lost, rejected, dropped) has the one before it, and those before the first pose
-    have that: what a robot would have known then. Nothing is interpolated, which would make losses look smaller.
+    A frame without a pose of its own (lost, rejected, dropped) gets the pose before it, which is what a robot would
+    have known then. Frames before the first pose get the first pose. No pose is interpolated, because that would make
+    tracking losses look smaller.
 
     Args:
-        path: Where to write.
+        path: Path of the file to write.
         trajectory: The poses.
-        frames_ns: `(m,)` stamps of all frames, in the order of time.
+        frames_ns: `(m,)` timestamps of all frames in increasing order, nanoseconds.
 
     Returns:
-        How many rows were filled in.
+        Number of rows that repeat another frame's pose.
 
     Raises:
         TrajectoryError: If the file cannot be written, or there is no pose.
@@ -265,7 +275,7 @@ def write_kitti_frames(path: PathLike, trajectory: Trajectory, frames_ns: np.nda
 
 
 def _first_problem(stamps: np.ndarray, poses: np.ndarray) -> tuple[int, str] | None:
-    """Index and description of the first pose that cannot be right."""
+    """Return the index and a description of the first invalid pose; `None` if all are valid."""
     off = np.abs(np.linalg.norm(poses[:, :4], axis=1) - 1)
     checks = (
         (~np.isfinite(poses).all(axis=1), NOT_FINITE),
@@ -277,10 +287,10 @@ def _first_problem(stamps: np.ndarray, poses: np.ndarray) -> tuple[int, str] | N
 
 
 def _mutually_nearest(stamps: np.ndarray, second: np.ndarray, limit: int) -> np.ndarray:
-    """Which neighbors in a sorted list are each other's nearest of the other kind; `(n - 1,)`.
+    """Return the `(n - 1,)` mask of neighbors in a sorted list that are each other's nearest from the other list.
 
-    These pairs the greedy matching takes whatever becomes of the rest. The two gaps at one stamp never tie, because
-    the key also holds which list's stamp is the earlier.
+    The greedy matching takes these pairs whatever becomes of the rest. The two gaps at one timestamp never tie, because
+    the key also holds which list's timestamp is earlier.
     """
     nodes, none = np.arange(len(stamps)), np.iinfo(np.int64).max
     previous = np.where(second, _last_true(~second), _last_true(second))
@@ -292,7 +302,7 @@ def _mutually_nearest(stamps: np.ndarray, second: np.ndarray, limit: int) -> np.
 
 
 def _last_true(flags: np.ndarray) -> np.ndarray:
-    """At each place, where the last true flag up to there is; -1 if there is none."""
+    """Return, for each index, the index of the last true flag up to it; -1 if there is none."""
     return np.maximum.accumulate(np.where(flags, np.arange(len(flags)), -1))
 
 
