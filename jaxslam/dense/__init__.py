@@ -1,4 +1,4 @@
-"""The dense map: colored points of what stands still, and where space is free."""
+"""Dense map: a colored point cloud of the static scene, and its occupancy grid."""
 
 import lazy_loader
 

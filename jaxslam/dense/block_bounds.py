@@ -1,41 +1,58 @@
-"""Where in space the rows of a grid are, block by block, so that those out of view need no look."""
+"""Bounding boxes of the blocks of a voxel grid, so that blocks out of view are skipped."""
 
 import numpy as np
 from jaxtyping import Float32, Int, Int32
 
 from jaxslam.dense.depth_view import DepthView
 from jaxslam.geometry.se3 import to_local
+from jaxslam.geometry.types import Pose
 
 
 class RowBoxes:
-    """A box around the voxels of each block of rows.
+    """A bounding box of the voxels of each block of rows.
 
-    Rows are given in the order in which voxels are first seen, so that those of a block lie together.
+    Rows are assigned in the order in which voxels are first seen, so the voxels of a block are close together.
     """
 
     def __init__(self, capacity: int, block: int) -> None:
-        """Of a grid of so many rows, without any."""
+        """Create empty boxes.
+
+        Args:
+            capacity: Number of rows of the grid.
+            block: Number of rows of a block.
+        """
         self._block = min(block, capacity)
         count = -(-capacity // self._block)
         self._low, self._high = (np.full((3, count), fill, np.float32) for fill in (np.inf, -np.inf))
 
     def __len__(self) -> int:
-        """Blocks."""
+        """Return the number of blocks."""
         return self._low.shape[1]
 
     def add(self, rows: Int[np.ndarray, " n"], X_world: Float32[np.ndarray, "3 n"]) -> None:
-        """Take in new rows by a point in the voxel of each."""
+        """Extend the boxes by new rows.
+
+        Args:
+            rows: `(n,)` row numbers.
+            X_world: `(3, n)` a point in the voxel of each row, meters.
+        """
         block = rows // self._block
         for axis, x in enumerate(X_world):
             np.minimum.at(self._low[axis], block, x)
             np.maximum.at(self._high[axis], block, x)
 
     def clear(self) -> None:
-        """Forget all."""
+        """Reset all boxes to empty."""
         self._low[:], self._high[:] = np.inf, -np.inf
 
-    def in_view(self, T_world_cam: np.ndarray, view: DepthView, voxel_m: float) -> Int32[np.ndarray, " b"]:
-        """Blocks of which a camera may see something, up to the farthest depth believed."""
+    def in_view(self, T_world_cam: Pose, view: DepthView, voxel_m: float) -> Int32[np.ndarray, " b"]:
+        """Return the blocks that a camera may see some of, up to the farthest valid depth.
+
+        Args:
+            T_world_cam: `(7,)` pose of the camera.
+            view: Pixels and range of the camera.
+            voxel_m: Side of a voxel, meters.
+        """
         used = np.flatnonzero(self._low[0] <= self._high[0])
         low, high = self._low[:, used] - voxel_m, self._high[:, used] + voxel_m
         corners = np.stack([np.where(np.array(at)[:, None], high, low) for at in np.ndindex(2, 2, 2)], axis=1)

@@ -1,8 +1,8 @@
-"""How much of what a frame sees is in the picture of a keyframe.
+"""Share of a frame's view that keyframes cover, from which keyframes for the dense map are chosen.
 
-The tracker counts points: while it sees all those of its keyframes, it makes no other one, however much has come into
-the picture beside them. A camera that draws back sees twice as much and has no new keyframe, and the dense map nothing
-of it: of a room that was backed away from for two seconds it had 84 % instead of 99 %.
+The tracker decides by counting points: while it sees the points of its keyframes, it makes no new keyframe, even if
+much else has come into view. A camera that moves backward may see twice as much without a new keyframe, and the dense
+map gets none of it: after backing away from a room for two seconds it held 84 % of the room instead of 99 %.
 """
 
 from collections import deque
@@ -15,23 +15,23 @@ from jaxslam.geometry.se3 import between, transform
 from jaxslam.sensors.camera import Camera
 
 _COLUMNS = 32
-"""Of pixels that are looked at."""
+"""Columns of the pixel grid that is checked."""
 _MAX = 32
-"""Keyframes, the newest ones; a place that was seen before those is seen anew."""
+"""Number of the newest keyframes that count; a place seen only before them counts as not covered."""
 _MIN_PIXELS = 24
-"""With depth; with fewer, nothing is said."""
+"""Fewest pixels with valid depth for an answer."""
 
 
 class SeenArea:
-    """The places of keyframes, and how much of a frame they show. What hides behind something counts as shown."""
+    """The poses of the newest keyframes, and the share of a frame that they cover; occluded points count as covered."""
 
     def __init__(self, camera: Camera, nearest_m: float, farthest_m: float) -> None:
-        """Begin without keyframes.
+        """Start without keyframes.
 
         Args:
-            camera: That takes the frames.
-            nearest_m: Nearest depth believed.
-            farthest_m: Farthest.
+            camera: Camera of the frames.
+            nearest_m: Smallest valid depth, meters.
+            farthest_m: Largest valid depth, meters.
         """
         self._view = DepthView(camera, max(1, camera.width // _COLUMNS), farthest_m, nearest_m)
         half = 0.5 / np.array([self._view.intrinsics.fx, self._view.intrinsics.fy], np.float64)
@@ -39,18 +39,18 @@ class SeenArea:
         self._keyframes: deque[np.ndarray] = deque(maxlen=_MAX)
 
     def add(self, T_world_cam: Float[np.ndarray, "7"]) -> None:
-        """Take in the pose of a keyframe."""
+        """Add the `(7,)` pose of a keyframe."""
         self._keyframes.append(T_world_cam)
 
     def share(
         self, depth: Float[np.ndarray, "h w"], ignore: Bool[np.ndarray, "h w"], T_world_cam: Float[np.ndarray, "7"]
     ) -> float:
-        """How much of a frame any of the keyframes shows, 0 to 1; 1 where there is too little depth to say.
+        """Return the share of a frame that any of the keyframes covers, 0 to 1; 1 if too few pixels have valid depth.
 
         Args:
-            depth: Meters; 0 where missing.
-            ignore: Where something moves or may.
-            T_world_cam: Where the frame was taken.
+            depth: `(h, w)` depth image, meters; 0 where depth is missing.
+            ignore: `(h, w)` mask of the pixels that are dynamic or may be.
+            T_world_cam: `(7,)` pose of the frame.
         """
         small = np.ascontiguousarray(self._view.every(depth), np.float32)
         usable = np.flatnonzero(self._view.is_believed(small, self._view.every(ignore)))

@@ -1,7 +1,7 @@
-"""The dense map: what keyframes see is put in, and moved when they are; what is seen past is not there any more.
+"""Dense map: the depth of keyframes in voxels that move with corrections and are carved by later depth images.
 
-Memory is bounded by the settings: the grids have a fixed size, and what is kept of keyframes is dropped oldest first.
-Not safe to be used from several threads at once.
+Memory is bounded by the settings: the grids have a fixed size, and the stored keyframes are dropped oldest first.
+Not thread-safe.
 """
 
 from typing import NamedTuple
@@ -27,29 +27,30 @@ from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.stereo_depth import DenseDepth
 
 _VOXELS_DEEP = 300
-"""Voxels from the camera to the farthest depth believed, if the settings do not give their side."""
+"""Number of voxels from the camera to the farthest valid depth, if the settings do not give the side of a voxel."""
 _CELL_VOXELS = 2.5
+"""Side of an occupancy cell, in voxels, if the settings do not give it."""
 _KEY_SHARE = 0.25
-"""Side of the voxels of key objects, in others."""
+"""Side of the voxels of key objects, as a share of the side of other voxels."""
 _MIN_MOVE_VOXELS = 0.25
-"""A keyframe that moves a point by less, two meters away, stays where it is."""
+"""Smallest correction of a keyframe that moves its points: the displacement of a point two meters away, in voxels."""
 _NUM_LOOKS = 4
-"""Earlier keyframes that new points are compared with."""
+"""Number of earlier keyframes that new points are compared with."""
 _KEY_POINTS = 131_072
-"""Points of key objects in a keyframe and its neighbors, at most."""
+"""Largest number of points of key objects in a keyframe and its neighbors."""
 
 
 class DenseKeyframe(NamedTuple):
-    """A keyframe and what it sees, copied.
+    """The images of one keyframe, copied.
 
     Attributes:
-        keyframe: Its id.
-        image: `(h, w, 3)` RGB or `(h, w)`.
-        depth: `(h, w)` meters; of a pair rough.
-        pair: Left and right image, gray, of a pair.
-        ignore: `(h, w)` where something moves or may.
-        T_cam_depth: `(7,)` from where depth was taken, seen from where the image was.
-        neighbors: Frames before.
+        keyframe: Id of the keyframe.
+        image: `(h, w, 3)` RGB or `(h, w)` gray image.
+        depth: `(h, w)` depth image, meters; rough for a stereo pair.
+        pair: Left and right gray images of a stereo pair; `None` for a depth camera.
+        ignore: `(h, w)` mask of the pixels that are dynamic or may be.
+        T_cam_depth: `(7,)` transform from the camera at the time of the depth to the camera at the time of the image.
+        neighbors: Frames shortly before the keyframe.
     """
 
     keyframe: int
@@ -62,12 +63,12 @@ class DenseKeyframe(NamedTuple):
 
 
 class DepthGlance(NamedTuple):
-    """What a frame between keyframes sees, at the size of what is kept.
+    """The reduced depth image of a frame between keyframes.
 
     Attributes:
-        depth: `(h, w)` meters.
-        ignore: `(h, w)` where something moves or may.
-        T_world_cam: `(7,)` where depth was taken.
+        depth: `(h, w)` depth at the size of stored keyframes, meters.
+        ignore: `(h, w)` mask of the pixels that are dynamic or may be.
+        T_world_cam: `(7,)` pose of the camera at the time of the depth.
     """
 
     depth: np.ndarray
@@ -76,15 +77,15 @@ class DepthGlance(NamedTuple):
 
 
 class DenseFigures(NamedTuple):
-    """How the map was made.
+    """Statistics of a dense map.
 
     Attributes:
-        keyframes: Put in.
-        passed_over: Keyframes that were never looked at, because too many waited.
-        frozen: Keyframes that are forgotten, whose points move no more.
-        moved: Times that the points of a keyframe were moved with it.
-        coarsened: Times that voxels became twice as large.
-        measured: Pixels with depth to be believed in all keyframes put in, and in all parts of neighbors.
+        keyframes: Number of keyframes added.
+        passed_over: Number of keyframes skipped because too many waited.
+        frozen: Number of keyframes dropped from memory, whose points no longer move with corrections.
+        moved: Number of times that the points of a keyframe were moved with it.
+        coarsened: Number of times that the side of the voxels was doubled.
+        measured: Number of pixels with valid depth in all added keyframes, and of points from their neighbors.
         working_mb: Memory in use, megabytes.
     """
 
@@ -98,11 +99,11 @@ class DenseFigures(NamedTuple):
 
 
 class DenseMap:
-    """Points of keyframes, in voxels, at the poses that the sparse map gives the keyframes.
+    """The points of keyframes in voxels, at the poses that the sparse map gives the keyframes.
 
     Attributes:
-        sparse: Where keyframes are; to be replaced when they have moved.
-        has_keys: Whether key objects are kept at full density.
+        sparse: The sparse map with the poses of the keyframes; the owner replaces it after a correction.
+        has_keys: Whether key objects are stored at full density.
     """
 
     def __init__(
@@ -115,15 +116,15 @@ class DenseMap:
         key_detector: Detector | None = None,
         times: StageTimes | None = None,
     ) -> None:
-        """Begin empty.
+        """Create an empty map.
 
         Args:
-            camera: That takes the frames.
-            config: Settings.
-            nearest_m: Nearest depth believed.
-            farthest_m: Farthest.
-            key_detector: Finds key objects.
-            times: Where to keep how long it takes.
+            camera: Camera of the frames.
+            config: Settings of the dense map.
+            nearest_m: Smallest valid depth, meters.
+            farthest_m: Largest valid depth, meters.
+            key_detector: Detector of key objects; `None` for a map without key objects.
+            times: Record of the stage durations.
         """
         self.sparse: Map | None = None
         self._config, self._farthest_m, self._times = config, farthest_m, times or StageTimes()
@@ -146,16 +147,16 @@ class DenseMap:
         self._put = self._frozen = self._moved = self._measured = 0
 
     def compile(self) -> None:
-        """Compile all that is needed."""
+        """Compile all programs of the dense map."""
         for layer in self._layers:
             layer.compile(self._view, self._small, _NUM_LOOKS)
 
     def look_of(self, depth: np.ndarray, ignore: np.ndarray, T_world_cam: np.ndarray) -> DepthGlance:
-        """What `look` needs of a whole depth image, copied; from any thread."""
+        """Reduce a whole depth image to the copy that `look` needs; callable from any thread."""
         return DepthGlance(self._small.every(depth).copy(), self._small.every(ignore).copy(), T_world_cam)
 
     def add(self, shown: DenseKeyframe) -> None:
-        """Put in what a keyframe sees."""
+        """Add the points of a keyframe."""
         whole, watch = shown.depth, self._times.stopwatch()
         if shown.pair is not None and self._stereo is not None:
             whole = self._stereo.of(*shown.pair)
@@ -181,13 +182,13 @@ class DenseMap:
             self._add_keys(self._keys, shown, whole, depth, poses, watch)
 
     def look(self, seen: DepthGlance) -> None:
-        """Take in what a frame between keyframes sees past."""
+        """Update the voxels with a frame between keyframes: carve the voxels that it sees through."""
         watch = self._times.stopwatch()
         self._see_past(self._small.cleaned(seen.depth, seen.ignore), seen.T_world_cam, self._small)
         watch.ends("dense: look")
 
     def remove(self, movers: DynamicObservations) -> None:
-        """Take out what a keyframe shows under a mask that has come late."""
+        """Remove the points of a keyframe under a mask that arrived after the keyframe was added."""
         if not self._kept.remove_under(movers.keyframe, movers.mask):
             return
         for layer in self._layers:
@@ -197,31 +198,31 @@ class DenseMap:
                 layer.take_out(movers.keyframe, self._view.under(movers.mask, X_cam))
 
     def correct(self) -> None:
-        """Move the points of some keyframes that have moved, those that have moved by most."""
+        """Move the points of the few keyframes whose poses have changed most."""
         self._move(self._kept.poses(self.sparse), self._config.corrections)
 
     def correct_all(self) -> None:
-        """Move the points of all keyframes to where the sparse map has them."""
+        """Move the points of all keyframes to the poses of the sparse map."""
         poses = self._kept.poses(self.sparse)
         while self._move(poses, len(poses)):
-            pass  # voxels may have become larger
+            pass  # moving may have coarsened the voxels
 
     def cloud(self) -> DenseCloud:
-        """The points as they are now, in the submap with most keyframes."""
+        """Return the current points in the submap with most keyframes."""
         shown = [layer.shown() for layer in self._layers]
         points, colors, counts = (np.concatenate(column) for column in zip(*shown, strict=True))
         is_key = np.arange(len(points)) >= len(shown[0][0])
         return DenseCloud(points, colors, counts, is_key, self._layer.voxel_m)
 
     def depths(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Depth of the keyframes that are kept, and where it was taken, for `cells`."""
+        """Return the stored depth images of keyframes and their poses, the input of `cells`."""
         return self._kept.shown(self._kept.poses(self.sparse))
 
     def cells(self, depths: list[np.ndarray], poses: list[np.ndarray]) -> Occupancy:
-        """What is occupied and free, by depth images and their poses; from any thread.
+        """Compute the occupancy grid from depth images and their poses; callable from any thread.
 
         Raises:
-            MapFileError: If there is none yet.
+            MapFileError: If there are no depth images.
         """
         if not depths:
             raise MapFileError("octree: expected at least one keyframe with depth in the dense map, got none")
@@ -229,11 +230,11 @@ class DenseMap:
 
     @property
     def sees_anything(self) -> bool:
-        """Whether a keyframe that is kept has depth."""
+        """Whether a stored keyframe has valid depth."""
         return self._kept.any_seen(self._kept.poses(self.sparse))
 
     def figures(self, passed_over: int) -> DenseFigures:
-        """How the map was made so far; so many keyframes were never given to it."""
+        """Return the statistics so far; `passed_over` keyframes were never given to the map."""
         return DenseFigures(
             keyframes=self._put,
             passed_over=passed_over,
@@ -245,7 +246,7 @@ class DenseMap:
         )
 
     def _put_in(self, layer: VoxelLayer, keyframe: int, part: VoxelPart, poses: Poses, watch: Stopwatch) -> None:
-        """Put the points of a keyframe into a layer."""
+        """Add the points of a keyframe to a layer."""
         pose, past = poses[keyframe], None
         if pose is None:
             layer.parts[keyframe] = part
@@ -259,13 +260,13 @@ class DenseMap:
         watch.ends("dense: put in")
 
     def _see_past(self, depth: np.ndarray, pose: np.ndarray, view: DepthView) -> None:
-        """Take in which voxels of all layers a depth image sees again, and which it sees past."""
+        """Update the voxels of all layers with a depth image: confirm or carve the voxels in view."""
         looks = view.looks(depth)
         for layer in self._layers:
             layer.look(looks, pose, view)
 
     def _num_believed(self, depth: np.ndarray, ignore: np.ndarray) -> int:
-        """Pixels of a whole depth image that a map without voxels would hold."""
+        """Count the pixels with valid depth in a whole depth image: the points of a map without voxels."""
         good = cv2.inRange(depth, np.array([1e-6]), np.array([self._farthest_m])).view(bool)
         return int(np.count_nonzero(good & ~ignore))
 
@@ -278,7 +279,7 @@ class DenseMap:
         poses: Poses,
         watch: Stopwatch,
     ) -> None:
-        """Put in the key objects that the network sees in a keyframe, from it and from its neighbors."""
+        """Add the key objects found in a keyframe, with points from the keyframe and its neighbors."""
         assert self._key_detector is not None
         image = shown.image if shown.image.ndim == 3 else np.repeat(shown.image[..., None], 3, axis=2)
         found = self._key_detector(image)
@@ -292,7 +293,7 @@ class DenseMap:
         watch.ends("dense: key objects")
 
     def _move(self, poses: Poses, at_most: int) -> int:
-        """Move the points of keyframes that have moved by most; gives how many were."""
+        """Move the points of at most `at_most` keyframes, the most displaced first; return the number moved."""
         moves = [(distance(self._layer.parts[id].T_world_cam, pose), -id) for id, pose in poses.items()]
         least = _MIN_MOVE_VOXELS * self._layer.voxel_m
         chosen = [-id for way, id in sorted(moves, reverse=True)[:at_most] if way > least]
@@ -306,7 +307,7 @@ class DenseMap:
         return len(chosen)
 
     def _bound(self) -> None:
-        """Forget the oldest keyframes while too much is kept of them."""
+        """Drop the oldest stored keyframes until memory is within the limit."""
         limit = self._config.memory_mb * 1e6
         while len(self._kept) > 1 and sum(layer.part_bytes for layer in self._layers) + self._kept.nbytes > limit:
             oldest = self._kept.forget_oldest()
@@ -317,7 +318,7 @@ class DenseMap:
 
 
 def _sampled(X: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points, evenly thinned out if there are too many."""
+    """Subsample points and colors evenly if there are too many."""
     if X.shape[1] <= _KEY_POINTS:
         return X, colors
     chosen = np.linspace(0, X.shape[1] - 1, _KEY_POINTS).astype(np.int64)

@@ -1,9 +1,9 @@
-"""Key objects at full density: points inside them from a keyframe and from frames shortly before it.
+"""Key objects at full density: their points from a keyframe and from frames shortly before it.
 
 Source: RTS-SLAM (Sensors 2026), Algorithm 2, lines 5 to 14. The paper finds "corresponding object regions" in the
-neighbors and does not say how. Here the network looks at the keyframe alone; depth in its boxes gives each object a
-box in space, and what neighbors see in that is of the object. So a neighbor costs no look of the network, and what
-stands before or behind an object stays out in all frames.
+neighbors and does not say how. Here the detector runs on the keyframe only. The depth inside its detections gives each
+object a 3D box, and the points of the neighbors inside that box belong to the object. So a neighbor costs no inference,
+and the foreground and background of an object are left out in all frames.
 """
 
 from collections import deque
@@ -18,21 +18,22 @@ from jaxslam.masks.box_to_mask import add_box
 from jaxslam.semantics import Detections
 
 _BOUNDS = (2.0, 98.0)
-"""Percentiles of an object's points, along each axis, between which its box is,"""
+"""Percentiles of an object's points along each axis that bound its 3D box."""
 _BEYOND_M = 0.03
-"""and how far it reaches beyond."""
+"""Margin of the 3D box beyond these percentiles, meters."""
 _FEWEST = 50
-"""Points of an object with fewer say nothing of its size."""
+"""Fewest points of an object from which its size is estimated."""
 
 
 class Neighbor(NamedTuple):
-    """A frame before a keyframe.
+    """A frame shortly before a keyframe.
 
     Attributes:
-        image: `(h, w, 3)` or `(h, w)`.
-        depth: `(h, w)` meters.
-        ignore: `(h, w)` where something moves or may.
-        pose: `(7,)` where the tracker had it; seen from the keyframe once it goes with one.
+        image: `(h, w, 3)` RGB or `(h, w)` gray image.
+        depth: `(h, w)` depth image, meters.
+        ignore: `(h, w)` mask of the pixels that are dynamic or may be.
+        pose: `(7,)` pose of the frame in the tracker's world, or relative to the keyframe once it is returned by
+            `Neighbors.before`.
     """
 
     image: np.ndarray
@@ -42,10 +43,10 @@ class Neighbor(NamedTuple):
 
 
 class Neighbors:
-    """Some of the latest frames, evenly spread."""
+    """Some of the latest frames, evenly spaced."""
 
     def __init__(self, window: int, count: int) -> None:
-        """Keep so many out of the latest `window` frames."""
+        """Keep `count` of the latest `window` frames."""
         self._kept: deque[tuple[int, Neighbor]] = deque(maxlen=max(count, 1))
         self._every, self._window, self._count = max(1, window // max(count, 1)), window, count
 
@@ -57,12 +58,20 @@ class Neighbors:
         ignore: Bool[np.ndarray, "h w"],
         pose: np.ndarray,
     ) -> None:
-        """Take in a frame that was tracked; it is copied if it is one of those kept."""
+        """Add a tracked frame; only a frame that is kept is copied.
+
+        Args:
+            frame: Number of the frame.
+            image: `(h, w, 3)` RGB or `(h, w)` gray image.
+            depth: `(h, w)` depth image, meters.
+            ignore: `(h, w)` mask of the pixels that are dynamic or may be.
+            pose: `(7,)` pose of the frame in the tracker's world.
+        """
         if self._count and frame % self._every == 0:
             self._kept.append((frame, Neighbor(image.copy(), depth.copy(), ignore.copy(), pose)))
 
     def before(self, frame: int, pose: np.ndarray) -> tuple[Neighbor, ...]:
-        """Those in the window before a keyframe, as seen from it."""
+        """Return the kept frames in the window before a keyframe, with poses relative to the keyframe."""
         return tuple(
             kept._replace(pose=between(pose, kept.pose))
             for number, kept in self._kept
@@ -73,12 +82,12 @@ class Neighbors:
 def object_boxes(
     found: Detections, depth: Float32[np.ndarray, "_h _w"], view: DepthView
 ) -> Float32[np.ndarray, "k 2 3"]:
-    """Boxes in space, in the axes of the camera, of what was found in a keyframe.
+    """Return the 3D boxes (lower and upper corner) of the objects found in a keyframe, in the camera frame, meters.
 
     Args:
-        found: In the whole image.
-        depth: Of the pixels that the view uses, 0 where something may move.
-        view: Those pixels.
+        found: Detections in the whole image.
+        depth: `(_h, _w)` depth on the grid of the view, meters; 0 where it is missing or may be dynamic.
+        view: The pixel grid of `depth`.
     """
     boxes: list[np.ndarray] = []
     for number, box in enumerate(found.boxes):
@@ -98,12 +107,12 @@ def object_boxes(
 def points_inside(
     boxes: Float32[np.ndarray, "k 2 3"], frame: Neighbor, view: DepthView
 ) -> tuple[Float32[np.ndarray, "3 n"], UInt8[np.ndarray, "3 n"]]:
-    """Points of a frame inside boxes, in the axes of the keyframe, with their colors.
+    """Return the points of a frame inside 3D boxes, in the frame of the keyframe in meters, and their colors.
 
     Args:
-        boxes: In the axes of the keyframe.
-        frame: Seen from there.
-        view: All pixels of its image.
+        boxes: `(k, 2, 3)` lower and upper corners in the frame of the keyframe, meters.
+        frame: The frame, with its pose relative to the keyframe.
+        view: The pixel grid of the frame at full size.
     """
     X, colors = view.cloud(view.depth(frame.depth, frame.ignore), frame.image)
     X = transform(frame.pose, X).astype(np.float32)

@@ -1,4 +1,4 @@
-"""What is kept of the depth of keyframes: small images, packed, and where each was taken."""
+"""Stored depth images of keyframes: reduced, 16-bit, each with its pose."""
 
 from collections.abc import Mapping
 from typing import NamedTuple, TypeAlias
@@ -12,19 +12,20 @@ from jaxslam.geometry.se3 import IDENTITY, angle, between, compose
 from jaxslam.map.types import Map, has
 
 Poses: TypeAlias = Mapping[int, np.ndarray | None]
-"""Where the depth of each keyframe was taken, `(7,)`; `None` if the keyframe is in a submap that is not shown, or in no
-map."""
+"""The `(7,)` pose of the depth of each keyframe, by keyframe id. A pose is `None` if the keyframe is not in the map or
+in a submap that is not shown."""
 _NEAR_M, _NEAR_RAD = 1.5, 0.6
-"""Keyframes so near, and turned by so little, see the same."""
+"""Largest distance (meters) and rotation (radians) between keyframes with overlapping views."""
 _COUNTS = 65535
+"""Number of quantization steps of the depth."""
 
 
 class _StoredDepth(NamedTuple):
-    """Of a keyframe.
+    """The stored depth of one keyframe.
 
     Attributes:
-        depth: `(h, w)` parts of the farthest depth.
-        T_cam_depth: `(7,)` from where depth was taken, seen from where the image was.
+        depth: `(h, w)` depth in units of 1/65535 of the farthest valid depth; 0 where it is missing.
+        T_cam_depth: `(7,)` transform from the camera at the time of the depth to the camera at the time of the image.
     """
 
     depth: UInt16[np.ndarray, "h w"]
@@ -32,24 +33,31 @@ class _StoredDepth(NamedTuple):
 
 
 class KeyframeDepths:
-    """Depth images of keyframes, the oldest first."""
+    """The stored depth images of keyframes, oldest first."""
 
     def __init__(self, view: DepthView) -> None:
-        """Keep the pixels of a view, which is half of that of the images given."""
+        """Store depth on the grid of `view`, which has half the resolution of the images given to `add`."""
         self._view, self._kept = view, dict[int, _StoredDepth]()
 
     def __len__(self) -> int:
         return len(self._kept)
 
     def add(self, keyframe: int, depth: Float32[np.ndarray, "_h _w"], T_cam_depth: Float[np.ndarray, "7"]) -> None:
-        """Keep every second pixel of a depth image, in 65,535 steps up to the farthest depth."""
+        """Store every second pixel of a depth image, in 65,535 steps up to the farthest valid depth.
+
+        Args:
+            keyframe: Id of the keyframe.
+            depth: `(_h, _w)` depth image, meters; 0 where it is missing.
+            T_cam_depth: `(7,)` transform from the camera at the time of the depth to the camera at the time of the
+                image.
+        """
         small = self._view.of_finer(depth)
         self._kept[keyframe] = _StoredDepth(
             np.rint(small * np.float32(_COUNTS / self._view.farthest_m)).astype(np.uint16), T_cam_depth
         )
 
     def remove_under(self, keyframe: int, mask: Bool[np.ndarray, "h w"]) -> bool:
-        """Forget the depth under a mask of the whole image; gives whether the keyframe is kept."""
+        """Erase the depth of a keyframe under a mask of the whole image; return whether the keyframe is stored."""
         kept = self._kept.get(keyframe)
         if kept is None:
             return False
@@ -59,13 +67,13 @@ class KeyframeDepths:
         return True
 
     def forget_oldest(self) -> int:
-        """Forget the oldest keyframe; gives its id."""
+        """Drop the oldest keyframe, and return its id."""
         oldest = next(iter(self._kept))
         del self._kept[oldest]
         return oldest
 
     def poses(self, slam_map: Map | None) -> Poses:
-        """Where each keyframe is in the submap with most keyframes."""
+        """Return the pose of each stored keyframe in the submap with most keyframes."""
         poses: dict[int, np.ndarray | None] = dict.fromkeys(self._kept)
         ids = np.array(list(self._kept), np.int64)
         if slam_map is None or not len(slam_map.ids) or not len(ids):
@@ -79,12 +87,18 @@ class KeyframeDepths:
         return poses
 
     def shown(self, poses: Poses) -> tuple[list[Float32[np.ndarray, "h w"]], list[np.ndarray]]:
-        """Depth, meters, and poses of all that have one."""
+        """Return the depth images (meters) and poses of all keyframes that have a pose."""
         there = [(self._meters(id), pose) for id, pose in poses.items() if pose is not None]
         return [depth for depth, _ in there], [pose for _, pose in there]
 
     def around(self, keyframe: int, poses: Poses, count: int) -> tuple[Looks, Float[np.ndarray, "k 7"]] | None:
-        """Some other keyframes that see the same: `k` images, blank if there are fewer; `None` if there are none."""
+        """Return some other keyframes with an overlapping view; `None` if there are none.
+
+        Args:
+            keyframe: Id of the keyframe.
+            poses: Poses of all stored keyframes.
+            count: Number `k` of depth images to return; the images beyond those found are blank.
+        """
         pose = poses[keyframe]
         others = [(id, at) for id, at in poses.items() if at is not None and id != keyframe]
         if pose is None or not others:
@@ -94,7 +108,7 @@ class KeyframeDepths:
         near = np.flatnonzero((np.linalg.norm(change[:, 4:], axis=1) < _NEAR_M) & (angle(change) < _NEAR_RAD))
         if not len(near):
             return None
-        # Evenly spread in time: those just before see the person who stands there too.
+        # Evenly spaced in time: the keyframes just before would show the same person at the same place.
         chosen = near[np.unique(np.linspace(0, len(near) - 1, count).astype(int))]
         depths = np.zeros((count, *self._view.shape), np.float32)
         for slot, index in enumerate(chosen.tolist()):
@@ -104,12 +118,12 @@ class KeyframeDepths:
         return Looks(depths, np.stack([self._view.looks(depth).least for depth in depths])), at
 
     def any_seen(self, poses: Poses) -> bool:
-        """Whether one that has a pose has depth."""
+        """Return whether any keyframe with a pose has valid depth."""
         return any(kept.depth.any() and poses[id] is not None for id, kept in self._kept.items())
 
     @property
     def nbytes(self) -> int:
-        """What they take up."""
+        """Memory of the stored depth images, bytes."""
         return sum(kept.depth.nbytes for kept in self._kept.values())
 
     def _meters(self, keyframe: int) -> Float32[np.ndarray, "h w"]:

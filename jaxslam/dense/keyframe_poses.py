@@ -1,4 +1,4 @@
-"""Where keyframes are in the map, and how far they have moved."""
+"""Poses of keyframes in the map, and the size of their corrections."""
 
 import numpy as np
 
@@ -9,7 +9,10 @@ _AT_M = 2.0
 
 
 def distance(now: np.ndarray | None, wanted: np.ndarray | None) -> float:
-    """How far a point two meters away goes from one pose to the other; infinite into or out of the map."""
+    """Bound the displacement of a point two meters ahead between two poses, meters.
+
+    A pose is `None` outside the map: the displacement is infinite if only one is, and 0 if both are.
+    """
     if now is None or wanted is None:
         return 0.0 if now is wanted else float("inf")
     change = compose(inverse(now), wanted)
@@ -17,7 +20,7 @@ def distance(now: np.ndarray | None, wanted: np.ndarray | None) -> float:
 
 
 def poses_of(slam_map: Map, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """`(n, 7)` poses and `(n,)` submaps of keyframes, also of those that were culled; as `Map.pose` of each."""
+    """Return the `(n, 7)` poses and `(n,)` submaps of keyframes, including culled ones; as `Map.pose` for each."""
     order, at = np.argsort(slam_map.culled.ids), ids.copy()
     T_at_keyframe = np.tile(IDENTITY, (len(ids), 1))
     while (gone := ~has(slam_map.ids, at)).any():

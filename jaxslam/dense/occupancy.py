@@ -1,8 +1,8 @@
-"""Where space is occupied, free and unknown, in cells: log-odds of what rays of depth hit and go through.
+"""Occupancy grid: log-odds of occupied, free and unknown cells from the rays of depth images.
 
-Made of the depth images of all keyframes when it is asked for, with the poses they have then; nothing has to be put
-right when the map moves. Source: Hornung et al., "OctoMap", Autonomous Robots 2013: a scan counts once in each cell,
-and in a cell that it both hits and goes through, the hit counts.
+It is computed on request from the depth images of all keyframes with their poses of that moment, so corrections of the
+map need no update. Source: Hornung et al., "OctoMap", Autonomous Robots 2013: a scan counts once in each cell, and in
+a cell with both hits and misses the hit counts.
 """
 
 from collections.abc import Sequence
@@ -16,20 +16,20 @@ from jaxslam.geometry.so3 import matrices
 
 HIT, MISS = np.float32(np.log(0.7 / 0.3)), np.float32(np.log(0.4 / 0.6))
 LEAST, MOST = np.float32(np.log(0.12 / 0.88)), np.float32(np.log(0.97 / 0.03))
-"""OctoMap's probabilities of a hit and of a ray that goes through, and its bounds, as log-odds."""
+"""OctoMap's clamping bounds, log-odds; `HIT` and `MISS` above are its log-odds of a hit and of a miss."""
 _MAX_CELLS = 2**26
-"""Of the box around all that is seen; with more, cells become twice as large."""
+"""Largest number of cells in the bounding box of the measured space; above it, the side of a cell is doubled."""
 _MARGIN_CELLS = 2
 
 
 class Occupancy(NamedTuple):
-    """A box of cells.
+    """An axis-aligned grid of cells in the world.
 
     Attributes:
-        cell_m: Side of a cell.
-        first: `(3,)` number of the first cell along each axis; cell `i` reaches from `i cell_m` to `(i + 1) cell_m`.
-        log_odds: `(x, y, z)`; of a cell that is occupied 0 or more, as in OctoMap.
-        known: `(x, y, z)` cells that any ray has come to.
+        cell_m: Side of a cell, meters.
+        first: `(3,)` index of the first cell along each axis; cell `i` extends from `i cell_m` to `(i + 1) cell_m`.
+        log_odds: `(x, y, z)` log-odds of occupancy; 0 or more in an occupied cell, as in OctoMap.
+        known: `(x, y, z)` mask of the cells that a ray has reached.
     """
 
     cell_m: float
@@ -38,7 +38,7 @@ class Occupancy(NamedTuple):
     known: Bool[np.ndarray, "x y z"]
 
     def at(self, points: Float[np.ndarray, "n 3"]) -> Float32[np.ndarray, " n"]:
-        """Log-odds at points in meters; not a number where nothing is known."""
+        """Look up the log-odds at `(n, 3)` world points in meters; NaN in unknown cells."""
         index = np.floor(np.asarray(points, np.float64) / self.cell_m).astype(np.int64) - self.first
         inside = np.all((index >= 0) & (index < np.array(self.log_odds.shape)), axis=1)
         x, y, z = np.where(inside[:, None], index, 0).T
@@ -49,16 +49,16 @@ class Occupancy(NamedTuple):
 def occupancy(
     depths: Sequence[np.ndarray], poses: Float[np.ndarray, "k 7"], rays: Float[np.ndarray, "2 n"], cell_m: float
 ) -> Occupancy:
-    """The cells that depth images say something of.
+    """Compute the occupancy grid of some depth images.
 
     Args:
-        depths: `k` images of `n` pixels, meters, 0 where missing.
-        poses: Where each was taken, `T_world_cam`.
-        rays: Where the ray of each pixel meets the plane one meter ahead of the camera.
-        cell_m: Side of a cell; doubled until the box around all of them has no more than 67 million.
+        depths: `k` depth images of `n` pixels, meters; 0 where depth is missing.
+        poses: `(k, 7)` poses `T_world_cam` of the images.
+        rays: `(2, n)` normalized image coordinates of the pixels.
+        cell_m: Side of a cell, meters; it is doubled until the grid has at most 67 million cells.
 
     Raises:
-        MapFileError: If there is no depth at all.
+        MapFileError: If no image has depth.
     """
     ahead = np.concatenate([rays, np.ones_like(rays[:1])]).astype(np.float32)
     ends = [_ends(depth, pose, ahead) for depth, pose in zip(depths, poses, strict=True)]
@@ -79,7 +79,7 @@ def occupancy(
 
 
 def _ends(depth: np.ndarray, pose: np.ndarray, ahead: np.ndarray) -> Float32[np.ndarray, "3 m"]:
-    """Where the rays end, in the world."""
+    """Return the end points of the rays with depth, in the world, meters."""
     flat = depth.reshape(-1)
     seen = flat > 0
     return (matrices(pose[:4]) @ (ahead[:, seen] * flat[seen]) + pose[4:, None]).astype(np.float32)
@@ -94,13 +94,23 @@ def _add_scan(
     shape: np.ndarray,
     cell_m: float,
 ) -> None:
-    """Take in one depth image: a step of a cell along each ray, up to the cell before its end."""
+    """Add one depth image to the grid, stepping along each ray by the side of a cell.
+
+    Args:
+        log_odds: `(x y z)` log-odds of all cells, updated in place.
+        known: `(x y z)` mask of the known cells, updated in place.
+        ends: `(3, m)` end points of the rays in the world, meters.
+        center: `(3,)` position of the camera in the world, meters.
+        first: `(3,)` index of the first cell along each axis.
+        shape: `(3,)` number of cells along each axis.
+        cell_m: Side of a cell, meters.
+    """
     if not ends.shape[1]:
         return
     start = ((center / cell_m) - first).astype(np.float32)[:, None]
     way = ends / np.float32(cell_m) - first.astype(np.float32)[:, None] - start
     length = np.linalg.norm(way, axis=0)
-    # Longest first, so that the rays that still go on are always the first ones.
+    # Longest first, so that the rays that have not ended yet are always the first ones.
     order = np.argsort(-length)
     way, length = way[:, order], length[order]
     unit = way / np.maximum(length, 1e-6)
@@ -108,7 +118,7 @@ def _add_scan(
     hit = (start + way).astype(np.int64).T @ scales
     free = np.zeros(len(log_odds), bool)
     steps = np.arange(0.5, length[0], 1.0, dtype=np.float32)
-    counts = np.searchsorted(-length, -(steps + 1))  # rays longer than that
+    counts = np.searchsorted(-length, -(steps + 1))  # number of rays longer than the step
     for step, count in zip(steps.tolist(), counts.tolist(), strict=True):
         x, y, z = (start + unit[:, :count] * np.float32(step)).astype(np.int64)
         free[x * scales[0] + y * scales[1] + z] = True

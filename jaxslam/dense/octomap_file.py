@@ -1,8 +1,8 @@
-"""Octrees as OctoMap's files hold them: `.bt`, occupied or free, and `.ot`, with log-odds.
+"""Write OctoMap's octree files: `.bt` (occupied or free) and `.ot` (log-odds).
 
 Format: the sources of OctoMap 1.10, `OcTreeBaseImpl::writeData` and `OccupancyOcTreeBase::writeBinaryNode`: sixteen
-levels, children in the order x, y, z of their bits, nodes from the root down, each before its children. Written
-without a loop over nodes: sorted by their place along a Morton curve, then by level, nodes are in that order.
+levels, children ordered by their x, y, z bits, nodes in depth-first order, parents first. There is no loop over nodes:
+sorting nodes by Morton code and then by level gives this order.
 """
 
 import os
@@ -22,13 +22,13 @@ _HALF = 1 << (LEVELS - 1)
 
 
 class Octree(NamedTuple):
-    """Nodes of an octree, each before its children.
+    """Nodes of an octree in depth-first order, parents first.
 
     Attributes:
-        code: `(n,)` Morton code of the first of the smallest cells in each.
-        level: `(n,)` 0 for the root, 16 for the smallest cells.
-        value: `(n,)` log-odds of each; of one with children, the greatest of theirs.
-        leaf: `(n,)` nodes without children.
+        code: `(n,)` Morton code of the first of the smallest cells in each node.
+        level: `(n,)` level of each node: 0 for the root, 16 for the smallest cells.
+        value: `(n,)` log-odds of each node; for a node with children, the largest of theirs.
+        leaf: `(n,)` mask of the nodes without children.
     """
 
     code: UInt64[np.ndarray, " n"]
@@ -38,7 +38,7 @@ class Octree(NamedTuple):
 
 
 def write_bt(path: PathLike, cells: Occupancy) -> None:
-    """Write what is occupied and what is free, as `octomap` and its servers read it.
+    """Write the occupied and the free cells as a `.bt` file, which `octomap` and its servers read.
 
     Raises:
         MapFileError: If the file cannot be written, nothing is known, or a cell is beyond the 65,536 along an axis.
@@ -55,10 +55,10 @@ def write_bt(path: PathLike, cells: Occupancy) -> None:
 
 
 def write_ot(path: PathLike, cells: Occupancy) -> None:
-    """Write the log-odds of all cells.
+    """Write the log-odds of all cells as an `.ot` file.
 
     Raises:
-        MapFileError: As `write_bt`.
+        MapFileError: If the file cannot be written, nothing is known, or a cell is beyond the 65,536 along an axis.
     """
     tree = octree(cells)
     parent, child = _parents(tree)
@@ -72,7 +72,7 @@ def write_ot(path: PathLike, cells: Occupancy) -> None:
 
 
 def octree(cells: Occupancy) -> Octree:
-    """The octree of cells: eight equal ones without children become one.
+    """Build the octree of a grid, merging eight equal children into their parent.
 
     Raises:
         MapFileError: If nothing is known, or a cell is beyond the 65,536 along an axis.
@@ -106,7 +106,7 @@ def octree(cells: Occupancy) -> Octree:
 
 
 def _morton(index: Int[np.ndarray, "n 3"]) -> UInt64[np.ndarray, " n"]:
-    """Bits of three numbers of 16 bits, interleaved: those of x are the lowest of each three."""
+    """Interleave the bits of three 16-bit indices; the bit of x is the lowest of each three."""
     code = np.zeros(len(index), np.uint64)
     for axis in range(3):
         bits = index[:, axis].astype(np.uint64)
@@ -119,7 +119,7 @@ def _morton(index: Int[np.ndarray, "n 3"]) -> UInt64[np.ndarray, " n"]:
 
 
 def _parents(tree: Octree) -> tuple[np.ndarray, np.ndarray]:
-    """Of every node but the root: the place of its parent, and which child of that it is."""
+    """Return, for every node but the root, the index of its parent and its number among the parent's children."""
     parent = np.zeros(len(tree.code) - 1, np.int64)
     for level in range(1, LEVELS + 1):
         mine = np.flatnonzero(tree.level == level)

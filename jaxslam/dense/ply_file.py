@@ -1,4 +1,4 @@
-"""The dense map as a PLY file."""
+"""Write the dense map as a PLY file."""
 
 import os
 from typing import TypeAlias
@@ -10,7 +10,7 @@ PathLike: TypeAlias = str | os.PathLike[str]
 
 
 def write_points(path: PathLike, cloud: DenseCloud) -> None:
-    """Write the points as a binary PLY: place in meters, color, and how many measured points each stands for.
+    """Write the points as a binary PLY file: position in meters, color, and number of measured points.
 
     Raises:
         MapFileError: If the file cannot be written.

@@ -1,4 +1,4 @@
-"""The dense map as it is given out: points with colors."""
+"""The point cloud of a dense map."""
 
 from typing import NamedTuple
 
@@ -7,14 +7,14 @@ from jaxtyping import Bool, Float32, UInt8
 
 
 class DenseCloud(NamedTuple):
-    """Points of the dense map, one a row, as libraries for point clouds take them.
+    """Points of the dense map, one per row, as point cloud libraries take them.
 
     Attributes:
-        points: `(n, 3)` meters in the world, each the centroid of a voxel.
-        colors: `(n, 3)` red, green, blue.
-        counts: `(n,)` how many measured points each stands for.
-        is_key: `(n,)` points of key objects, which are at full density; they come after the others.
-        voxel_m: Side of the voxels of the others.
+        points: `(n, 3)` centroids of the voxels in the world, meters.
+        colors: `(n, 3)` red, green, and blue of each point, 0 to 255.
+        counts: `(n,)` number of measured points in each voxel.
+        is_key: `(n,)` mask of the points of key objects, which are at full density and come after the others.
+        voxel_m: Side of the voxels of the points that are not of key objects, meters.
     """
 
     points: Float32[np.ndarray, "n 3"]
@@ -25,5 +25,5 @@ class DenseCloud(NamedTuple):
 
     @property
     def megabytes(self) -> float:
-        """What the points take up."""
+        """Size of the points, colors and counts, megabytes."""
         return (self.points.nbytes + self.colors.nbytes + self.counts.nbytes) / 1e6

@@ -1,7 +1,7 @@
-"""A picture of the dense map without a mesh: each point a small square, the nearest in front, with the camera's path.
+"""Render the dense map without a mesh: each point is drawn as a small square, nearest on top, with the camera's path.
 
-Two views beside each other: from behind and above the camera, and from the top. Up is where the camera's rows point
-on average, as nothing in the map knows gravity.
+There are two views side by side: from behind and above the camera, and from the top. The map does not know gravity, so
+down is the mean direction of the camera's y axis.
 """
 
 import os
@@ -21,19 +21,19 @@ PathLike: TypeAlias = str | os.PathLike[str]
 _WIDTH, _HEIGHT = 960, 720
 _BACKGROUND, _PATH_RGB = 24, (255, 160, 0)
 _VIEW = 0.9
-"""Tangent of half the angle of the perspective view, along a row."""
+"""Tangent of half the horizontal field of view of the perspective view."""
 _MAX_SPLAT_PX = 6
 _HEADROOM_M = 0.3
-"""What is so far above the camera is left out from the top: a ceiling."""
+"""Height above the camera, meters, beyond which points are left out of the top view because they are a ceiling."""
 
 
 class _Screen(NamedTuple):
-    """Where things are in a picture.
+    """Points projected into a picture.
 
     Attributes:
-        uv: `(2, n)` pixels.
-        depth: `(n,)` how far behind the screen; what is not above 0 is not seen.
-        pixel_per_m: `(n,)` pixels a meter there.
+        uv: `(2, n)` image coordinates, pixels.
+        depth: `(n,)` depth behind the screen, meters; points that are not in front of the viewer are hidden.
+        pixel_per_m: `(n,)` scale at each point, pixels per meter.
     """
 
     uv: np.ndarray
@@ -42,12 +42,12 @@ class _Screen(NamedTuple):
 
 
 class _Stand(NamedTuple):
-    """Where to look from.
+    """Pose and size of the shown part of the map.
 
     Attributes:
-        axes: `(3, 3)` rows: right, down, ahead.
-        center: `(3,)` the middle of what is looked at.
-        extent_m: How far that reaches to either side.
+        axes: `(3, 3)` rows: unit vectors to the right, down, and ahead, in the world.
+        center: `(3,)` center of the shown part in the world, meters.
+        extent_m: Half the size of the shown part, meters.
     """
 
     axes: np.ndarray
@@ -56,7 +56,7 @@ class _Stand(NamedTuple):
 
 
 def write_picture(path: PathLike, cloud: DenseCloud, T_world_cam: Float[np.ndarray, "k 7"]) -> None:
-    """Write a PNG of the map with the path of the camera.
+    """Write a PNG picture of the map with the path of the camera.
 
     Raises:
         MapFileError: If the file cannot be written.
@@ -66,11 +66,11 @@ def write_picture(path: PathLike, cloud: DenseCloud, T_world_cam: Float[np.ndarr
 
 
 def picture(cloud: DenseCloud, T_world_cam: Float[np.ndarray, "k 7"]) -> UInt8[np.ndarray, "h w 3"]:
-    """The map from behind the camera and from the top, with the path of the camera.
+    """Render the map from behind the camera and from the top, with the path of the camera.
 
     Args:
-        cloud: The map; it may be empty.
-        T_world_cam: Poses along the path; there may be none.
+        cloud: Points of the map; it may be empty.
+        T_world_cam: `(k, 7)` poses along the path; `k` may be 0.
     """
     stand = _stand(cloud, T_world_cam)
     path = T_world_cam[:, 4:]
@@ -102,7 +102,7 @@ def _stand(cloud: DenseCloud, T_world_cam: np.ndarray) -> _Stand:
     points = cloud.points if len(cloud.points) else np.zeros((1, 3))
     local = points @ axes.T
     low, high = np.percentile(local, [2, 98], axis=0)
-    if len(T_world_cam):  # of a road, the beginning of the path is before all that was seen from it
+    if len(T_world_cam):  # on a road, the path starts behind everything that was seen from it
         path = T_world_cam[:, 4:] @ axes.T
         low, high = np.minimum(low, path.min(axis=0)), np.maximum(high, path.max(axis=0))
     extent_m = float(max(0.5 * (high - low)[[0, 2]].max(), 0.5))
@@ -115,7 +115,7 @@ def _unit(vector: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
 
 
 def _ahead(X: np.ndarray, stand: _Stand) -> _Screen:
-    """Perspective, from behind what is seen and above it, looking down by 30 degrees."""
+    """Project points in perspective, from behind and above the shown part, looking down by 30 degrees."""
     right, down, ahead = stand.axes
     cos, sin = np.cos(np.pi / 6), np.sin(np.pi / 6)
     axes = np.stack([right, down * cos - ahead * sin, ahead * cos + down * sin])
@@ -127,7 +127,7 @@ def _ahead(X: np.ndarray, stand: _Stand) -> _Screen:
 
 
 def _from_above(X: np.ndarray, stand: _Stand) -> _Screen:
-    """Without perspective, from the top; what the camera looks at is up."""
+    """Project points orthographically from the top; the viewing direction of the camera is up in the picture."""
     scale = 0.46 * min(_WIDTH, _HEIGHT) / stand.extent_m
     x, y, z = ((X - stand.center) @ stand.axes.T).T
     uv = np.stack([0.5 * _WIDTH + scale * x, 0.5 * _HEIGHT - scale * z])
@@ -135,7 +135,7 @@ def _from_above(X: np.ndarray, stand: _Stand) -> _Screen:
 
 
 def _drawn(screen: _Screen, cloud: DenseCloud) -> UInt8[np.ndarray, "h w 3"]:
-    """Squares as large as voxels are there, the farthest first."""
+    """Draw each point as a square of the projected size of its voxel, the farthest first."""
     panel = np.full((_HEIGHT * _WIDTH, 3), _BACKGROUND, np.uint8)
     order = np.argsort(-screen.depth)
     order = order[screen.depth[order] > 0.1]
@@ -143,7 +143,7 @@ def _drawn(screen: _Screen, cloud: DenseCloud) -> UInt8[np.ndarray, "h w 3"]:
     side = np.clip(np.ceil(screen.pixel_per_m * voxels_m), 1, _MAX_SPLAT_PX).astype(np.int64)[order]
     column, row = np.clip(np.nan_to_num(screen.uv[:, order]), -1e6, 1e6).astype(np.int64)
     most = int(side.max(initial=1))
-    # The same order for all pixels of a square: the last of those written to a pixel is the nearest.
+    # All pixels of a square have the same order, so the largest index at a pixel is the nearest point.
     steps = np.arange(most) - most // 2
     dv, du = (grid.ravel() for grid in np.meshgrid(steps, steps, indexing="ij"))
     covers = np.maximum(np.abs(dv), np.abs(du))[None] * 2 <= side[:, None]

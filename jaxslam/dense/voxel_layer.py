@@ -1,6 +1,6 @@
-"""One grid of voxels, and what each keyframe has put into it, so that its points move when the keyframe does.
+"""One voxel grid and the points that each keyframe added to it, so that the points move with their keyframe.
 
-Not safe to be used from several threads at once.
+Not thread-safe.
 """
 
 from typing import NamedTuple
@@ -30,26 +30,28 @@ from jaxslam.geometry.se3 import IDENTITY, transform
 from jaxslam.runtime.padding import padded
 
 HIT = np.float32(0.85)
-"""Log-odds of a voxel that a keyframe has a point in: a probability of 0.7, OctoMap's."""
+"""Log-odds of a hit, a point of a keyframe in a voxel: a probability of 0.7, as in OctoMap."""
 _GONE = -1.0
-"""Points in voxels with less do not go with their keyframe when it is moved."""
+"""Log-odds of a voxel below which its points are dropped when their keyframe is moved."""
 _MAX_PAST = 3
-"""Earlier keyframes that see past a new point of which no more count: something may have been put there since."""
+"""Largest number of earlier keyframes seeing through a new point that counts: an object may have been placed there
+since."""
 _FULL, _STILL_FULL = 0.9, 0.7
-"""Shares of the voxels in use from which free ones are forgotten, and with which voxels become larger."""
+"""Shares of voxels in use above which free voxels are removed, and above which, after that, voxels are enlarged."""
 _SIZES = 4
-"""Sizes that points to be reduced are brought to. The search for voxels goes over all of them at once."""
+"""Number of array sizes to which the points given to `reduce` are padded; the voxel search runs on all of them at
+once."""
 
 
 class VoxelPart(NamedTuple):
-    """What a keyframe has in the grid.
+    """The points of one keyframe in the grid.
 
     Attributes:
-        X_cam: `(3, m)` in units of the layer, int16.
-        color: `(3, m)` uint8.
-        counts: `(m,)` float16.
-        rows: `(m,)` of the grid; `NO_ROW` of points that have left it.
-        T_world_cam: `(7,)` where the keyframe was when they were put there; `None` while they are not in the grid.
+        X_cam: `(3, m)` int16 coordinates in the camera frame, in units of `VoxelLayer.unit_m`.
+        color: `(3, m)` uint8 red, green, and blue of each point.
+        counts: `(m,)` float16 number of measured points that each point stands for.
+        rows: `(m,)` row of each point in the grid; `NO_ROW` for points that have left the grid.
+        T_world_cam: `(7,)` pose of the keyframe with which the points are in the grid; `None` while they are not in it.
     """
 
     X_cam: np.ndarray
@@ -60,7 +62,7 @@ class VoxelPart(NamedTuple):
 
     @property
     def nbytes(self) -> int:
-        """What it takes up."""
+        """Memory of the points, bytes."""
         return self.X_cam.nbytes + self.color.nbytes + self.counts.nbytes + self.rows.nbytes
 
 
@@ -68,20 +70,20 @@ class VoxelLayer:
     """A grid of voxels of one size.
 
     Attributes:
-        voxel_m: Side of a voxel; it doubles when the grid is full.
-        parts: Of keyframes, by their ids.
-        unit_m: Of the coordinates of parts.
+        voxel_m: Side of a voxel, meters; it doubles when the grid is full.
+        parts: The points of each keyframe, by keyframe id.
+        unit_m: Unit of the coordinates of parts, meters.
     """
 
     def __init__(self, capacity: int, part_points: int, most_points: int, voxel_m: float, farthest_m: float) -> None:
-        """Begin empty.
+        """Create an empty grid.
 
         Args:
-            capacity: Voxels at most.
-            part_points: Points of a keyframe at most.
-            most_points: Points at most that `reduce` gets.
-            voxel_m: Side of a voxel.
-            farthest_m: No point of a keyframe is further from it along any axis but by the view of its camera.
+            capacity: Largest number of voxels.
+            part_points: Largest number of points of a keyframe.
+            most_points: Largest number of points given to `reduce`.
+            voxel_m: Side of a voxel, meters.
+            farthest_m: Largest valid depth, meters.
         """
         self.voxel_m = voxel_m
         self.parts: dict[int, VoxelPart] = {}
@@ -91,7 +93,14 @@ class VoxelLayer:
         self._grid, self._boxes = empty_grid(capacity), RowBoxes(capacity, ROWS)
 
     def reduce(self, X_cam: Float32[np.ndarray, "3 n"], colors: UInt8[np.ndarray, "3 n"]) -> VoxelPart:
-        """The points of a keyframe, one a voxel in its own axes; voxels are larger if there are too many."""
+        """Reduce the points of a keyframe to one per voxel in its camera frame.
+
+        Voxels are enlarged until no more than `part_points` points are left.
+
+        Args:
+            X_cam: `(3, n)` points in the camera frame, meters.
+            colors: `(3, n)` red, green, and blue of each point.
+        """
         voxel_m, count = self.voxel_m, X_cam.shape[1]
         size = next(size for size in self._sizes if size >= count)
         X_cam, colors = padded(X_cam, size, axis=1), padded(colors, size, axis=1)
@@ -102,20 +111,20 @@ class VoxelLayer:
             num = int(num)
             if num <= self._part_points:
                 break
-            voxel_m *= 1.05 * np.sqrt(num / self._part_points)  # surfaces have so many
+            voxel_m *= 1.05 * np.sqrt(num / self._part_points)  # points of a surface: proportional to 1 / voxel_m^2
         X, color, counts = (np.asarray(array)[..., :num].copy() for array in cloud)
         return VoxelPart(X, color, counts, np.full(num, NO_ROW, np.int32), None)
 
     def put(
         self, keyframe: int, part: VoxelPart, T_world_cam: np.ndarray, past: Int[np.ndarray, " m"] | None = None
     ) -> None:
-        """Put the points of a keyframe into the grid.
+        """Add the points of a keyframe to the grid.
 
         Args:
-            keyframe: Its id.
-            part: Its points.
-            T_world_cam: `(7,)` its pose.
-            past: `(m,)` how many earlier keyframes see past each.
+            keyframe: Id of the keyframe.
+            part: Points of the keyframe.
+            T_world_cam: `(7,)` pose of the keyframe.
+            past: `(m,)` number of earlier keyframes that see through each point.
         """
         evidence = np.full(self._cloud_size, HIT)
         if past is not None:
@@ -128,7 +137,11 @@ class VoxelLayer:
         self.parts[keyframe] = part._replace(rows=rows, T_world_cam=T_world_cam)
 
     def take_out(self, keyframe: int, which: Bool[np.ndarray, " m"] | None = None) -> VoxelPart:
-        """Take points of a keyframe out of the grid: all, or some for good; gives what is left of it."""
+        """Remove points of a keyframe from the grid: all for now, or those where `which` is true for good.
+
+        Returns:
+            The remaining points of the keyframe.
+        """
         part = self.parts[keyframe]
         if part.T_world_cam is None:
             left = part if which is None else _at(part, ~which)
@@ -143,7 +156,7 @@ class VoxelLayer:
         return left
 
     def move(self, keyframe: int, T_world_cam: np.ndarray | None) -> None:
-        """Move the points of a keyframe with it, or out of the grid; those found to be gone stay out."""
+        """Move the points of a keyframe to a new pose, or out of the grid if it is `None`; drop the carved points."""
         part = self.parts[keyframe]
         if part.T_world_cam is not None:
             odds = np.asarray(self._grid.sums)[np.maximum(part.rows, 0), 7]
@@ -154,11 +167,11 @@ class VoxelLayer:
             self.put(keyframe, part, T_world_cam)
 
     def forget(self, keyframe: int) -> None:
-        """Leave the points of a keyframe where they are, for good."""
+        """Freeze the points of a keyframe: they stay in the grid but can no longer be moved."""
         del self.parts[keyframe]
 
     def look(self, looks: Looks, T_world_cam: np.ndarray, view: DepthView) -> None:
-        """Take in which voxels a frame sees again, and which it sees past."""
+        """Update the voxels in view of a frame: confirm those that it sees again, carve those that it sees through."""
         blocks = self._boxes.in_view(T_world_cam, view, self.voxel_m)
         count, blocks = np.int32(len(blocks)), padded(blocks, len(self._boxes))
         pose, size = T_world_cam.astype(np.float32), np.float32(self.voxel_m)
@@ -167,12 +180,20 @@ class VoxelLayer:
     def past(
         self, part: VoxelPart, T_world_cam: np.ndarray, looks: Looks, poses: np.ndarray, view: DepthView
     ) -> np.ndarray:
-        """`(m,)` how many of `(k, h, w)` depth images, taken at `(k, 7)` poses, see past the points of a keyframe."""
+        """Count the depth images that see through each point of a keyframe; `(m,)`.
+
+        Args:
+            part: Points of the keyframe.
+            T_world_cam: `(7,)` pose of the keyframe.
+            looks: `(k, h, w)` depth images.
+            poses: `(k, 7)` poses of the depth images.
+            view: Pixel grid of the depth images.
+        """
         arrays = T_world_cam.astype(np.float32), looks.depth, looks.least, poses.astype(np.float32), view.intrinsics
         return np.asarray(num_past(self._cloud(part), *arrays))[: len(part.counts)]
 
     def make_room(self) -> None:
-        """Forget free voxels when the grid is nearly full, and if that does not help, make voxels larger."""
+        """Remove free voxels if the grid is nearly full; if that is not enough, enlarge the voxels."""
         if int(self._grid.table.num) < _FULL * self._capacity:
             return
         self._rebuild(1)
@@ -180,7 +201,7 @@ class VoxelLayer:
             self._rebuild(2)
 
     def shown(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Points `(n, 3)`, colors `(n, 3)` and counts `(n,)` of voxels that have some and are not free."""
+        """Return the points `(n, 3)`, colors `(n, 3)` and counts `(n,)` of all voxels with points that are not free."""
         num = int(self._grid.table.num)
         voxels = all_centroids(self._grid, np.float32(self.voxel_m))
         keep = (np.asarray(voxels.counts)[:num] > 0) & (np.asarray(self._grid.sums)[:num, 7] > 0)
@@ -189,12 +210,12 @@ class VoxelLayer:
         return np.ascontiguousarray(X.T), np.ascontiguousarray(color.T), count
 
     def compile(self, view: DepthView, small: DepthView, num_looks: int) -> None:
-        """Compile all that is needed, on a grid that holds nothing.
+        """Compile all programs on an empty grid.
 
         Args:
-            view: Of new depth images.
-            small: Of earlier ones.
-            num_looks: Earlier ones that new points are compared with.
+            view: Pixel grid of new depth images.
+            small: Pixel grid of the stored depth images.
+            num_looks: Number of stored depth images that new points are compared with.
         """
         parts = [self.reduce(np.full((3, n), np.nan, np.float32), np.zeros((3, n), np.uint8)) for n in self._sizes]
         part = parts[0]
@@ -209,22 +230,22 @@ class VoxelLayer:
 
     @property
     def nbytes(self) -> int:
-        """Memory in use, bytes: of the grid, whatever is in it, and of the parts."""
+        """Memory in use, bytes: the grid, which has a fixed size, and the points of keyframes."""
         return sum(leaf.nbytes for leaf in jax.tree.leaves(self._grid)) + self.part_bytes
 
     @property
     def part_bytes(self) -> int:
-        """Memory in use for the parts of keyframes."""
+        """Memory in use for the points of keyframes, bytes."""
         return sum(part.nbytes for part in self.parts.values())
 
     def _cloud(self, part: VoxelPart) -> Cloud:
-        """A part at the size that programs are compiled for."""
+        """Pad a part to the size that programs are compiled for."""
         size = self._cloud_size
         X, color = padded(part.X_cam, size, axis=1), padded(part.color, size, axis=1)
         return Cloud(X, color, padded(part.counts, size), np.int32(len(part.counts)), self.unit_m)  # pyright: ignore[reportArgumentType]
 
     def _rebuild(self, factor: int) -> None:
-        """The same grid with larger voxels, or as large ones, without those that are free."""
+        """Rebuild the grid without free voxels, with voxels `factor` times as large."""
         old, self.voxel_m = np.float32(self.voxel_m), self.voxel_m * factor
         self._grid, rows, X = rebuilt(self._grid, old, np.float32(self.voxel_m), self._capacity)
         rows, X = np.asarray(rows), np.asarray(X)

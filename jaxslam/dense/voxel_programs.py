@@ -1,8 +1,8 @@
-"""Compiled programs over a grid of voxels, block by block of points or rows.
+"""Compiled programs over a voxel grid, working block by block of points or rows.
 
-A loop over blocks does only as many as there are: a keyframe with half of the points costs half. What is worked out of
-a block stays in the processor's cache; arrays as long as the grid would be fetched from memory time and again. With
-213,000 voxels, comparing all with a depth image takes 3.5 ms in blocks of 1024 and 5.7 in blocks of 65,536.
+A loop over blocks runs only over the blocks in use: a keyframe with half the points costs half. Intermediate results of
+a block stay in the processor's cache, while arrays as long as the grid would be fetched from memory again and again.
+With 213,000 voxels, comparing all with a depth image takes 3.5 ms in blocks of 1024 and 5.7 ms in blocks of 65,536.
 """
 
 from collections.abc import Callable
@@ -33,25 +33,26 @@ from jaxslam.runtime.compile_cache import SINGLE_THREAD
 from jaxslam.runtime.compiled import compiled
 
 ROWS = 1024
-"""Rows of the grid in a block: small, so that few of a block in view are out of it."""
+"""Rows of the grid in a block: small, so that few rows of a block in view are out of view."""
 _POINTS = 2048
 MISS, SEEN = -0.85, 0.4
-"""Log-odds of a voxel that a depth image sees past: 0.4 as a probability in OctoMap, for rays that graze a surface;
-here it must be clearly behind, and says as much as a point does. And of one that has a surface where its points are."""
+"""Log-odds of a voxel that a depth image sees through, and of a voxel in which it sees a surface. OctoMap uses a
+probability of 0.4 for a miss, because its rays graze surfaces; here the surface must be clearly behind the voxel, so a
+miss counts as much as a point."""
 _SAME_SHARE, _SAME_M = 0.03, 0.03
-"""Differences of depth that are none, a share and meters: sensors are a percent or two off at four meters."""
+"""Largest difference between equal depths, a share plus meters: sensors are 1 to 2 % off at four meters."""
 _State = TypeVar("_State")
 
 
 class Cloud(NamedTuple):
-    """The points of a part, at the size that programs are compiled for: a multiple of that of blocks.
+    """The points of a keyframe, padded to the size that programs are compiled for, a multiple of the block size.
 
     Attributes:
-        X_cam: `(3, m)` in units, int16.
-        color: `(3, m)` uint8.
-        counts: `(m,)` float16, 0 beyond the last point.
-        num: Points.
-        unit_m: Of the coordinates.
+        X_cam: `(3, m)` int16 coordinates in the camera frame, in units of `unit_m`.
+        color: `(3, m)` uint8 red, green, and blue of each point.
+        counts: `(m,)` float16 number of measured points that each point stands for; 0 in the padding.
+        num: Number of points without the padding.
+        unit_m: Unit of the coordinates, meters.
     """
 
     X_cam: Int16[Array, "3 m"]
@@ -62,17 +63,17 @@ class Cloud(NamedTuple):
 
     @property
     def size(self) -> int:
-        """`m`."""
+        """Number `m` of points with the padding."""
         return self.counts.shape[0]
 
     def block(self, start: Array) -> tuple[Points, Colors, Weights]:
-        """Points in meters, colors and counts of a block."""
+        """Return the points (meters), colors and counts of the block that begins at `start`."""
         X, color, counts = (_cut(array, start).astype(self.unit_m.dtype) for array in self[:3])
         return X * self.unit_m, color, counts
 
 
 def cloud_size(points: int) -> int:
-    """The size of clouds of so many points."""
+    """Return the padded size of a cloud of so many points."""
     return -(-points // _POINTS) * _POINTS
 
 
@@ -86,7 +87,7 @@ def reduced(
     *,
     capacity: int,
 ) -> tuple[tuple[Array, Array, Array], Int32[Array, ""]]:
-    """The first `num` of some points, one a voxel, as a `Part` keeps them; and how many there are."""
+    """Reduce the first `num` points to one per voxel, in the types of `VoxelPart`; also return their number."""
     mask = jnp.arange(X_cam.shape[1], dtype=jnp.int32) < num
     voxels = reduced_cloud(X_cam, color.astype(X_cam.dtype), mask, voxel_m, capacity=capacity)
     X = jnp.clip(jnp.round(voxels.X / unit_m), -32767, 32767).astype(jnp.int16)
@@ -97,7 +98,7 @@ def reduced(
 def put(
     grid: VoxelGrid, cloud: Cloud, evidence: Float[Array, " m"], pose: Float[Array, "7"], voxel_m: Float[Array, ""]
 ) -> tuple[VoxelGrid, Int[Array, " m"]]:
-    """The grid with the points of a part in it, and their rows."""
+    """Add the points of a keyframe to the grid; also return their rows."""
 
     def add(start: Array, so_far: tuple[VoxelGrid, Array]) -> tuple[VoxelGrid, Array]:
         grid, rows = so_far
@@ -118,7 +119,7 @@ def taken_out(
     pose: Float[Array, "7"],
     voxel_m: Float[Array, ""],
 ) -> VoxelGrid:
-    """The grid without the points of a part that have a row."""
+    """Remove the points of a keyframe that have a row from the grid."""
 
     def take(start: Array, grid: VoxelGrid) -> VoxelGrid:
         X_cam, color, count = cloud.block(start)
@@ -139,7 +140,10 @@ def looked(
     intrinsics: Intrinsics,
     voxel_m: Float[Array, ""],
 ) -> VoxelGrid:
-    """The grid after a depth image has said, of the first `num` of some blocks of rows, what is there and what not."""
+    """Update the log-odds of the first `num` blocks of rows with a depth image.
+
+    Voxels that the image sees again gain log-odds, and voxels that it sees through lose log-odds.
+    """
     size = min(ROWS, len(grid.sums))
 
     def look(index: Array, sums: Array) -> Array:
@@ -163,11 +167,11 @@ def num_past(
     poses: Float[Array, "k 7"],
     intrinsics: Intrinsics,
 ) -> Int[Array, " m"]:
-    """How many depth images see past each point of a part."""
+    """Count the depth images that see through each point of a keyframe."""
 
     def count(start: Array, counts: Array) -> Array:
         X = to_world(SE3(pose), cloud.block(start)[0])
-        # One image after the other: side by side they would be fetched anew for each point.
+        # One image after the other: batched, the images would be fetched from memory again for each point.
         past = [_seen(X, *one, intrinsics).past for one in zip(poses, depths, leasts, strict=True)]
         return lax.dynamic_update_slice(counts, sum(one.astype(jnp.int32) for one in past), (start,))
 
@@ -176,7 +180,7 @@ def num_past(
 
 @compiled(when="warm-up")
 def all_centroids(grid: VoxelGrid, voxel_m: Float[Array, ""]) -> Voxels:
-    """The points of all rows."""
+    """Return the centroids of the voxels of all rows."""
     return centroids(grid, jnp.zeros((), jnp.int32), voxel_m, size=len(grid.sums))
 
 
@@ -184,14 +188,18 @@ def all_centroids(grid: VoxelGrid, voxel_m: Float[Array, ""]) -> Voxels:
 def rebuilt(
     grid: VoxelGrid, old_m: Float[Array, ""], new_m: Float[Array, ""], capacity: int
 ) -> tuple[VoxelGrid, Int[Array, " c"], Points]:
-    """The grid with voxels of another side, without free ones; the new row of each old one, and its point."""
+    """Rebuild the grid with another voxel size and without free voxels.
+
+    Returns:
+        The new grid, the new row of each old row, and the centroid of each old row.
+    """
     voxels = centroids(grid, jnp.zeros((), jnp.int32), old_m, size=capacity)
     count = jnp.where(grid.log_odds > 0, voxels.counts, 0)
     return *with_cloud(empty_grid(capacity), voxels.X, voxels.color, count, grid.log_odds, new_m), voxels.X
 
 
 def _over_blocks(cloud: Cloud, step: Callable[[Array, _State], _State], begin: _State) -> _State:
-    """`step` for the start of each block of points, as many as there are."""
+    """Run `step` for the start of each block of points in use."""
     blocks = (cloud.num + _POINTS - 1) // _POINTS
     return lax.fori_loop(0, blocks, lambda index, state: step(index * _POINTS, state), begin)
 

@@ -258,10 +258,7 @@ def _records() -> list[FrameRecord]:
 def _evaluation(path: jaxslam.Trajectory) -> jaxslam.Evaluation:
     """Make an evaluation in which every figure is known."""
     positions = path.T_world_cam[:, 4:]
-    values: dict[str, Any] = {
-        name: np.zeros((0, 2)) if hint is np.ndarray else _made_up(hint)
-        for name, hint in get_type_hints(jaxslam.Evaluation).items()
-    }
+    values: dict[str, Any] = {name: _made_up(hint) for name, hint in get_type_hints(jaxslam.Evaluation).items()}
     values |= {"timestamps_ns": path.timestamps_ns, "errors_m": np.zeros(len(positions))}
     values |= {"positions_m": positions, "reference_m": positions}
     return jaxslam.Evaluation(**values)
