@@ -1,7 +1,7 @@
 """Match ORB features with those of another image, and with map points projected by a pose."""
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int64, UInt8, UInt16
+from jaxtyping import Bool, Float, Float32, Int, Int64, Integer, UInt8, UInt16, UInt64
 
 from jaxslam.features.orb import DEFAULT_PLAN, FeaturePlan, Features
 
@@ -77,7 +77,10 @@ def same_turn(turn: Float32[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
 
 
 def predicted_octave(
-    octave: np.ndarray, depth_then: np.ndarray, depth_now: np.ndarray, plan: FeaturePlan = DEFAULT_PLAN
+    octave: Integer[np.ndarray, " n"],
+    depth_then: Float[np.ndarray, " n"],
+    depth_now: Float[np.ndarray, " n"],
+    plan: FeaturePlan = DEFAULT_PLAN,
 ) -> Int64[np.ndarray, " n"]:
     """Predict the octave of features seen from another distance: image size is inversely proportional to depth.
 
@@ -92,8 +95,8 @@ def predicted_octave(
 
 
 def match_by_projection(
-    predicted_uv: np.ndarray,
-    octave: np.ndarray,
+    predicted_uv: Float[np.ndarray, "2 p"],
+    octave: Integer[np.ndarray, " p"],
     descriptor: UInt8[np.ndarray, "p 32"],
     features: Features,
     *,
@@ -134,8 +137,12 @@ def match_by_projection(
 
 
 def _near(
-    predicted_uv: np.ndarray, octave: np.ndarray, features: Features, radius_px: float, plan: FeaturePlan
-) -> tuple[np.ndarray, np.ndarray]:
+    predicted_uv: Float[np.ndarray, "2 p"],
+    octave: Integer[np.ndarray, " p"],
+    features: Features,
+    radius_px: float,
+    plan: FeaturePlan,
+) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
     """Find the pairs of points and features of similar octave within the search radius of the octave."""
     from scipy.spatial import KDTree  # noqa: PLC0415 - see `late_imports`
 
@@ -155,11 +162,11 @@ def _near(
     return point, feature
 
 
-def _first(groups: np.ndarray) -> np.ndarray:
+def _first(groups: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
     """Return which entries are the first of their group; groups must be contiguous."""
     return np.append(True, groups[1:] != groups[:-1])[: len(groups)]
 
 
-def _words(descriptor: UInt8[np.ndarray, "n 32"]) -> np.ndarray:
+def _words(descriptor: UInt8[np.ndarray, "n 32"]) -> UInt64[np.ndarray, "4 n"]:
     """View the descriptors as `(4, n)` uint64."""
     return np.ascontiguousarray(np.ascontiguousarray(descriptor).view(np.uint64).T)

@@ -10,7 +10,7 @@ from jaxslam_kernels.camera import to_pixels
 from jaxslam_kernels.depth.sampling import sample_depth, valid_depth
 from jaxslam_kernels.image.pyramid import build_pyramid
 from jaxslam_kernels.types import Pixels, Weights
-from jaxtyping import Array, Bool, Float, Float32, UInt8
+from jaxtyping import Array, Bool, Float, Float32, Int64, Integer, UInt8
 
 from jaxslam.config.schema import MappingConfig
 from jaxslam.runtime.compiled import compiled
@@ -70,13 +70,13 @@ class FeaturePlan(NamedTuple):
     fast_threshold: int = _SETTINGS.fast_threshold
     min_fast_threshold: int = _SETTINGS.min_fast_threshold
 
-    def quotas(self) -> np.ndarray:
+    def quotas(self) -> Int64[np.ndarray, " num_levels"]:
         """Return `(num_levels,)` features per level, in proportion to its scale (Mur-Artal et al. 2015)."""
         shares = self.scale_factor ** -np.arange(self.num_levels, dtype=np.float64)
         ends = np.round(np.cumsum(shares) / shares.sum() * self.num_features).astype(np.int64)
         return np.diff(ends, prepend=0)
 
-    def scale(self, octave: np.ndarray) -> np.ndarray:
+    def scale(self, octave: Integer[np.ndarray, " n"]) -> Float32[np.ndarray, " n"]:
         """Return the size of features of these octaves in the image, relative to octave 0."""
         return np.float32(self.scale_factor) ** octave.astype(np.float32)
 
@@ -94,7 +94,7 @@ DEFAULT_PLAN = FeaturePlan()
 
 
 def features_of(
-    frame: FrameArrays, twist: np.ndarray, sensor: SensorModel, plan: FeaturePlan = DEFAULT_PLAN
+    frame: FrameArrays, twist: Float[np.ndarray, "6"], sensor: SensorModel, plan: FeaturePlan = DEFAULT_PLAN
 ) -> Features:
     """Extract the features of a frame, remove distortion and rolling shutter, and read their depth.
 
@@ -111,7 +111,9 @@ def features_of(
     return Features(patches.uv_raw, uv[:, :num], depth[:num], *patches[1:])
 
 
-def extract(gray: np.ndarray, ignore: np.ndarray | None = None, plan: FeaturePlan = DEFAULT_PLAN) -> Patches:
+def extract(
+    gray: UInt8[np.ndarray, "h w"], ignore: Bool[np.ndarray, "h w"] | None = None, plan: FeaturePlan = DEFAULT_PLAN
+) -> Patches:
     """Extract ORB features that are well spread over the image.
 
     Every level of the pyramid has its quota and a grid of as many cells. The best corner of every cell comes first,
@@ -141,7 +143,11 @@ def _distance_to(ignore: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
 
 
 def _extract_level(
-    gray: np.ndarray, picture: np.ndarray, clearance: np.ndarray | None, quota: int, plan: FeaturePlan
+    gray: UInt8[np.ndarray, "h w"],
+    picture: UInt8[np.ndarray, "_h _w"],
+    clearance: Float32[np.ndarray, "h w"] | None,
+    quota: int,
+    plan: FeaturePlan,
 ) -> Patches:
     """Extract the features of one pyramid level; their octave is 0."""
     if min(picture.shape) <= 2 * _BORDER_PX or quota == 0:
@@ -170,7 +176,7 @@ def _extract_level(
     return Patches(uv_raw, np.zeros(len(kept), np.uint8), angle, descriptor)
 
 
-def _pyramid(gray: np.ndarray, plan: FeaturePlan) -> list[np.ndarray]:
+def _pyramid(gray: UInt8[np.ndarray, "h w"], plan: FeaturePlan) -> list[UInt8[np.ndarray, "_h _w"]]:
     """Build the scale pyramid, each level from the previous one, so that fine texture is smoothed and not aliased."""
     pictures = [np.ascontiguousarray(gray)]
     for scale in plan.scale(np.arange(1, plan.num_levels)):
@@ -183,15 +189,21 @@ def _positions(corners: Sequence[cv2.KeyPoint]) -> Float32[np.ndarray, "2 n"]:
     return np.asarray(cv2.KeyPoint.convert(corners), np.float32).reshape(-1, 2).T
 
 
-def _in_image(uv: np.ndarray, picture: np.ndarray, gray: np.ndarray) -> Float32[np.ndarray, "2 n"]:
+def _in_image(
+    uv: Float32[np.ndarray, "2 n"], picture: UInt8[np.ndarray, "_h _w"], gray: UInt8[np.ndarray, "h w"]
+) -> Float32[np.ndarray, "2 n"]:
     """Map pixels of a pyramid level to the image: the outer edges of both coincide, not their first pixels."""
     ratio = np.array([[gray.shape[1] / picture.shape[1]], [gray.shape[0] / picture.shape[0]]], np.float32)
     return (uv + np.float32(0.5)) * ratio - np.float32(0.5)
 
 
 def _spread(
-    uv: np.ndarray, response: np.ndarray, shape: tuple[int, ...], quota: int, fast_threshold: int
-) -> np.ndarray:
+    uv: Float32[np.ndarray, "2 n"],
+    response: Float32[np.ndarray, " n"],
+    shape: tuple[int, ...],
+    quota: int,
+    fast_threshold: int,
+) -> Int64[np.ndarray, " k"]:
     """Return the indices of at most `quota` corners: in each round, the best remaining one of every cell.
 
     The response of a corner is the highest threshold at which it is detected. A cell with a corner at `fast_threshold`

@@ -9,9 +9,10 @@ from jaxlie import SE3
 from jaxslam_kernels.camera import without_distortion
 from jaxslam_kernels.pose.pose_refine import PoseRefinement, PoseStatus, refine_pose
 from jaxslam_kernels.types import Pixels, Points, Weights
-from jaxtyping import Float64, Int64
+from jaxtyping import Float, Float32, Float64, Int, Int64
 
 from jaxslam.features.orb import FeaturePlan, Features
+from jaxslam.geometry.types import Pose
 from jaxslam.runtime.compile_cache import FAST_COMPILE
 from jaxslam.runtime.compiled import compiled
 from jaxslam.runtime.padding import padded
@@ -66,20 +67,20 @@ class FeaturePose(NamedTuple):
         share: Share of the matches that are inliers.
     """
 
-    T_origin_cam: Float64[np.ndarray, "7"]
+    T_origin_cam: Pose
     covariance: Float64[np.ndarray, "6 6"]
     agree: Int64[np.ndarray, " k"]
     share: float
 
 
 def matches_of(
-    X: np.ndarray,
-    depth_then: np.ndarray,
+    X: Float[np.ndarray, "3 k"],
+    depth_then: Float[np.ndarray, " k"],
     features: Features,
-    which: np.ndarray,
+    which: Int[np.ndarray, " k"],
     plan: FeaturePlan,
     *,
-    weight: np.ndarray | None = None,
+    weight: Float[np.ndarray, " k"] | None = None,
     capacity: int | None = None,
 ) -> Matches:
     """Collect points matched with features as padded `Matches`.
@@ -107,7 +108,7 @@ def matches_of(
 
 
 def fit_pose(
-    T_origin_cam: np.ndarray,
+    T_origin_cam: Pose,
     matches: Matches,
     sensor: SensorModel,
     *,
@@ -148,13 +149,13 @@ def matches_depth_sigma(matches: Matches, sensor: SensorModel) -> Weights:
     return jnp.hypot(depth_sigma(matches.depth_then, sensor), depth_sigma(matches.depth, sensor))
 
 
-def pinhole(sensor: SensorModel) -> tuple[np.ndarray, np.ndarray]:
+def pinhole(sensor: SensorModel) -> tuple[Float64[np.ndarray, "2 1"], Float64[np.ndarray, "2 1"]]:
     """Return the focal lengths and the principal point, `(2, 1)` each."""
     fx, fy, cx, cy = (float(value) for value in sensor.intrinsics[:4])
     return np.array([[fx], [fy]]), np.array([[cx], [cy]])
 
 
-def _cells(uv: np.ndarray, sensor: SensorModel) -> int:
+def _cells(uv: Float32[np.ndarray, "2 n"], sensor: SensorModel) -> int:
     """Count the image cells that contain at least one of the pixels."""
     focal, center = pinhole(sensor)
     return np.unique(np.floor((uv - center) / (_CELL * focal)), axis=1).shape[1]

@@ -5,21 +5,24 @@ whole process.
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxslam.geometry.so3 import matrices, multiply
+from jaxslam.geometry.types import Points, Pose, Transforms
 
 IDENTITY = np.array([1.0, 0, 0, 0, 0, 0, 0])
 """The identity transform, `(7,)` `wxyz_xyz`."""
 
 
-def rotate(T: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+def rotate(T: Transforms, vectors: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
     """Rotate `(..., 3)` vectors by the rotations of `(..., 7)` transforms."""
     return np.einsum("...ij,...j->...i", matrices(T[..., :4]), vectors)
 
 
-def compose(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def compose(first: Transforms, second: Transforms) -> Transforms:
     """Compose `(..., 7)` transforms, `second` acting first: return `T_a_c` for `T_a_b` and `T_b_c`."""
     if first.ndim == second.ndim == 1:
         return _compose_one(first.tolist(), second.tolist())
@@ -28,7 +31,7 @@ def compose(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.concatenate([rotation, rotate(first, second[..., 4:]) + first[..., 4:]], axis=-1)
 
 
-def _compose_one(first: list[float], second: list[float]) -> np.ndarray:
+def _compose_one(first: Sequence[float], second: Sequence[float]) -> Pose:
     """Compose two single transforms in plain Python: NumPy's calls would take ten times as long as the arithmetic."""
     w, x, y, z, t, u, v = first
     a, b, c, d, e, f, g = second
@@ -49,37 +52,37 @@ def _compose_one(first: list[float], second: list[float]) -> np.ndarray:
     return np.array([part / length for part in rotation] + list(shifted))
 
 
-def inverse(T: np.ndarray) -> np.ndarray:
+def inverse(T: Transforms) -> Transforms:
     """Invert `(..., 7)` transforms."""
     if T.ndim == 1:
         w, x, y, z, *shift = T.tolist()
-        turned_back = _compose_one([w, -x, -y, -z, 0, 0, 0], [1, 0, 0, 0, *shift])
+        turned_back = _compose_one([w, -x, -y, -z, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0, *shift])
         return np.concatenate([[w, -x, -y, -z], -turned_back[4:]])
     conjugate = np.concatenate([T[..., :4] * np.array([1.0, -1, -1, -1]), np.zeros_like(T[..., 4:])], axis=-1)
     return np.concatenate([conjugate[..., :4], -rotate(conjugate, T[..., 4:])], axis=-1)
 
 
-def between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def between(first: Transforms, second: Transforms) -> Transforms:
     """Return the `(..., 7)` relative transforms from `second` to `first`: `T_a_b` for `T_world_a` and `T_world_b`."""
     return compose(inverse(first), second)
 
 
-def transform(T: np.ndarray, X: np.ndarray) -> np.ndarray:
+def transform(T: Float[np.ndarray, "7"], X: Points) -> Points:
     """Transform `(3, n)` points by one `(7,)` transform: `X_a` for `T_a_b` and `X_b`, meters."""
     return matrices(T[:4]) @ X + T[4:, None]
 
 
-def to_local(T: np.ndarray, X: np.ndarray) -> np.ndarray:
+def to_local(T: Float[np.ndarray, "7"], X: Points) -> Points:
     """Transform `(3, n)` points by the inverse of one `(7,)` transform: `X_b` for `T_a_b` and `X_a`, meters."""
     return matrices(T[:4]).T @ (X - T[4:, None])
 
 
-def angle(T: np.ndarray) -> np.ndarray:
+def angle(T: Transforms) -> Float[np.ndarray, "..."] | np.floating:
     """Return the `(...,)` rotation angles of `(..., 7)` transforms, radians, 0 to pi."""
     return 2 * np.arctan2(np.linalg.norm(T[..., 1:4], axis=-1), np.abs(T[..., 0]))
 
 
-def retract(T: np.ndarray, tangent: np.ndarray) -> np.ndarray:
+def retract(T: Pose, tangent: Float[np.ndarray, "6"]) -> Pose:
     """Retract a `(6,)` tangent vector at a `(7,)` transform: the product of `T` and the small motion.
 
     The tangent holds a translation (meters) and a rotation vector (radians), both in the local axes of `T`. The two are

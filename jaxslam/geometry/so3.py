@@ -5,9 +5,12 @@ whole process.
 """
 
 import numpy as np
+from jaxtyping import Float
+
+from jaxslam.geometry.types import Quaternions
 
 
-def matrices(wxyz: np.ndarray) -> np.ndarray:
+def matrices(wxyz: Quaternions) -> Float[np.ndarray, "... 3 3"]:
     """Convert `(..., 4)` unit quaternions to `(..., 3, 3)` rotation matrices."""
     w, x, y, z = np.moveaxis(wxyz, -1, 0)
     rows = [
@@ -18,7 +21,7 @@ def matrices(wxyz: np.ndarray) -> np.ndarray:
     return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
 
 
-def axis_rotation(axis: int, angle: np.ndarray) -> np.ndarray:
+def axis_rotation(axis: int, angle: Float[np.ndarray, "..."]) -> Quaternions:
     """Return the `(..., 4)` unit quaternions that rotate by `(...,)` radians about coordinate axis 0, 1 or 2."""
     half = 0.5 * np.asarray(angle, np.float64)
     quaternion = np.zeros((*half.shape, 4))
@@ -27,7 +30,7 @@ def axis_rotation(axis: int, angle: np.ndarray) -> np.ndarray:
     return quaternion
 
 
-def multiply(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def multiply(first: Quaternions, second: Quaternions) -> Quaternions:
     """Return the Hamilton products of `(..., 4)` quaternions: `second` acts first."""
     w, x, y, z = np.moveaxis(first, -1, 0)
     a, b, c, d = np.moveaxis(second, -1, 0)
@@ -42,7 +45,7 @@ def multiply(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     )
 
 
-def quaternions(M: np.ndarray) -> np.ndarray:
+def quaternions(M: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 4"]:
     """Convert `(n, 3, 3)` matrices to the `(n, 4)` unit quaternions of the nearest rotations, with w not negative.
 
     Source: Bar-Itzhack, "New Method for Extracting the Quaternion from a Rotation Matrix", 2000, version 3.
@@ -57,7 +60,9 @@ def quaternions(M: np.ndarray) -> np.ndarray:
     return np.where(wxyz[:, :1] < 0, -wxyz, wxyz)
 
 
-def slerp(first: np.ndarray, second: np.ndarray, share: np.ndarray) -> np.ndarray:
+def slerp(
+    first: Float[np.ndarray, "n 4"], second: Float[np.ndarray, "n 4"], share: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "n 4"]:
     """Interpolate between `(n, 4)` unit quaternions along the shorter arc.
 
     Args:

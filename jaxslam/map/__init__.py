@@ -1,4 +1,4 @@
-"""The immutable map of keyframes and points: types, edits, invariants, files, export."""
+"""Immutable map of keyframes and points: types, edits, invariants, files, export."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""What may move leaves a keyframe and the map, once it is known where it was seen.
+"""Remove the features and points on dynamic objects from a keyframe and the map, once their mask is known.
 
 Source: Ji, Wang and Xie, "Towards Real-time Semantic RGB-D SLAM in Dynamic Environments" (TRS-SLAM), 2021, section
 III-A: keyframes and map keep static features and points only.
@@ -10,17 +10,18 @@ import numpy as np
 from jaxtyping import Bool, Int64, Num
 
 from jaxslam.features.orb import Features
+from jaxslam.geometry.types import Ids
 from jaxslam.map.edit import without_points
 from jaxslam.map.types import NONE, Keyframe, Map, has
 
 
 class DynamicObservations(NamedTuple):
-    """What may move in a keyframe.
+    """The dynamic part of a keyframe.
 
     Attributes:
-        keyframe: Its id; `NONE` if it does not go into the map.
-        mask: True where it is, in pixels of the image.
-        tracks: The tracker's numbers of the points that it saw there.
+        keyframe: Id of the keyframe; `NONE` if it is not added to the map.
+        mask: `(h, w)` mask of the dynamic objects, in pixels of the distorted image.
+        tracks: `(n,)` tracker ids of the points observed under the mask.
     """
 
     keyframe: int
@@ -29,17 +30,22 @@ class DynamicObservations(NamedTuple):
 
 
 def under(mask: Bool[np.ndarray, "h w"], uv_raw: Num[np.ndarray, "2 n"]) -> Bool[np.ndarray, " n"]:
-    """Which pixels of the image, as seen, are under a mask; those beyond its border count as on it."""
+    """Return which pixels of the distorted image are under a mask; pixels outside are clamped to its border."""
     limits = np.array(mask.shape[::-1])[:, None] - 1
     column, row = np.clip(np.round(uv_raw), 0, limits).astype(np.int64)
     return mask[row, column]
 
 
 def without_dynamic(slam_map: Map, keyframe_id: int, mask: Bool[np.ndarray, "h w"]) -> Map:
-    """The map without what a keyframe shows under a mask.
+    """Remove what a keyframe observes under a mask.
 
-    The features there leave the keyframe, and the points that it saw there leave the map, with all that was seen of
-    them from elsewhere.
+    The features under the mask are removed from the keyframe. The points that it observes there are removed from the
+    map with all their observations.
+
+    Args:
+        slam_map: The map.
+        keyframe_id: Id of the keyframe.
+        mask: `(h, w)` mask in pixels of the distorted image.
 
     Raises:
         KeyError: If the keyframe is not in the map.
@@ -54,14 +60,14 @@ def without_dynamic(slam_map: Map, keyframe_id: int, mask: Bool[np.ndarray, "h w
     return _with_features(slam_map, keyframe, stays)
 
 
-def without_dynamic_points(slam_map: Map, point_ids: np.ndarray) -> Map:
-    """Remove those of some points that are in the map."""
+def without_dynamic_points(slam_map: Map, point_ids: Ids) -> Map:
+    """Remove some points; ids that are not in the map are skipped."""
     known = np.unique(point_ids)
     return without_points(slam_map, known[has(slam_map.points.ids, known)])
 
 
 def _with_features(slam_map: Map, keyframe: Keyframe, stays: Bool[np.ndarray, " n"]) -> Map:
-    """The map with only some features of a keyframe; no point may be seen by the others."""
+    """Keep only the features of a keyframe where `stays` is true; the others must have no observation."""
     row, features, seen = slam_map.row(keyframe.id), keyframe.features, slam_map.observations
     kept = {name: array[..., stays] for name, array in features._asdict().items() if name != "descriptor"}
     left = Features(descriptor=features.descriptor[stays], **kept)

@@ -1,6 +1,6 @@
-"""The map for other programs: a point cloud, a COLMAP model, and the trajectory of the keyframes.
+"""Export the map for other programs: a point cloud, a COLMAP model, and the trajectory of the keyframes.
 
-Submaps have no common frame, so that each export holds one of them: by default the one with most keyframes.
+Submaps have no common frame, so each export holds one of them: by default the one with most keyframes.
 """
 
 import os
@@ -24,17 +24,17 @@ PathLike: TypeAlias = str | os.PathLike[str]
 _UNKNOWN_GRAY = 128
 _KEYFRAME_RGB = (255, 128, 0)
 _COLMAP_CENTER = 0.5
-"""What COLMAP calls the center of the top-left pixel; ours is 0."""
+"""Coordinate of the center of the top-left pixel in COLMAP, pixels; here it is 0."""
 
 
 def write_ply(path: PathLike, slam_map: Map, submap: int | None = None, *, keyframes: bool = False) -> None:
-    """Write the points as a binary PLY: place in meters, gray value, weight, and number of observations.
+    """Write the points as a binary PLY file: position in meters, gray value, weight, and number of observations.
 
     Args:
-        path: Where to write; the file appears whole or not at all.
+        path: Path of the file to write; the file appears whole or not at all.
         slam_map: The map.
         submap: Number of the submap; by default the one with most keyframes.
-        keyframes: Whether to add the centers of the keyframes as orange points, with the number of points they see.
+        keyframes: Whether to add the keyframe positions as orange points, with the number of points they observe.
 
     Raises:
         MapFileError: If the file cannot be written, there is no such submap, or an image cannot be decoded.
@@ -52,15 +52,16 @@ def write_ply(path: PathLike, slam_map: Map, submap: int | None = None, *, keyfr
 
 
 def write_colmap(folder: PathLike, slam_map: Map, submap: int | None = None) -> None:
-    """Write the map as COLMAP has it: `sparse/0/{cameras,images,points3D}.txt` and `images/*.png` in a folder.
+    """Write a COLMAP model: `sparse/0/{cameras,images,points3D}.txt` and `images/*.png` in a folder.
 
-    The camera is a pinhole without distortion, the pixels are those of such a camera, `Observations.uv`, and the images
-    are undistorted: residuals are then the same as in the map, where rolling shutter and distortion are corrected in
-    the pixels, and dense methods take such models as they are. COLMAP counts pixels from the corner of the image: all
-    are half a pixel more than here. Ids are those of the map plus one. Points that no keyframe sees are left out.
+    The camera is a pinhole without distortion, the pixels are those of such a camera (`Observations.uv`), and the
+    images are undistorted. The residuals are then the same as in the map, where rolling shutter and distortion are
+    corrected in the pixels, and dense methods can use the model directly. COLMAP measures pixels from the corner of the
+    image, so all coordinates are half a pixel larger than here. Ids are those of the map plus one. Points without
+    observations are left out.
 
     Args:
-        folder: Where to write; made if missing. Files of an earlier export are replaced, one by one.
+        folder: Folder to write to; it is created if missing. Files of an earlier export are replaced one by one.
         slam_map: The map.
         submap: Number of the submap; by default the one with most keyframes.
 
@@ -102,7 +103,7 @@ def write_keyframe_trajectory(path: PathLike, slam_map: Map, submap: int | None 
 
 
 def one_submap(slam_map: Map, submap: int | None = None) -> Map:
-    """The part of a map that is in one world; an empty map stays as it is.
+    """Extract one submap; an empty map is returned unchanged.
 
     Args:
         slam_map: The map.
@@ -132,7 +133,7 @@ def one_submap(slam_map: Map, submap: int | None = None) -> Map:
 
 
 def _counts(ids: np.ndarray, mentioned: np.ndarray) -> np.ndarray:
-    """How often each of the ascending ids is mentioned."""
+    """Count how often each of the ascending ids occurs in `mentioned`."""
     return np.bincount(rows(ids, mentioned), minlength=len(ids))
 
 
@@ -145,7 +146,7 @@ def _decoded(keyframe: Keyframe) -> np.ndarray:
 
 
 def _grays(slam_map: Map) -> np.ndarray:
-    """`(p,)` gray value of each point where a keyframe first saw it."""
+    """Return the `(p,)` gray value of each point in the first keyframe that observes it."""
     grays = np.full(len(slam_map.points.ids), _UNKNOWN_GRAY, np.uint8)
     points, first = np.unique(slam_map.observations.point, return_index=True)
     seen = observations_at(slam_map.observations, first)
@@ -160,7 +161,7 @@ def _grays(slam_map: Map) -> np.ndarray:
 
 
 def _undistorted(keyframe: Keyframe, camera: Camera) -> bytes:
-    """The image, as PNG, that the same camera without distortion would have taken; black where it saw more."""
+    """Return the undistorted image as PNG; black where the distorted image has no data."""
     if not any(camera.distortion):
         return keyframe.image_png
     K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
@@ -179,7 +180,7 @@ def _camera_lines(camera: Camera) -> Iterator[str]:
 
 
 def _image_lines(slam_map: Map) -> Iterator[str]:
-    """Two lines a keyframe: its pose, world to camera, and its pixels."""
+    """Yield two lines for each keyframe: its pose (world to camera) and its pixels."""
     yield "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"
     yield "# POINTS2D[] as (X, Y, POINT3D_ID)"
     us, vs = (slam_map.observations.uv.astype(np.float64) + _COLMAP_CENTER).tolist()
@@ -205,20 +206,20 @@ def _point_lines(slam_map: Map) -> Iterator[str]:
 
 
 def _track_entries(slam_map: Map) -> np.ndarray:
-    """`(s, 2)` image of each observation, and which of the image's pixels it is."""
+    """Return the `(s, 2)` image id of each observation, and the index of its pixel in that image."""
     starts = np.repeat(_bounds(slam_map)[0], _counts(slam_map.ids, slam_map.observations.keyframe))
     return np.column_stack([slam_map.observations.keyframe + 1, np.arange(len(starts)) - starts])
 
 
 def _bounds(slam_map: Map) -> tuple[np.ndarray, np.ndarray]:
-    """Where the observations of each keyframe begin and end, if they are sorted by keyframe."""
+    """Return the first and the end row of each keyframe's observations, which must be sorted by keyframe."""
     return np.searchsorted(slam_map.observations.keyframe, slam_map.ids), np.searchsorted(
         slam_map.observations.keyframe, slam_map.ids, "right"
     )
 
 
 def _pixel_errors(slam_map: Map) -> np.ndarray:
-    """`(s,)` pixels between where a point was seen and where it should have been."""
+    """Return the `(s,)` reprojection errors of the observations, pixels."""
     T_cam_world = inverse(slam_map.T_world_cam)[rows(slam_map.ids, slam_map.observations.keyframe)]
     X_world = slam_map.points.X_world[:, rows(slam_map.points.ids, slam_map.observations.point)]
     u, v = slam_map.camera.project((rotate(T_cam_world, X_world.T) + T_cam_world[:, 4:]).T)
@@ -226,5 +227,5 @@ def _pixel_errors(slam_map: Map) -> np.ndarray:
 
 
 def _words(numbers: Sequence[float]) -> str:
-    """The shortest text that reads back to the same floats."""
+    """Format floats as the shortest text that reads back to the same values."""
     return " ".join([str(number) for number in numbers])

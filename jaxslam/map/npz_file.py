@@ -1,11 +1,11 @@
-"""The map as one file: a NumPy `.npz` archive without pickles or compression, which `numpy.load` can open too.
+"""The map file: a NumPy `.npz` archive without pickles or compression, which `numpy.load` can open too.
 
 Its first member, `header.json`, holds
 
     format           "jaxslam map"
     version          3
     camera           the fields of `jaxslam.Camera`, by name
-    counts           how many keyframes k, points p, observations s, loops l, culled keyframes c, features n of all
+    counts           number of keyframes k, points p, observations s, loops l, culled keyframes c, features n of all
                      keyframes together, and bytes b of all images together
     next_keyframe    next id of a keyframe
     next_point       next id of a point
@@ -30,23 +30,23 @@ The others are arrays, each `NAME.npy`, little-endian, in C order:
     points.X_world                 float64  (3, p)     meters
     points.weight                  float32  (p)        0 to 1
     points.descriptor              uint8    (p, 32)    ORB; zeros for none
-    points.has_descriptor            bool     (p)        whether there is a descriptor
+    points.has_descriptor          bool     (p)        whether there is a descriptor
     points.reference_keyframe      int64    (p)        id of a keyframe
     points.state                   int8     (p)        0 static, 1 blocked, 2 occluded; not in version 1: 0 there
-    observations.keyframe             int64    (s)        id
-    observations.point                int64    (s)        id
-    observations.feature              int32    (s)        index in the keyframe; -1 for none
+    observations.keyframe          int64    (s)        id
+    observations.point             int64    (s)        id
+    observations.feature           int32    (s)        index in the keyframe; -1 for none
     observations.uv_raw            float32  (2, s)     pixels of the distorted image
-    observations.uv                   float32  (2, s)     pixels of an ideal pinhole camera
-    observations.depth                float32  (s)        meters; 0 unknown
-    observations.sigma_px             float32  (s)        pixels
-    observations.weight               float32  (s)        0 to 1
+    observations.uv                float32  (2, s)     pixels of an ideal pinhole camera
+    observations.depth             float32  (s)        meters; 0 unknown
+    observations.sigma_px          float32  (s)        pixels
+    observations.weight            float32  (s)        0 to 1
     loops.source                   int64    (l)        id of a keyframe
     loops.target                   int64    (l)        id of a keyframe
     loops.T_source_target          float64  (l, 7)     qw qx qy qz x y z, meters
     loops.information              float64  (l, 6, 6)  inverse covariance, tangent translation first
     culled.ids                     int64    (c)        keyframes that were dropped
-    culled.anchor                  int64    (c)        id of the keyframe that holds the place of each
+    culled.anchor                  int64    (c)        id of the keyframe relative to which each pose is stored
     culled.T_anchor_keyframe       float64  (c, 7)     qw qx qy qz x y z, meters
 
 Any change of these is a new version.
@@ -60,7 +60,7 @@ import os
 import struct
 import zipfile
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -77,14 +77,14 @@ READABLE = (1, 2, 3)
 """Versions that `load_map` reads."""
 
 _SINCE = {"points.state": 2}
-"""The version that an array came with, if not the first; where it is not in a file it is all zeros."""
+"""The first version with an array, if not version 1; in older files the array is missing and read as zeros."""
 
 _BEFORE_VERSION_3 = {
     "features.uv_raw": "features.seen_uv",
     "points.has_descriptor": "points.recognisable",
     "points.reference_keyframe": "points.made_by",
 }
-"""Arrays that had another name before version 3, where all of `observations` was called `sightings` too."""
+"""Names of arrays before version 3, in which `observations` were also called `sightings`."""
 
 _COUNTS = {
     "k": "keyframes",
@@ -100,9 +100,9 @@ _HEADER = "header.json"
 _MAX_HEADER_BYTES = 1 << 16
 _MAX_ARRAY_HEADER_BYTES = 1 << 10
 _END_BYTES = 22
-"""Of the record at the end of an archive without a comment."""
+"""Size of the end record of a zip archive without a comment, bytes."""
 _DAMAGE = (zipfile.BadZipFile, EOFError, ValueError, KeyError, RuntimeError, struct.error)
-"""What reading an archive of arbitrary bytes may raise, besides `OSError`."""
+"""Exceptions besides `OSError` that reading an archive of arbitrary bytes may raise."""
 
 
 class _Header(NamedTuple):
@@ -114,10 +114,10 @@ class _Header(NamedTuple):
 
 
 def save_map(path: str | os.PathLike[str], slam_map: Map) -> None:
-    """Write a map; the file appears whole or not at all, and the same map gives the same bytes.
+    """Write a map file; it appears whole or not at all, and the same map gives the same bytes.
 
     Raises:
-        MapFileError: If the file cannot be written, or the map is not whole.
+        MapFileError: If the file cannot be written, or the map is invalid.
     """
     if wrong := problems(slam_map):
         raise MapFileError(f"{path}: not written: {_first(wrong)}")
@@ -125,17 +125,17 @@ def save_map(path: str | os.PathLike[str], slam_map: Map) -> None:
     with replacing(path, MapFileError) as temporary, zipfile.ZipFile(temporary, "w") as archive:
         archive.writestr(zipfile.ZipInfo(_HEADER), json.dumps(_header(slam_map, arrays), indent=1))
         for name, array in arrays.items():
-            member = zipfile.ZipInfo(f"{name}.npy")  # of 1980: the time of writing is no part of a map
+            member = zipfile.ZipInfo(f"{name}.npy")  # dated 1980, so that equal maps give equal bytes
             member.file_size = array.nbytes
             with archive.open(member, "w") as file:
                 np.lib.format.write_array(file, array, version=(1, 0), allow_pickle=False)
 
 
 def load_map(path: str | os.PathLike[str]) -> Map:
-    """Read a map that `save_map` wrote, equal to the bit.
+    """Read a map file that `save_map` wrote; all numbers are restored exactly.
 
     Raises:
-        MapFileError: If the file is missing, empty, damaged, of another format or version, or the map is not whole.
+        MapFileError: If the file is missing, empty, damaged, of another format or version, or the map is invalid.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -152,7 +152,7 @@ def load_map(path: str | os.PathLike[str]) -> Map:
 
 
 def _layout() -> dict[str, ArrayField]:
-    """What each array of a file is."""
+    """Return the type and shape of each array of a file."""
     layout = {f"keyframes.{name}": field for name, field in array_fields(Map).items()}
     layout["keyframes.timestamp_ns"] = ArrayField(np.dtype(np.int64), ("k",))
     layout["keyframes.feature_offsets"] = layout["keyframes.image_offsets"] = ArrayField(np.dtype(np.int64), ("k+1",))
@@ -182,7 +182,7 @@ def _header(slam_map: Map, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
 
 
 def _arrays(slam_map: Map) -> dict[str, np.ndarray]:
-    """The arrays of a file by their names, in its order."""
+    """Return the arrays of a file by name, in the order of the file."""
     features = [keyframe.features for keyframe in slam_map.keyframes]
     images = [keyframe.image_png for keyframe in slam_map.keyframes]
     keyframes = {
@@ -205,7 +205,7 @@ def _arrays(slam_map: Map) -> dict[str, np.ndarray]:
 
 
 def _joined(features: list[Features]) -> dict[str, np.ndarray]:
-    """All features in one record; also of none."""
+    """Concatenate the features of all keyframes; works without keyframes too."""
     fields = array_fields(Features)
     none = {name: np.zeros(field.shape({"n": 0}), field.dtype) for name, field in fields.items()}
     return {
@@ -219,7 +219,7 @@ def _offsets(lengths: list[int]) -> np.ndarray:
 
 
 def _check_ends(archive: zipfile.ZipFile, path: Path) -> None:
-    """Refuse a file with something before or behind the archive, which `zipfile` passes over."""
+    """Reject a file with bytes before or after the archive, which `zipfile` would ignore."""
     with path.open("rb") as file:
         file.seek(-_END_BYTES, os.SEEK_END)
         end = file.read()
@@ -258,7 +258,7 @@ def _field(record: dict[str, Any], name: str, kind: type) -> Any:
 
 
 def _name_in_version(name: str, version: int) -> str:
-    """The name that an array or a count had in files of a version."""
+    """Return the name of an array or a count in files of a version."""
     if version >= 3:
         return name
     return _BEFORE_VERSION_3.get(name, name.replace("observations", "sightings").replace("uv_raw", "seen_uv"))
@@ -305,7 +305,7 @@ def _read_array(archive: zipfile.ZipFile, name: str, dtype: np.dtype, shape: tup
         if np.lib.format.read_magic(file) != (1, 0):
             raise MapFileError(f"{name}: expected an array in version 1.0 of NumPy's format")
         found_shape, by_column, found_dtype = _read_array_header(file, name)
-        data = file.read()  # to the end, where the checksum is compared
+        data = file.read()  # to the end, because the checksum is compared there
     if (found_shape, found_dtype) != (shape, dtype) or (by_column and len(shape) > 1):
         raise MapFileError(f"{name}: expected {dtype} {shape}, got {found_dtype} {found_shape}")
     if len(data) != dtype.itemsize * math.prod(shape):
@@ -313,8 +313,8 @@ def _read_array(archive: zipfile.ZipFile, name: str, dtype: np.dtype, shape: tup
     return np.frombuffer(data, dtype).reshape(shape).copy()
 
 
-def _read_array_header(file: IO[bytes], name: str) -> tuple[Any, Any, np.dtype]:
-    """Shape, order of Fortran, and type, as NumPy's format 1.0 says; NumPy itself would first try to repair them."""
+def _read_array_header(file: zipfile.ZipExtFile, name: str) -> tuple[Any, Any, np.dtype]:
+    """Read shape, Fortran order and type from a header of NumPy's format 1.0; NumPy would first try to repair it."""
     text = file.read(int.from_bytes(file.read(2), "little"))
     try:
         header = ast.literal_eval(text.decode("ascii")) if len(text) <= _MAX_ARRAY_HEADER_BYTES else {}
@@ -323,12 +323,12 @@ def _read_array_header(file: IO[bytes], name: str) -> tuple[Any, Any, np.dtype]:
         raise MapFileError(f"{name}: expected the header of a NumPy array, got {text!r:.40}") from None
 
 
-def _opened(archive: zipfile.ZipFile, name: str) -> IO[bytes]:
-    """A member that takes no more memory than it takes place in the file."""
+def _opened(archive: zipfile.ZipFile, name: str) -> zipfile.ZipExtFile:
+    """Open an uncompressed member, which takes no more memory than space in the file."""
     member = archive.getinfo(name)
     if member.compress_type != zipfile.ZIP_STORED or member.file_size != member.compress_size:
         raise MapFileError(f"{name}: expected no compression")
-    return archive.open(member)
+    return archive.open(member)  # pyright: ignore[reportReturnType] - typeshed says IO[bytes]
 
 
 def _assembled(header: _Header, arrays: dict[str, np.ndarray]) -> Map:
@@ -359,14 +359,14 @@ def _record(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]
 
 
 def _features(arrays: dict[str, np.ndarray], name: str) -> list[np.ndarray]:
-    """One array of the features of each keyframe."""
+    """Split one array of features by keyframe."""
     axis = array_fields(Features)[name].dims.index("n")
     parts = _split(arrays, f"features.{name}", "keyframes.feature_offsets", axis)
     return [np.array(part, order="C") for part in parts]
 
 
 def _split(arrays: dict[str, np.ndarray], name: str, offsets_name: str, axis: int = 0) -> list[np.ndarray]:
-    """What belongs to each keyframe."""
+    """Split an array by keyframe."""
     offsets, whole = arrays[offsets_name], arrays[name]
     if offsets[0] != 0 or offsets[-1] != whole.shape[axis] or (np.diff(offsets) < 0).any():
         raise MapFileError(f"{offsets_name}: expected them to rise from 0 to {whole.shape[axis]}")

@@ -1,17 +1,18 @@
-"""The spanning tree of a submap's keyframes, and how it closes over one that goes."""
+"""Queries of the spanning tree of a submap's keyframes, and its new parents after a keyframe is removed."""
 
 import numpy as np
 
+from jaxslam.geometry.types import Ids
 from jaxslam.map.types import NONE, Map, covisible, rows
 
 
-def children(slam_map: Map, keyframe_id: int) -> np.ndarray:
-    """Ids, ascending, of the keyframes that hang on one in the spanning tree."""
+def children(slam_map: Map, keyframe_id: int) -> Ids:
+    """Return the ascending ids of the children of a keyframe in the spanning tree."""
     return slam_map.ids[slam_map.parent == keyframe_id]
 
 
-def subtree(slam_map: Map, keyframe_id: int) -> np.ndarray:
-    """Ids, ascending, of a keyframe and of all that hang on it, directly or not."""
+def subtree(slam_map: Map, keyframe_id: int) -> Ids:
+    """Return the ascending ids of a keyframe and all its descendants in the spanning tree."""
     from scipy.sparse import csr_array  # noqa: PLC0415 - see `late_imports`
     from scipy.sparse.csgraph import breadth_first_order  # noqa: PLC0415
 
@@ -21,8 +22,11 @@ def subtree(slam_map: Map, keyframe_id: int) -> np.ndarray:
     return np.sort(slam_map.ids[breadth_first_order(below, slam_map.row(keyframe_id), return_predecessors=False)])
 
 
-def parents_from(slam_map: Map, keyframe_id: int) -> np.ndarray:
-    """`(k,)` parents if a keyframe were the first of its submap: those above it hang on it, each on the one before."""
+def parents_from(slam_map: Map, keyframe_id: int) -> Ids:
+    """Return the `(k,)` parents with a keyframe as the root of its submap.
+
+    The path from the keyframe to the former root is reversed. All other keyframes keep their parents.
+    """
     parent, above, below = slam_map.parent.copy(), int(keyframe_id), NONE
     while above != NONE:
         row = slam_map.row(above)
@@ -31,12 +35,12 @@ def parents_from(slam_map: Map, keyframe_id: int) -> np.ndarray:
 
 
 def new_anchor(slam_map: Map, keyframe_id: int) -> int:
-    """Id of the keyframe that holds the place of one that goes.
+    """Return the id of the keyframe relative to which the pose of a removed keyframe is stored.
 
-    Its parent, or for the first of a submap the child that shares most points with it.
+    It is the parent or, for the first keyframe of a submap, the child with the most shared points.
 
     Raises:
-        ValueError: If it is the only one of its submap.
+        ValueError: If the keyframe is the only one of its submap.
     """
     parent = slam_map.parent[slam_map.row(keyframe_id)]
     if parent != NONE:
@@ -49,11 +53,11 @@ def new_anchor(slam_map: Map, keyframe_id: int) -> int:
     return int(near[0] if len(near) else below[0])
 
 
-def parents_without(slam_map: Map, keyframe_id: int, anchor: int) -> np.ndarray:
-    """`(k,)` parents after a keyframe went and `anchor` took its place.
+def parents_without(slam_map: Map, keyframe_id: int, anchor: int) -> Ids:
+    """Return the `(k,)` parents after the removal of a keyframe whose anchor is `anchor`.
 
-    Its children hang on the keyframe that shares most points with them and does not itself hang on them, or if there
-    is none on `anchor`.
+    Each of its children gets the keyframe with the most shared points that is not its own descendant as parent or, if
+    there is none, `anchor`.
     """
     parent = slam_map.parent.copy()
     if slam_map.parent[slam_map.row(keyframe_id)] == NONE:

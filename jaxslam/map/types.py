@@ -1,18 +1,19 @@
-"""The map: keyframes, points, and which keyframe saw which point where.
+"""The map: keyframes, points, and the observations of points in keyframes.
 
-Immutable: a change makes a new `Map` that shares all that did not change. Whoever holds one reads it without locks
-and without waiting, whatever other threads do. Rows are sorted by id, and an id is never given twice.
+A `Map` is immutable: an edit returns a new one that shares all unchanged arrays, so any thread can read a map without
+locks. Rows are sorted by id, and an id is never assigned twice.
 
-Arrays are NumPy's and as long as needed; what the kernels get is cut out and padded to a few sizes where it is used.
+Arrays are NumPy arrays without padding; code that calls kernels extracts and pads the rows that it needs.
 """
 
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int8, Int32, Int64, UInt8
+from jaxtyping import Bool, Float32, Float64, Int, Int8, Int32, Int64, UInt8
 
 from jaxslam.features.orb import DESCRIPTOR_BYTES, Features
 from jaxslam.geometry.se3 import IDENTITY, compose
+from jaxslam.geometry.types import Ids, Pose
 from jaxslam.sensors.camera import Camera
 
 if TYPE_CHECKING:
@@ -23,13 +24,13 @@ NONE = -1
 
 
 class Keyframe(NamedTuple):
-    """What was seen from one place; nothing of it changes, but features may leave it.
+    """A keyframe. It never changes, except that its features on dynamic objects may be removed.
 
     Attributes:
-        id: Its number.
-        timestamp_ns: Its time, nanoseconds.
-        features: What can be recognized in it.
-        image_png: The gray image, losslessly compressed.
+        id: Id of the keyframe.
+        timestamp_ns: Time of the image, nanoseconds.
+        features: ORB features of the image.
+        image_png: Gray image, compressed as PNG.
     """
 
     id: int
@@ -39,16 +40,17 @@ class Keyframe(NamedTuple):
 
 
 class MapPoints(NamedTuple):
-    """Points of the world, one a row.
+    """The `p` points of the map.
 
     Attributes:
-        ids: Ascending.
-        X_world: Meters.
-        weight: How much each counts, 0 to 1.
-        descriptor: ORB descriptor of the points that can be recognized, zeros for the others.
-        recognizable: Which have a descriptor; the others are only followed and looked up by their picture.
-        reference_keyframe: Id of the keyframe that made each.
-        state: A `PointState` of each: whether something that moves has passed before it.
+        ids: `(p,)` ids of the points, ascending.
+        X_world: `(3, p)` positions in the world frame of their submap, meters.
+        weight: `(p,)` weights in optimization, 0 to 1.
+        descriptor: `(p, 32)` ORB descriptors; zeros for a point without one.
+        has_descriptor: `(p,)` mask of the points with a descriptor. The others are only tracked by optical flow and
+            aligned with image patches.
+        reference_keyframe: `(p,)` ids of the keyframes that created the points.
+        state: `(p,)` a `PointState` of each point: whether a moving object has passed in front of it.
     """
 
     ids: Int64[np.ndarray, " p"]
@@ -61,17 +63,17 @@ class MapPoints(NamedTuple):
 
 
 class Observations(NamedTuple):
-    """Which keyframe saw which point where; a keyframe sees a point at most once.
+    """The `s` observations of points in keyframes; a keyframe observes a point at most once.
 
     Attributes:
-        keyframe: Ids.
-        point: Ids.
-        feature: Index among the features of the keyframe; `NONE` for a point that was followed by optical flow.
-        uv_raw: As seen, pixels of the distorted image.
-        uv: As an ideal pinhole camera without distortion and rolling shutter would have seen it, pixels.
-        depth: Meters, 0 where there was none to believe.
-        sigma_px: Standard deviation of `uv`, pixels.
-        weight: How much each counts, 0 to 1.
+        keyframe: `(s,)` ids of the keyframes.
+        point: `(s,)` ids of the points.
+        feature: `(s,)` index among the features of the keyframe; `NONE` for a point that was tracked by optical flow.
+        uv_raw: `(2, s)` measured coordinates in the distorted image, pixels.
+        uv: `(2, s)` coordinates in an ideal pinhole image without distortion and rolling shutter, pixels.
+        depth: `(s,)` measured depth, meters; 0 where no valid depth was measured.
+        sigma_px: `(s,)` standard deviation of each coordinate of `uv`, pixels.
+        weight: `(s,)` weights in optimization, 0 to 1.
     """
 
     keyframe: Int64[np.ndarray, " s"]
@@ -85,13 +87,13 @@ class Observations(NamedTuple):
 
 
 class Loops(NamedTuple):
-    """Relative poses measured where a place was recognized.
+    """The `l` loop constraints: relative poses measured when a place was recognized.
 
     Attributes:
-        source: Ids of the keyframes in whose frame was measured.
-        target: Ids of the keyframes that were measured.
-        T_source_target: `wxyz_xyz`.
-        information: Inverse covariances, tangent translation first.
+        source: `(l,)` ids of the keyframes in whose frame the relative pose is given.
+        target: `(l,)` ids of the other keyframes.
+        T_source_target: `(l, 7)` poses of the targets relative to the sources, `wxyz_xyz`.
+        information: `(l, 6, 6)` inverse covariances of the relative poses; the tangent is translation, then rotation.
     """
 
     source: Int64[np.ndarray, " l"]
@@ -101,12 +103,12 @@ class Loops(NamedTuple):
 
 
 class Culled(NamedTuple):
-    """Keyframes that were dropped, held by their place relative to another one, for the trajectory.
+    """The `c` culled keyframes: their poses relative to other keyframes are kept for the trajectory.
 
     Attributes:
-        ids: In the order in which they were dropped.
-        anchor: Ids of the keyframes they are held by, which may have been culled later.
-        T_anchor_keyframe: `wxyz_xyz`.
+        ids: `(c,)` ids of the culled keyframes, in the order in which they were culled.
+        anchor: `(c,)` ids of the keyframes relative to which their poses are stored; an anchor may be culled later.
+        T_anchor_keyframe: `(c, 7)` poses relative to the anchors, `wxyz_xyz`.
     """
 
     ids: Int64[np.ndarray, " c"]
@@ -115,21 +117,21 @@ class Culled(NamedTuple):
 
 
 class Map(NamedTuple):
-    """All that is known of the world at one time.
+    """The immutable map of `k` keyframes.
 
     Attributes:
-        camera: That made it.
-        keyframes: Ascending by id.
-        ids: `(k,)` their ids.
-        T_world_cam: `(k, 7)` their poses, `wxyz_xyz`.
-        parent: `(k,)` id of each one's parent in the spanning tree; `NONE` for the first of a submap.
-        submap: `(k,)` number of the submap each belongs to; those of one submap share a world frame.
-        points: The points.
-        observations: Who saw what.
-        loops: Loops closed so far.
-        culled: Keyframes dropped so far.
-        next_keyframe: The next id of a keyframe.
-        next_point: The next id of a point.
+        camera: Camera of all keyframes.
+        keyframes: The keyframes, ascending by id.
+        ids: `(k,)` ids of the keyframes.
+        T_world_cam: `(k, 7)` poses of the keyframes, `wxyz_xyz`.
+        parent: `(k,)` id of each keyframe's parent in the spanning tree; `NONE` for the first keyframe of a submap.
+        submap: `(k,)` number of the submap of each keyframe; the keyframes of a submap share a world frame.
+        points: The map points.
+        observations: The observations of points in keyframes.
+        loops: The loops closed so far.
+        culled: The keyframes culled so far.
+        next_keyframe: Id of the next keyframe to be added.
+        next_point: Id of the next point to be added.
     """
 
     camera: Camera
@@ -147,19 +149,31 @@ class Map(NamedTuple):
 
     @property
     def world_submap(self) -> int:
-        """Number of the submap whose frame is the map's own: the earliest, into which the others are carried."""
+        """Number of the earliest submap, into whose frame the others are merged."""
         return int(self.submap.min()) if len(self.submap) else 0
 
     def row(self, keyframe_id: int) -> int:
-        """Row of a keyframe that is in the map."""
+        """Return the row of a keyframe.
+
+        Raises:
+            KeyError: If the keyframe is not in the map.
+        """
         return int(rows(self.ids, np.array([keyframe_id]))[0])
 
     def keyframe(self, keyframe_id: int) -> Keyframe:
-        """A keyframe that is in the map."""
+        """Return a keyframe.
+
+        Raises:
+            KeyError: If the keyframe is not in the map.
+        """
         return self.keyframes[self.row(keyframe_id)]
 
-    def pose(self, keyframe_id: int) -> np.ndarray:
-        """`(7,)` pose `T_world_cam` of a keyframe, also of one that was culled."""
+    def pose(self, keyframe_id: int) -> Pose:
+        """Return the pose `T_world_cam` of a keyframe, which may have been culled.
+
+        Raises:
+            KeyError: If the keyframe was never in this map.
+        """
         T_anchor_keyframe = IDENTITY
         while not has(self.ids, np.array([keyframe_id]))[0]:
             found = np.flatnonzero(self.culled.ids == keyframe_id)
@@ -171,7 +185,7 @@ class Map(NamedTuple):
 
 
 def empty_map(camera: Camera) -> Map:
-    """A map of nothing."""
+    """Create an empty map."""
     none = np.zeros(0, np.int64)
     return Map(
         camera=camera,
@@ -190,7 +204,7 @@ def empty_map(camera: Camera) -> Map:
 
 
 def empty_points() -> MapPoints:
-    """No points."""
+    """Return a record of no points."""
     return MapPoints(
         ids=np.zeros(0, np.int64),
         X_world=np.zeros((3, 0)),
@@ -203,7 +217,7 @@ def empty_points() -> MapPoints:
 
 
 def empty_observations() -> Observations:
-    """No observations."""
+    """Return a record of no observations."""
     return Observations(
         keyframe=np.zeros(0, np.int64),
         point=np.zeros(0, np.int64),
@@ -216,18 +230,18 @@ def empty_observations() -> Observations:
     )
 
 
-def has(ids: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Which of the wanted ids are among the ascending `ids`."""
+def has(ids: Ids, wanted: Int[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
+    """Return which of the wanted ids are among the ascending `ids`."""
     if not len(ids):
         return np.zeros(len(wanted), bool)
     return ids[np.minimum(np.searchsorted(ids, wanted), len(ids) - 1)] == wanted
 
 
-def rows(ids: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Where each of the wanted ids is among the ascending `ids`.
+def rows(ids: Ids, wanted: Int[np.ndarray, " m"]) -> Int[np.ndarray, " m"]:
+    """Look up the index of each wanted id in the ascending `ids`.
 
     Raises:
-        KeyError: If one is not there.
+        KeyError: If a wanted id is not there.
     """
     known = has(ids, wanted)
     if not known.all():
@@ -236,23 +250,25 @@ def rows(ids: np.ndarray, wanted: np.ndarray) -> np.ndarray:
 
 
 def visibility(slam_map: Map) -> "csr_array":
-    """`(k, p)` matrix of ones where a keyframe saw a point, rows and columns as in the map."""
+    """Return the sparse `(k, p)` matrix that is 1 where a keyframe observes a point."""
     from scipy.sparse import csr_array  # noqa: PLC0415 - see `late_imports`
 
     at = (rows(slam_map.ids, slam_map.observations.keyframe), rows(slam_map.points.ids, slam_map.observations.point))
     return csr_array((np.ones(len(at[0]), np.int32), at), shape=(len(slam_map.ids), len(slam_map.points.ids)))
 
 
-def covisible(slam_map: Map, keyframe_id: int, at_least: int = 15) -> tuple[np.ndarray, np.ndarray]:
-    """The keyframes that saw the same points as one of them: the covisibility graph around it.
+def covisible(
+    slam_map: Map, keyframe_id: int, at_least: int = 15
+) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+    """Return the covisible keyframes: its neighbors in the covisibility graph.
 
     Args:
         slam_map: The map.
-        keyframe_id: A keyframe in it.
-        at_least: Fewest points in common.
+        keyframe_id: Id of a keyframe.
+        at_least: Fewest points that a neighbor shares with it.
 
     Returns:
-        Ids, most points in common first, and how many they are; without the keyframe itself.
+        `(k,)` ids of the neighbors, the most shared points first, and `(k,)` numbers of shared points.
     """
     mine = np.unique(slam_map.observations.point[slam_map.observations.keyframe == keyframe_id])
     others = slam_map.observations.keyframe[has(mine, slam_map.observations.point)]
@@ -262,20 +278,18 @@ def covisible(slam_map: Map, keyframe_id: int, at_least: int = 15) -> tuple[np.n
     return ids[order], counts[order]
 
 
-def neighborhood(
-    slam_map: Map, keyframe_id: int, at_least: int = 15, at_most: int = 20
-) -> tuple[np.ndarray, np.ndarray]:
-    """The part of the map around a keyframe: what is matched and adjusted together.
+def neighborhood(slam_map: Map, keyframe_id: int, at_least: int = 15, at_most: int = 20) -> tuple[Ids, Ids]:
+    """Return the local map around a keyframe.
 
     Args:
         slam_map: The map.
-        keyframe_id: A keyframe in it.
-        at_least: Fewest points in common with it.
-        at_most: Most keyframes besides it.
+        keyframe_id: Id of a keyframe.
+        at_least: Fewest points that a neighbor shares with it.
+        at_most: Largest number of neighbors.
 
     Returns:
-        Ids of the keyframe, then of those that share most points with it; and, ascending, of the points that they saw.
-        Its parent in the spanning tree comes along even if it shares too few.
+        Ids of the keyframe and its neighbors, the most shared points first, and the ascending ids of the points that
+        they observe. The parent in the spanning tree is included even if it shares too few points.
     """
     near = covisible(slam_map, keyframe_id, at_least)[0][:at_most]
     parent = slam_map.parent[slam_map.row(keyframe_id)]
@@ -285,11 +299,11 @@ def neighborhood(
     return ids, np.unique(slam_map.observations.point[np.isin(slam_map.observations.keyframe, ids)])
 
 
-def surviving_keyframes(slam_map: Map, keyframe_ids: np.ndarray) -> np.ndarray:
-    """For each keyframe its own id, or for one that was culled, of the keyframe in the map that holds its place.
+def surviving_keyframes(slam_map: Map, keyframe_ids: Int[np.ndarray, " m"]) -> Int64[np.ndarray, " m"]:
+    """Replace the id of each culled keyframe by the id of its anchor that is still in the map.
 
     Raises:
-        KeyError: If one was never in this map.
+        KeyError: If a keyframe was never in this map.
     """
     order = np.argsort(slam_map.culled.ids)
     culled, anchor = slam_map.culled.ids[order], slam_map.culled.anchor[order]
@@ -299,18 +313,18 @@ def surviving_keyframes(slam_map: Map, keyframe_ids: np.ndarray) -> np.ndarray:
     return ids
 
 
-def point_submaps(slam_map: Map) -> np.ndarray:
-    """`(p,)` submap of each point: that of the keyframe that made it."""
+def point_submaps(slam_map: Map) -> Int32[np.ndarray, " p"]:
+    """Return the `(p,)` submap of each point: the submap of its reference keyframe."""
     makers, which = np.unique(slam_map.points.reference_keyframe, return_inverse=True)
     return slam_map.submap[rows(slam_map.ids, surviving_keyframes(slam_map, makers))][which]
 
 
-def points_at(points: MapPoints, index: np.ndarray) -> MapPoints:
-    """The points in these rows, or where this mask is true."""
+def points_at(points: MapPoints, index: Ids | Bool[np.ndarray, " _n"]) -> MapPoints:
+    """Select the points in some rows, or where a mask is true."""
     columns = {name: array[index] for name, array in points._asdict().items() if name != "X_world"}
     return MapPoints(X_world=points.X_world[:, index], **columns)
 
 
-def observations_at(observations: Observations, index: np.ndarray) -> Observations:
-    """The observations in these rows, or where this mask is true."""
+def observations_at(observations: Observations, index: Ids | Bool[np.ndarray, " _n"]) -> Observations:
+    """Select the observations in some rows, or where a mask is true."""
     return Observations(*(array[..., index] for array in observations))

@@ -1,4 +1,4 @@
-"""What holds in every map, whoever made it: checked in files that are read, and in tests."""
+"""Invariants of a map, checked when a map file is read or written and in tests."""
 
 from collections.abc import Iterator
 from typing import NamedTuple, TypeAlias, get_type_hints
@@ -13,31 +13,29 @@ from jaxslam.map.types import NONE, Culled, Loops, Map, MapPoints, Observations,
 Record: TypeAlias = Map | MapPoints | Observations | Loops | Culled | Features
 
 _UNIT = 1e-6
-"""How far from 1 the length of a quaternion may be."""
-
-
+"""Largest difference of a quaternion's length from 1."""
 _FARTHEST_M = 1e12
-"""Coordinates beyond it are damage: the square of a distance would soon overflow the float32 of the tracker."""
+"""Largest valid coordinate, meters; beyond it, squared distances would overflow the tracker's float32."""
 
 
 class ArrayField(NamedTuple):
-    """What an array of a record is declared to be.
+    """The declared type of an array in a record.
 
     Attributes:
-        dtype: Of its numbers.
-        dims: Lengths of its axes, as numbers or as the letter that its record gives them.
+        dtype: Type of the numbers.
+        dims: Length of each axis: a number, or the letter that names it in the record.
     """
 
     dtype: np.dtype
     dims: tuple[str, ...]
 
     def shape(self, lengths: dict[str, int]) -> tuple[int, ...]:
-        """Its shape, given what the letters stand for."""
+        """Return the shape, given the length of each letter."""
         return tuple(lengths[dim] if dim in lengths else int(dim) for dim in self.dims)
 
 
 def array_fields(record: type) -> dict[str, ArrayField]:
-    """The arrays that a record such as `MapPoints` holds, as annotated, in order."""
+    """Return the annotated array fields of a record such as `MapPoints`, in order."""
     hints = get_type_hints(record)
     return {
         name: ArrayField(np.dtype(hint.dtypes[0]), tuple(hint.dim_str.split()))
@@ -47,9 +45,9 @@ def array_fields(record: type) -> dict[str, ArrayField]:
 
 
 def problems(slam_map: Map) -> list[str]:
-    """All that is wrong with a map, in words; nothing, if it is whole.
+    """Describe all violated invariants of a map; empty if it is valid.
 
-    Types and shapes come first; if one is wrong, nothing else is looked at.
+    Types and shapes are checked first; if one is wrong, nothing else is checked.
     """
     wrong = list(_structure(slam_map))
     if not wrong:
@@ -58,14 +56,14 @@ def problems(slam_map: Map) -> list[str]:
 
 
 def _records(slam_map: Map) -> dict[str, Record]:
-    """All records of a map, and what to put before the names of their arrays."""
+    """Return all records of a map by the prefix of their arrays' names in messages."""
     records: dict[str, Record] = {"": slam_map, "points.": slam_map.points, "observations.": slam_map.observations}
     records |= {"loops.": slam_map.loops, "culled.": slam_map.culled}
     return records | {f"keyframe {keyframe.id}: ": keyframe.features for keyframe in slam_map.keyframes}
 
 
 def _structure(slam_map: Map) -> Iterator[str]:
-    """Types and shapes."""
+    """Check types and shapes."""
     lengths = {"k": len(slam_map.keyframes), "p": len(slam_map.points.ids), "s": len(slam_map.observations.point)}
     lengths |= {"l": len(slam_map.loops.source), "c": len(slam_map.culled.ids)}
     for prefix, record in _records(slam_map).items():
@@ -78,7 +76,7 @@ def _structure(slam_map: Map) -> Iterator[str]:
 
 
 def _identity(slam_map: Map) -> Iterator[str]:
-    """Ids that ascend, were given, and exist where they are mentioned."""
+    """Check that ids ascend, were assigned, and exist wherever they are referenced."""
     if slam_map.ids.tolist() != [keyframe.id for keyframe in slam_map.keyframes]:
         yield "ids: not those of the keyframes"
     for name, ids, after in (
@@ -110,7 +108,7 @@ def _identity(slam_map: Map) -> Iterator[str]:
 
 
 def number_problems(record: Record, prefix: str = "") -> list[str]:
-    """What is wrong with the numbers of a record: one that is not finite, or out of its range."""
+    """Describe the numbers of a record that are not finite or out of range; empty if there are none."""
     wrong = [
         f"{prefix}{name}: holds a number that is not finite"
         for name, array in record._asdict().items()
@@ -128,7 +126,7 @@ def number_problems(record: Record, prefix: str = "") -> list[str]:
 
 
 def _numbers(slam_map: Map) -> Iterator[str]:
-    """Numbers in their ranges, and unit quaternions."""
+    """Check the ranges of numbers and the length of quaternions."""
     for prefix, record in _records(slam_map).items():
         yield from number_problems(record, prefix)
     poses = {"T_world_cam": slam_map.T_world_cam, "loops.T_source_target": slam_map.loops.T_source_target}
@@ -143,7 +141,7 @@ def _numbers(slam_map: Map) -> Iterator[str]:
 
 
 def _tree(slam_map: Map) -> Iterator[str]:
-    """One tree a submap, loops between two keyframes, and culled ones that are held by something."""
+    """Check that each submap has one spanning tree, and that each loop connects two keyframes."""
     roots = slam_map.parent == NONE
     parent = np.arange(len(slam_map.ids))
     parent[~roots] = rows(slam_map.ids, slam_map.parent[~roots])
@@ -182,7 +180,7 @@ def _circle_of_culled(slam_map: Map) -> bool:
 
 
 def _ends(following: np.ndarray) -> np.ndarray:
-    """Where a walk from each row ends, if it ends; every round doubles the steps."""
+    """Return the end of the walk from each row along `following`, if it ends; every round doubles the steps."""
     for _ in range(len(following).bit_length()):
         following = following[following]
     return following

@@ -5,7 +5,8 @@ Source: Mur-Artal and Tardos, "ORB-SLAM2", 2017, and "ORB-SLAM", 2015, sections 
 
 import numpy as np
 
-from jaxslam.map.edit import without_keyframe, without_points
+from jaxslam.map.edit import without_points
+from jaxslam.map.keyframe_removal import without_keyframe
 from jaxslam.map.types import NONE, Map, covisible, has, rows
 
 CONFIRM_WITHIN = 3

@@ -7,7 +7,8 @@ import numpy as np
 from jaxslam.features.matching import NEAR, match_by_projection
 from jaxslam.features.orb import FeaturePlan, Features
 from jaxslam.geometry.se3 import to_local
-from jaxslam.map.edit import with_fused_points, with_observations
+from jaxslam.map.edit import with_observations
+from jaxslam.map.point_fusion import with_fused_points
 from jaxslam.map.types import NONE, Map, Observations, empty_observations, observations_at, rows
 
 _MARGIN_PX = 1.0

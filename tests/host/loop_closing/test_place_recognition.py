@@ -19,7 +19,8 @@ from jaxslam.geometry.se3 import angle, between
 from jaxslam.loop_closing import place_recognition
 from jaxslam.loop_closing.place_index import PlaceIndex
 from jaxslam.loop_closing.place_recognition import Recognition, recognize, verify
-from jaxslam.map.edit import with_keyframe, without_keyframe
+from jaxslam.map.edit import with_keyframe
+from jaxslam.map.keyframe_removal import without_keyframe
 from jaxslam.map.types import NONE, Keyframe, Map, empty_map
 from jaxslam.sensors.frame_arrays import frame_arrays
 from jaxslam.sensors.sensor_model import sensor_model

@@ -13,16 +13,16 @@ from jaxslam.geometry.se3 import between, compose, inverse, to_local, transform
 from jaxslam.geometry.so3 import matrices
 from jaxslam.map.edit import (
     transformed,
-    with_fused_points,
     with_keyframe,
     with_loop,
     with_observations,
     with_points,
     with_positions,
-    without_keyframe,
     without_observations,
     without_points,
 )
+from jaxslam.map.keyframe_removal import without_keyframe
+from jaxslam.map.point_fusion import with_fused_points
 from jaxslam.map.types import NONE, Map, Observations, point_submaps
 from jaxslam.map.validate import problems
 

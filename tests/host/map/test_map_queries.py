@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from small_map import CAMERA, keyframe, pose, small_map
 
-from jaxslam.map.edit import with_keyframe, without_keyframe, without_observations
+from jaxslam.map.edit import with_keyframe, without_observations
+from jaxslam.map.keyframe_removal import without_keyframe
 from jaxslam.map.spanning_tree import children, subtree
 from jaxslam.map.types import (
     NONE,

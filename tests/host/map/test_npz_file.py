@@ -23,7 +23,8 @@ from small_map import CAMERA, keyframe, pose, same, small_map
 
 from jaxslam.errors import MapFileError
 from jaxslam.map import npz_file as map_file
-from jaxslam.map.edit import with_keyframe, without_keyframe
+from jaxslam.map.edit import with_keyframe
+from jaxslam.map.keyframe_removal import without_keyframe
 from jaxslam.map.npz_file import load_map, save_map
 from jaxslam.map.types import NONE, Map, empty_map
 from jaxslam.sensors.camera import Camera

@@ -6,16 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_map import arrays, keyframe, observations, pose, same, small_map
 
-from jaxslam.map.edit import (
-    with_fused_points,
-    with_keyframe,
-    with_observations,
-    with_positions,
-    without_keyframe,
-    without_observations,
-    without_points,
-)
+from jaxslam.map.edit import with_keyframe, with_observations, with_positions, without_observations, without_points
+from jaxslam.map.keyframe_removal import without_keyframe
 from jaxslam.map.partial_map import extract_around, merge_back, most_shared
+from jaxslam.map.point_fusion import with_fused_points
 from jaxslam.map.types import NONE, Map, covisible
 from jaxslam.map.validate import problems
 

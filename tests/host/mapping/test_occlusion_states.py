@@ -28,16 +28,10 @@ from jaxslam.errors import MapFileError
 from jaxslam.features.orb import FeaturePlan, Features
 from jaxslam.features.pose_from_matches import FeaturePose
 from jaxslam.geometry.se3 import IDENTITY, between, to_local
-from jaxslam.map.edit import (
-    with_fused_points,
-    with_keyframe,
-    with_observations,
-    with_points,
-    with_states,
-    without_points,
-)
+from jaxslam.map.edit import with_keyframe, with_observations, with_points, with_states, without_points
 from jaxslam.map.npz_file import load_map, save_map
 from jaxslam.map.partial_map import extract_around, merge_back
+from jaxslam.map.point_fusion import with_fused_points
 from jaxslam.map.types import NONE, Keyframe, Map, empty_map, rows
 from jaxslam.map.validate import problems
 from jaxslam.mapping.local_bundle_adjustment import AdjustPlan, adjust_all, adjust_around

@@ -1,0 +1,91 @@
+"""Fuse map points that are the same point of the world."""
+
+import numpy as np
+from jaxtyping import Int
+
+from jaxslam.geometry.types import Ids
+from jaxslam.map.edit import first_of_rivals
+from jaxslam.map.types import Map, MapPoints, observations_at, point_submaps, points_at, rows
+
+
+def with_fused_points(slam_map: Map, keep: Int[np.ndarray, " f"], drop: Int[np.ndarray, " f"]) -> Map:
+    """Fuse pairs of points: the observations of `drop[i]` become observations of `keep[i]`, and `drop[i]` is removed.
+
+    Points linked by several pairs become one point, the one with the lowest id among those not dropped. It takes the
+    position and weight of the most observed of them, a descriptor if it has none, and the highest state, because an
+    object that passed in front of one of them passed in front of all. Of two observations in one keyframe the first
+    stays.
+
+    Args:
+        slam_map: The map.
+        keep: `(f,)` ids of the points to keep.
+        drop: `(f,)` ids of the points to remove.
+
+    Raises:
+        ValueError: If the points of a pair are in different submaps.
+        KeyError: If a point is not in the map.
+    """
+    if not len(keep):
+        return slam_map
+    into = _representatives(slam_map, rows(slam_map.points.ids, keep), rows(slam_map.points.ids, drop))
+    submaps = point_submaps(slam_map)
+    if (submaps != submaps[into]).any():
+        raise ValueError("points of different submaps cannot be one")
+    changed = np.isin(slam_map.observations.point, [keep, drop])
+    point = slam_map.observations.point.copy()
+    point[changed] = slam_map.points.ids[into[rows(slam_map.points.ids, point[changed])]]
+    seen = slam_map.observations._replace(point=point)
+    stays = ~changed
+    stays[changed] = first_of_rivals(observations_at(seen, changed))
+    points = _with_best_known(_with_descriptors(slam_map.points, into), into, slam_map.observations.point)
+    points = _with_highest_state(points, into)
+    return slam_map._replace(
+        points=points_at(points, into == np.arange(len(into))), observations=observations_at(seen, stays)
+    )
+
+
+def _representatives(slam_map: Map, keep: Ids, drop: Ids) -> Ids:
+    """Return the `(p,)` row of the point that each point becomes; for most points, their own row."""
+    from scipy.sparse import coo_array  # noqa: PLC0415 - see `late_imports`
+    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
+
+    count = len(slam_map.points.ids)
+    links = coo_array((np.ones(len(keep), np.int8), (keep, drop)), shape=(count, count))
+    group = connected_components(links, directed=False)[1]
+    dropped = np.zeros(count, bool)
+    dropped[drop[keep != drop]] = True
+    order = np.lexsort((dropped, group))  # stable: lowest id first
+    return order[np.unique(group[order], return_index=True)[1]][group]
+
+
+def _with_descriptors(points: MapPoints, into: Ids) -> MapPoints:
+    """Give points without a descriptor the descriptor of the first point that is fused into them."""
+    givers = np.flatnonzero(points.has_descriptor & ~points.has_descriptor[into])
+    takers, first = np.unique(into[givers], return_index=True)
+    descriptor, recognizable = points.descriptor.copy(), points.has_descriptor.copy()
+    descriptor[takers], recognizable[takers] = descriptor[givers[first]], True
+    return points._replace(descriptor=descriptor, has_descriptor=recognizable)
+
+
+def _with_best_known(points: MapPoints, into: Ids, seen: Ids) -> MapPoints:
+    """Give points the position and weight of the most observed point among those that are fused.
+
+    Of several equally often observed ones, the kept point itself wins, then the one with the lowest id.
+    """
+    changing = np.flatnonzero(np.isin(into, into[into != np.arange(len(into))]))
+    counts = np.bincount(rows(points.ids, seen), minlength=len(points.ids))[changing]
+    order = changing[np.lexsort((changing, changing != into[changing], -counts, into[changing]))]
+    takers, first = np.unique(into[order], return_index=True)
+    X_world, weight = points.X_world.copy(), points.weight.copy()
+    X_world[:, takers], weight[takers] = points.X_world[:, order[first]], points.weight[order[first]]
+    return points._replace(X_world=X_world, weight=weight)
+
+
+def _with_highest_state(points: MapPoints, into: Ids) -> MapPoints:
+    """Give points the highest state among those that are fused."""
+    givers = np.flatnonzero(points.state[into] < points.state)
+    if not len(givers):
+        return points
+    state = points.state.copy()
+    np.maximum.at(state, into[givers], points.state[givers])
+    return points._replace(state=state)
