@@ -144,7 +144,7 @@ def _near(
     plan: FeaturePlan,
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
     """Find the pairs of points and features of similar octave within the search radius of the octave."""
-    from scipy.spatial import KDTree  # noqa: PLC0415 - see `late_imports`
+    from scipy.spatial import KDTree  # noqa: PLC0415 - see `runtime.preload`
 
     finite = np.isfinite(predicted_uv).all(axis=0)
     pairs = [np.zeros((2, 0), np.int64)]

@@ -77,9 +77,9 @@ def to_local(T: Float[np.ndarray, "7"], X: Points) -> Points:
     return matrices(T[:4]).T @ (X - T[4:, None])
 
 
-def angle(T: Transforms) -> Float[np.ndarray, "..."] | np.floating:
+def angle(T: Transforms) -> Float[np.ndarray, "..."]:
     """Return the `(...,)` rotation angles of `(..., 7)` transforms, radians, 0 to pi."""
-    return 2 * np.arctan2(np.linalg.norm(T[..., 1:4], axis=-1), np.abs(T[..., 0]))
+    return np.asarray(2 * np.arctan2(np.linalg.norm(T[..., 1:4], axis=-1), np.abs(T[..., 0])))
 
 
 def retract(T: Pose, tangent: Float[np.ndarray, "6"]) -> Pose:

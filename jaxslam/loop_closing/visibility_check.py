@@ -28,7 +28,7 @@ def see_through_ratio(camera: Camera, source: Features, target: Features, T_sour
     Returns:
         The share, 0 to 1; 0 where too few surfaces can be compared.
     """
-    from scipy.spatial import KDTree  # noqa: PLC0415 - see `late_imports`
+    from scipy.spatial import KDTree  # noqa: PLC0415 - see `runtime.preload`
 
     focal, center = np.array([[camera.fx], [camera.fy]]), np.array([[camera.cx], [camera.cy]])
     known, measured = source.depth > 0, target.depth > 0

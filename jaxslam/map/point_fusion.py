@@ -46,7 +46,7 @@ def with_fused_points(slam_map: Map, keep: Int[np.ndarray, " f"], drop: Int[np.n
 
 def _representatives(slam_map: Map, keep: Ids, drop: Ids) -> Ids:
     """Return the `(p,)` row of the point that each point becomes; for most points, their own row."""
-    from scipy.sparse import coo_array  # noqa: PLC0415 - see `late_imports`
+    from scipy.sparse import coo_array  # noqa: PLC0415 - see `runtime.preload`
     from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
 
     count = len(slam_map.points.ids)

@@ -13,7 +13,7 @@ def children(slam_map: Map, keyframe_id: int) -> Ids:
 
 def subtree(slam_map: Map, keyframe_id: int) -> Ids:
     """Return the ascending ids of a keyframe and all its descendants in the spanning tree."""
-    from scipy.sparse import csr_array  # noqa: PLC0415 - see `late_imports`
+    from scipy.sparse import csr_array  # noqa: PLC0415 - see `runtime.preload`
     from scipy.sparse.csgraph import breadth_first_order  # noqa: PLC0415
 
     hangs = np.flatnonzero(slam_map.parent != NONE)

@@ -251,7 +251,7 @@ def rows(ids: Ids, wanted: Int[np.ndarray, " m"]) -> Int[np.ndarray, " m"]:
 
 def visibility(slam_map: Map) -> "csr_array":
     """Return the sparse `(k, p)` matrix that is 1 where a keyframe observes a point."""
-    from scipy.sparse import csr_array  # noqa: PLC0415 - see `late_imports`
+    from scipy.sparse import csr_array  # noqa: PLC0415 - see `runtime.preload`
 
     at = (rows(slam_map.ids, slam_map.observations.keyframe), rows(slam_map.points.ids, slam_map.observations.point))
     return csr_array((np.ones(len(at[0]), np.int32), at), shape=(len(slam_map.ids), len(slam_map.points.ids)))

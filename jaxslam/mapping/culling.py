@@ -5,6 +5,7 @@ Source: Mur-Artal and Tardos, "ORB-SLAM2", 2017, and "ORB-SLAM", 2015, sections 
 
 import numpy as np
 
+from jaxslam.geometry.types import Ids
 from jaxslam.map.edit import without_points
 from jaxslam.map.keyframe_removal import without_keyframe
 from jaxslam.map.types import NONE, Map, covisible, has, rows
@@ -37,7 +38,7 @@ def without_unconfirmed(slam_map: Map, keyframe_id: int) -> Map:
     return without_points(slam_map, slam_map.points.ids[(old & ~enough) | (seen < 1)])
 
 
-def without_redundant(slam_map: Map, keyframe_id: int, among: np.ndarray) -> Map:
+def without_redundant(slam_map: Map, keyframe_id: int, among: Ids) -> Map:
     """Drop the neighbors of a keyframe whose points other keyframes observe well enough.
 
     Args:

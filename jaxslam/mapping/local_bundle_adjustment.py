@@ -7,11 +7,12 @@ import numpy as np
 from jaxslam_kernels.bundle.bundle_adjust import BundleAdjustment, BundleStatus, bundle_adjust
 from jaxslam_kernels.bundle.cost import Observations as BundleObservations
 from jaxslam_kernels.types import Scalar
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Float32, Int
 
 from jaxslam.config.schema import MappingConfig, TrackConfig
 from jaxslam.dynamics.occlusion import state_weights
 from jaxslam.geometry.se3 import between, compose, inverse, rotate, to_local, transform
+from jaxslam.geometry.types import Ids, Points, Pose, Poses
 from jaxslam.map.edit import with_positions, without_observations
 from jaxslam.map.types import NONE, Map, Observations, covisible, has, observations_at, rows
 from jaxslam.runtime.compile_cache import FAST_COMPILE
@@ -54,19 +55,19 @@ class AdjustPlan(NamedTuple):
 
 
 class _Window(NamedTuple):
-    keyframes: np.ndarray
+    keyframes: Ids
     """Ids, the adjusted keyframes first."""
     num_free: int
     """Number of adjusted keyframes."""
-    points: np.ndarray
+    points: Ids
     """Ids, ascending."""
     observations: Observations
     """Observations of the points in the keyframes."""
-    row: np.ndarray
+    row: Int[np.ndarray, " s"]
     """Row of each observation in the map."""
 
 
-def adjust_around(slam_map: Map, keyframe_id: int, plan: AdjustPlan, movable: np.ndarray | None = None) -> Map:
+def adjust_around(slam_map: Map, keyframe_id: int, plan: AdjustPlan, movable: Ids | None = None) -> Map:
     """Adjust a keyframe, its covisible keyframes and their points to fit their observations best.
 
     Outlier observations are dropped. Everything outside the window stays; a window that cannot be solved leaves the map
@@ -104,7 +105,7 @@ def adjust_around(slam_map: Map, keyframe_id: int, plan: AdjustPlan, movable: np
     return _put_back(slam_map, window, reference, solution)
 
 
-def adjust_all(slam_map: Map, plan: AdjustPlan, movable: np.ndarray, sweeps: int = 2) -> Map:
+def adjust_all(slam_map: Map, plan: AdjustPlan, movable: Ids, sweeps: int = 2) -> Map:
     """Adjust some keyframes (ids, ascending) window by window, in several sweeps.
 
     As one problem they would need a Schur complement over all keyframes. Windows that overlap by half propagate the
@@ -132,7 +133,7 @@ def _no_observations(room: int) -> BundleObservations:
     return BundleObservations(index, index, plane[:2], plane[0], plane, plane[0], plane[0] > 0)
 
 
-def _window(slam_map: Map, keyframe_id: int, plan: AdjustPlan, movable: np.ndarray) -> _Window | None:
+def _window(slam_map: Map, keyframe_id: int, plan: AdjustPlan, movable: Ids) -> _Window | None:
     """Select the window; `None` if nothing holds it fixed or nothing can move."""
     near, _ = covisible(slam_map, keyframe_id)
     submap = slam_map.submap[slam_map.row(keyframe_id)]
@@ -161,7 +162,9 @@ def _window(slam_map: Map, keyframe_id: int, plan: AdjustPlan, movable: np.ndarr
     return _Window(keyframes, len(free), points, observations_at(slam_map.observations, row), row)
 
 
-def _solve_input(slam_map: Map, window: _Window, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _solve_input(
+    slam_map: Map, window: _Window, reference: Pose
+) -> tuple[Float32[np.ndarray, "k 7"], Float32[np.ndarray, "3 n"]]:
     """Express poses and points in the axes of the reference, so that float32 suffices far from the world's origin."""
     poses = between(reference[None, :], slam_map.T_world_cam[rows(slam_map.ids, window.keyframes)])
     X = to_local(reference, slam_map.points.X_world[:, rows(slam_map.points.ids, window.points)])
@@ -211,7 +214,7 @@ def _adjust(
     )
 
 
-def _put_back(slam_map: Map, window: _Window, reference: np.ndarray, solution: Any) -> Map:
+def _put_back(slam_map: Map, window: _Window, reference: Pose, solution: Any) -> Map:
     poses = compose(reference[None, :], solution.poses[: window.num_free].astype(np.float64))
     good = solution.determined[: len(window.points)]
     X_world = transform(reference, solution.X_world[:, : len(window.points)].astype(np.float64))
@@ -224,7 +227,7 @@ def _put_back(slam_map: Map, window: _Window, reference: np.ndarray, solution: A
     return without_observations(slam_map, wrong)
 
 
-def _moved_along(slam_map: Map, keyframe_ids: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _moved_along(slam_map: Map, keyframe_ids: Ids, poses: Poses) -> tuple[Ids, Points]:
     """Return the points that only one of these keyframes observes, and their positions after it has moved."""
     row = rows(slam_map.points.ids, slam_map.observations.point)
     once = np.bincount(row, minlength=len(slam_map.points.ids))[row] == 1
@@ -236,5 +239,5 @@ def _moved_along(slam_map: Map, keyframe_ids: np.ndarray, poses: np.ndarray) -> 
     return slam_map.observations.point[lone], X_world.T
 
 
-def _identity_row() -> np.ndarray:
+def _identity_row() -> Float32[np.ndarray, "7"]:
     return np.array([1, 0, 0, 0, 0, 0, 0], np.float32)

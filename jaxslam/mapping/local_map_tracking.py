@@ -8,6 +8,7 @@ import numpy as np
 from jaxslam.features.orb import FeaturePlan, Features
 from jaxslam.features.pose_from_matches import FeaturePose, fit_pose, matches_of
 from jaxslam.geometry.se3 import angle, between, compose, to_local
+from jaxslam.geometry.types import Ids, Pose
 from jaxslam.map.types import Map, covisible, rows
 from jaxslam.mapping.map_point_matching import described_points_in, find_points
 from jaxslam.mapping.occlusion_states import PointStates
@@ -34,15 +35,13 @@ _SCALES = (0.5, 2.0)
 _MARGIN_PX = 8
 
 
-def local_keyframes(slam_map: Map, keyframe_id: int) -> np.ndarray:
+def local_keyframes(slam_map: Map, keyframe_id: int) -> Ids:
     """Return the ids of a keyframe and of those most covisible with it."""
     near, _ = covisible(slam_map, keyframe_id, at_least=1)
     return np.append(np.int64(keyframe_id), near[:LOCAL_KEYFRAMES])
 
 
-def keyframes_in_view(
-    slam_map: Map, T_world_cam: np.ndarray, submap: int, exclude: set[int], at_most: int
-) -> list[int]:
+def keyframes_in_view(slam_map: Map, T_world_cam: Pose, submap: int, exclude: set[int], at_most: int) -> list[int]:
     """Return the keyframes that observe the most points in view, best first.
 
     Args:
@@ -74,7 +73,7 @@ def keyframes_in_view(
 def match_local_map(
     slam_map: Map,
     keyframe_id: int,
-    T_keyframe_cam: np.ndarray,
+    T_keyframe_cam: Pose,
     features: Features,
     sensor: SensorModel,
     plan: FeaturePlan,
@@ -115,6 +114,6 @@ def match_local_map(
     return found
 
 
-def _near(T_a: np.ndarray, T_b: np.ndarray) -> bool:
+def _near(T_a: Pose, T_b: Pose) -> bool:
     apart = between(T_a, T_b)
     return bool(np.linalg.norm(apart[4:]) < _NEAR_M and angle(apart) < _NEAR_RAD)

@@ -1,9 +1,10 @@
-"""What becomes of a new keyframe: features, points of the map found in it, new points, adjustment, culling.
+"""Local mapping: add a keyframe to the map, match and create points, adjust the local map, and cull.
 
-Runs beside tracking, in a thread or in turn, and owns the map: nobody else makes a new one. The tracker gets the new
-map when it is there, and moves what it tracks along with the keyframes.
+It runs in the back end, in a thread or in turn with tracking, and is the only code that edits the map. The tracker
+takes over each new map when it is ready, and moves its points along with the corrected keyframes.
 
-Source: Mur-Artal and Tardos, "ORB-SLAM2", 2017, section III, for the order of things and for the rules of culling.
+Source: Mur-Artal et al., "ORB-SLAM", 2015, section VI, for the steps; Mur-Artal and Tardos, "ORB-SLAM2", 2017, section
+III, for points with measured depth.
 """
 
 from typing import NamedTuple
@@ -14,11 +15,12 @@ import numpy as np
 from jaxslam_kernels.camera import to_pixels
 from jaxslam_kernels.depth.sampling import valid_depth
 from jaxslam_kernels.types import Pixels, Weights
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Float32, Int
 
 from jaxslam.config.schema import Config, MappingConfig
 from jaxslam.features.orb import FeaturePlan, Features, features_of
 from jaxslam.geometry.se3 import compose, transform
+from jaxslam.geometry.types import Ids, Pose
 from jaxslam.loop_closing.loop_correction import with_loop_closed
 from jaxslam.loop_closing.loop_detector import LoopClosure
 from jaxslam.map.dynamic_removal import DynamicObservations, without_dynamic, without_dynamic_points
@@ -50,51 +52,52 @@ from jaxslam.sensors.measurement import measure
 from jaxslam.sensors.sensor_model import SensorModel, depth_noise
 
 _PART_KEYFRAMES = 30
-"""Keyframes that mapping looks at and changes at all, for a new one."""
+"""Number of keyframes in the part of the map that a new keyframe may change."""
 _FUSE_KEYFRAMES = 6
+"""Number of neighbors with whose features the points of a new keyframe are matched to fuse duplicates."""
 _LOOP_KEYFRAMES = 96
-"""Keyframes around a loop that are adjusted when it is closed: where those that see the same do not yet agree."""
+"""Number of keyframes around a loop that are adjusted when it is closed: there, covisible keyframes still disagree."""
 
 
 class TrackedObservations(NamedTuple):
-    """Points the tracker saw in a keyframe.
+    """The points that the tracker observed in a keyframe.
 
     Attributes:
-        id: `(n,)` the tracker's ids, see `TrackId`.
-        uv_raw: `(2, n)` pixels as seen.
-        X_cam: `(3, n)` in the axes of the camera, meters.
-        weight: `(n,)` 0 to 1; 0 for no point.
+        id: `(n,)` tracker ids of the points (`TrackId`).
+        uv_raw: `(2, n)` coordinates in the distorted image, pixels.
+        X_cam: `(3, n)` positions in the camera frame, meters.
+        weight: `(n,)` weights of the points, 0 to 1; 0 for a slot without a point.
     """
 
-    id: np.ndarray
-    uv_raw: np.ndarray
-    X_cam: np.ndarray
-    weight: np.ndarray
+    id: Int[np.ndarray, " n"]
+    uv_raw: Float32[np.ndarray, "2 n"]
+    X_cam: Float32[np.ndarray, "3 n"]
+    weight: Float32[np.ndarray, " n"]
 
 
 class NewKeyframe(NamedTuple):
-    """A frame the tracker kept.
+    """A frame that the tracker made a keyframe.
 
     Attributes:
-        id: Number of the keyframe; they come in order.
-        timestamp_ns: Its time.
-        frame: Image (gray, uint8), depth and what to ignore.
-        parent: The keyframe it hangs on; `NONE` if it is the first of a submap.
-        T_parent_keyframe: `(7,)` its pose seen from there; in the world without a parent.
+        id: Id of the keyframe; ids arrive in order.
+        timestamp_ns: Time of the image, nanoseconds.
+        frame: The gray uint8 image, the depth image, and the mask of ignored pixels.
+        parent: Id of its parent in the spanning tree; `NONE` for the first keyframe of a submap.
+        T_parent_keyframe: `(7,)` pose relative to the parent; pose in the world if there is no parent.
         submap: Number of its submap.
-        twist: `(6,)` velocity of the camera in its own axes.
-        tracks: Points seen.
-        features: Found in it, if that has been done.
-        states: Of points, changed since the keyframe before.
+        twist: `(6,)` velocity of the camera in its own axes, m/s, then rad/s.
+        tracks: Points that the tracker observed.
+        features: ORB features of the image; `None` if they are not extracted yet.
+        states: States of map points that have changed since the previous keyframe; `None` without occlusion states.
     """
 
     id: int
     timestamp_ns: int
     frame: FrameArrays
     parent: int
-    T_parent_keyframe: np.ndarray
+    T_parent_keyframe: Pose
     submap: int
-    twist: np.ndarray
+    twist: Float32[np.ndarray, "6"]
     tracks: TrackedObservations
     features: Features | None = None
     states: StateChanges | None = None
@@ -104,13 +107,13 @@ _SETTINGS = MappingConfig()  # the only place of defaults
 
 
 class MappingPlan(NamedTuple):
-    """Settings of local mapping, static.
+    """Settings of local mapping.
 
     Attributes:
-        features: How features are found.
-        adjust: How windows are adjusted.
-        track_sigma_px: Standard deviation of a point followed by flow, pixels.
-        search_px: How far from where the pose puts a point a feature is sought.
+        features: Settings of feature extraction.
+        adjust: Settings of local bundle adjustment.
+        track_sigma_px: Standard deviation of the position of a point tracked by optical flow, pixels.
+        search_px: Search radius around the projection of a map point at octave 0, pixels.
     """
 
     features: FeaturePlan = FeaturePlan()
@@ -120,7 +123,7 @@ class MappingPlan(NamedTuple):
 
 
 def mapping_plan(camera: Camera, config: Config) -> MappingPlan:
-    """The settings of local mapping; depth is measured as well as in tracking."""
+    """Collect the settings of local mapping; the depth noise is the tracker's."""
     mapping, occlusion, noise = config.mapping, config.dynamics.occlusion, depth_noise(camera, config.track)
     return MappingPlan(
         features=FeaturePlan(
@@ -144,7 +147,11 @@ def mapping_plan(camera: Camera, config: Config) -> MappingPlan:
 
 
 class LocalMapping:
-    """Makes the map out of keyframes."""
+    """Builds the map from keyframes.
+
+    Attributes:
+        map: The latest map.
+    """
 
     def __init__(self, camera: Camera, sensor: SensorModel, plan: MappingPlan, slam_map: Map | None = None) -> None:
         """Start with a map, empty by default."""
@@ -153,7 +160,7 @@ class LocalMapping:
         self._tracks = TrackTable()
 
     def compile(self, frame: FrameArrays, num_tracks: int) -> None:
-        """Compile all that a keyframe needs, for frames of this size with so many tracks."""
+        """Compile all programs of local mapping for frames of this size with `num_tracks` points."""
         twist = np.zeros(6, np.float32)
         features_of(frame, twist, self._sensor, self._plan.features)
         nothing = np.zeros((2, num_tracks), np.float32)
@@ -161,53 +168,66 @@ class LocalMapping:
         compile_adjustment(self._plan.adjust)
 
     def add(self, new: NewKeyframe) -> Map:
-        """Take in a keyframe; gives the new map."""
+        """Add a keyframe to the map; return the new map. Section numbers are of ORB-SLAM (2015)."""
+        # 1. Feature extraction, and keyframe insertion into the spanning tree (VI-A).
         features = new.features
         if features is None:
             features = features_of(new.frame, new.twist, self._sensor, self._plan.features)
         whole = with_new_keyframe(self.map, new, features)
+        # 2. Extract the part of the map that the keyframe may change.
         known = self._tracks.points(new.tracks.id)
         part = _part(whole, new.id, known[has(whole.points.ids, known)])
+        # 3. Observations of the points tracked by optical flow, which ORB-SLAM does not have.
         slam_map = self._with_tracks(part.map, new, known)
+        # 4. Matching of the local map by descriptor (V-D), here with the keyframe only and not with every frame.
         slam_map, taken = self._with_found_points(slam_map, new.id, features)
+        # 5. New points: from measured depth (ORB-SLAM2, III), then triangulated with covisible keyframes (VI-C).
         slam_map = self._with_new_points(slam_map, new.id, features, taken)
         near, _ = covisible(slam_map, new.id)
         near = near[has(part.keyframes, near)]
         slam_map = with_triangulated(slam_map, new.id, near, self._plan.features)
+        # 6. Fusion of duplicate points.
         slam_map = self._fused(slam_map, new.id, near[:_FUSE_KEYFRAMES])
+        # 7. Culling of recent map points (VI-B).
         slam_map = without_unconfirmed(slam_map, new.id)
+        # 8. Local bundle adjustment (VI-D).
         slam_map = adjust_around(slam_map, new.id, self._plan.adjust, part.keyframes)
+        # 9. Culling of redundant keyframes (VI-E).
         slam_map = without_redundant(slam_map, new.id, part.keyframes)
+        # 10. Merge the changed part back into the map.
         self._tracks.forget(new.id)
         self.map = merge_back(whole, part, slam_map)
         return self.map
 
     def take_states(self, changes: StateChanges) -> Map:
-        """Take in states of points that changed after the last keyframe; gives the new map."""
+        """Apply changes of point states that came after the latest keyframe; return the new map."""
         self.map = with_changes(self.map, changes)
         return self.map
 
     def close_loop(self, loop: LoopClosure) -> Map:
-        """Close a loop, or make one submap of two; gives the new map."""
+        """Close a loop, or merge two submaps; return the new map. Section numbers are of ORB-SLAM (2015)."""
         if not has(self.map.ids, np.array([loop.source, loop.target])).all():
             return self.map  # one of them has been culled since
+        # 1. Correct the poses by the essential graph optimization (VII-D), or merge the submaps.
         whole = with_loop_closed(self.map, loop)
+        # 2. Loop fusion (VII-C): fuse the points of the target with those of the source and its neighbors.
         part = extract_around(whole, _around_loop(whole, loop))
         near = covisible(part.map, loop.source)[0]
         near = near[has(part.keyframes, near) & (near != loop.target)][:LOCAL_KEYFRAMES]
         slam_map = self._fused(part.map, loop.target, np.append(np.int64(loop.source), near))
+        # 3. Bundle adjustment of the target's local map, then of all keyframes around the loop, window by window.
         slam_map = adjust_around(slam_map, loop.target, self._plan.adjust, part.keyframes)
         self.map = merge_back(whole, part, adjust_all(slam_map, self._plan.adjust, part.keyframes))
         return self.map
 
-    def remove(self, movers: DynamicObservations) -> tuple[Map, np.ndarray]:
-        """Take what may move out of a keyframe and the map.
+    def remove(self, movers: DynamicObservations) -> tuple[Map, Ids]:
+        """Remove the dynamic features and points of a keyframe from the map.
 
-        Of a keyframe that has been culled since, only the points that the tracker saw are known. The others were seen
-        by those that made it redundant, and leave with what may move in them.
+        If the keyframe has been culled since, only the points that the tracker observed are known. Its other points are
+        observed by the keyframes that made it redundant, and are removed with their masks.
 
         Returns:
-            The map, and the tracker's numbers of the points that have left it.
+            The new map, and the tracker ids of the removed points.
         """
         before = slam_map = self.map
         if has(slam_map.ids, np.array([movers.keyframe]))[0]:
@@ -219,8 +239,8 @@ class LocalMapping:
         self._tracks.mark_removed(movers.tracks, movers.keyframe)
         return slam_map, np.append(TrackId.of_map_points(gone), tracks)
 
-    def _with_tracks(self, slam_map: Map, new: NewKeyframe, known: np.ndarray) -> Map:
-        """The points the tracker saw: those the map has get a observation, the others become points."""
+    def _with_tracks(self, slam_map: Map, new: NewKeyframe, known: Ids) -> Map:
+        """Add the observations of tracked points; a track without a map point becomes a new point."""
         tracks = new.tracks
         uv, depth = jax.device_get(
             _ideal(tracks.uv_raw, tracks.X_cam[2].astype(np.float32), new.twist, new.frame, self._sensor)
@@ -254,8 +274,8 @@ class LocalMapping:
             ),
         )
 
-    def _with_found_points(self, slam_map: Map, keyframe_id: int, features: Features) -> tuple[Map, np.ndarray]:
-        """Points of the map that its neighbors see, found in it by their descriptor; and the features they are."""
+    def _with_found_points(self, slam_map: Map, keyframe_id: int, features: Features) -> tuple[Map, Ids]:
+        """Match the points of the local map with a keyframe by descriptor; also return the matched features."""
         points = described_points_in(slam_map, local_keyframes(slam_map, keyframe_id))
         plan = self._plan.features
         index, feature = find_points(
@@ -265,8 +285,8 @@ class LocalMapping:
             slam_map, feature_observations(keyframe_id, features, points.ids[index], feature, plan)
         ), feature
 
-    def _with_new_points(self, slam_map: Map, keyframe_id: int, features: Features, taken: np.ndarray) -> Map:
-        """A point for every feature with depth that is none yet."""
+    def _with_new_points(self, slam_map: Map, keyframe_id: int, features: Features, taken: Ids) -> Map:
+        """Create a point for every unmatched feature with measured depth."""
         free = np.flatnonzero(features.depth > 0)
         free = free[~np.isin(free, taken)]
         uv, depth = features.uv[:, free].astype(np.float64), features.depth[free].astype(np.float64)
@@ -279,7 +299,7 @@ class LocalMapping:
             feature_observations(keyframe_id, features, points.ids, free, self._plan.features),
         )
 
-    def _fused(self, slam_map: Map, keyframe_id: int, neighbors: np.ndarray) -> Map:
+    def _fused(self, slam_map: Map, keyframe_id: int, neighbors: Ids) -> Map:
         slam_map, keep, drop = fuse_duplicates(
             slam_map, keyframe_id, neighbors, self._plan.features, radius_px=self._plan.search_px
         )
@@ -288,14 +308,14 @@ class LocalMapping:
 
 
 def with_new_keyframe(slam_map: Map, new: NewKeyframe, features: Features) -> Map:
-    """The map with a keyframe where its parent has it, and no point seen in it yet; and what came with it of others."""
+    """Insert a keyframe without observations at its pose relative to its parent, and apply its changed point states."""
     if new.states is not None:
         slam_map = with_changes(slam_map, new.states)
     pose, parent, submap = new.T_parent_keyframe, new.parent, new.submap
     if parent != NONE:
         pose = compose(slam_map.pose(parent), pose)
         parent = int(surviving_keyframes(slam_map, np.array([parent]))[0])
-        submap = int(slam_map.submap[slam_map.row(parent)])  # which may have become part of another one
+        submap = int(slam_map.submap[slam_map.row(parent)])  # the submap may have been merged into another one
     encoded, png = cv2.imencode(".png", np.asarray(new.frame.image), [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not encoded:
         raise RuntimeError("the image of a keyframe could not be compressed")
@@ -307,14 +327,14 @@ def with_new_keyframe(slam_map: Map, new: NewKeyframe, features: Features) -> Ma
 def _ideal(
     uv_raw: Pixels, expected_depth: Weights, twist: Float[Array, "6"], frame: FrameArrays, sensor: SensorModel
 ) -> tuple[Pixels, Weights]:
-    """Pixels of the ideal camera, and depth."""
+    """Convert pixels of the distorted image to pixels of the ideal camera, and measure their depth."""
     believed = valid_depth(frame.depth, sensor.min_depth_m, sensor.max_depth_m)
     seen = measure(uv_raw, expected_depth, twist, believed, frame.depth_delay_s, sensor)
     return to_pixels(sensor.intrinsics, seen.xy), seen.depth
 
 
-def _part(slam_map: Map, keyframe_id: int, known: np.ndarray) -> PartialMap:
-    """The part of a map that a new keyframe may change, given the points of it that the tracker saw."""
+def _part(slam_map: Map, keyframe_id: int, known: Ids) -> PartialMap:
+    """Extract the part of the map that a new keyframe may change, given the map points that the tracker observed."""
     latest = slam_map.ids[slam_map.ids >= keyframe_id - CONFIRM_WITHIN]
     near = np.concatenate([most_shared(slam_map, known, LOCAL_KEYFRAMES), latest])
     parent = slam_map.parent[slam_map.row(keyframe_id)]
@@ -323,8 +343,8 @@ def _part(slam_map: Map, keyframe_id: int, known: np.ndarray) -> PartialMap:
     return extract_around(slam_map, np.concatenate([near, around]), known)
 
 
-def _around_loop(slam_map: Map, loop: LoopClosure) -> np.ndarray:
-    """The keyframes nearest to a loop, of its submap."""
+def _around_loop(slam_map: Map, loop: LoopClosure) -> Ids:
+    """Return the keyframes nearest to a loop, in its submap."""
     inside = slam_map.ids[slam_map.submap == slam_map.submap[slam_map.row(loop.target)]]
     apart = np.linalg.norm(
         slam_map.T_world_cam[rows(slam_map.ids, inside), 4:] - slam_map.pose(loop.target)[4:], axis=1

@@ -3,10 +3,12 @@
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float64, Int, Int64, UInt8
 
 from jaxslam.features.matching import NEAR, match_by_projection
 from jaxslam.features.orb import FeaturePlan, Features
 from jaxslam.geometry.se3 import to_local
+from jaxslam.geometry.types import Ids, Pose
 from jaxslam.map.edit import with_observations
 from jaxslam.map.point_fusion import with_fused_points
 from jaxslam.map.types import NONE, Map, Observations, empty_observations, observations_at, rows
@@ -28,13 +30,13 @@ class DescribedPoints(NamedTuple):
             octave 0.
     """
 
-    ids: np.ndarray
-    X_world: np.ndarray
-    descriptor: np.ndarray
-    size: np.ndarray
+    ids: Int64[np.ndarray, " r"]
+    X_world: Float64[np.ndarray, "3 r"]
+    descriptor: UInt8[np.ndarray, "r 32"]
+    size: Float64[np.ndarray, " r"]
 
 
-def described_points_in(slam_map: Map, keyframe_ids: np.ndarray) -> DescribedPoints:
+def described_points_in(slam_map: Map, keyframe_ids: Ids) -> DescribedPoints:
     """Return the points with a descriptor that these keyframes observe."""
     seen = np.flatnonzero(
         np.isin(slam_map.observations.keyframe, keyframe_ids) & (slam_map.observations.feature != NONE)
@@ -59,12 +61,12 @@ def find_points(
     slam_map: Map,
     points: DescribedPoints,
     features: Features,
-    T_world_cam: np.ndarray,
+    T_world_cam: Pose,
     plan: FeaturePlan,
     *,
     radius_px: float,
     max_distance: int = NEAR,
-) -> np.ndarray:
+) -> Int[np.ndarray, "2 m"]:
     """Match map points with the features of an image by projection from an approximate pose.
 
     Args:
@@ -104,7 +106,11 @@ def find_points(
 
 
 def feature_observations(
-    keyframe_id: int, features: Features, point_ids: np.ndarray, feature: np.ndarray, plan: FeaturePlan
+    keyframe_id: int,
+    features: Features,
+    point_ids: Int[np.ndarray, " m"],
+    feature: Int[np.ndarray, " m"],
+    plan: FeaturePlan,
 ) -> Observations:
     """Make observations of points at features of a keyframe."""
     return Observations(
@@ -120,8 +126,8 @@ def feature_observations(
 
 
 def fuse_duplicates(
-    slam_map: Map, keyframe_id: int, neighbors: np.ndarray, plan: FeaturePlan, *, radius_px: float
-) -> tuple[Map, np.ndarray, np.ndarray]:
+    slam_map: Map, keyframe_id: int, neighbors: Ids, plan: FeaturePlan, *, radius_px: float
+) -> tuple[Map, Int[np.ndarray, " f"], Int[np.ndarray, " f"]]:
     """Match the points of a keyframe with the features of its neighbors, and fuse those that are the same point.
 
     Args:

@@ -17,11 +17,12 @@ from jaxlie import SE3
 from jaxslam_kernels.camera import to_pixels
 from jaxslam_kernels.se3 import to_camera
 from jaxslam_kernels.types import DepthImage, Mask, Pixels, Points, Scalar, Weights
-from jaxtyping import Array, Bool, Float, Float32, Float64, Int8, Int64
+from jaxtyping import Array, Bool, Float, Float32, Float64, Int, Int8, Int64
 
 from jaxslam.config.cue_sections import OcclusionConfig
 from jaxslam.dynamics.occlusion import PointState, States, next_states, occluded_share, state_weights
 from jaxslam.geometry.se3 import IDENTITY, to_local
+from jaxslam.geometry.types import Ids, Pose
 from jaxslam.map.edit import with_states
 from jaxslam.map.types import NONE, Map, has, rows, visibility
 from jaxslam.runtime.compile_cache import SINGLE_THREAD
@@ -88,7 +89,7 @@ class _VisiblePoints(NamedTuple):
     map: Map
     keyframe: int
     submap: int
-    ids: np.ndarray
+    ids: Ids
     columns: _Columns
 
 
@@ -123,7 +124,7 @@ class PointStates:
         jax.block_until_ready(self._after(columns, IDENTITY, np.zeros(6, np.float32), frame))
 
     def see(
-        self, slam_map: Map, keyframe_id: int, T_keyframe_cam: np.ndarray, twist: np.ndarray, arrays: FrameArrays
+        self, slam_map: Map, keyframe_id: int, T_keyframe_cam: Pose, twist: Float[np.ndarray, "6"], arrays: FrameArrays
     ) -> float:
         """Update the states with a frame whose pose is known.
 
@@ -149,7 +150,7 @@ class PointStates:
         self._shown = shown
         return share
 
-    def weights(self, slam_map: Map, point_ids: np.ndarray) -> Float32[np.ndarray, " n"]:
+    def weights(self, slam_map: Map, point_ids: Int[np.ndarray, " n"]) -> Float32[np.ndarray, " n"]:
         """Return the relative weights of points of the latest map, 1 on average.
 
         Only ratios matter to a pose; with an average of 1, its covariance does not shrink where many are OCCLUDED.
@@ -171,7 +172,7 @@ class PointStates:
         self._change = np.append(self._change, np.zeros(more, np.int64))
         self._state[self._change <= number] = _AS_IN_MAP
 
-    def _of(self, slam_map: Map, point_ids: np.ndarray) -> np.ndarray:
+    def _of(self, slam_map: Map, point_ids: Int[np.ndarray, " n"]) -> Int8[np.ndarray, " n"]:
         """Return the current states of points."""
         ahead = self._state[point_ids]
         return np.where(ahead == _AS_IN_MAP, slam_map.points.state[rows(slam_map.points.ids, point_ids)], ahead)
@@ -191,7 +192,7 @@ class PointStates:
         )
         return _VisiblePoints(slam_map, keyframe_id, submap, ids, columns)
 
-    def _blocked(self, slam_map: Map) -> np.ndarray:
+    def _blocked(self, slam_map: Map) -> Ids:
         """Return the collected points that are blocked and still in the map, the latest first."""
         ids = self._shown.ids if self._shown is not None else np.zeros(0, np.int64)
         ids = ids[has(slam_map.points.ids, ids)]
@@ -203,7 +204,7 @@ class PointStates:
         return _Columns(*filled)
 
     def _after(
-        self, columns: _Columns, T_keyframe_cam: np.ndarray, twist: np.ndarray, arrays: FrameArrays
+        self, columns: _Columns, T_keyframe_cam: Pose, twist: Float[np.ndarray, "6"], arrays: FrameArrays
     ) -> tuple[States, Float[Array, "2"]]:
         motion = T_keyframe_cam.astype(np.float32), twist
         seen = arrays.ignore, arrays.depth, arrays.depth_delay_s

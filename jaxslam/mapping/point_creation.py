@@ -1,21 +1,35 @@
-"""Points made of what a keyframe sees."""
+"""Create map points from the features of a keyframe."""
 
 import numpy as np
+from jaxtyping import Float, UInt8
 
 from jaxslam.dynamics.occlusion import PointState
 from jaxslam.features.orb import DESCRIPTOR_BYTES, FeaturePlan, Features
 from jaxslam.geometry.se3 import between, transform
+from jaxslam.geometry.types import Ids
 from jaxslam.map.edit import with_observations, with_points
 from jaxslam.map.types import NONE, Map, MapPoints
 from jaxslam.mapping.map_point_matching import feature_observations
 from jaxslam.mapping.triangulation import at_baseline, triangulate
 
 _TRIANGULATE_KEYFRAMES = 8
-"""Keyframes whose features without depth are matched with those of a new one."""
+"""Number of neighbors with which the features of a new keyframe are triangulated."""
 
 
-def new_points(slam_map: Map, keyframe_id: int, X_world: np.ndarray, descriptor: np.ndarray | None = None) -> MapPoints:
-    """Points `(3, n)` made by a keyframe, with the map's next ids; recognizable if they have a descriptor `(n, 32)`."""
+def new_points(
+    slam_map: Map,
+    keyframe_id: int,
+    X_world: Float[np.ndarray, "3 n"],
+    descriptor: UInt8[np.ndarray, "n 32"] | None = None,
+) -> MapPoints:
+    """Create points with the map's next ids.
+
+    Args:
+        slam_map: The map.
+        keyframe_id: Id of their reference keyframe.
+        X_world: `(3, n)` positions in the world, meters.
+        descriptor: `(n, 32)` ORB descriptors; `None` for points without descriptors.
+    """
     num = X_world.shape[1]
     recognizable = np.full(num, descriptor is not None)
     return MapPoints(
@@ -29,14 +43,14 @@ def new_points(slam_map: Map, keyframe_id: int, X_world: np.ndarray, descriptor:
     )
 
 
-def with_triangulated(slam_map: Map, keyframe_id: int, neighbors: np.ndarray, plan: FeaturePlan) -> Map:
-    """Points for features without depth that a neighbor sees too.
+def with_triangulated(slam_map: Map, keyframe_id: int, neighbors: Ids, plan: FeaturePlan) -> Map:
+    """Triangulate the features of a keyframe without depth with its neighbors, and add the points.
 
     Args:
-        slam_map: The map, or a part with all that these keyframes saw.
-        keyframe_id: The keyframe.
-        neighbors: Ids of others, the most alike first.
-        plan: How features are found.
+        slam_map: The map, or a part with all observations of these keyframes.
+        keyframe_id: Id of the keyframe.
+        neighbors: Ids of its neighbors, the most shared points first.
+        plan: Settings of feature extraction.
     """
     features, pose = slam_map.keyframe(keyframe_id).features, slam_map.pose(keyframe_id)
     free = _free(slam_map, keyframe_id)
@@ -55,13 +69,13 @@ def with_triangulated(slam_map: Map, keyframe_id: int, neighbors: np.ndarray, pl
     return slam_map
 
 
-def _free(slam_map: Map, keyframe_id: int) -> np.ndarray:
-    """Indices of the features of a keyframe that have no depth and are no point."""
+def _free(slam_map: Map, keyframe_id: int) -> Ids:
+    """Return the indices of the features of a keyframe that have neither depth nor a map point."""
     taken = slam_map.observations.feature[slam_map.observations.keyframe == keyframe_id]
     return np.setdiff1d(np.flatnonzero(slam_map.keyframe(keyframe_id).features.depth <= 0), taken[taken != NONE])
 
 
-def _at(features: Features, index: np.ndarray) -> Features:
+def _at(features: Features, index: Ids) -> Features:
     return Features(
         *(array[index] if name == "descriptor" else array[..., index] for name, array in features._asdict().items())
     )

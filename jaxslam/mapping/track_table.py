@@ -1,4 +1,4 @@
-"""Which map point each point of the tracker is: the codec of the tracker's ids, and a table of its tracks."""
+"""The tracker's point ids: their codec, and a table from tracks to map points."""
 
 from collections.abc import Mapping
 

@@ -1,4 +1,4 @@
-"""Points where no depth was measured: features of two keyframes, matched along epipolar lines and triangulated.
+"""Triangulate features without depth: match two keyframes along epipolar lines, and intersect the rays.
 
 Source: Mur-Artal et al., "ORB-SLAM", 2015, section VI-C, for the checks.
 """
@@ -7,52 +7,54 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from jaxtyping import Bool, Float, Float64, Int64
 
 from jaxslam.features.matching import NEAR, hamming
 from jaxslam.features.orb import FeaturePlan, Features
 from jaxslam.geometry.se3 import between, inverse, transform
 from jaxslam.geometry.so3 import matrices
+from jaxslam.geometry.types import Pose
 from jaxslam.sensors.camera import Camera
 
 _RATIO = 0.8
-"""The best match must differ in less than this share of the bits of the second best along the line."""
+"""Largest ratio of the Hamming distances of the best and the second best match near the epipolar line."""
 _CHI2_LINE, _CHI2_POINT = 3.84, 5.99
 """95 % quantiles of chi squared with one and with two degrees of freedom."""
 _MIN_PARALLAX = np.deg2rad(2.0)
-"""Smallest angle between the two rays: with a focal length of 525 pixels, depth is then known to a tenth."""
+"""Smallest angle between the two rays, radians: with a focal length of 525 pixels, depth is then known to 10 %."""
 _SCALE_FACTOR = 1.5
-"""How far the ratio of distances may be from that of the features' sizes, besides a level of the pyramid."""
+"""Largest factor between the ratio of distances and the ratio of feature sizes, besides one pyramid level."""
 _NEAREST_M = 0.1
 
 
 class Triangulated(NamedTuple):
-    """Points seen by two keyframes; `(m,)`.
+    """The `m` triangulated points of two keyframes.
 
     Attributes:
-        first: Index of the feature in the first one.
-        second: Index of the feature in the second one.
-        X_first: `(3, m)` meters, in the axes of the first.
+        first: `(m,)` index of the feature in the first keyframe.
+        second: `(m,)` index of the feature in the second keyframe.
+        X_first: `(3, m)` positions in the camera frame of the first keyframe, meters.
     """
 
-    first: np.ndarray
-    second: np.ndarray
-    X_first: np.ndarray
+    first: Int64[np.ndarray, " m"]
+    second: Int64[np.ndarray, " m"]
+    X_first: Float64[np.ndarray, "3 m"]
 
 
 def triangulate(
-    camera: Camera, first: Features, second: Features, T_first_second: np.ndarray, plan: FeaturePlan
+    camera: Camera, first: Features, second: Features, T_first_second: Pose, plan: FeaturePlan
 ) -> Triangulated:
-    """Points seen as features of two keyframes whose relative pose is known.
+    """Triangulate the features of two keyframes whose relative pose is known.
 
-    Every match is the other's best along the epipolar line, and the point lies in front of both cameras, is seen from
-    directions that differ by a degree at least, projects onto both features, and is as far away as their sizes say.
+    The features of a match are each other's best near the epipolar line. The point lies in front of both cameras, has a
+    parallax of at least two degrees, reprojects onto both features, and is at distances that agree with their octaves.
 
     Args:
-        camera: Of both.
-        first: Features to match.
-        second: Features to match them with.
-        T_first_second: `(7,)` pose of the second keyframe in the axes of the first.
-        plan: How features are found.
+        camera: Camera of both keyframes.
+        first: Features of the first keyframe.
+        second: Features of the second keyframe.
+        T_first_second: `(7,)` pose of the second keyframe relative to the first.
+        plan: Settings of feature extraction.
     """
     rays = [_rays(camera, features) for features in (first, second)]
     sigmas = [plan.scale(features.octave) / np.sqrt(camera.fx * camera.fy) for features in (first, second)]
@@ -73,26 +75,28 @@ def triangulate(
     return Triangulated(pairs[0][good], pairs[1][good], X[:, good])
 
 
-def _rays(camera: Camera, features: Features) -> np.ndarray:
-    """`(3, n)` directions, third coordinate 1."""
+def _rays(camera: Camera, features: Features) -> Float64[np.ndarray, "3 n"]:
+    """Return the `(3, n)` rays of the features in the camera frame, with z = 1."""
     return camera.back_project(features.uv.astype(np.float64), np.ones(features.uv.shape[1]))
 
 
-def _near_lines(first: np.ndarray, second: np.ndarray, sigmas: list[np.ndarray], T: np.ndarray) -> np.ndarray:
-    """`(n, m)` which features of the second lie near the epipolar line of which feature of the first."""
+def _near_lines(
+    first: Float64[np.ndarray, "3 n"], second: Float64[np.ndarray, "3 m"], sigmas: list[np.ndarray], T: Pose
+) -> Bool[np.ndarray, "n m"]:
+    """Return the `(n, m)` mask of feature pairs that satisfy the epipolar constraint."""
     x, y, z = T[4:]
     essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ matrices(T[:4])
     error = first.T @ essential @ second
     of_first, of_second = (essential @ second)[:2], (essential.T @ first)[:2]
-    # Each line moves with the feature it is of, as the other feature does by itself: Sampson's distance.
+    # The Sampson distance: the errors of both features count.
     variance = (sigmas[0] ** 2)[:, None] * (of_first**2).sum(axis=0) + (sigmas[1] ** 2) * (of_second**2).sum(axis=0)[
         :, None
     ]
     return error**2 < _CHI2_LINE * variance
 
 
-def _matched(first: Features, second: Features, allowed: np.ndarray) -> np.ndarray:
-    """`(2, k)` pairs of features that are each other's best among those allowed, and clearly so."""
+def _matched(first: Features, second: Features, allowed: Bool[np.ndarray, "n m"]) -> Int64[np.ndarray, "2 k"]:
+    """Return the `(2, k)` allowed pairs of features that are each other's best match and pass the ratio test."""
     if not allowed.any():
         return np.zeros((2, 0), np.int64)
     distance = np.where(allowed, hamming(first.descriptor, second.descriptor), np.iinfo(np.uint16).max)
@@ -104,8 +108,10 @@ def _matched(first: Features, second: Features, allowed: np.ndarray) -> np.ndarr
     return np.stack([index[good], best[good]])
 
 
-def _intersections(first: np.ndarray, second: np.ndarray, T_first_second: np.ndarray) -> np.ndarray:
-    """`(3, k)` where pairs of rays meet best; not finite where they are parallel."""
+def _intersections(
+    first: Float64[np.ndarray, "3 k"], second: Float64[np.ndarray, "3 k"], T_first_second: Pose
+) -> Float64[np.ndarray, "3 k"]:
+    """Triangulate `(3, k)` points from pairs of rays; not finite where the rays are parallel."""
     if not first.shape[1]:
         return np.zeros((3, 0))
     T_second_first = inverse(T_first_second)
@@ -115,8 +121,14 @@ def _intersections(first: np.ndarray, second: np.ndarray, T_first_second: np.nda
         return X[:3] / X[3]
 
 
-def at_baseline(T_world_first: np.ndarray, T_world_second: np.ndarray, depth: np.ndarray) -> bool:
-    """Whether two keyframes are far enough apart for points as far away as those seen (meters, 0 for none)."""
+def at_baseline(T_world_first: Pose, T_world_second: Pose, depth: Float[np.ndarray, " n"]) -> bool:
+    """Return whether the baseline of two keyframes is long enough for the depths seen.
+
+    Args:
+        T_world_first: `(7,)` pose of the first keyframe.
+        T_world_second: `(7,)` pose of the second keyframe.
+        depth: `(n,)` depths of features, meters; 0 where depth is missing.
+    """
     seen = depth[depth > 0]
     apart = np.linalg.norm(between(T_world_first, T_world_second)[4:])
     return bool(len(seen) and apart > _MIN_PARALLAX * np.median(seen))
