@@ -21,7 +21,7 @@ def matrices(wxyz: Quaternions) -> Float[np.ndarray, "... 3 3"]:
     return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
 
 
-def axis_rotation(axis: int, angle: Float[np.ndarray, "..."]) -> Quaternions:
+def axis_rotation(axis: int, angle: Float[np.ndarray, "..."] | float) -> Quaternions:
     """Return the `(..., 4)` unit quaternions that rotate by `(...,)` radians about coordinate axis 0, 1 or 2."""
     half = 0.5 * np.asarray(angle, np.float64)
     quaternion = np.zeros((*half.shape, 4))

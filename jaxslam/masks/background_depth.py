@@ -1,8 +1,7 @@
-"""What the camera has seen before at the places it sees now: what has come since, and what stands still.
+"""Compare a depth image with earlier ones: find new surfaces, and the static background inside a propagated mask.
 
-Depth alone tells, with the pose of the camera: a surface in front of what was seen there before has come since, a
-person, a door or a chair that is carried, known to a network or not. One that was there already is no part of what
-moves by.
+Only depth and camera poses are used. A surface in front of the one seen there before is new: a person, a door, or a
+carried chair, whether a detector knows it or not. A surface that was there before does not belong to a passing object.
 """
 
 import math
@@ -24,34 +23,39 @@ from jaxslam.runtime.compiled import compiled
 from jaxslam.sensors.downscale import Downscaler, ImageGrid
 
 _COARSE_WIDTH = 160
-"""Images are compared at about so many columns."""
+"""Approximate number of columns of the reduced images that are compared."""
 _AGO_S = (0.27, 0.5)
-"""How long ago the frames were taken that tell what is new and what stands still: a walker has moved by half his width,
-and more than a step. With 0.33 s for the latter, masks without detections for a second are worse (Bonn `crowd`, against
-DeepLab, new_surfaces not added: median IoU 0.35 instead of 0.39): people who pause leave them."""
+"""Ages of the frames against which new surfaces and static surfaces are found, seconds: a walker has moved by half his
+width, and by more than a step. With 0.33 s for the latter, masks without detections for a second are worse, because
+people who pause drop out of them (Bonn `crowd`, against DeepLab, without new surfaces: median IoU 0.35 instead of
+0.39)."""
 _KEPT_S = 1.0
+"""Time for which frames are kept, seconds."""
 _NEW_SHARE = 0.003
-"""Least share of the image that a new surface covers."""
+"""Smallest share of the image that a new surface covers."""
 _NEW_RANGE_M = 0.2
-"""How much nearer and farther than the surface that is new the rest of it may be."""
+"""Margin of the depth range of an object beyond that of its new surface, meters."""
 _TIMING_S = 0.0125
-"""How well it is known when a row of a depth image was taken: half the readout of a rolling shutter. A camera that
-turns shows edges displaced by that: on TUM `fr1_rpy`, at 2 rad/s, desks had new_surfaces of 20 pixels along them."""
+"""Uncertainty of the time of a row of a depth image, seconds: half the readout time of a rolling shutter. A rotating
+camera displaces edges by that: on TUM `fr1_rpy`, at 2 rad/s, desks got false new surfaces of 20 pixels along their
+edges."""
 _PERCENTILES = (5, 95)
+"""Percentiles that bound the depth range of a new surface."""
 _MIN_OVERLAP = 0.1
-"""A piece of a new surface holds at least this share of the surface that is new."""
+"""Smallest share of the new surface that a connected component of its object holds."""
 
 
 class BackgroundSurfaces(NamedTuple):
-    """What is known of the pixels of a frame, at the coarse size.
+    """Comparison of a frame's depth with earlier frames, at the reduced size.
 
     Attributes:
-        depth: `(h, w)` meters, 0 where missing.
-        outside: `(h, w)` the surface was there, and outside the mask, in the frame the mask is carried on from.
-        still: `(h, w)` it has been there for a while.
-        unmoved: `(h, w)` it was there a little ago, and outside the mask.
-        new: `(h, w)` it was not.
-        displaced_px: How far edges may be displaced against that frame, coarse pixels.
+        depth: `(h, w)` depth of the frame, meters; 0 where it is missing.
+        outside: `(h, w)` mask of the surfaces that were there, outside the mask, in the frame from which the mask is
+            propagated.
+        still: `(h, w)` mask of the surfaces that were there in the older of the two earlier frames.
+        unmoved: `(h, w)` mask of the surfaces that were there, outside the mask, in the newer of these frames.
+        new: `(h, w)` mask of the surfaces that are in front of those of the newer of the two earlier frames.
+        displaced_px: Largest displacement of edges against the newer of the two earlier frames, reduced pixels.
     """
 
     depth: np.ndarray
@@ -63,7 +67,7 @@ class BackgroundSurfaces(NamedTuple):
 
 
 class _Remembered(NamedTuple):
-    """A frame that was tracked."""
+    """A tracked frame at the reduced size; fields as in the arguments of `SurfaceMemory.remember`."""
 
     time_s: float
     T_world_cam: np.ndarray
@@ -73,14 +77,14 @@ class _Remembered(NamedTuple):
 
 
 class SurfaceMemory:
-    """Keeps the depth, masks and poses of the last second, and compares new frames with them."""
+    """The depth images, masks and poses of the last second, with which new frames are compared."""
 
     def __init__(self, raster: ImageGrid, farthest_m: float = math.inf) -> None:
-        """Begin with nothing seen.
+        """Start without frames.
 
         Args:
-            raster: Of the images. Distortion is left out: between frames so close it makes no difference.
-            farthest_m: Depth beyond is as good as missing: sensors that see nothing may say that it is far away.
+            raster: Pixel grid of the images. Distortion is ignored: between frames so close it makes no difference.
+            farthest_m: Largest valid depth, meters; some sensors report missing depth as far away.
         """
         self._farthest_m = farthest_m
         self._reduced = Downscaler(raster, _COARSE_WIDTH)
@@ -92,7 +96,7 @@ class SurfaceMemory:
         self._seen: dict[int, _Remembered] = {}
 
     def compile(self) -> None:
-        """Compile all that is needed."""
+        """Compile the comparison."""
         self._compared(np.tile(np.eye(1, 7), (len(self._depths_then), 1)))
 
     def compare(
@@ -103,19 +107,19 @@ class SurfaceMemory:
         depth: Float[np.ndarray, "h w"],
         since: tuple[int, Bool[np.ndarray, "h w"]] | None = None,
     ) -> BackgroundSurfaces:
-        """Compare a frame with those before.
+        """Compare a frame with earlier frames.
 
         Args:
-            time_s: Of the frame.
-            T_world_cam: Where the camera was when the depth was taken.
-            turn_rad_per_s: How fast it turns.
-            depth: Meters, 0 where missing.
-            since: Number and mask of the frame that the mask is carried on from.
+            time_s: Time of the frame, seconds.
+            T_world_cam: `(7,)` pose of the camera at the time of the depth.
+            turn_rad_per_s: Angular speed of the camera.
+            depth: `(h, w)` depth image, meters; 0 where depth is missing.
+            since: Number and `(h, w)` mask of the frame from which the mask is propagated; `None` without one.
         """
         coarse = self._reduced.every(depth)
         np.copyto(self._depth, np.where(coarse < self._farthest_m, coarse, 0))
         poses = np.tile(np.eye(1, 7), (len(self._depths_then), 1))
-        self._depths_then[:] = 0  # says nothing
+        self._depths_then[:] = 0  # missing depth gives no evidence
         first = None if since is None else self._seen.get(since[0])
         if since is not None and first is not None:
             first = first._replace(mask=self._reduced.every(since[1]))
@@ -137,33 +141,41 @@ class SurfaceMemory:
         turn_rad_per_s: float,
         mask: Bool[np.ndarray, "h w"],
     ) -> None:
-        """Keep the frame compared last, now that it is known where it was taken."""
+        """Store the frame compared last, now that its pose and mask are final.
+
+        Args:
+            frame: Number of the frame.
+            time_s: Time of the frame, seconds.
+            T_world_cam: `(7,)` pose of the camera at the time of the depth.
+            turn_rad_per_s: Angular speed of the camera.
+            mask: `(h, w)` mask of the movable objects.
+        """
         coarse = self._depth.copy(), self._reduced.every(mask).copy()
         self._seen[frame] = _Remembered(time_s, T_world_cam, turn_rad_per_s, *coarse)
         for old in [number for number, seen in self._seen.items() if not 0 <= time_s - seen.time_s <= _KEPT_S]:
             del self._seen[old]
 
     def correct(self, T_new_old: Float[np.ndarray, "7"]) -> None:
-        """The world has moved: poses as they are now were others before."""
+        """Apply a correction of the world frame to the stored poses."""
         for frame, seen in self._seen.items():
             self._seen[frame] = seen._replace(T_world_cam=compose(T_new_old, seen.T_world_cam))
 
     def forget(self) -> None:
-        """Nothing that was seen says anything of what comes."""
+        """Drop all stored frames."""
         self._seen.clear()
 
     def without(self, mask: Bool[np.ndarray, "h w"], drop: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-        """A mask without pixels of the coarse size; single ones of those stay."""
+        """Remove the pixels of a reduced mask `drop` from a mask, except isolated ones."""
         smooth = cv2.medianBlur(drop.view(np.uint8), 3)
         return mask & ~self._reduced.whole(smooth.view(bool)) if smooth.any() else mask
 
     def with_new_surfaces(self, mask: Bool[np.ndarray, "h w"], seen: BackgroundSurfaces) -> Bool[np.ndarray, "h w"]:
-        """A mask with what has come into the picture: what is new, and what hangs together with it."""
+        """Add the objects with new surfaces to a mask."""
         coming = new_surfaces(seen, self._reduced.every(mask))
         return mask | self._reduced.whole(coming) if coming.any() else mask
 
     def _about(self, time_s: float, within_s: float) -> _Remembered | None:
-        """The frame taken nearest to a time; `None` if there is none within so many seconds."""
+        """Return the stored frame nearest to a time; `None` if none is within `within_s` seconds."""
         nearest = min(self._seen.values(), key=lambda seen: abs(seen.time_s - time_s), default=None)
         return None if nearest is None or abs(nearest.time_s - time_s) > within_s else nearest
 
@@ -174,11 +186,11 @@ class SurfaceMemory:
 
 
 def new_surfaces(seen: BackgroundSurfaces, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Pixels of what has come into the picture and is not in the mask: new surfaces, and the rest of their objects.
+    """Find the objects that have come into view outside a mask: new surfaces, and the rest of their objects.
 
-    The rest has the depth of the new surface, hangs together with it, and is not known to stand where it is.
+    The rest of an object is at the depth of its new surface, connected to it, and not known to be unmoved.
     """
-    side = max(3, 1 + math.ceil(seen.displaced_px)) | 1  # edges of depth are ragged; an even side would shift the rest
+    side = max(3, 1 + math.ceil(seen.displaced_px)) | 1  # depth edges are ragged; an even side would shift the mask
     fresh = cv2.morphologyEx((seen.new & ~mask).view(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8))
     num, piece, measures, _ = cv2.connectedComponentsWithStats(fresh, connectivity=4)
     coming = np.zeros(mask.shape, bool)
@@ -204,7 +216,7 @@ def _compared(
     T_then_now: Float[Array, "k 7"],
     intrinsics: Intrinsics,
 ) -> tuple[Bool[Array, "h w"], ...]:
-    """`outside`, `still`, `unmoved` and `new`, from the frame the mask comes from, one a little ago, one long ago."""
+    """Compute `outside`, `still`, `unmoved` and `new` from three frames: of the mask, the newer one, the older one."""
     change = jax.vmap(lambda then, pose: depth_change(depth, then, SE3(pose), intrinsics))(depths_then, T_then_now)
     masked = jax.vmap(lambda mask, then: mask.reshape(-1)[then])(masks_then, change.then)
     outside = change.same & ~masked

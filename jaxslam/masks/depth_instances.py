@@ -1,4 +1,4 @@
-"""A mask divided into the objects in it: pieces in which depth goes on without a step."""
+"""Divide a mask into objects: connected components without depth steps."""
 
 from typing import NamedTuple
 
@@ -11,19 +11,19 @@ from jaxslam.sensors.downscale import Downscaler, ImageGrid
 
 _WIDTH_PX = 320
 _STEP, _STEP_M = 0.04, 0.03
-"""Difference of depth between neighbors at which one object ends, as a share of depth and besides."""
+"""Difference of depth between neighboring pixels that separates objects: a share of the depth, plus meters."""
 _MIN = 0.002
-"""Share of the picture that makes an object; less has no points to judge it by."""
+"""Smallest share of the image that an object covers; a smaller one has too few points for a motion estimate."""
 _REACH_PX = 4
-"""How far from an object pixels of the mask belong to it that depth does not show, or shows in small pieces."""
+"""Distance up to which mask pixels without depth or in small components belong to the nearest object, pixels."""
 
 
 class Instances(NamedTuple):
-    """A mask, divided.
+    """A mask divided into objects.
 
     Attributes:
         labels: `(h, w)` number of the object at each pixel, from 1, the largest first; 0 where there is none.
-        rest: `(h, w)` what of the mask is in no object.
+        rest: `(h, w)` mask of the pixels of the mask that are in no object.
     """
 
     labels: UInt8[np.ndarray, "h w"]
@@ -31,23 +31,23 @@ class Instances(NamedTuple):
 
 
 class InstanceFinder:
-    """Divides masks of one camera's images."""
+    """Divides masks of one camera's images into objects."""
 
     def __init__(self, camera: Camera, most: int) -> None:
-        """Find so many objects at most, up to 255."""
+        """Find at most `most` objects in an image of a camera, up to 255."""
         self._reduced, self._most = Downscaler(ImageGrid.of(camera), _WIDTH_PX), most
 
     def divided(self, mask: Bool[np.ndarray, "h w"], depth: Float[np.ndarray, "h w"]) -> Instances:
-        """The objects in a mask.
+        """Divide a mask into objects.
 
         Args:
-            mask: What may move.
-            depth: Meters, 0 where missing.
+            mask: `(h, w)` mask of the movable objects.
+            depth: `(h, w)` depth image, meters; 0 where depth is missing.
         """
         if not mask.any():
             return Instances(np.zeros(mask.shape, np.uint8), np.zeros(mask.shape, bool))
         small = object_labels(self._reduced.every(mask), self._reduced.every(depth), self._most)
-        # Rows and columns that make no whole pixel of the smaller image are in no object.
+        # Rows and columns beyond the last whole pixel of the reduced image are in no object.
         whole = np.zeros(mask.shape, np.uint8)
         step = self._reduced.step
         large = np.repeat(np.repeat(small, step, axis=0), step, axis=1)
@@ -59,12 +59,12 @@ class InstanceFinder:
 def object_labels(
     mask: Bool[np.ndarray, "h w"], depth: Float[np.ndarray, "h w"], most: int
 ) -> UInt8[np.ndarray, "h w"]:
-    """Number of the object at each pixel of a mask, from 1, the largest first; 0 for none.
+    """Number the object at each pixel of a mask, from 1, the largest first; 0 for none.
 
     Args:
-        mask: What may move.
-        depth: Meters, 0 where missing.
-        most: Objects at most; the smallest are left out.
+        mask: `(h, w)` mask of the movable objects.
+        depth: `(h, w)` depth image, meters; 0 where depth is missing.
+        most: Largest number of objects; the smallest are left out.
     """
     inside = mask & (depth > 0) & ~_steps(depth)
     _, pieces, stats, _ = cv2.connectedComponentsWithStats(inside.view(np.uint8), connectivity=4)
@@ -80,7 +80,7 @@ def object_labels(
 
 
 def _steps(depth: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Pixels whose right or lower neighbor is at another depth."""
+    """Return the mask of pixels whose right or lower neighbor is across a depth step."""
     steps = np.zeros(depth.shape, bool)
     for axis in (0, 1):
         before = depth[:-1] if axis == 0 else depth[:, :-1]

@@ -1,6 +1,6 @@
-"""Points to follow a mask by: one in every cell, where the picture has most texture.
+"""Sample the points by which a mask is tracked: the best corner of every cell.
 
-Source: NGD-SLAM (Zhang, Bujanca and Luján 2025), section III-B.3; there, cells have 15 pixels of an image of 640.
+Source: NGD-SLAM (Zhang, Bujanca and Luján 2025), section III-C.3, with cells of 15 pixels in an image 640 pixels wide.
 """
 
 from typing import NamedTuple
@@ -10,23 +10,23 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 CELL_PX = 8
-"""Of an image about 320 pixels wide."""
+"""Side of a cell in an image about 320 pixels wide, pixels."""
 _WINDOW_PX = 5
 _MIN_SCORE = 1e-4
-"""Smaller eigenvalue of the gradient matrix, of a picture from 0 to 1, below which a random pixel does as well."""
+"""Smaller eigenvalue of the structure tensor, for gray values from 0 to 1, below which a random pixel is as good."""
 _TURNS = (0.7548776662, 0.5698402910)
-"""Of rows and columns of cells: those whose multiples of these add up to least, whole numbers left out, are all over
-the plane (the additive sequence R2: Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018)."""
+"""Factors of the row and the column of a cell. The cells with the smallest fractional parts of the sum are evenly spread
+over the image (the additive sequence R2: Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018)."""
 _NOT_MASKED = -1
-"""Score of a pixel that is not to be chosen; those of corners are 0 up to rounding, or greater."""
+"""Score of a pixel outside the mask; the scores of others are 0, up to rounding, or greater."""
 
 
 class SampledPoints(NamedTuple):
     """Points of a mask.
 
     Attributes:
-        uv: `(2, k)` pixels, row by row of cells.
-        spacing: How far those of neighboring cells are apart where they are fewest: 1 if every cell has one.
+        uv: `(2, k)` positions of the points, row by row of cells, pixels.
+        spacing: Spacing of the points in the most thinned component of the mask, in cells: 1 if every cell has a point.
     """
 
     uv: Float32[np.ndarray, "2 k"]
@@ -36,16 +36,17 @@ class SampledPoints(NamedTuple):
 def sample_mask(
     mask: Bool[np.ndarray, "h w"], gray: UInt8[np.ndarray, "h w"], capacity: int, seed: int
 ) -> SampledPoints:
-    """A masked pixel of every cell that has one: the best corner, or where there is none, a random one.
+    """Sample one masked pixel in every cell that has one: the best corner or, without a corner, a random pixel.
 
-    Only the part of the image around the mask is looked at. If there are more cells than points, large pieces of the
-    mask give way: in equal shares, somebody far away beside somebody near would have too few to be followed.
+    Only the part of the image around the mask is processed. If there are more cells than `capacity`, the large
+    components of the mask are thinned; if all were thinned alike, a person far away next to one nearby would have too
+    few points to be tracked.
 
     Args:
-        mask: Pixels to choose from.
-        gray: The image.
-        capacity: Most points.
-        seed: Of the random choice.
+        mask: `(h, w)` mask of the pixels to choose from.
+        gray: `(h, w)` gray image.
+        capacity: Largest number of points.
+        seed: Seed of the random choice.
     """
     region = _whole_cells(mask)
     inside = mask[region]
@@ -70,7 +71,7 @@ def sample_mask(
 def _shared_out(
     piece: Int[np.ndarray, " cells"], turn: Float[np.ndarray, " cells"], capacity: int
 ) -> tuple[Int[np.ndarray, " k"], float]:
-    """Which cells have a point, by the order of their turns: all of small pieces, of each large one equally many."""
+    """Choose cells in the order of their turns: all cells of small components, and equally many of each large one."""
     _, piece, counts = np.unique(piece, return_inverse=True, return_counts=True)
     share, rest = 1, capacity
     for left, count in zip(range(len(counts), 0, -1), np.sort(counts), strict=True):
@@ -85,19 +86,19 @@ def _shared_out(
 
 
 def _whole_cells(mask: Bool[np.ndarray, "h w"]) -> tuple[slice, slice]:
-    """Rows and columns of the cells around what is masked; cells that reach past the image do not count."""
+    """Return the rows and columns of the whole cells around the masked pixels."""
     height, width = (side // CELL_PX * CELL_PX for side in mask.shape)
     left, top, width, height = cv2.boundingRect(mask[:height, :width].view(np.uint8))
     return _cells(top, top + height), _cells(left, left + width)
 
 
 def _cells(begin: int, end: int) -> slice:
-    """The pixels of all cells of which some lie between."""
+    """Round an interval of pixels outward to whole cells."""
     return slice(begin // CELL_PX * CELL_PX, -(-end // CELL_PX) * CELL_PX)
 
 
 def _corners(gray: UInt8[np.ndarray, "h w"], region: tuple[slice, slice]) -> Float32[np.ndarray, "_h _w"]:
-    """Smaller eigenvalues of the gradient matrix in a part of the image, each from all pixels of its window."""
+    """Return the smaller eigenvalues of the structure tensor in a part of the image, with complete windows."""
     rows, columns = (slice(max(span.start - _WINDOW_PX, 0), span.stop + _WINDOW_PX) for span in region)
     score = cv2.cornerMinEigenVal(gray[rows, columns], _WINDOW_PX)
     top, left = region[0].start - rows.start, region[1].start - columns.start
@@ -113,7 +114,7 @@ def _rank_at_random(score: Float32[np.ndarray, "cells pixels"], generator: np.ra
 
 
 def _by_cell(image: np.ndarray) -> np.ndarray:
-    """`(cells, pixels)` of an image made of whole cells."""
+    """Reshape an image of whole cells to `(cells, pixels)`."""
     height, width = image.shape
     cells = image.reshape(height // CELL_PX, CELL_PX, width // CELL_PX, CELL_PX)
     return cells.swapaxes(1, 2).reshape(-1, CELL_PX * CELL_PX)

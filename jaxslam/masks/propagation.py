@@ -1,12 +1,18 @@
-"""A mask carried from one frame to a later one: its points followed by flow, and its outline found anew by depth.
+"""Mask propagation: track the points of a mask by optical flow, cluster them, and predict the mask in a later frame.
 
-Source: NGD-SLAM (Zhang, Bujanca and Luján 2025), section III-B: dynamic flow, clustering by DBSCAN, prediction of the
-mask from the depth of each cluster. The paper leaves open how the mask grows from a cluster: here it is where its part
-of the old mask has moved to, and a little around, as far as it has the cluster's depth and hangs together with its
-points. By that alone what people touch joins them: on Bonn `crowd`, thirty frames after the last detection, the mask
-agreed with DeepLab's with a median IoU of 0.18 only. What stood there before is taken out again in `surfaces`.
+Source: NGD-SLAM (Zhang, Bujanca and Luján 2025), section III-C, whose steps are
 
-Lengths in pixels are of images about 320 wide, whatever the camera gives.
+    3. sampling       of points in the mask               `make_origin`
+    4. tracking       by optical flow                     `follow`
+    5. clustering     of the tracked points by DBSCAN     `as_objects`
+    6. prediction     of the mask from each cluster       `predicted_mask`
+
+The paper leaves open how the mask grows from a cluster. Here the cluster's part of the old mask is moved along with its
+points and dilated a little, and the pixels at the cluster's depth that are connected to its points are kept. That alone
+adds the objects that people touch: on Bonn `crowd`, thirty frames after the last detection, the mask agreed with
+DeepLab's with a median IoU of only 0.18. `background_depth` therefore removes surfaces that were there before.
+
+Lengths in pixels are of images about 320 pixels wide, whatever the size of the camera's images.
 """
 
 import itertools
@@ -28,37 +34,39 @@ from jaxslam.runtime.compile_cache import SINGLE_THREAD
 from jaxslam.runtime.compiled import compiled
 
 CAPACITY = 128
-"""Most points: of a person who fills a fifth of the image, one in about every other cell."""
+"""Largest number of points: for a person who fills a fifth of the image, one in about every other cell."""
 PYRAMID_LEVELS = 3
 _FLOW = FlowPlan(finest=LevelPlan(window=11, iterations=3, tolerance=0.2, accepted=0.5))
-"""Objects are moved by whole pixels: flow to a fifth of one, in a smaller window, takes three quarters of the time."""
+"""Objects are moved by whole pixels, so flow stops at a fifth of a pixel; with the smaller window it takes three
+quarters of the time."""
 _NEIGHBORS_PX = 20.0
-"""Points of one object are at most so far apart in the image if every cell has one, and farther if fewer have,"""
+"""Radius of DBSCAN, pixels, if every cell has a point; it grows with the spacing of the points."""
 _PX_PER_M = 100.0
-"""a meter of depth counting as so many pixels,"""
+"""Number of pixels that a meter of depth counts as in DBSCAN."""
 _MIN_NEIGHBORS = 5
-"""and every one that says anything has so many neighbors, itself included."""
+"""Fewest neighbors of a core point in DBSCAN, the point itself included."""
 _GROW_PX = 4
+"""Dilation of a moved part of the mask, pixels, besides a share of its size."""
 _DEPTH_TAIL = 20
-"""One in so many points of a cluster may be nearer than it, and one farther,"""
+"""One in this many points of a cluster is ignored as too near, and one as too far, for its depth range."""
 _DEPTH_MARGIN_M = 0.2
-"""and so much nearer or farther than the others the object may reach."""
+"""Margin of the object's depth range beyond the points of its cluster, meters."""
 _MIN_SHARE = 0.05
-"""A piece of the new mask holds at least this share of the cluster's points."""
+"""Smallest share of the cluster's points that a connected component of the new mask holds."""
 
 
 class TrackedMask(NamedTuple):
-    """A mask, and the points it is followed by.
+    """A mask and the points by which it is tracked.
 
     Attributes:
-        mask: `(h, w)` true where something moves or may.
-        uv: `(2, CAPACITY)` pixels in it.
-        ok: `(CAPACITY,)` which there are.
-        spacing: How far they are apart, as in `SampledPoints`.
-        corner: `(2,)` the first column and row of what is true.
-        piece: `(h', w')` from there on, the number of the connected piece of each pixel, 0 outside of them.
-        num: How many pieces, and one more.
-        held: `(CAPACITY,)` the piece that each point is in.
+        mask: `(h, w)` mask of the movable objects.
+        uv: `(2, CAPACITY)` points in the mask, pixels.
+        ok: `(CAPACITY,)` mask of the slots with a point.
+        spacing: Spacing of the points, in cells, as in `SampledPoints`.
+        corner: `(2,)` column and row of the top left corner of the mask's bounding box.
+        piece: `(h', w')` number of the connected component of each pixel in the bounding box; 0 for the background.
+        num: Number of connected components, including the background.
+        held: `(CAPACITY,)` number of the connected component of each point.
     """
 
     mask: Bool[np.ndarray, "h w"]
@@ -72,12 +80,12 @@ class TrackedMask(NamedTuple):
 
 
 class MaskFlow(NamedTuple):
-    """The points of a mask in a later frame.
+    """The tracked points of a mask in a later frame.
 
     Attributes:
-        uv: `(2, n)` pixels.
-        depth: `(n,)` there, meters; 0 where there is none.
-        label: `(n,)` the object each belongs to, from 0 on; -1 for none.
+        uv: `(2, n)` positions in the later frame, pixels.
+        depth: `(n,)` depths in the later frame, meters; 0 where depth is missing.
+        label: `(n,)` number of the cluster of each point, from 0; -1 for a point without a cluster.
     """
 
     uv: Pixels
@@ -86,19 +94,21 @@ class MaskFlow(NamedTuple):
 
 
 def make_origin(mask: Bool[np.ndarray, "h w"], gray: UInt8[np.ndarray, "h w"], seed: int) -> TrackedMask:
-    """Choose the points by which a mask is followed.
+    """Sample the points by which a mask is tracked.
 
     Args:
-        mask: Of a frame.
-        gray: Its image.
-        seed: Of random choices.
+        mask: `(h, w)` mask of a frame.
+        gray: `(h, w)` gray image of the frame.
+        seed: Seed of the random choices.
     """
+    # Sampling (III-C.3): one point in each cell of the mask.
     sampled = sample_mask(mask, gray, CAPACITY, seed)
     count, region = sampled.uv.shape[1], _bounded(mask)
     uv, spacing = (aligned_array(shape, np.float32) for shape in ((2, CAPACITY), ()))
     ok = aligned_array((CAPACITY,), np.bool_)
     uv[:, :count], uv[:, count:] = sampled.uv, 0
     ok[:], spacing[...] = np.arange(CAPACITY) < count, sampled.spacing
+    # The connected components of the mask, and the one that each point is in; not in the paper.
     num, piece = 1, np.zeros((0, 0), np.int32)
     if region.inside.size:
         num, piece = cv2.connectedComponents(region.inside.view(np.uint8), connectivity=4)
@@ -110,59 +120,61 @@ def make_origin(mask: Bool[np.ndarray, "h w"], gray: UInt8[np.ndarray, "h w"], s
 def follow(
     origin: TrackedMask, pyramids: Sequence[Pyramid], gray: UInt8[np.ndarray, "h w"], depth: Float32[np.ndarray, "h w"]
 ) -> tuple[Pyramid, MaskFlow]:
-    """Follow the points of a mask into a later frame.
+    """Track the points of a mask into a later frame, and cluster them.
 
     Args:
         origin: The mask and its points.
-        pyramids: Of the frame they are of and of all before the present one, in order.
-        gray: The present image.
-        depth: Meters, 0 where missing.
+        pyramids: Image pyramids of the frame of the mask and of all frames between it and the current one, in order.
+        gray: `(h, w)` current gray image.
+        depth: `(h, w)` current depth image, meters; 0 where depth is missing.
 
     Returns:
-        The pyramid of the present image, and the points in it.
+        The pyramid of the current image, and the points in it.
     """
+    # Tracking (III-C.4), "across the intermediate frames".
     uv, ok = origin.uv, origin.ok
     for a, b in itertools.pairwise(pyramids):
-        uv, ok = map(np.asarray, _follow_between(a, b, uv, ok))  # for JAX's own, programs would be compiled again
+        uv, ok = map(np.asarray, _follow_between(a, b, uv, ok))  # JAX arrays would compile the programs again
+    # The last frame, with clustering (III-C.5) in the same program.
     return _follow_last(pyramids[-1], gray, uv, ok, depth, origin.spacing)
 
 
 @compiled(when="first use")  # `_follow_last` holds it; by itself only tests call it
 def as_objects(uv: Pixels, ok: Mask, depth: Float[Array, "h w"], spacing: Float[Array, ""]) -> MaskFlow:
-    """Points with depth that lie close together, taken for one object.
+    """Cluster points with depth into objects (III-C.5).
 
     Args:
-        uv: `(2, n)` pixels.
-        ok: `(n,)` which of them count.
-        depth: Meters, 0 where missing.
-        spacing: How far they were apart, as in `SampledPoints`.
+        uv: `(2, n)` positions of the points, pixels.
+        ok: `(n,)` mask of the points to cluster.
+        depth: `(h, w)` depth image, meters; 0 where depth is missing.
+        spacing: Spacing of the points when they were sampled, as in `SampledPoints`.
     """
     column, row = jnp.round(uv).astype(jnp.int32)
     inside = (row >= 0) & (row < depth.shape[0]) & (column >= 0) & (column < depth.shape[1])
     z = depth.at[row, column].get(mode="fill", fill_value=0)
     known = ok & inside & jnp.isfinite(z) & (z > 0)
-    # As if there was a point in every cell: those of a large mask are farther apart, but no more objects.
+    # Scaled as if every cell had a point: the points of a large mask are farther apart, but not more objects.
     points = jnp.concatenate([uv / spacing, _PX_PER_M * jnp.where(known, z, 0)[None]])
     label = dbscan(points, known, radius=_NEIGHBORS_PX, min_points=_MIN_NEIGHBORS).label
     return MaskFlow(uv, jnp.where(known, z, 0), label)
 
 
 def predicted_mask(origin: TrackedMask, followed: MaskFlow, depth: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Where the objects of a mask are after its points have moved.
-
-    A piece that is too small for a cluster of points is an object by itself.
+    """Predict the mask in a later frame from the tracked points (III-C.6).
 
     Args:
-        origin: The mask.
-        followed: Its points.
-        depth: Of the new frame, meters, 0 where missing.
+        origin: The earlier mask.
+        followed: Its points in the later frame.
+        depth: `(h, w)` later depth image, meters; 0 where depth is missing.
     """
     uv, z, label = (np.asarray(each) for each in followed)
     new = np.zeros_like(origin.mask)
+    # 1. The objects: each cluster, and each connected component with too few points for a cluster.
     points_of_piece = np.bincount(origin.held[origin.ok], minlength=origin.num)
     small = (points_of_piece[origin.held] < _MIN_NEIGHBORS) & (z > 0) & origin.ok
     objects = [label == cluster for cluster in range(int(label.max(initial=-1)) + 1)]
     objects += [small & (origin.held == piece) for piece in np.unique(origin.held[small])]
+    # 2. For each object, move the components of the old mask that hold its points, and cut them by depth.
     for points in objects:
         pieces = np.zeros(origin.num, bool)
         pieces[origin.held[points]] = True
@@ -172,18 +184,18 @@ def predicted_mask(origin: TrackedMask, followed: MaskFlow, depth: Float[np.ndar
 
 
 class _Region(NamedTuple):
-    """A part of an image, outside of which nothing is true: most masks fill a small one.
+    """A mask cropped to a rectangle, outside of which it is false: most masks fill a small part of the image.
 
     Attributes:
-        corner: `(2,)` its top left pixel, column and row; it may lie outside the image.
-        inside: `(h, w)` where.
+        corner: `(2,)` column and row of the top left pixel of the rectangle, which may lie outside the image.
+        inside: `(h, w)` mask in the rectangle.
     """
 
     corner: np.ndarray
     inside: Bool[np.ndarray, "h w"]
 
     def slices(self) -> tuple[slice, slice]:
-        """Its rows and columns in the image."""
+        """Return the rows and the columns of the rectangle in the image."""
         (left, top), (height, width) = self.corner, self.inside.shape
         return slice(top, top + height), slice(left, left + width)
 
@@ -191,18 +203,28 @@ class _Region(NamedTuple):
 def _add_object(
     new: np.ndarray, old: _Region, before: np.ndarray, now: np.ndarray, z: np.ndarray, depth: np.ndarray
 ) -> None:
-    """Add one object to the new mask: its part of the old one moved, cut by depth, and connected to its points.
+    """Add one object to the new mask: move its part of the old mask, cut it by depth, and keep what its points are on.
 
-    Its part is every piece of the old mask that holds one of its points: of people who overlap, depth keeps the others
-    out. Cut to what is near its points, masks had holes where flow had failed.
+    Its part is every connected component of the old mask that holds one of its points; where people overlap, depth
+    separates them. When the part was restricted to the surroundings of the points, masks had holes where flow failed.
+
+    Args:
+        new: `(h, w)` new mask, changed in place.
+        old: The object's part of the old mask.
+        before: `(2, k)` positions of its points in the earlier frame, pixels.
+        now: `(2, k)` positions of its points in the later frame, pixels.
+        z: `(k,)` depths of its points in the later frame, meters.
+        depth: `(h, w)` later depth image, meters.
     """
-    # Sorted, not by `np.median` and `np.percentile`: they take 0.3 ms, most of it their own code.
+    # The median motion and the depth range. `np.median` and `np.percentile` take 0.3 ms, most of it overhead.
     count = now.shape[1]
     shift = np.round(np.sort(now - before, axis=1)[:, count // 2]).astype(int)
     nearest, farthest = np.sort(z)[[count // _DEPTH_TAIL, -1 - count // _DEPTH_TAIL]]
+    # The moved and dilated part of the old mask.
     around = _in_view(_grown(old._replace(corner=old.corner + shift)), new.shape)
     if not around.inside.size:
         return
+    # The connected components at the object's depth that hold its points.
     here = around.slices()
     right_depth = (depth[here] > nearest - _DEPTH_MARGIN_M) & (depth[here] < farthest + _DEPTH_MARGIN_M)
     num, piece = cv2.connectedComponents((around.inside & right_depth).view(np.uint8), connectivity=4)
@@ -212,22 +234,22 @@ def _add_object(
 
 
 def _bounded(mask: Bool[np.ndarray, "h w"], corner: np.ndarray | tuple[int, int] = (0, 0)) -> _Region:
-    """A mask cut to what is true, `corner` being the place of its first pixel; of no size if nothing is."""
+    """Crop a mask, whose first pixel is at `corner`, to its bounding box; of size 0 for an empty mask."""
     left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
     return _Region(np.add(corner, (left, top)), mask[top : top + height, left : left + width])
 
 
 def _grown(region: _Region) -> _Region:
-    """A region and what is near it: the larger, the farther, because what comes nearer grows."""
+    """Dilate a region, a large one by more, because an object that comes nearer grows in proportion."""
     reach = _GROW_PX + max(region.inside.shape) // 30
     bordered = cv2.copyMakeBorder(region.inside.view(np.uint8), reach, reach, reach, reach, cv2.BORDER_CONSTANT)
-    # Counting the pixels of a square is faster than their maximum, `cv2.dilate`: 0.2 ms instead of 0.4.
+    # Counting the pixels in a square takes 0.2 ms, `cv2.dilate` 0.4 ms.
     count = cv2.boxFilter(bordered, cv2.CV_32F, (2 * reach + 1,) * 2, normalize=False, borderType=cv2.BORDER_CONSTANT)
     return _Region(region.corner - reach, count > 0.5)
 
 
 def _in_view(region: _Region, shape: tuple[int, ...]) -> _Region:
-    """What of a region lies in an image; of no size if nothing does."""
+    """Crop a region to the image; of size 0 if it lies outside."""
     size = np.array(shape[::-1])
     begin = np.clip(region.corner, 0, size)
     (left, top), (right, bottom) = begin - region.corner, np.clip(size - region.corner, 0, None)
@@ -235,14 +257,14 @@ def _in_view(region: _Region, shape: tuple[int, ...]) -> _Region:
 
 
 def _at(piece: Int32[np.ndarray, "h w"], uv: np.ndarray, corner: np.ndarray) -> Int32[np.ndarray, " k"]:
-    """The pieces in which points lie, without those outside the image of pieces, whose first pixel is at `corner`."""
+    """Return the components of the points inside a component image, whose first pixel is at `corner`."""
     column, row = np.round(uv).astype(int) - corner[:, None]
     in_view = (row >= 0) & (row < piece.shape[0]) & (column >= 0) & (column < piece.shape[1])
     return piece[row[in_view], column[in_view]]
 
 
 def _pieces(piece: Int32[np.ndarray, "h w"], wanted: Bool[np.ndarray, " num"]) -> Bool[np.ndarray, "h w"]:
-    """Where one of the wanted pieces is. Mostly there is one, and to compare is faster than to look up in a table."""
+    """Return the mask of the wanted components; for a single one, the usual case, comparing beats a table look-up."""
     numbers = np.flatnonzero(wanted)
     return piece == numbers[0] if len(numbers) == 1 else wanted[piece]
 
@@ -264,6 +286,6 @@ def _follow_last(
     depth: Float[Array, "h w"],
     spacing: Float[Array, ""],
 ) -> tuple[Pyramid, MaskFlow]:
-    """One program for all that the present frame adds: each call takes a tenth of a millisecond by itself."""
+    """Build the pyramid, track, and cluster in one program, because each call costs a tenth of a millisecond."""
     now = build_pyramid(gray, num_levels=PYRAMID_LEVELS)
     return now, as_objects(*_flow(before, now, uv, ok), depth, spacing)
