@@ -15,8 +15,9 @@ _WINDOW_PX = 5
 _MIN_SCORE = 1e-4
 """Smaller eigenvalue of the structure tensor, for gray values from 0 to 1, below which a random pixel is as good."""
 _TURNS = (0.7548776662, 0.5698402910)
-"""Factors of the row and the column of a cell. The cells with the smallest fractional parts of the sum are evenly spread
-over the image (the additive sequence R2: Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018)."""
+"""Factors of the row and the column of a cell. The cells with the smallest fractional parts of the sum are spread
+evenly over the image (the additive sequence R2: Roberts, "The unreasonable effectiveness of quasirandom sequences",
+2018)."""
 _NOT_MASKED = -1
 """Score of a pixel outside the mask; the scores of others are 0, up to rounding, or greater."""
 
