@@ -29,11 +29,11 @@ from .tracking.cue_registry import with_cue_params as with_cue_params
 from .tracking.cue_registry import with_cues as with_cues
 from .tracking.from_config import track_params as track_params
 from .tracking.from_config import track_plan as track_plan
+from .tracking.points import TrackedPoints as TrackedPoints
 from .tracking.pose_estimation import PoseStatus as PoseStatus
 from .tracking.state import FlowPlan as FlowPlan
 from .tracking.state import KeyframeReason as KeyframeReason
 from .tracking.state import LevelPlan as LevelPlan
-from .tracking.state import TrackedPoints as TrackedPoints
 from .tracking.state import TrackOutput as TrackOutput
 from .tracking.state import TrackParams as TrackParams
 from .tracking.state import TrackPlan as TrackPlan

@@ -1,4 +1,4 @@
-"""The pure tracking step: feature flow, pose, rejection of what moves, and the keyframe decision."""
+"""Pure tracking step: optical flow, pose estimation, rejection of dynamic points, and the keyframe decision."""
 
 import lazy_loader
 

@@ -4,8 +4,8 @@ from .cue_registry import with_cue_params as with_cue_params
 from .cue_registry import with_cues as with_cues
 from .from_config import track_params as track_params
 from .from_config import track_plan as track_plan
+from .points import TrackedPoints as TrackedPoints
 from .state import KeyframeReason as KeyframeReason
-from .state import TrackedPoints as TrackedPoints
 from .state import TrackOutput as TrackOutput
 from .state import TrackParams as TrackParams
 from .state import TrackPlan as TrackPlan

@@ -1,4 +1,4 @@
-"""Many clips tracked at once: recordings, or one recording with many seeds or settings, in one compiled program."""
+"""Track many clips at once in one compiled program: several recordings, or one with several seeds or settings."""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -18,11 +18,11 @@ from jaxslam.tracking.step import DEFAULT_PLAN, init_state, track_step
 
 
 class TrackedClips(NamedTuple):
-    """What came of clips tracked at once, as NumPy arrays.
+    """Results of clips that were tracked at once, as NumPy arrays.
 
     Attributes:
-        T_world_cam: `(clips, frames, 7)` poses as `wxyz_xyz`; the world of a clip is its camera's place at the start.
-        status: `(clips, frames)` a `TrackStatus` each.
+        T_world_cam: `(clips, frames, 7)` poses, `wxyz_xyz`; the world of a clip is its first camera frame.
+        status: `(clips, frames)` a `TrackStatus` of each frame.
     """
 
     T_world_cam: Float[np.ndarray, "clips frames 7"]
@@ -30,7 +30,7 @@ class TrackedClips(NamedTuple):
 
 
 class _Batch(NamedTuple):
-    """Clips that one program tracks, with the seed and the settings of each."""
+    """Clips with the seed and the settings of each."""
 
     clips: Sequence[FrameArrays]
     seeds: Sequence[int]
@@ -46,25 +46,26 @@ def track_clips(
     at_once: int | None = None,
     threads: int = 1,
 ) -> TrackedClips:
-    """Track clips side by side with `vmap` of `track_step`; poses are those of each clip alone but for rounding.
+    """Track clips in parallel with `vmap` of `track_step`; the poses equal those of each clip alone up to rounding.
 
-    On an accelerator leave `at_once` and `threads` as they are. On a processor a few clips at once, in a thread a
-    core, are the fastest (`jaxslam bench batch` measures it), and take the least memory: that of `at_once * threads`
-    trackers. Each number of clips at once is compiled once.
+    On an accelerator, keep the defaults of `at_once` and `threads`. On a CPU, a few clips at once with one thread per
+    core are the fastest (`jaxslam bench batch` measures it) and take the least memory: that of `at_once * threads`
+    trackers. Each value of `at_once` is compiled once.
 
     Args:
-        clips: As `stack_frames` makes them, NumPy arrays of one shape. A clip may be there many times, at no cost, to
-            be tracked with other seeds or settings.
+        clips: Clips from `stack_frames`, NumPy arrays of one shape. To track a clip with several seeds or settings,
+            repeat it in the list; that takes no memory.
         params: Camera and thresholds, for all clips or one for each.
-        plan: Capacities, static.
-        seeds: Of the random choices in each clip; 0 if not given.
-        at_once: How many clips one program tracks; all if not given. The last ones are filled up with copies.
-        threads: How many such programs run at a time. JAX's settings for one thread, as of `with jax.enable_x64()`,
-            do not reach further ones.
+        plan: Array sizes and search settings, static.
+        seeds: Seeds of the random choices, one for each clip; 0 by default.
+        at_once: Number of clips that one program tracks; all by default. The last batch is filled with copies.
+        threads: Number of programs that run at the same time. JAX settings of one thread, such as those of `with
+            jax.enable_x64()`, do not apply in the other threads.
 
     Raises:
         FrameError: If there is no clip or no frame, clips differ in shape or type, or gray values are from 0 to 1.
-        ConfigError: If `params` or `seeds` are not as many as clips, or `at_once` or `threads` is below 1.
+        ConfigError: If the number of `params` or `seeds` differs from the number of clips, or `at_once` or `threads` is
+            below 1.
     """
     _check_clips(clips)
     batch = _Batch(
@@ -87,7 +88,7 @@ def track_clips(
 
 
 def _track(batch: _Batch, size: int, plan: TrackPlan, first: int) -> TrackedClips:
-    """As many clips from the first one on; the last one again and again where there are not as many."""
+    """Track `size` clips from the index `first` on; the last clip is repeated if there are fewer."""
     which = [min(first + index, len(batch.clips) - 1) for index in range(size)]
     clips = [batch.clips[index] for index in which]
     params = _stacked([batch.params[index] for index in which])
@@ -99,7 +100,7 @@ def _track(batch: _Batch, size: int, plan: TrackPlan, first: int) -> TrackedClip
         now = _stacked([_frame_of(clip, frame) for clip in clips])
         states, seen = _step(states, now, params, plan)
         found.append(seen)
-        jax.block_until_ready(found[-2:-1])  # only the next frame is made ready meanwhile, however long the clip
+        jax.block_until_ready(found[-2:-1])  # prepare only one frame ahead, so that memory is bounded
     poses, statuses = zip(*jax.device_get(found), strict=True)
     return TrackedClips(np.stack(poses, axis=1), np.stack(statuses, axis=1))
 
@@ -112,12 +113,12 @@ def _new_states(
     return jax.vmap(lambda seed: make(seed=seed))(seeds)
 
 
-# In its thread: for a batch as fast as without, and programs in several threads do not wait for each other's parts.
+# In a single thread: it is as fast for a batch, and programs in several threads do not wait for each other.
 @compiled(when="first use", static="plan", donate="states", options=FAST_COMPILE | SINGLE_THREAD)
 def _step(
     states: TrackState, frames: FrameArrays, params: TrackParams, plan: TrackPlan
 ) -> tuple[TrackState, tuple[Array, Array]]:
-    """The next frame of each clip: states, and of the outputs what is kept, poses and statuses."""
+    """Track the next frame of each clip; return the states, and the poses and statuses."""
     states, outputs = jax.vmap(partial(track_step, plan=plan))(states, frames, params)
     return states, (outputs.T_world_cam.wxyz_xyz, outputs.status)
 

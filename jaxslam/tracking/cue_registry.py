@@ -1,4 +1,4 @@
-"""The cues that settings can name, and their parameters as the settings have them."""
+"""Registry of the cues that the configuration can name, and their parameters from the configuration."""
 
 import functools
 import importlib
@@ -28,9 +28,12 @@ def _known() -> dict[str, SettingsCue]:
 
 
 def with_cues(plan: TrackPlan, config: DynamicsConfig, *, pairs: bool = False) -> TrackPlan:
-    """The plan with the cues of the settings, and regions if one of them needs those.
+    """Add the configured cues to a plan, and regions if a cue needs them.
 
-    The depth of pairs is found at half the size, and so are its regions.
+    Args:
+        plan: The plan.
+        config: Settings of the cues.
+        pairs: Whether the frames are stereo pairs, whose depth and regions are computed at half the image size.
     """
     chosen, clusters = [_known()[name] for name in config.cues], config.clusters
     step_px = 2 * clusters.step_px if pairs else clusters.step_px
@@ -45,15 +48,15 @@ def with_cues(plan: TrackPlan, config: DynamicsConfig, *, pairs: bool = False) -
 
 
 def with_cue_params(params: TrackParams, config: DynamicsConfig, dtype: DTypeLike | None = None) -> TrackParams:
-    """The parameters with those of the cues of the settings, all of one floating-point type.
+    """Add the parameters of the configured cues to the tracker's parameters.
 
     Args:
-        params: From `track_params`.
+        params: Parameters from `track_params`.
         config: Settings of the cues.
-        dtype: Floating-point type of the parameters added; that of `params` if not given.
+        dtype: Floating-point type of the added parameters; by default the type of `params`.
 
     Raises:
-        TypeError: If `dtype` is no floating-point type, or is float64 while `jax_enable_x64` is off.
+        TypeError: If `dtype` is not a floating-point type, or is float64 while `jax_enable_x64` is off.
     """
     dtype = jnp.result_type(params.pixel_sigma) if dtype is None else floating_dtype(dtype)
     cues = tuple(_params_of(getattr(config, name), _known()[name].params, config, dtype) for name in config.cues)

@@ -1,4 +1,4 @@
-"""The settings of the tracker as its programs take them, for a camera that measures depth or for a stereo pair."""
+"""Convert the configuration to the tracker's plan and parameters, for a depth camera or a stereo pair."""
 
 from dataclasses import replace
 
@@ -13,14 +13,14 @@ from jaxslam.tracking.state import TrackParams, TrackPlan
 
 
 def with_dense_keyframes(config: Config) -> TrackConfig:
-    """The tracker's settings, with keyframes often enough for a dense map if there is to be one."""
+    """Return the tracker's settings, with keyframes frequent enough for the dense map if it is enabled."""
     if not config.dense.enabled:
         return config.track
     return replace(config.track, keyframe_below=max(config.track.keyframe_below, config.dense.keyframe_below))
 
 
 def track_plan(config: TrackConfig) -> TrackPlan:
-    """The static part of the tracker's settings."""
+    """Convert the static part of the tracker's settings."""
     return TrackPlan(
         num_points=config.num_points,
         num_levels=config.num_levels,
@@ -36,16 +36,16 @@ def track_plan(config: TrackConfig) -> TrackPlan:
 
 
 def track_params(camera: Camera, config: TrackConfig, dtype: DTypeLike = jnp.float32) -> TrackParams:
-    """The traced part of the tracker's settings, with the camera; `track_step` takes it.
+    """Convert the traced part of the tracker's settings, and the camera, to parameters of `track_step`.
 
     Args:
-        camera: That takes the frames.
-        config: The tracker's settings.
-        dtype: Floating-point type of every parameter, that of the state and the frames; float32 if not given, also
-            with `jax_enable_x64`.
+        camera: Camera of the frames.
+        config: Settings of the tracker.
+        dtype: Floating-point type of every parameter, equal to that of the state and the frames; float32 by default,
+            also with `jax_enable_x64`.
 
     Raises:
-        TypeError: If `dtype` is no floating-point type, or is float64 while `jax_enable_x64` is off.
+        TypeError: If `dtype` is not a floating-point type, or is float64 while `jax_enable_x64` is off.
     """
     dtype = floating_dtype(dtype)
     max_speed_m_per_s = config.max_speed_m_per_s

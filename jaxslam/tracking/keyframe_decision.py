@@ -1,4 +1,4 @@
-"""When a frame is kept as a keyframe, and why."""
+"""Decide whether a frame becomes a keyframe, and for which reason."""
 
 from typing import NamedTuple
 
@@ -9,25 +9,26 @@ from jaxslam_kernels.scene_flow import flow_length
 from jaxslam_kernels.se3 import to_camera
 from jaxslam_kernels.types import Code, Flag, Mask, Scalar
 
-from jaxslam.tracking.state import KeyframeReason, KeyframeRing, TrackedPoints, TrackParams, TrackPlan, TrackState
+from jaxslam.tracking.points import KeyframeRing, TrackedPoints
+from jaxslam.tracking.state import KeyframeReason, TrackParams, TrackPlan, TrackState
 
 _MIN_OVERLAP = 0.25
-"""Share of the interval between keyframes that is kept to where nothing is left of the last one."""
+"""Smallest share of the minimum interval between keyframes that is waited when nothing overlaps the last keyframe."""
 
 
 class KeyframeCandidate(NamedTuple):
-    """A frame that may be kept.
+    """A frame that may become a keyframe.
 
     Attributes:
-        T_world_cam: Its pose.
-        points: What is followed in it.
-        tracked: `(n,)` which of them are at rest and were there before.
-        overlap: Largest share of a keyframe's points that it shows.
-        lost: Whether it was not tracked,
-        weak: or only just.
-        started: Whether tracking begins in it.
-        since_keyframe_s: Seconds since the last keyframe.
-        movable: Share of the picture that may move.
+        T_world_cam: Pose of the frame.
+        points: Points tracked in the frame.
+        tracked: `(n,)` mask of the static points that were tracked from the previous frame.
+        overlap: Largest share of a keyframe's points that are in view.
+        lost: Whether tracking was lost in the frame.
+        weak: Whether tracking was weak in the frame.
+        started: Whether tracking starts in the frame.
+        since_keyframe_s: Time since the last keyframe, seconds.
+        movable: Share of the image covered by movable objects.
     """
 
     T_world_cam: SE3
@@ -42,7 +43,7 @@ class KeyframeCandidate(NamedTuple):
 
 
 def keyframe_reason(state: TrackState, frame: KeyframeCandidate, params: TrackParams, plan: TrackPlan) -> Code:
-    """Why to keep a frame, a `KeyframeReason`; `NONE` if it is not kept."""
+    """Return the `KeyframeReason` of a frame; `NONE` if it does not become a keyframe."""
     num_points, since_s = frame.tracked.shape[0], frame.since_keyframe_s
     old = frame.tracked & (frame.points.age > state.since_keyframe)
     num_kept = jnp.sum(frame.tracked, dtype=since_s.dtype)
@@ -70,10 +71,10 @@ def keyframe_reason(state: TrackState, frame: KeyframeCandidate, params: TrackPa
 
 
 def _adds_information(keyframes: KeyframeRing, frame: KeyframeCandidate, params: TrackParams, plan: TrackPlan) -> Flag:
-    """Whether a keyframe for which there is time comes at the right moment: the rules of USD-SLAM, section III-C.
+    """Return whether a keyframe that is not urgent adds information: the rules of USD-SLAM, section III-C.
 
-    Not soon after the last one, but the sooner the less is left of that; only if the camera has moved, as the points
-    show; and not while much of the picture may move, unless that lasts.
+    It must not follow the last keyframe too soon (the interval shrinks with the overlap), the camera must have moved
+    relative to the points, and the image must not be largely movable, unless that lasts.
     """
     left = frame.overlap / jnp.maximum(params.keyframe_below, 1e-3)
     interval_s = params.keyframe_min_s * jnp.clip(left, _MIN_OVERLAP, 1)
@@ -84,7 +85,7 @@ def _adds_information(keyframes: KeyframeRing, frame: KeyframeCandidate, params:
 
 
 def _has_moved(keyframes: KeyframeRing, frame: KeyframeCandidate, params: TrackParams, plan: TrackPlan) -> Flag:
-    """Whether the points have gone far enough in the axes of the camera since the last keyframe, in parts of depth."""
+    """Return whether the points have moved enough in the camera frame since the last keyframe, relative to depth."""
     last = SE3(keyframes.T_world_cam[(keyframes.made - 1) % plan.num_keyframes])
     then, now = (to_camera(pose, frame.points.X_world) for pose in (last, frame.T_world_cam))
     parts = flow_length(now - then) / jnp.maximum(now[2], params.sensor.min_depth_m)

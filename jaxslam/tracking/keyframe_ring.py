@@ -11,7 +11,8 @@ from jaxslam_kernels.types import Mask, Pixels, Scalar, Weights
 from jaxtyping import Array, Bool, Float, Int, Num
 
 from jaxslam.sensors.measurement import PreparedFrame, predict_pixels
-from jaxslam.tracking.state import KeyframeMatches, KeyframeRing, TrackedPoints, TrackParams, TrackPlan
+from jaxslam.tracking.points import KeyframeMatches, KeyframeRing, TrackedPoints
+from jaxslam.tracking.state import TrackParams, TrackPlan
 
 _MARGIN_PX = 8
 _MAX_TURN = 0.7

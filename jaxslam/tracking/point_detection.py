@@ -9,7 +9,8 @@ from jaxslam_kernels.types import Code
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.sensors.measurement import Measurements, PreparedFrame, depth_sigma, match_depth, measure
-from jaxslam.tracking.state import TrackedPoints, TrackParams, TrackPlan
+from jaxslam.tracking.points import TrackedPoints
+from jaxslam.tracking.state import TrackParams, TrackPlan
 
 _MIN_SCORE = 2.0
 """Smallest eigenvalue of a corner worth tracking, in squared intensity a squared pixel, on the second level."""

@@ -11,7 +11,8 @@ from jaxslam_kernels.types import Code, Mask, Pixels, Points, Weights
 from jaxtyping import Array, Float
 
 from jaxslam.sensors.measurement import PreparedFrame, depth_sigma, match_depth, measure_points
-from jaxslam.tracking.state import KeyframeMatches, TrackParams, TrackPlan, TrackState
+from jaxslam.tracking.points import KeyframeMatches
+from jaxslam.tracking.state import TrackParams, TrackPlan, TrackState
 
 _DEPTH_GATE_M, _DEPTH_SIGMAS = 0.1, 3.0
 """Of depth that supports a pose hypothesis: meters, and deviations with even votes or of a pair.

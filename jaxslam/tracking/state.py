@@ -1,4 +1,4 @@
-"""Everything the tracker carries from frame to frame, as pytrees of fixed capacity, and what it says of a frame."""
+"""The tracker's settings, its state between frames, and its output for a frame, as pytrees of fixed capacity."""
 
 import enum
 from typing import Any, Literal, NamedTuple
@@ -9,50 +9,51 @@ from jaxslam_kernels.flow.disparity import ROW_PLAN
 from jaxslam_kernels.flow.lk_flow import FlowPlan, LevelPlan
 from jaxslam_kernels.image.pyramid import Pyramid
 from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Points, Scalar, Weights
-from jaxtyping import Array, Bool, Float, Int, Key, Num, UInt32
+from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from jaxslam.config.schema import TrackConfig
 from jaxslam.dynamics.cue import Cue, CueResult
 from jaxslam.dynamics.object_motion import MotionMemory, MotionParams, MotionPlan, MotionState
 from jaxslam.dynamics.regions import RegionMemory, RegionPlan, Regions
 from jaxslam.sensors.sensor_model import SensorModel
+from jaxslam.tracking.points import KeyframeMatches, KeyframeRing, TrackedPoints
 
 
 class TrackStatus(enum.IntEnum):
-    """What a pose is worth."""
+    """Quality of the pose of a frame."""
 
     OK = 0
     WEAK = 1
-    """Few points agree, or they agree badly: the pose is an estimate, its covariance is wide."""
+    """Few points agree with the pose, or they agree badly: its covariance is large."""
     LOST = 2
-    """No pose was found; the one given is the last one, held."""
+    """No pose was found; the pose of the last tracked frame is repeated."""
     STARTED = 3
-    """Tracking begins here, or begins anew in a new submap, at the pose held while lost."""
+    """Tracking starts in this frame, or restarts in a new submap at the pose held while lost."""
     REJECTED = 4
-    """The frame could not be read or does not fit; it never reached the tracker."""
+    """The frame could not be read or is invalid; the tracker did not process it."""
     RELOCALIZED = 5
-    """After a loss, tracking goes on where the map shows this place, in the submap that `Tracked.submap` names."""
+    """After a loss, the frame was localized in the map; `FrameResult.submap` names the submap."""
     DROPPED = 6
-    """In a run in real time: the next frame was there before the tracker had time for this one."""
+    """In a real-time run, the next frame arrived before the tracker was ready for this one."""
 
 
 class KeyframeReason(enum.IntEnum):
-    """Why a frame was kept, the first that applies."""
+    """Why a frame became a keyframe: the first reason that applies."""
 
     NONE = 0
-    """It was not kept."""
+    """The frame is not a keyframe."""
     STARTED = 1
-    """Tracking begins here."""
+    """Tracking starts in this frame."""
     NEW_AREA = 2
-    """No kept keyframe shows much of what it shows."""
+    """No keyframe overlaps the view enough."""
     FEW_FOLLOWED = 3
-    """Few of the points followed were there at the last keyframe."""
+    """Few of the tracked points were tracked at the last keyframe."""
     WEAK = 4
-    """Tracking is weak here: more points are wanted."""
+    """Tracking is weak and needs more points."""
     TIME = 5
-    """The last one was long ago."""
+    """The last keyframe was long ago."""
     FEW_POINTS = 6
-    """Few points are left to follow."""
+    """Few points are still tracked."""
 
 
 class TrackReason(enum.IntEnum):
@@ -72,7 +73,7 @@ class TrackReason(enum.IntEnum):
 
     @property
     def text(self) -> str:
-        """One line for a person."""
+        """The reason in words."""
         return _REASON_TEXT[self]
 
 
@@ -92,33 +93,35 @@ _REASON_TEXT = {
 }
 
 
-_SETTINGS = TrackConfig()  # the only place of defaults
+_SETTINGS = TrackConfig()  # defaults are defined there only
 
 
 class TrackPlan(NamedTuple):
-    """Sizes of all arrays and how searches run; static: each combination is compiled once.
+    """Sizes of all arrays and search settings: static, so each combination is compiled once.
 
     Attributes:
-        num_points: Points followed from frame to frame.
-        num_levels: Levels of the image pyramid.
-        num_keyframes: Latest keyframes kept to look points up in again.
-        num_reloaded: Further keyframes to look into, put there from a map by `reloaded`.
-        num_sources: How many of them are looked into in a frame; 0 for following alone.
-        points_per_source: Points looked up from each.
-        num_hypotheses: Pose hypotheses a frame.
-        cell_px: Side of the cells that each get at most one new corner, even.
-        new_points: In which frames new points are sought: `always`, where there are few, or in `keyframes` only.
-        flow: How points are followed from frame to frame.
-        cues: What tells points that move, see `dynamics.cue.Cue`; functions, in the order of `TrackParams.cues`.
-        regions: How the depth image is divided for cues that judge whole surfaces; `None` if none does.
-        balance_regions: Whether no region has more of a say in the pose than an even share.
-        motion: How things that may move are judged, see `FrameArrays.movable`; `None` if they are not.
-        keyframe_policy: Whether a keyframe is made as soon as there is a reason, or at the right moment after.
-        look_up: How points of keyframes are searched. A window of 21 takes 1 ms a frame more and is no more accurate;
-            17, 15 and 13 are alike too: TUM `fr1_rpy` 10.2, 10.2, 10.2 mm, Bonn `crowd` (start) 9.7, 9.6, 9.5.
-        pose_steps: Bound on the evaluations of the cost in each refinement of the pose; `TrackOutput.pose_status`
-            says where it was reached.
-        pair_flow: How points of a stereo pair are matched along the rows of its images.
+        num_points: Number of points tracked from frame to frame.
+        num_levels: Number of levels of the image pyramid.
+        num_keyframes: Number of latest keyframes that are kept to match their points again.
+        num_reloaded: Number of further keyframes, loaded from the map by `load_keyframe`.
+        num_sources: Number of keyframes whose points are matched in a frame; 0 to track by optical flow only.
+        points_per_source: Number of points matched from each of these keyframes.
+        num_hypotheses: Number of RANSAC pose hypotheses per frame.
+        cell_px: Side of the cells that each get at most one new corner, pixels, even.
+        new_points: Frames in which new points are detected: `always` for every frame with too few points, or
+            `keyframes` for keyframes only.
+        flow: Settings of the optical flow from frame to frame.
+        look_up: Settings of the alignment of keyframe points. A window of 21 takes 1 ms more per frame and is not more
+            accurate; 17, 15 and 13 are alike: TUM `fr1_rpy` 10.2, 10.2, 10.2 mm, Bonn `crowd` (start) 9.7, 9.6, 9.5.
+        cues: Functions that find dynamic points (`dynamics.cue.Cue`), in the order of `TrackParams.cues`.
+        regions: Segmentation of the depth image for cues that classify whole surfaces; `None` if no cue needs it.
+        balance_regions: Whether the votes of points are weighted so that no region has more than an even share.
+        motion: Settings of the motion estimates of movable objects (`FrameArrays.movable`); `None` without estimates.
+        keyframe_policy: Whether a keyframe is made as soon as there is a reason (`as_needed`), or only when it adds
+            information (`sparing`).
+        pose_steps: Largest number of cost evaluations in each refinement of the pose; `TrackOutput.pose_status` tells
+            whether it was reached.
+        pair_flow: Settings of the matching along the rows of a stereo pair.
     """
 
     num_points: int = _SETTINGS.num_points
@@ -141,17 +144,16 @@ class TrackPlan(NamedTuple):
     pair_flow: FlowPlan = ROW_PLAN
 
     def exact(self) -> "TrackPlan":
-        """The same with searches and solvers that go on until nothing moves, for derivatives that must be exact.
+        """Return the plan with searches and solvers that run to convergence, for exact derivatives.
 
-        State, parameters and frames must be float64: float32 cannot hold what these searches stop at, and `track_step`
-        refuses it.
+        State, parameters and frames must be float64: float32 cannot resolve the tolerances of these searches, and
+        `track_step` rejects it.
 
-        A search that stops at a few hundredths of a pixel, as is enough to track with, leaves a result that still
-        depends on where it started. Derivatives are those of the solution itself: over ten frames of a small picture
-        they differ from finite differences of the tracker by 0.2 to 1 % for the camera and the map points, by up to
-        10 % for weights; with this plan by 1e-5. Points whose search never settles are dropped here. A pose whose
-        refinement has not converged all the same has the `TrackOutput.pose_status` NOT_CONVERGED, and no exact
-        derivative.
+        A search that stops at a few hundredths of a pixel, which is enough for tracking, gives a result that still
+        depends on its start. Derivatives are those of the exact solution: over ten frames of a small image they differ
+        from finite differences of the tracker by 0.2 to 1 % for the camera and the map points and by up to 10 % for
+        weights; with this plan, by 1e-5. Points whose search never converges are dropped here. A pose whose refinement
+        has still not converged has the `TrackOutput.pose_status` NOT_CONVERGED, and no exact derivative.
         """
         to_the_end = lambda level: LevelPlan(level.window, 100, 1e-10, 1e-8)
         return self._replace(
@@ -163,40 +165,43 @@ class TrackPlan(NamedTuple):
 
 
 class TrackParams(NamedTuple):
-    """Everything that can change, or be differentiated, without recompiling; scalars unless said otherwise.
+    """Settings that can change, or be differentiated, without recompiling; scalars unless said otherwise.
 
     Attributes:
-        sensor: Camera with its depth noise.
-        pixel_sigma: Standard deviation of a tracked point, pixels.
+        sensor: Camera model with its depth noise.
+        pixel_sigma: Standard deviation of the position of a tracked point, pixels.
         loss_scale: Scale of the Cauchy loss, in standard deviations.
-        ransac_px: Reprojection error up to which a point supports a pose hypothesis while nothing moves, pixels.
-        outlier_px: Reprojection error over which a point is dropped while nothing moves, pixels.
-        error_per_flow: Growth of both with the median motion in the image, pixels a pixel: blur and what is left of
-            the rolling shutter grow with it, and so would a threshold that lets people pass in a calm picture.
-        min_correlation: Correlation from which a point looked up in a keyframe is believed.
-        min_inliers: Fewest points that make a pose.
-        weak_inliers: Below this the status is `WEAK`.
-        min_share: Smallest share of the followed points that must agree on the pose.
-        detect_below: New points are sought when fewer than this share of the capacity is alive.
-        keyframe_below: A keyframe is made when no kept one shows more than this share of its points (`NEW_AREA`),
-        keyframe_followed_below: when less than this share of the followed points was there at the last keyframe
-            (`FEW_FOLLOWED`),
-        keyframe_points_below: when less than this share of the capacity is still followed (`FEW_POINTS`), half of it
-            if the last one was made just now,
-        keyframe_after_s: or when the last one was made this many seconds ago (`TIME`),
-        keyframe_weak_after_s: or this many while tracking is weak (`WEAK`) or has few points.
-        keyframe_min_s: With a sparing choice, not before this many seconds have gone since the last one,
-        keyframe_motion: nor before points have moved by this part of their depth in the axes of the camera,
-        keyframe_movable_below: nor while more than this share of the picture may move,
-        keyframe_patience_s: for so many seconds more.
-        probation_frames: Frames after which a point counts in full. What moves on its own is an outlier within a few
-            frames, so that it never counts for much.
-        anchor_frames: Frames after which the place of a point counts as where it was, for cues to slow motion.
-        restart_after: Frames of loss after which tracking starts anew at the held pose.
-        max_speed_m_per_s: Highest believed speed of the camera.
-        max_turn_rad_per_s: Highest believed angular speed of the camera.
+        ransac_px: Largest reprojection error of an inlier of a pose hypothesis with a static camera, pixels.
+        outlier_px: Reprojection error above which a point is dropped with a static camera, pixels.
+        error_per_flow: Growth of `ransac_px` and `outlier_px` per pixel of median image motion: motion blur and the
+            residual rolling-shutter error grow with it. A large constant threshold would accept points on people in a
+            calm scene.
+        min_correlation: Smallest correlation of an accepted match with a keyframe.
+        min_inliers: Smallest number of inliers of a pose.
+        weak_inliers: Number of inliers below which the status is `WEAK`.
+        min_share: Smallest share of the tracked points that are inliers of the pose.
+        detect_below: Share of the capacity below which new points are detected.
+        keyframe_below: Share of a keyframe's points in view. A keyframe is made if no keyframe has more (`NEW_AREA`).
+        keyframe_followed_below: Share of the tracked points. A keyframe is made if fewer of them were tracked at the
+            last keyframe (`FEW_FOLLOWED`).
+        keyframe_points_below: Share of the capacity. A keyframe is made if fewer points are still tracked
+            (`FEW_POINTS`); right after a keyframe, half this share.
+        keyframe_after_s: Time after which the next keyframe is made in any case (`TIME`), seconds.
+        keyframe_weak_after_s: Time after which the next keyframe is made while tracking is weak (`WEAK`) or has few
+            points, seconds.
+        keyframe_min_s: Shortest time between keyframes with the `sparing` policy, seconds.
+        keyframe_motion: Smallest motion of the points between keyframes with the `sparing` policy, in the camera frame,
+            as a share of their depth.
+        keyframe_movable_below: Share of movable pixels above which a keyframe is postponed with the `sparing` policy.
+        keyframe_patience_s: Longest time for which such a keyframe is postponed, seconds.
+        probation_frames: Number of frames after which a point has full weight. A point on a moving object becomes an
+            outlier within a few frames, so it never has much weight.
+        anchor_frames: Number of frames after which the anchor position of a point is renewed, for cues to slow motion.
+        restart_after: Number of lost frames after which tracking restarts at the held pose.
+        max_speed_m_per_s: Largest plausible speed of the camera.
+        max_turn_rad_per_s: Largest plausible angular speed of the camera.
         cues: Parameters of each of `TrackPlan.cues`.
-        motion: Parameters of `TrackPlan.motion`; `None` without.
+        motion: Parameters of `TrackPlan.motion`; `None` without motion estimates.
     """
 
     sensor: SensorModel
@@ -228,99 +233,29 @@ class TrackParams(NamedTuple):
     motion: MotionParams | None = None
 
 
-class TrackedPoints(NamedTuple):
-    """Points followed from frame to frame; slots that are not `valid` are free.
-
-    Attributes:
-        uv: `(2, n)` where they are in the last good frame, pixels.
-        xy: `(2, n)` the same as an ideal camera sees it, normalized coordinates.
-        depth: `(n,)` measured there, meters, 0 where nothing was.
-        X_world: `(3, n)` where they are in the world, meters, as measured over the last few frames.
-        X_anchor: `(3, n)` the same as measured `anchor_age` frames ago: what moves slowly leaves it.
-        information: `(n,)` inverse variance of their depth, 1 / m^2.
-        weight: `(n,)` how much each counts, 0 to 1; the caller may change it between steps.
-        age: `(n,)` frames each has survived.
-        anchor_age: `(n,)` frames since `X_anchor` was measured.
-        id: `(n,)` number of each point, given once and never again.
-        valid: `(n,)` which slots hold a point.
-    """
-
-    uv: Pixels
-    xy: Pixels
-    depth: Weights
-    X_world: Points
-    X_anchor: Points
-    information: Weights
-    weight: Weights
-    age: Int[Array, " n"]
-    anchor_age: Int[Array, " n"]
-    id: Int[Array, " n"]
-    valid: Mask
-
-
-class KeyframeRing(NamedTuple):
-    """Past frames with the points seen in them, to look up again: a ring of the latest, then those reloaded.
-
-    Attributes:
-        images: `(k, h, w)` pictures, of the type of the frames.
-        T_world_cam: `(k, 7)` poses as `wxyz_xyz`.
-        uv: `(k, 2, n)` the points in them, pixels.
-        X_world: `(k, 3, n)` the points in the world, meters.
-        weight: `(k, n)` how much each counted when the keyframe was made; 0 for a slot without a point.
-        id: `(k, n)` number of each point.
-        made: Keyframes made so far; the next one goes to slot `made` modulo the size of the ring.
-    """
-
-    images: Num[Array, "k h w"]
-    T_world_cam: Float[Array, "k 7"]
-    uv: Float[Array, "k 2 n"]
-    X_world: Float[Array, "k 3 n"]
-    weight: Float[Array, "k n"]
-    id: Int[Array, "k n"]
-    made: Code
-
-
-class KeyframeMatches(NamedTuple):
-    """Points of keyframes found in a frame.
-
-    Attributes:
-        X_world: `(3, n)` meters.
-        uv: `(2, n)` pixels in the frame.
-        weight: `(n,)` how much each counts; 0 for what was not found.
-        id: `(n,)` number of each point.
-        overlap: Largest share of a keyframe's points that the frame shows.
-    """
-
-    X_world: Points
-    uv: Pixels
-    weight: Weights
-    id: Int[Array, " n"]
-    overlap: Scalar
-
-
 class TrackState(NamedTuple):
-    """What the tracker knows after a frame: a pytree whose leaves are all plain arrays.
+    """State of the tracker after a frame: a pytree whose leaves are all plain arrays.
 
     A state can be saved with `numpy.savez(path, *jax.tree.leaves(state))`, with `pickle`, or with
     `equinox.tree_serialize_leaves`. To restore one from its leaves, take the structure of a state that `init_state`
-    makes for the same plan and size of image, `jax.tree.unflatten(jax.tree.structure(blank), leaves)`. Tracking goes on
-    from it with the same bytes.
+    makes for the same plan and size of image, `jax.tree.unflatten(jax.tree.structure(blank), leaves)`. Tracking then
+    continues with the same bytes.
 
     Attributes:
-        pyramid: Of the last good frame.
-        points: Followed points, as in the last good frame.
-        keyframes: Past frames to look points up in.
+        pyramid: Image pyramid of the last good frame.
+        points: Tracked points in the last good frame.
+        keyframes: Keyframes whose points are matched again.
         T_world_cam: Pose of the camera.
-        twist: Velocity of the camera in its own axes, meters a second then radians a second.
-        elapsed_s: Seconds since the last good frame.
-        since_keyframe_s: Seconds since the last keyframe.
-        since_keyframe: Good frames since the last keyframe.
-        lost_frames: Frames since tracking was lost, 0 while it is not.
-        frame: Frames seen.
-        next_id: Number of the next new point.
-        key: Data of the random key that every random choice is derived from, see `random_key`.
-        regions: What is kept of the regions of the last frame, see `TrackPlan.regions`.
-        motion: What is kept of the things in it that may move, see `TrackPlan.motion`.
+        twist: `(6,)` velocity of the camera in its own axes, m/s, then rad/s.
+        elapsed_s: Time since the last good frame, seconds.
+        since_keyframe_s: Time since the last keyframe, seconds.
+        since_keyframe: Number of good frames since the last keyframe.
+        lost_frames: Number of frames since tracking was lost; 0 while it is not lost.
+        frame: Number of frames processed.
+        next_id: Id of the next new point.
+        key: Data of the random key from which every random choice is derived (`random_key`).
+        regions: Memory of the regions of the last frame (`TrackPlan.regions`).
+        motion: Memory of the movable objects of the last frame (`TrackPlan.motion`).
     """
 
     pyramid: Pyramid
@@ -339,38 +274,38 @@ class TrackState(NamedTuple):
     motion: MotionMemory
 
     def random_key(self) -> Key[Array, ""]:
-        """The typed random key that `key` holds the data of; JAX's own typed keys cannot be saved as arrays."""
+        """Return the typed random key with the data in `key`; JAX's typed keys cannot be saved as arrays."""
         return jax.random.wrap_key_data(self.key)
 
 
 class TrackOutput(NamedTuple):
-    """What the tracker says of one frame.
+    """Output of the tracker for one frame.
 
     Attributes:
-        T_world_cam: Pose of the camera; meaningful when `status` is not `LOST`, then it is the last one.
-        covariance: `(6, 6)` of the pose, in the tangent space at the camera, translation first.
+        T_world_cam: Pose of the camera; if `status` is `LOST`, the pose of the last tracked frame.
+        covariance: `(6, 6)` covariance of the pose in the tangent space at the camera, translation first.
         status: A `TrackStatus`.
         reason: A `TrackReason`.
-        num_inliers: Followed points that agree with the pose.
-        inlier_ratio: Their share of the points that could be followed.
-        num_keyframe_matches: Points found again in keyframes.
-        residual_px: Robust standard deviation of the reprojection error of the inliers, pixels.
-        uv: `(2, n)` pixels of the points in this frame, new ones included.
-        weights: `(n,)` final weight of each, 0 to 1; 0 for what is no inlier, 1 times the given weight for a new point.
-        tracked: `(n,)` which of the points came from the frame before.
-        X_world: `(3, n)` where the points are in the world, meters.
-        id: `(n,)` number of each point.
-        keyframe_matches: Points of keyframes found in the frame.
-        twist: Velocity of the camera in its own axes, meters a second then radians a second.
+        num_inliers: Number of tracked points that agree with the pose.
+        inlier_ratio: Share of inliers among the points found by optical flow.
+        num_keyframe_matches: Number of keyframe points matched in the frame.
+        residual_px: Robust standard deviation of the reprojection errors of the inliers, pixels.
+        uv: `(2, n)` positions of the points in this frame, new ones included, pixels.
+        weights: `(n,)` final weights of the points, 0 to 1: 0 for an outlier, the given weight for a new point.
+        tracked: `(n,)` mask of the points that were tracked from the previous frame.
+        X_world: `(3, n)` positions of the points in the world, meters.
+        id: `(n,)` ids of the points.
+        keyframe_matches: Keyframe points matched in the frame.
+        twist: `(6,)` velocity of the camera in its own axes, m/s, then rad/s.
         keyframe: A `KeyframeReason`.
-        pose_status: A `PoseStatus` of the refinement of the pose in this frame, also of one that was not taken because
-            the frame is lost. `NOT_CONVERGED` means that it ran out of `TrackPlan.pose_steps`: the pose is then near
-            the optimum, and its derivatives are not exact. With more steps than by default, as in
-            `TrackPlan.exact()`, it is `NOT_CONVERGED` too where the coarse pose that it began with is.
-        verdicts: What each of `TrackPlan.cues` says of the points that were followed,
-        regions: and the regions they speak of.
-        moving: `(h, w)` true in regions and things that move; `None` without either.
-        motion: What is known of the things that may move; `None` without `TrackPlan.motion`.
+        pose_status: A `PoseStatus` of the refinement of the pose in this frame, even if the pose was rejected and the
+            frame is lost. `NOT_CONVERGED` means that it ran out of `TrackPlan.pose_steps`: the pose is then near the
+            optimum, and its derivatives are not exact. With more steps than by default, as in `TrackPlan.exact()`, it
+            is also `NOT_CONVERGED` if the initial coarse pose is.
+        cue_results: Result of each of `TrackPlan.cues` for the tracked points.
+        regions: Regions to which the cue results refer; `None` without regions.
+        moving: `(h, w)` mask of the moving regions and objects; `None` without either.
+        motion: Motion estimates of the movable objects; `None` without `TrackPlan.motion`.
     """
 
     T_world_cam: SE3
@@ -397,5 +332,5 @@ class TrackOutput(NamedTuple):
 
     @property
     def is_keyframe(self) -> Flag:
-        """Whether the frame was kept."""
+        """Whether the frame is a keyframe."""
         return self.keyframe > 0

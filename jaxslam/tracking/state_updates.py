@@ -1,4 +1,4 @@
-"""Changes to the tracker's state from outside: what a map, once corrected, does to what is being tracked."""
+"""Update the tracker's state from the map: corrections, loaded keyframes, removed points, and restarts."""
 
 import jax
 import jax.numpy as jnp
@@ -16,12 +16,12 @@ from jaxslam.tracking.step_checks import check_array
 def apply_map_correction(
     state: TrackState, T_new_old: Float[Array, "7"], T_new_old_keyframes: Float[Array, "k 7"]
 ) -> TrackState:
-    """The state after the world was corrected: everything moves rigidly with the keyframe it hangs on.
+    """Apply a correction of the map to the state: everything moves rigidly with its keyframe.
 
     Args:
         state: The state.
-        T_new_old: Correction at the camera, `wxyz_xyz`: carries its pose and the points followed.
-        T_new_old_keyframes: Correction at each keyframe of the state.
+        T_new_old: `(7,)` correction at the camera, `wxyz_xyz`, applied to its pose and the tracked points.
+        T_new_old_keyframes: `(k, 7)` correction at each keyframe of the state.
 
     Raises:
         ValueError: While tracing, if a shape does not fit the state.
@@ -54,21 +54,21 @@ def load_keyframe(
     weight: Weights,
     id: Int[Array, " n"],
 ) -> TrackState:
-    """The state with a keyframe of the map to look points up in, in place of what was in a slot.
+    """Load a keyframe of the map into a slot of the state, so that its points are matched again.
 
     Args:
         state: The state.
-        slot: Which slot, `num_keyframes` or more so that new keyframes leave it alone.
-        image: The keyframe's picture.
-        T_world_cam: Its pose, `wxyz_xyz`.
-        uv: Points in it, pixels as seen; as many as the tracker follows.
-        X_world: Where they are in the world, meters.
-        weight: How much each counts, 0 for none.
-        id: Numbers of the points.
+        slot: Slot to replace, at least `num_keyframes` so that new keyframes do not overwrite it.
+        image: `(h, w)` image of the keyframe.
+        T_world_cam: `(7,)` pose of the keyframe, `wxyz_xyz`.
+        uv: `(2, n)` positions of the points in the distorted image, pixels; `n` is the number of tracked points.
+        X_world: `(3, n)` positions of the points in the world, meters.
+        weight: `(n,)` weights of the points; 0 for a slot without a point.
+        id: `(n,)` ids of the points.
 
     Raises:
-        ValueError: While tracing, if a shape is not that of the keyframes of the state.
-        TypeError: While tracing, if a type is not: a picture in floating point has no room in one of whole numbers.
+        ValueError: While tracing, if a shape differs from that of the keyframes of the state.
+        TypeError: While tracing, if a type differs: a floating-point image does not fit into integer images.
     """
     put = lambda ring, new: lax.dynamic_update_index_in_dim(ring, new.astype(ring.dtype), slot, 0)
     keyframes = state.keyframes
@@ -90,15 +90,15 @@ def load_keyframe(
 
 
 def drop_points(state: TrackState, ids: Int[Array, " m"]) -> TrackState:
-    """The state without some points: they are followed no longer, and not looked up in keyframes.
+    """Drop points from the state: they are no longer tracked, and no longer matched with keyframes.
 
     Args:
         state: The state.
-        ids: `(m,)` their numbers, ascending; a number may come more than once.
+        ids: `(m,)` ascending ids of the points; an id may occur more than once.
 
     Raises:
-        ValueError: While tracing, if they are not in one row.
-        TypeError: While tracing, if they are not of the type of the numbers in the state.
+        ValueError: While tracing, if `ids` is not one-dimensional.
+        TypeError: While tracing, if `ids` are not of the type of the ids in the state.
     """
     check_array("ids", ids, (np.size(ids),), state.points.id.dtype)
 
@@ -114,13 +114,14 @@ def drop_points(state: TrackState, ids: Int[Array, " m"]) -> TrackState:
 
 
 def reset_at_pose(state: TrackState, T_world_cam: Float[Array, "7"]) -> TrackState:
-    """The state of a tracker that is lost and begins anew at a pose: the next step starts there at once.
+    """Reset a lost tracker at a pose: the next step starts there at once.
 
-    Its keyframes are forgotten: nothing says how they lie to where it begins. Those that do can be `reloaded`.
+    Its keyframes are dropped, because their poses relative to the new start are not known. Keyframes of the map can be
+    loaded again with `load_keyframe`.
 
     Args:
         state: The state.
-        T_world_cam: `(7,)` the pose, `wxyz_xyz`.
+        T_world_cam: `(7,)` pose to start from, `wxyz_xyz`.
 
     Raises:
         ValueError: While tracing, if the pose has another shape.

@@ -34,17 +34,9 @@ from jaxslam.tracking.dynamic_rejection import DynamicRejection, FramePoints, re
 from jaxslam.tracking.keyframe_decision import KeyframeCandidate, keyframe_reason
 from jaxslam.tracking.keyframe_ring import align_keyframe_points, empty_keyframes, with_keyframe
 from jaxslam.tracking.point_detection import detect_new_points
+from jaxslam.tracking.points import KeyframeMatches, TrackedPoints
 from jaxslam.tracking.pose_estimation import coarse_pose, fits, refined_pose, worse_status
-from jaxslam.tracking.state import (
-    KeyframeMatches,
-    TrackedPoints,
-    TrackOutput,
-    TrackParams,
-    TrackPlan,
-    TrackReason,
-    TrackState,
-    TrackStatus,
-)
+from jaxslam.tracking.state import TrackOutput, TrackParams, TrackPlan, TrackReason, TrackState, TrackStatus
 from jaxslam.tracking.step_checks import check_cues, check_followed, check_plan, check_pose, check_state, check_step
 
 DEFAULT_PLAN = TrackPlan()
