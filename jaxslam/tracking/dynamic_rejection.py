@@ -1,4 +1,4 @@
-"""What all cues of a plan say of the points, regions and things of one frame, and what is left out of it for that."""
+"""Combine the dynamic cues of one frame into point weights and a mask of moving pixels."""
 
 from typing import NamedTuple
 
@@ -23,23 +23,23 @@ from jaxslam.dynamics.regions import (
 )
 from jaxslam.sensors.measurement import PreparedFrame, depth_sigma, measure_points
 from jaxslam.tracking.state import TrackParams, TrackPlan, TrackState
-from jaxslam.tracking.step_checks import check_verdict
+from jaxslam.tracking.step_checks import check_cue_result
 
-_MAX_WITNESSES, _ENOUGH_WITNESSES = 10, 5
-"""Of each region."""
+_MAX_MONITORED, _ENOUGH_MONITORED = 10, 5
+"""Largest number of monitored points of a moving region or object, and the number from which it needs no new ones."""
 
 
 class FramePoints(NamedTuple):
-    """The points of a state in a frame, `(n,)` each.
+    """The `n` points of a state in a frame.
 
     Attributes:
-        uv: `(2, n)` where they are, pixels.
-        followed: Which are there under no mask.
-        masked: Which are there under one.
-        agreeing: Which of those that are followed agree with the coarse pose.
-        trust: How much each counts, before anything is said of it.
-        there: Which are there under nothing that is left out in any case.
-        thing: Number of the thing that may move that each is on, from 1; 0 for none.
+        uv: `(2, n)` positions in the frame, pixels.
+        followed: `(n,)` mask of the tracked background points outside every mask.
+        masked: `(n,)` mask of the tracked points under the mask of ignored pixels.
+        agreeing: `(n,)` mask of the followed points that agree with the coarse pose.
+        trust: `(n,)` weights of the points before the cues.
+        there: `(n,)` mask of the tracked points outside the mask of ignored pixels.
+        object_id: `(n,)` number of the movable object that each point is on, from 1; 0 for none.
     """
 
     uv: Pixels
@@ -48,56 +48,62 @@ class FramePoints(NamedTuple):
     agreeing: Mask
     trust: Weights
     there: Mask
-    thing: Int[Array, " n"]
+    object_id: Int[Array, " n"]
 
 
 class DynamicRejection(NamedTuple):
-    """What cues say, and the pixels that are left out for it.
+    """Combined result of the cues for one frame.
 
     Attributes:
-        verdicts: Of each cue, in the order of `TrackPlan.cues`.
-        regions: The surfaces of the frame, if something asks for them.
-        memory: What the next frame has of them.
-        remembered: `(n,)` 0 for points in regions that moved a moment ago.
-        moving: Pixels of regions and things that move.
-        heard: Whether it counts for points: not where the frame would be lost for it.
-        motion: What is known of the things that may move.
+        cue_results: Result of each cue, in the order of `TrackPlan.cues`.
+        regions: Regions of the frame; `None` if no setting needs them.
+        memory: Memory of the regions for the next frame.
+        remembered: `(n,)` factor on the weights: 0 for points in regions that moved a moment ago, 1 elsewhere.
+        moving: `(h, w)` mask of the moving regions and objects.
+        applied: Whether the results are applied to the points: not if tracking would be lost by it.
+        motion: Motion estimates of the movable objects.
     """
 
-    verdicts: tuple[CueResult, ...] = ()
+    cue_results: tuple[CueResult, ...] = ()
     regions: Regions | None = None
     memory: RegionMemory | None = None
     remembered: Weights | None = None
     moving: Bool[Array, "h w"] | None = None
-    heard: Flag | bool = True
+    applied: Flag | bool = True
     motion: MotionState | None = None
 
     def weights(self, weight: Weights) -> Weights:
-        """Weights of the points, times those of the cues, and 0 in regions that moved a moment ago."""
-        judged = combine_cues(self.verdicts, weight)
+        """Multiply the weights of points by those of the cues; 0 in regions that moved a moment ago."""
+        judged = combine_cues(self.cue_results, weight)
         judged = judged if self.remembered is None else judged * self.remembered
-        return jnp.where(self.heard, judged, weight)
+        return jnp.where(self.applied, judged, weight)
 
     def counts(self) -> Mask | Flag:
-        """`(n,)` which points no cue says anything against."""
+        """Return the `(n,)` mask of the points that no cue rejects."""
         return self.weights(jnp.ones(())) > 0
 
     def without_moving_pixels(self, view: PreparedFrame) -> PreparedFrame:
-        """The frame with nothing trusted where regions move."""
+        """Return the frame with the moving pixels ignored."""
         return view if self.moving is None else view.without(self.moving)
 
     def with_motion(self, motion: MotionState, view: PreparedFrame) -> "DynamicRejection":
-        """The same, with what is known of the things that may move."""
+        """Add the motion estimates of movable objects, and their moving pixels."""
         assert view.frame.movable is not None
         moving = motion.moving_pixels(view.frame.movable)
         return self._replace(motion=motion, moving=moving if self.moving is None else self.moving | moving)
 
     def monitor_points(self, uv: Pixels, age: Int[Array, " n"], points: Mask) -> Mask:
-        """`(n,)` which points, now at `uv`, are to be followed on what moves, to see whether it goes on.
+        """Return the `(n,)` mask of the monitored points: tracked on moving objects to see whether they go on moving.
 
-        A few of each, those of some age first. New points in their place in every frame show the motion of one frame
-        only, and a box that comes nearer by 5 mm is at rest then: the rendered room rpy with two boxes 0.024 to 0.12 m,
-        with witnesses 0.002. With all of them as witnesses little room is left for points of the room: xyz 0.042 m.
+        A few points of each object are kept, older ones first. New points in every frame would show the motion of one
+        frame only, in which a box that comes nearer by 5 mm seems at rest: in the rendered room rpy with two boxes the
+        error is 0.024 to 0.12 m without monitored points and 0.002 m with them. If all points were monitored, little
+        room would be left for points of the room: xyz 0.042 m.
+
+        Args:
+            uv: `(2, n)` positions of the points in the frame, pixels.
+            age: `(n,)` ages of the points, frames.
+            points: `(n,)` mask of the points to choose from.
         """
         if self.moving is None:
             return jnp.zeros_like(points)
@@ -109,13 +115,13 @@ class DynamicRejection(NamedTuple):
         after = jnp.sum(there_old, axis=1, dtype=jnp.int32)[:, None]
         old_rank, new_rank = (jnp.cumsum(there, axis=1, dtype=jnp.int32) for there in (there_old, there_new))
         rank = jnp.where(there_old, old_rank, after + new_rank)
-        return jnp.any((there_old | there_new) & (rank <= _MAX_WITNESSES), axis=0)
+        return jnp.any((there_old | there_new) & (rank <= _MAX_MONITORED), axis=0)
 
-    def without_monitored(self, view: PreparedFrame, witnesses: Mask, plan: TrackPlan) -> PreparedFrame:
-        """The frame with nothing new to be followed where what moves has witnesses."""
+    def without_monitored(self, view: PreparedFrame, monitored: Mask, plan: TrackPlan) -> PreparedFrame:
+        """Return the frame with moving regions and objects ignored that have enough monitored points."""
         if self.moving is None:
             return view
-        watched = jnp.sum(self._in_regions(witnesses), axis=1) >= _ENOUGH_WITNESSES
+        watched = jnp.sum(self._in_regions(monitored), axis=1) >= _ENOUGH_MONITORED
         height, width = view.depth.shape
         if self.regions is not None and plan.regions is not None:
             num = self.regions.centers.shape[1]
@@ -124,11 +130,11 @@ class DynamicRejection(NamedTuple):
             watched = watched[num:]
         return view if self.motion is None else view.without(self._in_objects(watched & ~self.motion.at_rest, view))
 
-    def unmonitored(self, view: PreparedFrame, witnesses: Mask) -> Bool[Array, "h w"] | None:
-        """Pixels of things that move, for all that is known, and have too few points to tell; `None` without things."""
+    def unmonitored(self, view: PreparedFrame, monitored: Mask) -> Bool[Array, "h w"] | None:
+        """Return the pixels of moving objects with too few monitored points; `None` without motion estimates."""
         if self.motion is None:
             return None
-        few = jnp.sum(self._in_regions(witnesses), axis=1) < _ENOUGH_WITNESSES
+        few = jnp.sum(self._in_regions(monitored), axis=1) < _ENOUGH_MONITORED
         return self._in_objects(few[-len(self.motion.at_rest) :] & ~self.motion.at_rest, view)
 
     def _in_objects(self, chosen: Bool[Array, " k"], view: PreparedFrame) -> Bool[Array, "h w"]:
@@ -137,7 +143,7 @@ class DynamicRejection(NamedTuple):
         return by_label[view.frame.movable.astype(jnp.int32)]
 
     def _in_regions(self, points: Mask) -> Bool[Array, "k n"]:
-        """Which points are in each region, and on each thing."""
+        """Return the mask of the points in each region, followed by those on each movable object."""
         parts: list[Bool[Array, "_k n"]] = []
         if self.regions is not None:
             parts.append(
@@ -149,10 +155,10 @@ class DynamicRejection(NamedTuple):
         return points[None, :] & jnp.concatenate(parts)
 
     def at_rest(self, uv: Pixels) -> Mask:
-        """`(n,)` which pixels are in no region that moves.
+        """Return the `(n,)` mask of the pixels outside moving regions and objects.
 
-        New points are taken there all the same where witnesses are few: without them nothing is known of the region in
-        the next frame, and what moves passes for a room in every other one.
+        New points are still detected in a moving region with few monitored points: without them nothing would be known
+        of the region in the next frame, and it would count as static in every other frame.
         """
         if self.moving is None:
             return jnp.ones(uv.shape[1], bool)
@@ -170,12 +176,23 @@ def reject_dynamic_points(
     params: TrackParams,
     plan: TrackPlan,
 ) -> DynamicRejection:
-    """What is said of points and things, given the coarse pose, which most of the points at rest have made."""
-    verdicts = _cue_results(state, view, seen, regions, coarse, twist, params, plan)
-    judged = _with_regions(verdicts, regions, state.regions.weight, view, seen.agreeing, plan)
-    if verdicts:
+    """Apply the cues to the points, regions and movable objects of a frame, given its coarse pose.
+
+    Args:
+        state: State before the frame.
+        view: The frame.
+        seen: Points of the state in the frame.
+        regions: Regions of the frame; `None` without regions.
+        coarse: Coarse pose of the frame, from RANSAC.
+        twist: `(6,)` velocity of the camera in its own axes, m/s, then rad/s.
+        params: Parameters of the tracker.
+        plan: Plan of the tracker.
+    """
+    cue_results = _cue_results(state, view, seen, regions, coarse, twist, params, plan)
+    judged = _with_regions(cue_results, regions, state.regions.weight, view, seen.agreeing, plan)
+    if cue_results:
         left = jnp.sum(seen.agreeing & (judged.weights(seen.trust) > 0), dtype=seen.trust.dtype)
-        judged = judged._replace(heard=left >= params.min_inliers)
+        judged = judged._replace(applied=left >= params.min_inliers)
     if plan.motion is None:
         return judged
     motion = _motion(state, view, seen, coarse, twist, params, as_published=plan.motion.as_published)
@@ -192,7 +209,7 @@ def _motion(
     *,
     as_published: bool,
 ) -> MotionState:
-    """What is known of the things that may move."""
+    """Estimate the motion of the movable objects."""
     assert params.motion is not None
     points = state.points
     observed = measure_points(points.X_world, seen.uv, coarse, twist, view, params.sensor, view.matched)
@@ -210,29 +227,29 @@ def _motion(
     measured = MeasuredPoints(X_world, observed.in_camera(), sigma, there)
     background = seen.agreeing.astype(sigma.dtype)
     return classify_motion(
-        measured, seen.thing, background, coarse, state.motion, params.motion, as_published=as_published
+        measured, seen.object_id, background, coarse, state.motion, params.motion, as_published=as_published
     )
 
 
 def _with_regions(
-    verdicts: tuple[CueResult, ...],
+    cue_results: tuple[CueResult, ...],
     regions: Regions | None,
     before: Float[Array, " k"],
     view: PreparedFrame,
     agreeing: Mask,
     plan: TrackPlan,
 ) -> DynamicRejection:
-    """Verdicts, and what becomes of those on regions, given what was remembered before."""
+    """Combine the cue results on regions with the memory of earlier frames."""
     if regions is None or plan.regions is None:
-        return DynamicRejection(verdicts)
-    of_regions = [verdict.regions for verdict in verdicts if verdict.regions is not None]
+        return DynamicRejection(cue_results)
+    of_regions = [result.regions for result in cue_results if result.regions is not None]
     if not of_regions:
-        return DynamicRejection(verdicts, regions, RegionMemory(regions.centers, before))
+        return DynamicRejection(cue_results, regions, RegionMemory(regions.centers, before))
     weight = lasting_weights(regions, of_regions, before, agreeing, plan.regions)
     remembered = of_points((weight >= 0.5).astype(weight.dtype), regions, jnp.ones_like(weight[0]))
     height, width = view.depth.shape
     moving = moving_pixels(regions, jnp.minimum(weight, region_weights(of_regions)), height, width, plan.regions)
-    return DynamicRejection(verdicts, regions, RegionMemory(regions.centers, weight), remembered, moving)
+    return DynamicRejection(cue_results, regions, RegionMemory(regions.centers, weight), remembered, moving)
 
 
 def _cue_results(
@@ -268,7 +285,7 @@ def _cue_results(
         key=jax.random.fold_in(jax.random.fold_in(state.random_key(), -1 - state.frame), 1),
         regions=regions,
     )
-    verdicts = tuple(cue(scene, chosen) for cue, chosen in zip(plan.cues, params.cues, strict=True))
-    for index, verdict in enumerate(verdicts):
-        check_verdict(f"plan.cues[{index}]", verdict, seen.uv.shape[1], seen.uv.dtype)
-    return verdicts
+    cue_results = tuple(cue(scene, chosen) for cue, chosen in zip(plan.cues, params.cues, strict=True))
+    for index, result in enumerate(cue_results):
+        check_cue_result(f"plan.cues[{index}]", result, seen.uv.shape[1], seen.uv.dtype)
+    return cue_results

@@ -54,13 +54,13 @@ _LOOK_EVERY = 3
 
 
 class FlowResult(NamedTuple):
-    """The points of a state in a frame.
+    """The points of a state, tracked into a frame by optical flow.
 
     Attributes:
-        pyramid: Of the frame's image.
-        predicted: Where the camera should be by constant velocity.
-        uv: `(2, n)` where optical flow has the points, in pixels.
-        ok: `(n,)` which it has found.
+        pyramid: Image pyramid of the frame.
+        predicted: Pose of the camera predicted by constant velocity.
+        uv: `(2, n)` positions of the points in the frame, pixels.
+        ok: `(n,)` mask of the points that were found.
     """
 
     pyramid: Pyramid
@@ -102,22 +102,22 @@ def init_state(
     image_dtype: DTypeLike = jnp.uint8,
     dtype: DTypeLike = jnp.float32,
 ) -> TrackState:
-    """A state that has seen nothing: the first frame given to `track_step` starts tracking.
+    """Create the state before the first frame: the first frame given to `track_step` starts tracking.
 
     Args:
-        height: Rows of the frames.
-        width: Columns of the frames.
-        plan: Capacities, static.
-        T_world_cam: Pose of the camera at the first frame; the world's origin if not given.
-        seed: Of every random choice.
-        image_dtype: Type of the images given later, `uint8` or floating point to differentiate with respect to them.
-            The step refuses others, since keyframes hold images of this type.
-        dtype: Floating-point type of everything else, that of parameters and frames; float32 if not given, also with
-            `jax_enable_x64`.
+        height: Number of rows of the images.
+        width: Number of columns of the images.
+        plan: Array sizes and search settings, static.
+        T_world_cam: Pose of the camera at the first frame; by default the origin of the world.
+        seed: Seed of every random choice.
+        image_dtype: Type of the images: `uint8`, or floating point to differentiate with respect to them. The step
+            rejects other types, because keyframes hold images of this type.
+        dtype: Floating-point type of everything else, equal to that of parameters and frames; float32 by default, also
+            with `jax_enable_x64`.
 
     Raises:
-        ValueError: If the parts of the plan do not go together, or the image is too small for its levels.
-        TypeError: If `T_world_cam` is no pose, or `dtype` is no floating-point type or is float64 while
+        ValueError: If the parts of the plan are inconsistent, or the image is too small for its levels.
+        TypeError: If `T_world_cam` is not a pose, or `dtype` is not a floating-point type or is float64 while
             `jax_enable_x64` is off.
     """
     check_plan(plan)
@@ -176,20 +176,20 @@ def track_step(
     """Track one frame.
 
     Args:
-        state: From `init_state` or the step before.
-        frame: Image, depth and time.
+        state: State from `init_state` or from the previous step.
+        frame: Image, depth and time of the frame.
         params: Camera and thresholds, traced.
-        plan: Capacities, static; those the state was made with.
+        plan: Array sizes and search settings, static; the plan with which the state was made.
 
     Returns:
-        The new state and what is known of the frame. A frame that cannot be used is no error: it leaves points and
-        pose as they were and says so in `status` and `reason`.
+        The new state and the output for the frame. A frame that cannot be used is not an error: points and pose stay,
+        and `status` and `reason` report it.
 
     Raises:
-        ValueError: While tracing, if a shape does not fit the image or the plan. Of an image that is no tracer, if its
-            gray values are from 0 to 1 and not to 255.
-        TypeError: While tracing, if state, parameters and frame are not of one floating-point type, the images of
-            the state are of another type than that of the frame, or float32 is given for `TrackPlan.exact()`.
+        ValueError: While tracing, if a shape does not fit the image or the plan; also if an image that is not a tracer
+            has gray values from 0 to 1 instead of 255.
+        TypeError: While tracing, if state, parameters and frame differ in floating-point type, the images of the state
+            and the frame differ in type, or float32 is given with `TrackPlan.exact()`.
     """
     _check(state, frame, params, plan)
     check_cues(state, frame, params, plan)  # here too: before anything is computed where nothing is traced
@@ -199,19 +199,19 @@ def track_step(
 def follow_points(
     state: TrackState, frame: FrameArrays, params: TrackParams, plan: TrackPlan = DEFAULT_PLAN
 ) -> FlowResult:
-    """The first part of `track_step`: the points of the state followed into a frame by optical flow.
+    """Track the points of the state into a frame by optical flow: the first part of `track_step`.
 
-    It takes nothing of the frame but image and time: what is to be ignored may be found out meanwhile.
+    Only the image and the time of the frame are read, so its masks can be computed at the same time.
 
     Args:
-        state: As for `track_step`.
-        frame: As for `track_step`; the values of depth, `ignore` and `movable` may still change after it.
-        params: As for `track_step`; those of cues need not be there.
-        plan: As for `track_step`.
+        state: State from `init_state` or from the previous step.
+        frame: Image and time of the frame; the values of depth, `ignore` and `movable` may still change afterward.
+        params: Camera and thresholds, traced; the parameters of cues may be missing.
+        plan: Array sizes and search settings, static.
 
     Raises:
-        ValueError: As `track_step`.
-        TypeError: As `track_step`.
+        ValueError: In the same cases as `track_step`.
+        TypeError: In the same cases as `track_step`.
     """
     _check(state, frame, params, plan)
     height, width = frame.image.shape
@@ -236,21 +236,21 @@ def track_followed(
     params: TrackParams,
     plan: TrackPlan = DEFAULT_PLAN,
 ) -> tuple[TrackState, TrackOutput]:
-    """The second part of `track_step`: pose, points, keyframe, from where `follow_points` has them.
+    """Estimate the pose, update the points, and decide on a keyframe: the second part of `track_step`.
 
     Args:
-        state: That the points were followed from.
-        frame: That they were followed into.
-        followed_points: From `follow_points`.
-        params: As for `track_step`.
-        plan: As for `track_step`.
+        state: State from which the points were tracked.
+        frame: The frame into which they were tracked, with depth and masks.
+        followed_points: Result of `follow_points`.
+        params: Camera and thresholds, traced.
+        plan: Array sizes and search settings, static.
 
     Returns:
-        As `track_step`.
+        The new state and the output for the frame, as `track_step`.
 
     Raises:
-        ValueError: As `track_step`.
-        TypeError: As `track_step`.
+        ValueError: In the same cases as `track_step`.
+        TypeError: In the same cases as `track_step`.
     """
     expected = _check(state, frame, params, plan)
     check_cues(state, frame, params, plan)
@@ -289,7 +289,12 @@ def track_followed(
     witnesses = judged.monitor_points(uv, state.points.anchor_age, followed & ~inliers)
     kept = _update_points(state, view, uv, inliers, witnesses, refined.T_world_cam, params)
     new_state, output = _conclude(state, view, kept, refined, keyframe_matches, verdict, judged, params, plan)
-    said = {"cue_results": judged.verdicts, "regions": judged.regions, "moving": judged.moving, "motion": judged.motion}
+    said = {
+        "cue_results": judged.cue_results,
+        "regions": judged.regions,
+        "moving": judged.moving,
+        "motion": judged.motion,
+    }
     if plan.pose_steps > DEFAULT_PLAN.pose_steps:
         # Not always: one more use of the coarse pose's status has XLA round the pose itself in another way.
         said["pose_status"] = worse_status(coarse_status, refined.status)

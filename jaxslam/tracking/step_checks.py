@@ -1,7 +1,7 @@
-"""Checks of what the tracker's step is given: shapes, types and counts.
+"""Validate the arguments of the tracking step: shapes, types and counts.
 
-They run while a program is traced, so that compiled code has none of them. A wrong shape or value is a `ValueError`, a
-wrong type a `TypeError`; the message names the argument, what was expected and what came.
+The checks run while a program is traced, so compiled code contains none of them. A wrong shape or value raises a
+`ValueError`, a wrong type a `TypeError`; the message names the argument, the expected value and the given one.
 """
 
 from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
@@ -23,9 +23,9 @@ _FINEST = float(jnp.finfo(jnp.float32).eps)
 
 
 def check_step(state: TrackState, frame: FrameArrays, params: TrackParams, plan: TrackPlan) -> None:
-    """Refuse arguments of both parts of the step that do not fit each other.
+    """Check that the arguments of the step are consistent.
 
-    Whether the state fits is for `check_state`, whether those of cues are there for `check_cues`.
+    `check_state` checks the state, and `check_cues` the parameters of cues.
 
     Raises:
         ValueError: If a shape does not fit the image, the parts of the plan do not go together, or an image that is no
@@ -43,7 +43,7 @@ def check_step(state: TrackState, frame: FrameArrays, params: TrackParams, plan:
 
 
 def check_cues(state: TrackState, frame: FrameArrays, params: TrackParams, plan: TrackPlan) -> None:
-    """Refuse arguments that lack what the cues of a plan and its `motion` need; following points takes none of it.
+    """Check the parameters of the plan's cues and `motion`, which `follow_points` does not need.
 
     Raises:
         ValueError: If there are not as many parameters of cues as cues, or no numbers of what may move.
@@ -67,14 +67,14 @@ def check_cues(state: TrackState, frame: FrameArrays, params: TrackParams, plan:
 
 
 def check_array(name: str, value: object, shape: tuple[int, ...], dtype: DTypeLike | None, like: str = "") -> None:
-    """Refuse an array of another shape or type.
+    """Check the shape and the type of an array.
 
     Args:
-        name: What to call it in the message, such as `frame.depth`.
-        value: What came. A Python number has the type it is compared with, as in any sum.
+        name: Name of the array in the message, such as `frame.depth`.
+        value: The given array. A Python number counts as having the expected type, as in JAX arithmetic.
         shape: The shape it must have.
         dtype: The type it must have; any if not given.
-        like: What it must be like, such as ` as frame.image`, for the message.
+        like: Suffix of the message that says what the array must match, such as ` as frame.image`.
 
     Raises:
         ValueError: If the shape is another one.
@@ -92,7 +92,7 @@ def check_array(name: str, value: object, shape: tuple[int, ...], dtype: DTypeLi
 
 
 def _fits(got: Any, dtype: jnp.dtype) -> bool:
-    """Whether an array is of a type, or a Python number that becomes one of it."""
+    """Return whether an array has a type, or is a Python number that converts to it."""
     kinds = (jnp.floating, jnp.integer) if jnp.issubdtype(dtype, jnp.floating) else (jnp.integer,)
     return got.dtype == dtype or (got.weak_type and any(jnp.issubdtype(got.dtype, kind) for kind in kinds))
 
@@ -103,7 +103,7 @@ def _check_class(name: str, value: object, cls: type) -> None:
 
 
 def _state_dtype(state: TrackState) -> jnp.dtype:
-    """The floating-point type of a state, that of its twist."""
+    """Return the floating-point type of a state: the type of its twist."""
     dtype = jax.typeof(state.twist).dtype
     if not jnp.issubdtype(dtype, jnp.floating):
         raise TypeError(f"state.twist: expected a floating-point type, got {dtype}")
@@ -111,7 +111,7 @@ def _state_dtype(state: TrackState) -> jnp.dtype:
 
 
 def check_state(state: TrackState, expected: TrackState) -> None:
-    """Refuse a state that was made for another plan, another size of image or another type.
+    """Check that a state was made for this plan, image size and type.
 
     Args:
         state: The state.
@@ -132,14 +132,14 @@ def check_state(state: TrackState, expected: TrackState) -> None:
 
 
 def _check_images(state: TrackState, expected: TrackState) -> None:
-    """Its keyframes first: of all that depends on the image they alone have its very shape and type."""
+    """Check the images of keyframes first: only they have exactly the shape and type of the frame's image."""
     kept, images = expected.keyframes.images, state.keyframes.images
     check_array("state.keyframes.images", images, kept.shape, None, " for the plan and frame.image")
     check_array("state.keyframes.images", images, kept.shape, kept.dtype, " as frame.image")
 
 
 def _check_like(name: str, given: Any, expected: Any) -> None:
-    """Refuse a pytree that has not the arrays of another one."""
+    """Check that a pytree has the same structure, shapes and types as another one."""
     wanted, came = (dict(jax.tree_util.tree_leaves_with_path(tree)) for tree in (expected, given))
     for path, leaf in wanted.items():
         at = name + jax.tree_util.keystr(path)
@@ -168,7 +168,7 @@ def _check_frame(frame: FrameArrays, dtype: jnp.dtype) -> None:
 
 
 def _checked_image(frame: FrameArrays) -> Any:
-    """Shape and type of the image, if it is one."""
+    """Return the shape and type of the image, after checking them."""
     try:
         image = jax.typeof(frame.image)
     except TypeError:
@@ -186,7 +186,7 @@ def _checked_image(frame: FrameArrays) -> Any:
 
 
 def _check_numbers(name: str, params: Any, dtype: jnp.dtype) -> None:
-    """Refuse parameters that are no scalars of a type; `distortion` has five of them, and cues are not looked at."""
+    """Check that parameters are scalars of a type; `distortion` has five numbers, and cues are skipped."""
     for field, value in params._asdict().items():
         if isinstance(value, tuple) and hasattr(value, "_fields"):
             _check_numbers(f"{name}.{field}", value, dtype)
@@ -195,21 +195,21 @@ def _check_numbers(name: str, params: Any, dtype: jnp.dtype) -> None:
 
 
 def check_followed(followed: NamedTuple, expected: NamedTuple) -> None:
-    """Refuse points that were followed into a frame by another plan, size or type, as `check_state` does."""
+    """Check that a `FlowResult` was computed with this plan, image size and type, as `check_state` does."""
     _check_class("followed_points", followed, type(expected))
     _check_like("followed_points", followed, expected)
 
 
-def check_verdict(name: str, verdict: CueResult, num_points: int, dtype: jnp.dtype) -> None:
-    """Refuse what a cue says if it is not of every point.
+def check_cue_result(name: str, result: CueResult, num_points: int, dtype: jnp.dtype) -> None:
+    """Check that a cue result has a value of the right type for every point.
 
     Raises:
-        ValueError: If a shape is another one.
-        TypeError: If it is no `CueResult`, or a type is another one.
+        ValueError: If a shape is wrong.
+        TypeError: If it is not a `CueResult`, or a type is wrong.
     """
-    _check_class(name, verdict, CueResult)
+    _check_class(name, result, CueResult)
     for field, of in (("weight", dtype), ("evidence", dtype), ("known", np.bool_)):
-        check_array(f"{name}.{field}", getattr(verdict, field), (num_points,), of, " for every point")
+        check_array(f"{name}.{field}", getattr(result, field), (num_points,), of, " for every point")
 
 
 _MIN = {
@@ -219,7 +219,7 @@ _MIN = {
 
 
 def check_plan(plan: TrackPlan) -> None:
-    """Refuse a plan whose parts do not go together.
+    """Check that the parts of a plan are consistent.
 
     Raises:
         ValueError: If a number is too small, a side of cells is odd or one of a window even, a word is unknown, more
@@ -242,7 +242,7 @@ def check_plan(plan: TrackPlan) -> None:
 
 
 def _check_sides(plan: TrackPlan) -> None:
-    """Sides of cells are even: corners are sought on the second level. Those of windows are odd."""
+    """Check that cell sides are even, because corners are detected on the second level, and window sides odd."""
     cells = {"cell_px": plan.cell_px}
     if plan.motion is not None:
         cells["motion.dense_cell_px"] = plan.motion.dense_cell_px
@@ -262,7 +262,7 @@ def _levels(plan: TrackPlan) -> dict[str, Any]:
 
 
 def _check_precision(plan: TrackPlan, dtype: jnp.dtype) -> None:
-    """Refuse a search that goes on to what its type cannot hold: no point would ever be found."""
+    """Reject tolerances below the resolution of the type, with which no search would ever converge."""
     for name, level in _levels(plan).items():
         if level.tolerance < _FINEST and jnp.finfo(dtype).eps >= _FINEST:
             raise TypeError(
@@ -273,7 +273,7 @@ def _check_precision(plan: TrackPlan, dtype: jnp.dtype) -> None:
 
 
 def check_pose(name: str, pose: object) -> None:
-    """Refuse what is no pose, such as a matrix.
+    """Check that an argument is a pose, and not, for example, a matrix.
 
     Raises:
         TypeError: If it is no `jaxlie.SE3`.

@@ -24,7 +24,7 @@ from jaxslam.tracking.from_config import track_params
 from jaxslam.tracking.state import TrackPlan, TrackState
 from jaxslam.tracking.state_updates import apply_map_correction, drop_points, load_keyframe, reset_at_pose
 from jaxslam.tracking.step import track_step
-from jaxslam.tracking.step_checks import check_verdict
+from jaxslam.tracking.step_checks import check_cue_result
 
 SIZE = (HEIGHT, WIDTH)
 USD = load_config("usd").dynamics
@@ -301,11 +301,11 @@ def test_points_followed_by_another_plan(frame: FrameArrays) -> None:
 def test_verdict_that_is_not_of_every_point() -> None:
     good = CueResult(jnp.ones(5), jnp.ones(5), jnp.ones(5, bool))
     dtype = jnp.dtype(jnp.float32)
-    check_verdict("plan.cues[0]", good, 5, dtype)
+    check_cue_result("plan.cues[0]", good, 5, dtype)
     with pytest.raises(ValueError, match=re.escape("plan.cues[0].weight: expected (5,) for every point, got ()")):
-        check_verdict("plan.cues[0]", good._replace(weight=jnp.ones(())), 5, dtype)
+        check_cue_result("plan.cues[0]", good._replace(weight=jnp.ones(())), 5, dtype)
     with pytest.raises(TypeError, match=re.escape("plan.cues[0].known: expected bool for every point, got float32")):
-        check_verdict("plan.cues[0]", good._replace(known=jnp.ones(5)), 5, dtype)
+        check_cue_result("plan.cues[0]", good._replace(known=jnp.ones(5)), 5, dtype)
 
 
 class TestEdits:
