@@ -31,6 +31,16 @@ class _Failed(NamedTuple):
 class Worker(Protocol[_Job_contra, _Result]):
     """Does jobs one after the other."""
 
+    @property
+    def num_waiting(self) -> int:
+        """Number of jobs that have not begun."""
+        ...
+
+    @property
+    def num_dropped(self) -> int:
+        """Number of jobs that were dropped before they began, because more than `max_waiting` waited."""
+        ...
+
     def submit(self, job: _Job_contra, frame: int) -> None:
         """Give it a job, in frame number `frame`.
 
@@ -79,6 +89,16 @@ class InlineWorker(Generic[_Job, _Result]):
         self._outcomes: deque[tuple[int, _Result | _Failed]] = deque()
         self._stopped = False
 
+    @property
+    def num_waiting(self) -> int:
+        """Always 0: each job runs when it is submitted."""
+        return 0
+
+    @property
+    def num_dropped(self) -> int:
+        """Always 0: no job waits."""
+        return 0
+
     def submit(self, job: _Job, frame: int) -> None:
         """Do it."""
         if self._stopped:
@@ -121,19 +141,46 @@ class ThreadWorker(Generic[_Job, _Result]):
     Those left when the interpreter ends are closed first: a thread stopped within compiled code ends the process badly.
     """
 
-    def __init__(self, work: Callable[[_Job], _Result], name: str, *, urgent: bool = False) -> None:
-        """Do jobs by calling `work` in a thread of this name, started with the first job.
+    def __init__(
+        self,
+        work: Callable[[_Job], _Result],
+        name: str,
+        *,
+        urgent: bool = False,
+        max_waiting: int | None = None,
+        may_drop: Callable[[_Job], bool] | None = None,
+    ) -> None:
+        """Prepare a thread, which starts with the first job.
 
-        It lets others go first, unless it is urgent.
+        Args:
+            work: Function that does a job and returns its result.
+            name: Name of the thread.
+            urgent: Whether the thread runs at normal priority; otherwise it runs at a lower one.
+            max_waiting: Number of droppable jobs that may wait. When one more is submitted, the oldest of them is
+                dropped. `None` for no limit.
+            may_drop: Whether a job may be dropped; every job by default. Other jobs do not count towards `max_waiting`.
         """
+        if max_waiting is not None and max_waiting < 1:
+            raise ValueError(f"max_waiting: expected at least 1, got {max_waiting}")
         self._work, self._name, self._urgent = work, name, urgent
+        self._max_waiting, self._may_drop, self._num_dropped = max_waiting, may_drop, 0
         self._jobs: queue.Queue[tuple[Callable[[Any], Any], Any] | None] = queue.Queue()
         self._outcomes: deque[_Result | _Failed] = deque()
         self._stopped = threading.Event()
         self._thread: threading.Thread | None = None
 
+    @property
+    def num_waiting(self) -> int:
+        """Number of jobs that have not begun."""
+        return self._jobs.qsize()
+
+    @property
+    def num_dropped(self) -> int:
+        """Number of jobs that were dropped before they began."""
+        return self._num_dropped
+
     def submit(self, job: _Job, frame: int) -> None:
-        """Queue it."""
+        """Queue it; drop the oldest droppable job if too many wait."""
         del frame
         if self._stopped.is_set():
             raise RuntimeError(f"{self._name} is closed")
@@ -143,6 +190,8 @@ class ThreadWorker(Generic[_Job, _Result]):
             self._thread.start()
             _running.add(self)
             weakref.finalize(self, _stop, self._jobs, self._stopped).atexit = False
+        if self._max_waiting is not None and self._is_droppable(job):
+            self._drop_oldest(self._max_waiting)
         self._jobs.put((self._work, job))
 
     def collect(self, frame: int) -> list[_Result]:
@@ -166,12 +215,45 @@ class ThreadWorker(Generic[_Job, _Result]):
         if self._thread is not None:
             self._thread.join(within_s)
 
+    def _is_droppable(self, job: _Job) -> bool:
+        return self._may_drop is None or self._may_drop(job)
+
+    def _drop_oldest(self, max_waiting: int) -> None:
+        """Make room for one more droppable job; a job that has begun is no longer in the queue."""
+        with self._jobs.mutex:
+            waiting = self._jobs.queue
+            droppable = [i for i, entry in enumerate(waiting) if entry is not None and self._is_droppable(entry[1])]
+            if len(droppable) < max_waiting:
+                return
+            del waiting[droppable[0]]
+            self._num_dropped += 1
+        self._jobs.task_done()  # `flush` waits until every job is done or dropped
+
 
 def make_worker(
-    work: Callable[[_Job], _Result], name: str, *, deterministic: bool, latency_frames: int, urgent: bool = False
+    work: Callable[[_Job], _Result],
+    name: str,
+    *,
+    deterministic: bool,
+    latency_frames: int,
+    urgent: bool = False,
+    max_waiting: int | None = None,
+    may_drop: Callable[[_Job], bool] | None = None,
 ) -> Worker[_Job, _Result]:
-    """A worker: on the fixed schedule of a deterministic run, else with a thread of its own, urgent or not."""
-    return InlineWorker(work, name, latency_frames) if deterministic else ThreadWorker(work, name, urgent=urgent)
+    """Return an `InlineWorker` for a deterministic run, else a `ThreadWorker`.
+
+    Args:
+        work: Function that does a job and returns its result.
+        name: Name of the worker and of its thread.
+        deterministic: Whether the run is deterministic.
+        latency_frames: Number of frames after which an `InlineWorker` returns a result.
+        urgent: Whether a thread runs at normal priority.
+        max_waiting: Number of droppable jobs that may wait for a thread; `None` for no limit.
+        may_drop: Whether a job may be dropped; every job by default.
+    """
+    if deterministic:
+        return InlineWorker(work, name, latency_frames)
+    return ThreadWorker(work, name, urgent=urgent, max_waiting=max_waiting, may_drop=may_drop)
 
 
 _running: "weakref.WeakSet[ThreadWorker[Any, Any]]" = weakref.WeakSet()

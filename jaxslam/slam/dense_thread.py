@@ -5,7 +5,6 @@ is never looked at.
 """
 
 import threading
-from collections import deque
 from typing import TypeAlias
 
 import numpy as np
@@ -57,11 +56,14 @@ class DenseMapping:
         self._seen, self._least_seen, self.wants_keyframe = seen, config.keyframe_below, False
         self._neighbors = Neighbors(config.key_window, config.key_frames) if slam_map.has_keys else None
         self._on_the_way: dict[int, DenseKeyframe] = {}
-        self._waiting: deque[_Job] = deque()
-        self._lock, self._waiting_lock = threading.Lock(), threading.Lock()
-        self._passed_over = 0
-        self.worker: Worker[None, None] = make_worker(
-            self._next_job, "jaxslam-dense", deterministic=deterministic, latency_frames=0
+        self._lock = threading.Lock()
+        self.worker: Worker[_Job, None] = make_worker(
+            self._do_job,
+            "jaxslam-dense",
+            deterministic=deterministic,
+            latency_frames=0,
+            max_waiting=_MAX_WAITING,
+            may_drop=_is_keyframe,
         )
 
     def compile(self) -> None:
@@ -103,7 +105,7 @@ class DenseMapping:
             return
         self.wants_keyframe = self._seen.share(depth, ignore, pose) < self._least_seen
         # Rough depth of a pair would see past what is there: keyframes, which are matched again, look instead.
-        if self._carves and arrays.right is None and len(self._waiting) < _MAX_WAITING:
+        if self._carves and arrays.right is None and self.worker.num_waiting < _MAX_WAITING:
             pose = retract(pose, np.asarray(output.twist) * float(arrays.depth_delay_s))
             self._add_job(self._map.look_of(depth, ignore, pose), frame)
 
@@ -155,33 +157,14 @@ class DenseMapping:
     def figures(self) -> DenseFigures:
         """How the map was made so far; from any thread."""
         with self._lock:
-            return self._map.figures(self._passed_over)
+            return self._map.figures(self.worker.num_dropped)
 
     def _add_job(self, job: _Job, frame: int) -> None:
-        if job is None and self._waiting:
-            return  # the newest map is looked at with each job
-        if isinstance(job, DenseKeyframe):
-            jobs = tuple(self._waiting)
-            waiting = [number for number, other in enumerate(jobs) if isinstance(other, DenseKeyframe)]
-            if len(waiting) >= _MAX_WAITING:
-                self._pass_over(jobs[waiting[0]])
-        self._waiting.append(job)
-        self.worker.submit(None, frame)
+        if job is None and self.worker.num_waiting:
+            return  # every job brings the dense map up to date with the newest map
+        self.worker.submit(job, frame)
 
-    def _pass_over(self, job: _Job) -> None:
-        """Take the place of a job that waits, unless its turn has come; then nothing is done in that turn."""
-        with self._waiting_lock:
-            for number, other in enumerate(self._waiting):
-                if other is job:
-                    del self._waiting[number]
-                    self._passed_over += 1
-                    return
-
-    def _next_job(self, _: None) -> None:
-        with self._waiting_lock:
-            if not self._waiting:
-                return
-            job = self._waiting.popleft()
+    def _do_job(self, job: _Job) -> None:
         with self._lock:
             if isinstance(job, DenseKeyframe):
                 self._map.add(job)
@@ -191,3 +174,8 @@ class DenseMapping:
                 self._map.look(job)
             else:
                 self._map.correct()
+
+
+def _is_keyframe(job: _Job) -> bool:
+    """Whether a job may be dropped: a keyframe may, but what was removed from another one must not be lost."""
+    return isinstance(job, DenseKeyframe)

@@ -5,7 +5,6 @@ III-A. Nobody waits for it: until a keyframe has been looked at, it is taken as 
 """
 
 import logging
-from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -53,8 +52,7 @@ class KeyframeSemantics:
     """Looks at one keyframe after the other, in their order.
 
     Attributes:
-        worker: That does it.
-        num_passed_over: Keyframes that were never looked at, because too many waited.
+        worker: The worker that runs the detector.
     """
 
     def __init__(
@@ -79,15 +77,19 @@ class KeyframeSemantics:
         """
         self._detector, self._dilate_px = detector, dilate_px
         self._reduced, self._failures = Downscaler(ImageGrid.of(camera), WIDTH_PX), ErrorLog()
-        self._waiting: deque[_KeyframeImage] = deque(maxlen=_MAX_WAITING)
-        self.num_passed_over = 0
-        # A job is only the word that there is one more: of those that wait, the thread takes the first.
-        self.worker: Worker[None, DynamicObservations | None] = make_worker(
+        self._has_warned = False
+        self.worker: Worker[_KeyframeImage, DynamicObservations] = make_worker(
             (times or StageTimes()).timed("detector", self._look),
             "jaxslam-semantics",
             deterministic=deterministic,
             latency_frames=latency_frames,
+            max_waiting=_MAX_WAITING,
         )
+
+    @property
+    def num_passed_over(self) -> int:
+        """Number of keyframes that the detector never looked at, because too many waited."""
+        return self.worker.num_dropped
 
     def submit(
         self, keyframe: int, image: np.ndarray, depth: Float[np.ndarray, "h w"], tracks: TrackedObservations, frame: int
@@ -103,8 +105,11 @@ class KeyframeSemantics:
         """
         seen = tracks.weight > 0
         points = tracks.id[seen].astype(np.int64), tracks.uv_raw[:, seen]
-        self._waiting.append(_KeyframeImage(keyframe, rgb_copy(image), self._reduced.every(depth).copy(), *points))
-        self.worker.submit(None, frame)
+        own_copy = _KeyframeImage(keyframe, rgb_copy(image), self._reduced.every(depth).copy(), *points)
+        self.worker.submit(own_copy, frame)
+        if self.num_passed_over and not self._has_warned:
+            self._has_warned = True
+            _log.warning("the detector is slow: keyframes that waited too long are not looked at")
 
     def collect(self, frame: int) -> tuple[list[DynamicObservations], str]:
         """What was found by a frame, in the order of the keyframes, and what went wrong last; told once."""
@@ -114,15 +119,12 @@ class KeyframeSemantics:
         """The same once all keyframes have been looked at; it waits for that, unless it is closed."""
         return self._collected(self.worker.flush)
 
-    def _look(self, _: None) -> DynamicObservations | None:
-        if not self._waiting:
-            return None  # more came than can wait
-        shown = self._waiting.popleft()
+    def _look(self, shown: _KeyframeImage) -> DynamicObservations:
         found = detect_mask(self._detector, self._reduced, shown.image, shown.depth)
         mask = dilated(self._reduced.whole(found), self._dilate_px)
         return DynamicObservations(shown.keyframe, mask, shown.id[under(mask, shown.uv_raw)])
 
-    def _collected(self, take: Callable[[], list[DynamicObservations | None]]) -> tuple[list[DynamicObservations], str]:
+    def _collected(self, take: Callable[[], list[DynamicObservations]]) -> tuple[list[DynamicObservations], str]:
         found: list[DynamicObservations] = []
         error = ""
         while True:
@@ -133,10 +135,4 @@ class KeyframeSemantics:
                 continue
             if not done:
                 return found, error
-            found += (movers for movers in done if movers is not None)
-            self._pass_over(sum(movers is None for movers in done))
-
-    def _pass_over(self, count: int) -> None:
-        if count and not self.num_passed_over:
-            _log.warning("the detector is slow: keyframes that waited too long are not looked at")
-        self.num_passed_over += count
+            found += done

@@ -7,6 +7,7 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytest
 
@@ -125,6 +126,54 @@ class TestErrors:
             worker.flush()
         assert worker.flush() == [7]
         worker.close()
+
+
+class TestDropping:
+    def held(self, **options: Any) -> tuple[ThreadWorker[int, int], threading.Event]:
+        """A worker whose first job, 0, has begun and waits for the event."""
+        begun, gate = threading.Event(), threading.Event()
+
+        def work(job: int) -> int:
+            begun.set()
+            assert gate.wait(10)
+            return job
+
+        worker = ThreadWorker(work, "test", **options)
+        worker.submit(0, 0)
+        assert begun.wait(10)
+        return worker, gate
+
+    def test_the_oldest_waiting_job_is_dropped(self) -> None:
+        worker, gate = self.held(max_waiting=2)
+        for job in range(1, 6):
+            worker.submit(job, 0)
+        assert (worker.num_waiting, worker.num_dropped) == (2, 3)
+        gate.set()
+        assert worker.flush() == [0, 4, 5]
+        worker.close()
+
+    def test_only_jobs_that_may_be_dropped_are(self) -> None:
+        """Odd jobs are kept, and do not count towards the limit."""
+        worker, gate = self.held(max_waiting=2, may_drop=lambda job: job % 2 == 0)
+        for job in range(1, 9):
+            worker.submit(job, 0)
+        assert worker.num_dropped == 2
+        gate.set()
+        assert worker.flush() == [0, 1, 3, 5, 6, 7, 8]
+        worker.close()
+
+    def test_nothing_is_dropped_without_a_limit(self) -> None:
+        worker, gate = self.held()
+        for job in range(1, 100):
+            worker.submit(job, 0)
+        gate.set()
+        assert worker.flush() == list(range(100))
+        assert worker.num_dropped == 0
+        worker.close()
+
+    def test_a_limit_of_0_is_refused(self) -> None:
+        with pytest.raises(ValueError, match="max_waiting: expected at least 1, got 0"):
+            ThreadWorker(double, "test", max_waiting=0)
 
 
 class TestClose:
