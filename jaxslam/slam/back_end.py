@@ -7,25 +7,22 @@ but their queues and the index of places, which has a lock.
 
 import threading
 from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any
 
 import jax
 import numpy as np
 from jaxlie import SE3
 
 from jaxslam.config.schema import Config
-from jaxslam.features.orb import Features, features_of, no_features
-from jaxslam.features.pose_from_matches import MIN_INLIERS
 from jaxslam.geometry.se3 import IDENTITY, compose, inverse, transform
 from jaxslam.loop_closing.essential_graph import GraphCompiler
 from jaxslam.loop_closing.loop_detector import LoopClosing, LoopClosure
 from jaxslam.loop_closing.place_index import PlaceIndex
-from jaxslam.loop_closing.place_recognition import compile_recognition, recognize
+from jaxslam.loop_closing.place_recognition import compile_recognition
 from jaxslam.map.dynamic_removal import DynamicObservations
 from jaxslam.map.types import NONE, Map, empty_map, has
-from jaxslam.mapping.local_map_tracking import keyframes_in_view, match_local_map
-from jaxslam.mapping.local_mapping import LocalMapping, NewKeyframe, mapping_plan, with_new_keyframe
-from jaxslam.mapping.occlusion_states import PointStates, StateChanges
+from jaxslam.mapping.local_mapping import mapping_plan
+from jaxslam.mapping.occlusion_states import PointStates
 from jaxslam.mapping.track_table import TrackId
 from jaxslam.runtime.compiled import compiled
 from jaxslam.runtime.preload import import_scipy
@@ -36,8 +33,11 @@ from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame_arrays import FrameArrays
 from jaxslam.sensors.sensor_model import SensorModel
 from jaxslam.slam.dense_thread import DenseMapping
-from jaxslam.slam.keyframe_reload import MapKeyframe, reload_keyframe
+from jaxslam.slam.frame_localizer import FrameLocalizer, LocalizedPose
+from jaxslam.slam.keyframe_reload import MapKeyframe
 from jaxslam.slam.keyframe_semantics import KeyframeSemantics
+from jaxslam.slam.map_jobs import MapJob, MapUpdate, MapWriter
+from jaxslam.slam.place_jobs import IndexUpdate, LoopSearch, PlaceJob, PlaceResult, PlaceSearch, Reload
 from jaxslam.slam.tracker_map_sync import AnchoredPose, TrackerMapSync, pose_of, tracks_of
 from jaxslam.tracking.state import TrackOutput, TrackPlan, TrackReason, TrackState, TrackStatus
 from jaxslam.tracking.state_updates import reset_at_pose
@@ -48,72 +48,6 @@ _RECALL_EVERY = 10
 """Frames after which a tracker that only localizes gets other keyframes."""
 _MAX_ON_THE_WAY = 2
 """Keyframes: one that mapping is at, and one that is done when it is looked for next."""
-_PATIENCE_S = 0.02
-"""Longest wait for the index of places, while lost; the next frame asks again."""
-
-
-class LocalizedPose(NamedTuple):
-    """Where a frame was taken, by points of the map found in it.
-
-    Attributes:
-        anchored: The pose.
-        num_matched: Points that agree on it.
-        covariance: `(6, 6)` in the tangent space at the camera: translation (m), then rotation (rad).
-    """
-
-    anchored: AnchoredPose
-    num_matched: int
-    covariance: np.ndarray
-
-
-class _LoopSearch(NamedTuple):
-    """A job: look whether a keyframe closes a loop."""
-
-    map: Map
-    keyframe: int
-
-
-class _Reload(NamedTuple):
-    """A job: find and prepare keyframes that show what the camera sees."""
-
-    map: Map
-    T_world_cam: np.ndarray
-    submap: int
-    known: frozenset[int]
-
-
-class _Replace(NamedTuple):
-    """A job: take in that a keyframe has lost features."""
-
-    map: Map
-    keyframe: int
-
-
-class _MapUpdate(NamedTuple):
-    """A new map, and what is new in it.
-
-    Attributes:
-        map: The map.
-        keyframe: The new keyframe, or `NONE`.
-        loops: Loops closed.
-        cleaned: The keyframe that what may move has left, or `NONE`.
-        removed: Points that have left the map with it,
-        gone: and the tracker's numbers of them.
-        states: Number of the changes of states that it has, and all before; 0 if no more than the map before.
-    """
-
-    map: Map
-    keyframe: int = NONE
-    loops: int = 0
-    cleaned: int = NONE
-    removed: int = 0
-    gone: np.ndarray | None = None
-    states: int = 0
-
-
-_MapJob: TypeAlias = NewKeyframe | LoopClosure | DynamicObservations | StateChanges
-_PlaceJob: TypeAlias = _LoopSearch | _Reload | _Replace
-_PlaceResult: TypeAlias = LoopClosure | tuple[MapKeyframe, ...] | None
 
 
 class BackEnd:
@@ -150,11 +84,12 @@ class BackEnd:
         self._plan = mapping_plan(camera, config)
         self._camera, self._config, self._localize_only = camera, config, localize_only
         start = empty_map(camera) if slam_map is None else slam_map
-        self._mapping = LocalMapping(camera, sensor, self._plan, start)
+        self._writer = MapWriter(camera, sensor, self._plan, start)
         self._index, self._lock = PlaceIndex.from_map(start), threading.Lock()
-        self._loops = LoopClosing(self._index, sensor, self._plan.features, self._lock)
-        self._to_mapping: Worker[_MapJob, _MapUpdate] = self._worker(self._map_job, "mapping", 1)
-        self._to_places: Worker[_PlaceJob, _PlaceResult] = self._worker(self._place_job, "places", 2)
+        loops = LoopClosing(self._index, sensor, self._plan.features, self._lock)
+        self._searches = PlaceSearch(loops, plan)
+        self._to_mapping: Worker[MapJob, MapUpdate] = self._worker(self._writer.do, "mapping", 1)
+        self._to_places: Worker[PlaceJob, PlaceResult] = self._worker(self._searches.do, "places", 2)
         self._semantics = None if detector is None else self._semantics_of(detector)
         self._dense = dense
         self._graphs = GraphCompiler()
@@ -162,12 +97,12 @@ class BackEnd:
         most = config.mapping.num_features + self._num_tracks
         occlusion = config.dynamics.occlusion
         self._states = PointStates(occlusion, sensor, start, most) if occlusion.enabled else None
+        self._localizer = FrameLocalizer(sensor, self._plan.features, self._link, self._index, self._lock, self._states)
         self._states_in_map = 0  # number of the changes that the newest map has
         self._arrived: Map | None = None
         self._waiting: list[MapKeyframe] = []
         self._wanted: set[int] = set()
         self._correction = IDENTITY
-        self._features: Features | None = None  # of the present frame, once they have been sought
         self._gone: list[np.ndarray] = []  # numbers of points that the tracker is to forget
         self._detector_error = ""
         self._loops_closed = self._removed = 0
@@ -207,7 +142,7 @@ class BackEnd:
     def compile(self, frame: FrameArrays, state: TrackState) -> None:
         """Compile all that is needed while frames of this kind come, with a state that is not needed any more."""
         import_scipy()
-        self._mapping.compile(frame, self._num_tracks)
+        self._writer.compile(frame, self._num_tracks)
         if self._states is not None:
             self._states.compile(frame)
         compile_recognition(self._sensor, self._plan.features)
@@ -229,7 +164,7 @@ class BackEnd:
         """
         if self._closed:
             raise RuntimeError("the tracker is closed; Slam.reset() begins anew")
-        self._features = None
+        self._localizer.begin_frame()
         if self._semantics is not None:
             self._take_movers(*self._semantics.collect(frame), frame)
         self._take_places(self._to_places.collect(frame), frame)
@@ -273,37 +208,32 @@ class BackEnd:
             states = None if self._states is None else self._states.handed_over()
             if self._dense is not None:
                 self._dense.insert_keyframe(new, image, pose_of(output), frame)
-            self._to_mapping.submit(new._replace(features=self._features, states=states), frame)
+            self._to_mapping.submit(new._replace(features=self._localizer.features, states=states), frame)
         if self._semantics is not None:
             self._semantics.submit(keyframe, image, np.asarray(arrays.depth), tracks_of(output), frame)
 
     def match_local_map(
         self, state: TrackState, arrays: FrameArrays, output: TrackOutput
     ) -> tuple[TrackState, TrackOutput, int]:
-        """A frame whose flow is weak, with the pose that points of the map around it give it.
+        """Refine the pose of a tracked frame against the local map.
+
+        Args:
+            state: State of the tracker after the frame.
+            arrays: The frame.
+            output: Output of the tracker for the frame.
 
         Returns:
-            State and output, and how many points agree on the pose; as they were and 0 if too few do.
+            State and output with the refined pose, and the number of map points that agree with it. Unchanged state
+            and output, and 0, if too few points agree.
         """
-        pose = pose_of(output)
-        self._features = features_of(arrays, np.asarray(output.twist), self._sensor, self._plan.features)
-        placed = self._in_local_map(self._features, pose)
-        if placed is None:
+        localized = self._localizer.match_tracked(arrays, output)
+        if localized is None:
             return state, output, 0
-        T_world_cam = self._link.pose(placed.anchored)
-        change = compose(T_world_cam, inverse(pose))
+        T_world_cam = self._link.pose(localized.anchored)
+        change = compose(T_world_cam, inverse(pose_of(output)))
         state = self._link.apply_correction(state, change, is_keyframe=bool(output.keyframe))
-        X_world = transform(change, np.asarray(output.X_world, np.float64))
-        fine = placed.num_matched >= self._config.track.weak_inliers
-        wxyz_xyz: Any = T_world_cam.astype(np.float32)
-        output = output._replace(
-            T_world_cam=SE3(wxyz_xyz),
-            X_world=X_world.astype(np.float32),
-            covariance=placed.covariance.astype(np.float32),
-            status=TrackStatus.OK if fine else output.status,
-            reason=TrackReason.NONE if fine else output.reason,
-        )
-        return state, output, placed.num_matched
+        output = _at_refined_pose(output, T_world_cam, change, localized, self._config.track.weak_inliers)
+        return state, output, localized.num_matched
 
     def update_occlusion(self, arrays: FrameArrays, output: TrackOutput) -> float | None:
         """Take in which points of the reference keyframe a frame that was tracked shows, and which are blocked in it.
@@ -316,39 +246,15 @@ class BackEnd:
         return self._states.see(self.map, anchored.keyframe, anchored.T_keyframe_cam, np.asarray(output.twist), arrays)
 
     def relocalize(self, arrays: FrameArrays, predicted: np.ndarray | None) -> tuple[LocalizedPose | None, bool]:
-        """Where a frame was taken that flow has lost, if the map shows that place.
-
-        Args:
-            arrays: The frame.
-            predicted: `(7,)` where the camera may be, if it was lost just now.
-
-        Returns:
-            Where; and if nowhere, whether the frame shows enough to tell that its place is not in the map.
-        """
-        features = features_of(arrays, np.zeros(6, np.float32), self._sensor, self._plan.features)
-        near = None if predicted is None else self._in_local_map(features, predicted)
-        if near is not None:
-            return near, False
-        if np.count_nonzero(features.depth) < MIN_INLIERS:
-            return None, False
-        if not self._lock.acquire(timeout=_PATIENCE_S):
-            return None, False
-        try:
-            found = recognize(self.map, self._index, features, self._sensor, plan=self._plan.features)
-        finally:
-            self._lock.release()
-        if found is None:
-            return None, True
-        return LocalizedPose(
-            AnchoredPose(found.keyframe, found.T_keyframe_cam), found.num_inliers, found.covariance
-        ), False
+        """Localize a lost frame in the map; see `FrameLocalizer.relocalize`."""
+        return self._localizer.relocalize(arrays, predicted)
 
     def reset_at_pose(self, state: TrackState, recognized: AnchoredPose) -> TrackState:
         """The state of the tracker begun anew where the map recognized a place, with keyframes of it at hand."""
         self._link.set_reference_keyframe(recognized.keyframe)
         pose = self._link.pose(recognized)
         state = self.start_submap(state, pose)
-        self._wait_for(self._reloads(_Reload(self.map, pose, self._link.submap_now(), frozenset())))
+        self._wait_for(self._searches.reload(Reload(self.map, pose, self._link.submap_now(), frozenset())))
         while self._waiting:
             state = self._with_reloaded(state)
         return state
@@ -405,18 +311,6 @@ class BackEnd:
         dense = () if self._dense is None else (self._dense.worker,)
         close_all((self._to_mapping, self._to_places, *looking, *dense))
 
-    def _in_local_map(self, features: Features, T_world_cam: np.ndarray) -> LocalizedPose | None:
-        """Where a frame was taken that is about at a pose, if the map around shows it."""
-        about = self._link.in_map(T_world_cam)
-        if about is None:
-            return None
-        found = match_local_map(
-            self.map, about.keyframe, about.T_keyframe_cam, features, self._sensor, self._plan.features, self._states
-        )
-        if found is None:
-            return None
-        return LocalizedPose(AnchoredPose(about.keyframe, found.T_origin_cam), len(found.agree), found.covariance)
-
     def _compile_edits(self, state: TrackState) -> None:
         """Compile the changes to the tracker's state."""
         state = self._link.compile(_relocated(state, np.asarray(IDENTITY, np.float32)))
@@ -444,37 +338,7 @@ class BackEnd:
             latency_frames=latency_frames,
         )
 
-    def _map_job(self, job: _MapJob) -> _MapUpdate:
-        before = self._mapping.map
-        try:
-            if isinstance(job, LoopClosure):
-                slam_map = self._mapping.close_loop(job)
-                return _MapUpdate(slam_map, loops=int(slam_map is not before))
-            if isinstance(job, DynamicObservations):
-                slam_map, gone = self._mapping.remove(job)
-                removed = len(before.points.ids) - len(slam_map.points.ids)
-                return _MapUpdate(slam_map, cleaned=job.keyframe, removed=removed, gone=gone)
-            if isinstance(job, StateChanges):
-                return _MapUpdate(self._mapping.take_states(job), states=job.number)
-            return _MapUpdate(self._mapping.add(job), job.id, states=0 if job.states is None else job.states.number)
-        except BaseException:
-            # What was begun is forgotten; those after a keyframe hang on it, and so it is there, without points.
-            slam_map = with_new_keyframe(before, job, no_features()) if isinstance(job, NewKeyframe) else before
-            self._mapping = LocalMapping(self._camera, self._sensor, self._plan, slam_map)
-            raise
-
-    def _place_job(self, job: _PlaceJob) -> _PlaceResult:
-        if isinstance(job, _LoopSearch):
-            return self._loops.look(job.map, job.keyframe)
-        if isinstance(job, _Replace):
-            return self._loops.replace(job.map, job.keyframe)
-        return self._reloads(job)
-
-    def _reloads(self, job: _Reload) -> tuple[MapKeyframe, ...]:
-        wanted = keyframes_in_view(job.map, job.T_world_cam, job.submap, set(job.known), self._track_plan.num_reloaded)
-        return tuple(reload_keyframe(job.map, keyframe_id, self._track_plan.num_points) for keyframe_id in wanted)
-
-    def _take_maps(self, updates: list[_MapUpdate], frame: int) -> bool:
+    def _take_maps(self, updates: list[MapUpdate], frame: int) -> bool:
         """Keep the newest map until the state is carried along, and look for loops; whether there was one."""
         for update in updates:
             self._arrived = update.map
@@ -487,9 +351,9 @@ class BackEnd:
             if update.gone is not None:
                 self._gone.append(update.gone)
             if update.cleaned != NONE and not self._closed:
-                self._to_places.submit(_Replace(update.map, update.cleaned), frame)
+                self._to_places.submit(IndexUpdate(update.map, update.cleaned), frame)
             if update.keyframe != NONE and not self._closed:
-                self._to_places.submit(_LoopSearch(update.map, update.keyframe), frame)
+                self._to_places.submit(LoopSearch(update.map, update.keyframe), frame)
         return bool(updates)
 
     def _carried(self, state: TrackState) -> TrackState:
@@ -520,7 +384,7 @@ class BackEnd:
         if len(changes.ids):
             self._to_mapping.submit(changes, 0)
 
-    def _take_places(self, results: list[_PlaceResult], frame: int) -> None:
+    def _take_places(self, results: list[PlaceResult], frame: int) -> None:
         for result in results:
             if isinstance(result, LoopClosure):
                 if not self._closed:
@@ -536,7 +400,7 @@ class BackEnd:
     def _request_reload(self, T_world_cam: np.ndarray, frame: int) -> None:
         if self._track_plan.num_reloaded and self._link.reference != NONE:
             known = frozenset(self._link.latest())
-            self._to_places.submit(_Reload(self.map, T_world_cam, self._link.submap_now(), known), frame)
+            self._to_places.submit(Reload(self.map, T_world_cam, self._link.submap_now(), known), frame)
 
     def _with_reloaded(self, state: TrackState) -> TrackState:
         """The state with one more of the keyframes that wait; one a frame, so that none takes long."""
@@ -559,3 +423,27 @@ def _without_removed(keyframe: MapKeyframe, slam_map: Map) -> MapKeyframe:
 def _copied(arrays: FrameArrays) -> FrameArrays:
     """A frame's own copy, for use after the caller has got its images back."""
     return FrameArrays(*jax.tree.map(np.array, tuple(arrays)))
+
+
+def _at_refined_pose(
+    output: TrackOutput, T_world_cam: np.ndarray, change: np.ndarray, localized: LocalizedPose, weak_inliers: float
+) -> TrackOutput:
+    """Return the output of a frame at the pose from the local map; it is `OK` if enough points agree with that pose.
+
+    Args:
+        output: Output of the tracker for the frame.
+        T_world_cam: `(7,)` refined pose.
+        change: `(7,)` transform of the world from the tracked pose to the refined one.
+        localized: Refined pose with its covariance and number of matches.
+        weak_inliers: Number of matches from which the frame is no longer `WEAK`.
+    """
+    X_world = transform(change, np.asarray(output.X_world, np.float64))
+    enough = localized.num_matched >= weak_inliers
+    wxyz_xyz: Any = T_world_cam.astype(np.float32)
+    return output._replace(
+        T_world_cam=SE3(wxyz_xyz),
+        X_world=X_world.astype(np.float32),
+        covariance=localized.covariance.astype(np.float32),
+        status=TrackStatus.OK if enough else output.status,
+        reason=TrackReason.NONE if enough else output.reason,
+    )

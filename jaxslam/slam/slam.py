@@ -30,11 +30,12 @@ from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame, check_frame
 from jaxslam.sensors.frame_arrays import FrameArrays, FrameMemory
 from jaxslam.slam.argument_checks import check_arguments, warn_of_other_camera
-from jaxslam.slam.back_end import BackEnd, LocalizedPose
+from jaxslam.slam.back_end import BackEnd
 from jaxslam.slam.background_consistency import BackgroundConsistency
 from jaxslam.slam.call_guard import one_at_a_time, refuse_after_fork
 from jaxslam.slam.dense_thread import DenseMapping
 from jaxslam.slam.frame_clock import FrameClock
+from jaxslam.slam.frame_localizer import LocalizedPose
 from jaxslam.slam.frame_result import FrameRecord, FrameResult, Rejected, frame_result
 from jaxslam.slam.input_checks import InputChecks
 from jaxslam.slam.input_warnings import InputWarnings

@@ -264,7 +264,7 @@ class TestWeakFrames:
 class TestLostFrames:
     def test_are_sought_in_the_local_map_first(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """No place is recognized here; the map around where the camera may be shows it."""
-        monkeypatch.setattr("jaxslam.slam.back_end.recognize", lambda *_, **__: None)
+        monkeypatch.setattr("jaxslam.slam.frame_localizer.recognize", lambda *_, **__: None)
         with Slam(room().camera, CONFIG) as slam:
             for frame in room().frames[:40]:
                 slam.track(frame)
@@ -276,7 +276,7 @@ class TestLostFrames:
 
     def test_go_on_from_there(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """A camera turned too fast for flow, while no place is recognized."""
-        monkeypatch.setattr("jaxslam.slam.back_end.recognize", lambda *_, **__: None)
+        monkeypatch.setattr("jaxslam.slam.frame_localizer.recognize", lambda *_, **__: None)
         with Slam(room().camera, CONFIG) as slam:
             for frame in room().frames[:LATER]:
                 slam.track(frame)

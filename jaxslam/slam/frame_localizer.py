@@ -1,0 +1,118 @@
+"""Localizes a frame in the map: against the local map from an approximate pose, or by place recognition."""
+
+import threading
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxslam.features.orb import FeaturePlan, Features, features_of
+from jaxslam.features.pose_from_matches import MIN_INLIERS
+from jaxslam.loop_closing.place_index import PlaceIndex
+from jaxslam.loop_closing.place_recognition import recognize
+from jaxslam.mapping.local_map_tracking import match_local_map
+from jaxslam.mapping.occlusion_states import PointStates
+from jaxslam.sensors.frame_arrays import FrameArrays
+from jaxslam.sensors.sensor_model import SensorModel
+from jaxslam.slam.tracker_map_sync import AnchoredPose, TrackerMapSync, pose_of
+from jaxslam.tracking.state import TrackOutput
+
+_PATIENCE_S = 0.02
+"""Longest wait for the lock of the place index while lost; the next frame tries again."""
+
+
+class LocalizedPose(NamedTuple):
+    """The pose of a frame from matches with map points.
+
+    Attributes:
+        anchored: The pose, relative to a keyframe.
+        num_matched: Number of points that agree with the pose.
+        covariance: `(6, 6)` in the tangent space at the camera: translation (m), then rotation (rad).
+    """
+
+    anchored: AnchoredPose
+    num_matched: int
+    covariance: np.ndarray
+
+
+class FrameLocalizer:
+    """Localizes frames in the map as the tracker knows it.
+
+    Attributes:
+        features: Features of the current frame; `None` until `match_tracked` has extracted them.
+    """
+
+    def __init__(
+        self,
+        sensor: SensorModel,
+        plan: FeaturePlan,
+        link: TrackerMapSync,
+        index: PlaceIndex,
+        lock: threading.Lock,
+        states: PointStates | None,
+    ) -> None:
+        """Keep what localization needs.
+
+        Args:
+            sensor: Noise model of the camera.
+            plan: Static sizes of feature extraction.
+            link: Map and reference keyframe of the tracker.
+            index: Place index.
+            lock: Lock of the place index.
+            states: Occlusion states of map points; `None` if the settings do not ask for them.
+        """
+        self._sensor, self._plan, self._link = sensor, plan, link
+        self._index, self._lock, self._states = index, lock, states
+        self.features: Features | None = None
+
+    def begin_frame(self) -> None:
+        """Forget the features of the frame before."""
+        self.features = None
+
+    def match_tracked(self, arrays: FrameArrays, output: TrackOutput) -> LocalizedPose | None:
+        """Localize a tracked frame against the local map; `None` if too few points agree.
+
+        Args:
+            arrays: The frame.
+            output: Output of the tracker for the frame.
+        """
+        self.features = features_of(arrays, np.asarray(output.twist), self._sensor, self._plan)
+        return self._in_local_map(self.features, pose_of(output))
+
+    def relocalize(self, arrays: FrameArrays, predicted: np.ndarray | None) -> tuple[LocalizedPose | None, bool]:
+        """Localize a lost frame: against the local map at the predicted pose, else by place recognition.
+
+        Args:
+            arrays: The frame.
+            predicted: `(7,)` predicted pose; `None` if the camera has been lost for too long to predict one.
+
+        Returns:
+            The pose, or `None`; and whether place recognition searched the whole map and found no such place.
+        """
+        features = features_of(arrays, np.zeros(6, np.float32), self._sensor, self._plan)
+        near = None if predicted is None else self._in_local_map(features, predicted)
+        if near is not None:
+            return near, False
+        if np.count_nonzero(features.depth) < MIN_INLIERS:
+            return None, False
+        if not self._lock.acquire(timeout=_PATIENCE_S):
+            return None, False
+        try:
+            found = recognize(self._link.map, self._index, features, self._sensor, plan=self._plan)
+        finally:
+            self._lock.release()
+        if found is None:
+            return None, True
+        anchored = AnchoredPose(found.keyframe, found.T_keyframe_cam)
+        return LocalizedPose(anchored, found.num_inliers, found.covariance), False
+
+    def _in_local_map(self, features: Features, T_world_cam: np.ndarray) -> LocalizedPose | None:
+        """Localize a frame against the local map from an approximate pose; `None` if too few points agree."""
+        about = self._link.in_map(T_world_cam)
+        if about is None:
+            return None
+        found = match_local_map(
+            self._link.map, about.keyframe, about.T_keyframe_cam, features, self._sensor, self._plan, self._states
+        )
+        if found is None:
+            return None
+        return LocalizedPose(AnchoredPose(about.keyframe, found.T_origin_cam), len(found.agree), found.covariance)

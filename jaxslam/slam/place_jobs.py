@@ -1,0 +1,82 @@
+"""Jobs of the place worker: detect loops, update the place index, and reload keyframes for the tracker."""
+
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+
+from jaxslam.loop_closing.loop_detector import LoopClosing, LoopClosure
+from jaxslam.map.types import Map
+from jaxslam.mapping.local_map_tracking import keyframes_in_view
+from jaxslam.slam.keyframe_reload import MapKeyframe, reload_keyframe
+from jaxslam.tracking.state import TrackPlan
+
+
+class LoopSearch(NamedTuple):
+    """A job: check whether a keyframe closes a loop.
+
+    Attributes:
+        map: Map that contains the keyframe.
+        keyframe: Id of the keyframe.
+    """
+
+    map: Map
+    keyframe: int
+
+
+class Reload(NamedTuple):
+    """A job: prepare keyframes of the map that see what the camera sees, for the tracker.
+
+    Attributes:
+        map: Map with the keyframes.
+        T_world_cam: `(7,)` pose of the camera.
+        submap: Number of the submap that the camera is in.
+        known: Ids of the keyframes that the tracker already holds.
+    """
+
+    map: Map
+    T_world_cam: np.ndarray
+    submap: int
+    known: frozenset[int]
+
+
+class IndexUpdate(NamedTuple):
+    """A job: update the place index after features of a keyframe were removed.
+
+    Attributes:
+        map: Map after the removal.
+        keyframe: Id of the keyframe.
+    """
+
+    map: Map
+    keyframe: int
+
+
+PlaceJob: TypeAlias = LoopSearch | Reload | IndexUpdate
+PlaceResult: TypeAlias = LoopClosure | tuple[MapKeyframe, ...] | None
+"""A loop, or reloaded keyframes; `None` if there are none."""
+
+
+class PlaceSearch:
+    """Does the jobs of the place worker."""
+
+    def __init__(self, loops: LoopClosing, plan: TrackPlan) -> None:
+        """Keep what the jobs need.
+
+        Args:
+            loops: Loop detector with its place index.
+            plan: Plan of the tracker, with the number of keyframes to reload.
+        """
+        self._loops, self._plan = loops, plan
+
+    def do(self, job: PlaceJob) -> PlaceResult:
+        """Do a job."""
+        if isinstance(job, LoopSearch):
+            return self._loops.look(job.map, job.keyframe)
+        if isinstance(job, IndexUpdate):
+            return self._loops.replace(job.map, job.keyframe)
+        return self.reload(job)
+
+    def reload(self, job: Reload) -> tuple[MapKeyframe, ...]:
+        """Return the keyframes that best cover the camera's view, at most `num_reloaded` of the plan."""
+        wanted = keyframes_in_view(job.map, job.T_world_cam, job.submap, set(job.known), self._plan.num_reloaded)
+        return tuple(reload_keyframe(job.map, keyframe_id, self._plan.num_points) for keyframe_id in wanted)
