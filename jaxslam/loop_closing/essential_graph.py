@@ -10,7 +10,8 @@ import jax
 import numpy as np
 from jaxlie import SE3
 from jaxslam_kernels.pose_graph.cost import PoseGraphEdges
-from jaxslam_kernels.pose_graph.pose_graph import PoseGraphStatus, band_rank, optimize_pose_graph
+from jaxslam_kernels.pose_graph.elimination_order import band_rank
+from jaxslam_kernels.pose_graph.pose_graph import PoseGraphStatus, optimize_pose_graph
 
 from jaxslam.geometry.se3 import IDENTITY, angle, between
 from jaxslam.map.types import NONE, Map, has, rows, visibility

@@ -13,7 +13,8 @@ import pytest
 from jaxlie import SE3
 from jaxslam_kernels.pose_graph.block_tridiagonal_cg import GraphMatrix, factorize, solve_factor
 from jaxslam_kernels.pose_graph.cost import PoseGraphEdges, graph_equations, graph_nodes, graph_problem
-from jaxslam_kernels.pose_graph.pose_graph import PoseGraphStatus, band_rank, optimize_pose_graph
+from jaxslam_kernels.pose_graph.elimination_order import band_rank
+from jaxslam_kernels.pose_graph.pose_graph import PoseGraphStatus, optimize_pose_graph
 from pose_graph_cases import read_g2o
 from scipy.sparse import bsr_array, coo_array
 from scipy.sparse.linalg import splu

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 from jaxlie import SE3
 from jaxslam_kernels.bundle.bundle_adjust import bundle_adjust
 from jaxslam_kernels.pose_graph.cost import PoseGraphEdges
-from jaxslam_kernels.pose_graph.pose_graph import Elimination, band_rank, optimize_pose_graph
+from jaxslam_kernels.pose_graph.elimination_order import band_rank
+from jaxslam_kernels.pose_graph.pose_graph import Elimination, optimize_pose_graph
 
 from jaxslam.benchmark.kernels.case import Case, Problem
 from jaxslam.benchmark.kernels.scenes.bundle_window import make_window, without_depth

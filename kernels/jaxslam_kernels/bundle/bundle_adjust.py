@@ -24,7 +24,6 @@ from jaxlie import SE3
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam_kernels.bundle.cost import (
-    BundleEquations,
     BundleProblem,
     Observations,
     Plane,
@@ -33,10 +32,9 @@ from jaxslam_kernels.bundle.cost import (
     bundle_problem,
     bundle_views,
     clean_weights,
-    exact_blocks,
     free_cameras,
-    normal_equations,
 )
+from jaxslam_kernels.bundle.equations import BundleEquations, exact_blocks, normal_equations
 from jaxslam_kernels.bundle.lens import Cameras, Lenses, move_cameras, shift_cameras, usable_lenses
 from jaxslam_kernels.bundle.schur import Reduced, eliminate, is_determined, points_determined, solve_reduced
 from jaxslam_kernels.bundle.zero_weight_points import idle_points

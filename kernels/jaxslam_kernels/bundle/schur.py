@@ -13,7 +13,8 @@ from jax import lax
 from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Float
 
-from jaxslam_kernels.bundle.cost import BundleEquations, BundleProblem, free_cameras
+from jaxslam_kernels.bundle.cost import BundleProblem, free_cameras
+from jaxslam_kernels.bundle.equations import BundleEquations
 from jaxslam_kernels.types import Flag, Mask, Points, Scalar, Weights
 
 

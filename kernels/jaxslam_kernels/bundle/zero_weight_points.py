@@ -11,7 +11,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxslam_kernels.bundle.cost import BundleProblem, Plane, bundle_views, normal_equations
+from jaxslam_kernels.bundle.cost import BundleProblem, Plane, bundle_views
+from jaxslam_kernels.bundle.equations import normal_equations
 from jaxslam_kernels.bundle.lens import Cameras
 from jaxslam_kernels.bundle.schur import inverse_root
 from jaxslam_kernels.pose.pose_cost import FARTHEST_M

@@ -102,17 +102,10 @@ def ransac_pnp(
     """
     if X_world.shape[1] == 0:
         return _none_found(_fallback(initial, X_world.dtype)[0])
-    problem, idle = pose_problem(
-        X_world,
-        uv,
-        intrinsics,
-        weights,
-        depth,
-        jnp.asarray(threshold_px, X_world.dtype) / _GATE_SIGMAS,
-        jnp.asarray(threshold_depth, X_world.dtype) / _GATE_SIGMAS,
-        _GATE_SIGMAS,
-        None,
+    sigma_px, sigma_depth = (
+        jnp.asarray(threshold, X_world.dtype) / _GATE_SIGMAS for threshold in (threshold_px, threshold_depth)
     )
+    problem, idle = pose_problem(X_world, uv, intrinsics, weights, depth, sigma_px, sigma_depth, _GATE_SIGMAS, None)
     fixed = lax.stop_gradient(problem)
     fallback, has_initial = _fallback(initial, X_world.dtype)
     hypotheses, real = _hypotheses(fixed, draw_samples(key, fixed.weights, num_hypotheses))
@@ -121,10 +114,8 @@ def ransac_pnp(
     best, _ = usable_pose(_as_pose(hypotheses[:, :, jnp.argmax(scores)]))
     consensus = _improved(best, fixed, averaged)
     inliers, _ = _consensus(consensus, fixed, averaged)
-    weights_of_inliers = jnp.where(inliers, problem.weights, 0.0)
-    on_inliers = problem._replace(weights=weights_of_inliers, scale=0.5 * problem.scale)
-    agrees = _squared_errors(_as_transform(consensus), *_observed(lax.stop_gradient(idle))) < 1.0
-    idle = idle._replace(weights=jnp.where(agrees, idle.weights, 0.0))
+    on_inliers = problem._replace(weights=jnp.where(inliers, problem.weights, 0.0), scale=0.5 * problem.scale)
+    idle = _agreeing_idle(consensus, idle)
     refined = refine_problem(consensus, on_inliers, idle, loss, max_steps)
     return _result(refined.T_world_cam, refined.status, fixed, fallback, scores.max() >= 0, min_inliers, averaged)
 
@@ -239,6 +230,12 @@ def _consensus(T_world_cam: SE3, problem: PoseProblem, averaged: bool) -> tuple[
     T = _as_transform(T_world_cam)
     error = _squared_errors(T, *_observed(problem))
     return (error < 1.0) & (problem.weights > 0), score_poses(T, problem, averaged)[0]
+
+
+def _agreeing_idle(T_world_cam: SE3, idle: PoseProblem) -> PoseProblem:
+    """Keep the points of weight 0 that would be inliers of a pose; only these have a derivative by their weight."""
+    agrees = _squared_errors(_as_transform(T_world_cam), *_observed(lax.stop_gradient(idle))) < 1.0
+    return idle._replace(weights=jnp.where(agrees, idle.weights, 0.0))
 
 
 def _result(

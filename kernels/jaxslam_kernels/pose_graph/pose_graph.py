@@ -19,7 +19,6 @@ from typing import Annotated, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxlie import SE3
 from jaxtyping import Array, Bool, Float, Int
@@ -60,8 +59,6 @@ GROUP_SIZE = 32
 Elimination = Literal["band", "host"]
 """How the normal equations are solved: in compiled code, within a band; or on the host, whatever the structure."""
 
-_GROUP_SIZES = (16, 32, 64)
-"""Those that `suitable_group_size` chooses from: beyond, the host is faster."""
 _INITIAL_DAMPING = 1e-5  # relative to the diagonal of the Hessian
 _MIN_DAMPING, _MAX_DAMPING = 1e-9, 1e9
 _STEP_TOLERANCE = 1e-2  # of the conjugate gradients in a step
@@ -178,35 +175,18 @@ def optimize_pose_graph(
     Returns:
         A `PoseGraph`; everything in it is finite, and so are its derivatives.
     """
-    k, d = fixed.shape[0], 6 if scales is None else 7
-    mask = jnp.ones(k, bool) if mask is None else mask
-    rank = jnp.arange(k) if rank is None else rank
+    mask = jnp.ones_like(fixed) if mask is None else mask
     initial, usable = graph_nodes(T_world_cam, scales)
-    problem, idle = graph_problem_and_idle(edges, mask & usable, loss_scale, d)
-    used = problem.weights > 0
+    problem, idle = graph_problem_and_idle(edges, mask & usable, loss_scale, 6 if scales is None else 7)
     anchored = _anchored(problem, fixed & mask & usable)
-    free = anchored & ~fixed
-    touched = jnp.zeros(k, bool).at[problem.source].max(used).at[problem.target].max(used)
     solver = _Solver(loss, max_steps, max_iterations, group_size, elimination)
     bad_initial = (mask & ~usable).any()
-    free = free & ~bad_initial
-    graph = _Graph(problem, free, rank)
+    graph = _Graph(problem, anchored & ~fixed & ~bad_initial, jnp.arange(fixed.size) if rank is None else rank)
     end = _solve(lax.stop_gradient(initial), lax.stop_gradient(graph), solver)
-    optimum = jnp.where(free[:, None], end.nodes, initial)
-    # An edge that would connect what has no path to a fixed node is fitted exactly, however small its weight.
-    idle_counts = anchored[idle.source] == anchored[idle.target]
-    idle = idle._replace(weights=jnp.where(idle_counts, idle.weights, 0.0))
+    optimum = jnp.where(graph.free[:, None], end.nodes, initial)
+    idle = _within_anchored(idle, anchored)
     optimum = shift_nodes(optimum, _optimum_shift(solver, end.converged, optimum, graph, idle))
-    status = jnp.select(
-        [bad_initial, ~(touched & free).any(), ~end.converged, (mask & ~anchored).any()],
-        [
-            PoseGraphStatus.BAD_INITIAL,
-            PoseGraphStatus.NOTHING_TO_DO,
-            PoseGraphStatus.NOT_CONVERGED,
-            PoseGraphStatus.DISCONNECTED,
-        ],
-        PoseGraphStatus.OK,
-    ).astype(jnp.int32)
+    status = _status(graph, bad_initial, end.converged, (mask & ~anchored).any())
     cost, chi2, robust_weights = graph_cost(optimum, problem, loss)
     return PoseGraph(
         T_world_cam=SE3(optimum[:, :7]),
@@ -222,44 +202,29 @@ def optimize_pose_graph(
     )
 
 
-def band_rank(source: np.ndarray, target: np.ndarray, num_nodes: int) -> np.ndarray:
-    """An order of elimination that keeps both ends of every edge close together, by reverse Cuthill-McKee.
+def _within_anchored(idle: GraphProblem, anchored: Bool[Array, " k"]) -> GraphProblem:
+    """Take out the edges of weight 0 that would connect nodes without a path to a fixed one.
 
-    For the host: the graph's structure decides, once for each change of it. A millisecond for thousands of nodes.
-
-    Args:
-        source: `(m,)` indices of nodes, those of edges in use only.
-        target: `(m,)` indices of nodes.
-        num_nodes: Capacity k, slots without edges included.
-
-    Returns:
-        `(k,)` each node's place.
+    Such an edge is fitted exactly, however small its weight.
     """
-    from scipy.sparse import coo_array  # noqa: PLC0415 - only for graphs, on the host
-    from scipy.sparse.csgraph import reverse_cuthill_mckee  # noqa: PLC0415
-
-    graph = coo_array((np.ones(len(source)), (source, target)), shape=(num_nodes, num_nodes))
-    order = reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True)
-    rank = np.empty(num_nodes, np.int32)
-    rank[order] = np.arange(num_nodes, dtype=np.int32)
-    return rank
+    counts = anchored[idle.source] == anchored[idle.target]
+    return idle._replace(weights=jnp.where(counts, idle.weights, 0.0))
 
 
-def suitable_group_size(source: np.ndarray, target: np.ndarray, rank: np.ndarray) -> int | None:
-    """The least group size of a few that makes every step exact in one iteration.
-
-    For the host, like `band_rank`. The sizes are few so that a graph that grows seldom compiles anew.
-
-    Args:
-        source: `(m,)` indices of nodes, those of edges in use only.
-        target: `(m,)` indices of nodes.
-        rank: `(k,)` each node's place, from `band_rank`.
-
-    Returns:
-        The size, or `None` if the band is too wide: then `elimination="host"` is faster.
-    """
-    width = int(np.abs(rank[source] - rank[target]).max(initial=1))
-    return next((size for size in _GROUP_SIZES if size >= width), None)
+def _status(graph: _Graph, bad_initial: Flag, converged: Flag, disconnected: Flag) -> Code:
+    """Status of a result: the first condition that applies."""
+    used = graph.problem.weights > 0
+    touched = jnp.zeros_like(graph.free).at[graph.problem.source].max(used).at[graph.problem.target].max(used)
+    return jnp.select(
+        [bad_initial, ~(touched & graph.free).any(), ~converged, disconnected],
+        [
+            PoseGraphStatus.BAD_INITIAL,
+            PoseGraphStatus.NOTHING_TO_DO,
+            PoseGraphStatus.NOT_CONVERGED,
+            PoseGraphStatus.DISCONNECTED,
+        ],
+        PoseGraphStatus.OK,
+    ).astype(jnp.int32)
 
 
 def _anchored(problem: GraphProblem, fixed: Bool[Array, " k"]) -> Bool[Array, " k"]:

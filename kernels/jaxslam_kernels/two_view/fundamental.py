@@ -21,7 +21,7 @@ from jaxslam_kernels.pose.pnp import draw_samples
 from jaxslam_kernels.two_view.epipolar import sampson_squared, seven_point
 from jaxslam_kernels.two_view.fundamental_refine import Matrix, TwoViews, refine_matrix, score_matrices, solve_matrix
 from jaxslam_kernels.two_view.homography import homography_suffices
-from jaxslam_kernels.types import Code, Mask, Pixels, Scalar, Weights
+from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Scalar, Weights
 
 SAMPLE_SIZE = 7
 
@@ -107,36 +107,19 @@ def ransac_fundamental(
     views, idle, shift, scale = _two_views(uv_before, uv_after, weights, threshold_px)
     fixed = lax.stop_gradient(views)
     draw_key, plane_key = jax.random.split(key)
-    samples = draw_samples(draw_key, fixed.weights, num_hypotheses, SAMPLE_SIZE)
-    hypotheses, real = seven_point(fixed.before[:, samples], fixed.after[:, samples])
-    hypotheses, real = hypotheses.reshape(3, 3, -1), real.reshape(-1)
+    hypotheses, real = _hypotheses(draw_key, fixed, num_hypotheses)
     if initial is not None:
         given, usable = _of_clean_points(lax.stop_gradient(initial), shift, scale)
-        hypotheses = jnp.concatenate([hypotheses, given[:, :, None]], axis=2)
-        real = jnp.append(real, usable)
+        hypotheses, real = jnp.concatenate([hypotheses, given[:, :, None]], axis=2), jnp.append(real, usable)
     scores = jnp.where(real, score_matrices(hypotheses, fixed), -1.0)
-    if num_improved > 0:
-        consensus = _improved(hypotheses, scores, fixed, num_improved, improving_steps)
-    else:
-        best = jnp.argmax(scores)
-        consensus = jnp.where(scores[best] >= 0, hypotheses[:, :, best], jnp.asarray(_SIDEWAYS, hypotheses.dtype))
+    consensus = _improved(hypotheses, scores, fixed, num_improved, improving_steps)
     on_inliers = views._replace(weights=jnp.where(_agree(consensus, fixed), views.weights, 0.0))
-    agrees = sampson_squared(consensus, *lax.stop_gradient(idle[:2])) < jnp.square(fixed.threshold)
-    idle = idle._replace(weights=jnp.where(agrees, idle.weights, 0.0))
+    idle = _agreeing_idle(consensus, idle, fixed.threshold)
     F, converged, determined = refine_matrix(consensus, on_inliers, idle, "huber", 0.5, max_steps)
     inliers = _agree(lax.stop_gradient(F), fixed)
     num_inliers = jnp.sum(inliers, dtype=jnp.int32)
     plane = homography_suffices(plane_key, F, fixed._replace(weights=jnp.where(inliers, fixed.weights, 0.0)))
-    status = jnp.select(
-        [jnp.sum(fixed.weights > 0) < SAMPLE_SIZE, num_inliers < min_inliers, plane | ~determined, ~converged],
-        [
-            FundamentalStatus.TOO_FEW_POINTS,
-            FundamentalStatus.NO_CONSENSUS,
-            FundamentalStatus.DEGENERATE,
-            FundamentalStatus.NOT_CONVERGED,
-        ],
-        FundamentalStatus.OK,
-    ).astype(jnp.int32)
+    status = _status(jnp.sum(fixed.weights > 0), num_inliers, min_inliers, plane | ~determined, converged)
     found = (status <= FundamentalStatus.NOT_CONVERGED) | (status == FundamentalStatus.DEGENERATE)
     return FundamentalResult(
         F=jnp.where(found, _in_pixels(F, shift, scale), 0.0),
@@ -145,6 +128,37 @@ def ransac_fundamental(
         score=jnp.where(found, score_matrices(lax.stop_gradient(F), fixed), 0.0),
         status=status,
     )
+
+
+def _hypotheses(
+    key: Key[Array, ""], views: TwoViews, num_hypotheses: int
+) -> tuple[Float[Array, "3 3 h"], Bool[Array, " h"]]:
+    """Solve random samples of seven matches: up to three matrices each, and which of them are real."""
+    samples = draw_samples(key, views.weights, num_hypotheses, SAMPLE_SIZE)
+    hypotheses, real = seven_point(views.before[:, samples], views.after[:, samples])
+    return hypotheses.reshape(3, 3, -1), real.reshape(-1)
+
+
+def _agreeing_idle(F: Matrix, idle: TwoViews, threshold: Scalar) -> TwoViews:
+    """Keep the matches of weight 0 that would be inliers of a matrix; only these have a derivative by their weight."""
+    agrees = sampson_squared(F, *lax.stop_gradient(idle[:2])) < jnp.square(threshold)
+    return idle._replace(weights=jnp.where(agrees, idle.weights, 0.0))
+
+
+def _status(
+    num_usable: Int[Array, ""], num_inliers: Int[Array, ""], min_inliers: int, degenerate: Flag, converged: Flag
+) -> Code:
+    """Status of a refined matrix: the first condition that fails."""
+    return jnp.select(
+        [num_usable < SAMPLE_SIZE, num_inliers < min_inliers, degenerate, ~converged],
+        [
+            FundamentalStatus.TOO_FEW_POINTS,
+            FundamentalStatus.NO_CONSENSUS,
+            FundamentalStatus.DEGENERATE,
+            FundamentalStatus.NOT_CONVERGED,
+        ],
+        FundamentalStatus.OK,
+    ).astype(jnp.int32)
 
 
 def _none_found(dtype: DTypeLike) -> FundamentalResult:
@@ -185,8 +199,14 @@ def _two_views(
 
 
 def _improved(F: Float[Array, "3 3 h"], scores: Float[Array, " h"], views: TwoViews, num: int, steps: int) -> Matrix:
-    """The best matrix after a redescending refinement of the best few; constant for differentiation."""
+    """Improve the best `num` matrices by a redescending refinement and return the best one; constant for derivatives.
+
+    With `num` 0 the best matrix is returned as it is.
+    """
     sideways = jnp.asarray(_SIDEWAYS, F.dtype)
+    if num == 0:
+        best = jnp.argmax(scores)
+        return jnp.where(scores[best] >= 0, F[:, :, best], sideways)
     _, best = lax.top_k(scores, num)
     starts = jnp.moveaxis(F[:, :, best], 2, 0)
     starts = jnp.where(scores[best][:, None, None] >= 0, starts, sideways[None])

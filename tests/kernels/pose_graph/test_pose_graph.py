@@ -30,14 +30,8 @@ from jaxslam_kernels.pose_graph.cost import (
     graph_problem,
     shift_nodes,
 )
-from jaxslam_kernels.pose_graph.pose_graph import (
-    Elimination,
-    PoseGraph,
-    PoseGraphStatus,
-    band_rank,
-    optimize_pose_graph,
-    suitable_group_size,
-)
+from jaxslam_kernels.pose_graph.elimination_order import band_rank, suitable_group_size
+from jaxslam_kernels.pose_graph.pose_graph import Elimination, PoseGraph, PoseGraphStatus, optimize_pose_graph
 from jaxslam_kernels.pose_graph.sparse_solve import solve_on_host
 from jaxslam_kernels.robust import Loss
 from pose_graph_cases import isotropic, move, read_g2o, scipy_optimum
