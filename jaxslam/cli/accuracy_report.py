@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxslam.benchmark.machine_names import cpu_name, machine_of, versions_of
-from jaxslam.benchmark.reports.markdown import table
+from jaxslam.benchmark.reports.document import Bullets, Table, to_markdown
 from jaxslam.benchmark.suites.accuracy_ruler import (
     MAX_MEAN,
     MAX_RECORDING,
@@ -62,7 +62,7 @@ def print_and_write(
     plain_console.print(make_table(title, *_COLUMNS, rows=cells))
     for line in lines:
         plain_console.print(line)
-    text = "\n".join([table(_COLUMNS, cells), *(f"- {line}" for line in lines), ""])
+    text = to_markdown([Table([_COLUMNS, *cells]), Bullets(lines)])
     write_atomically(out / _REPORT, text.encode(), BenchmarkError)
     plain_console.print(f"Report: {out / _REPORT}")
 

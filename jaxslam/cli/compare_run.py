@@ -6,7 +6,7 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jaxslam.benchmark.reports.markdown import table
+from jaxslam.benchmark.reports.document import Bullets, Table, to_markdown
 from jaxslam.benchmark.suites.aggregate import shown_label
 from jaxslam.cli.console import console, make_table, plain_console
 from jaxslam.cli.tracking_run import number, track
@@ -70,7 +70,7 @@ def write_tables(rows: list[dict[str, Any]], out: Path) -> None:
     """
     lines = [line for row in rows for line in remarks(row)]
     write_atomically(out / "comparison.json", (json.dumps(rows, indent=2) + "\n").encode())
-    text = table(_COLUMNS, [_cells(row) for row in rows]) + "".join(f"\n- {line}\n" for line in lines)
+    text = to_markdown([Table([_COLUMNS, *map(_cells, rows)]), Bullets(lines)])
     write_atomically(out / "comparison.md", text.encode())
     console.print(f"Table in {out}: comparison.md, comparison.json; results of each run in {out}/PRESET/SEED")
 

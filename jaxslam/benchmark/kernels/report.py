@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxslam.benchmark.kernels.case import Case
-from jaxslam.benchmark.reports.markdown import table
+from jaxslam.benchmark.reports.document import Bullets, Heading, Paragraph, Table, to_markdown
 from jaxslam.visualization.plots import png
 
 COLUMNS = ("kernel", "size", "on", "ours, ms", "p95", "theirs, ms", "p95", "ratio", "difference", "compile, s")
@@ -63,13 +63,17 @@ def about(case: Case, rows: Rows) -> str:
 def markdown_report(cases: Sequence[Case], rows: Rows, machine: Mapping[str, Any]) -> str:
     """All rows in one table, what is compared, how the times grow, and on what they were taken."""
     of = {case.name: [row for row in rows if row["kernel"] == case.name] for case in cases}
-    parts = ["# Kernels beside other libraries\n", table(COLUMNS, [cells(row) for row in rows])]
-    parts.append("".join(f"- `{case.name}` {about(case, of[case.name])}\n" for case in cases))
-    grown = [f"- `{name}`: {_growth(slopes(rows))}\n" for name, rows in of.items() if slopes(rows)]
-    if grown:
-        parts += ["Growth with the size N:\n", "".join(grown)]
-    parts.append(f"{_HOW} {_on_what(rows, machine)}\n")
-    return "\n".join(parts)
+    grown = [f"`{name}`: {_growth(slopes(rows))}" for name, rows in of.items() if slopes(rows)]
+    return to_markdown(
+        [
+            Heading("Kernels beside other libraries", 1),
+            Table([COLUMNS, *map(cells, rows)]),
+            Bullets([f"`{case.name}` {about(case, of[case.name])}" for case in cases]),
+            Paragraph("Growth with the size N:" if grown else ""),
+            Bullets(grown),
+            Paragraph(f"{_HOW} {_on_what(rows, machine)}"),
+        ]
+    )
 
 
 def picture(cases: Sequence[Case], rows: Rows) -> bytes:

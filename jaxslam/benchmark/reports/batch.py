@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxslam.benchmark.reports.markdown import table
+from jaxslam.benchmark.reports.document import Heading, Paragraph, Table, to_markdown
 from jaxslam.visualization.plots import png
 
 COLUMNS = (
@@ -52,8 +52,9 @@ def cells(row: Mapping[str, Any]) -> list[str]:
 def markdown_report(content: Mapping[str, Any]) -> str:
     """What `batch.json` holds, as a table, and how it was measured."""
     width, height = content["size"]
-    title = f"# Many clips at once: {content['frames']} frames of {width} x {height} each\n"
-    return "\n".join([title, table(COLUMNS, [cells(row) for row in content["rows"]]), f"{how(content)}\n"])
+    title = f"Many clips at once: {content['frames']} frames of {width} x {height} each"
+    table = Table([COLUMNS, *map(cells, content["rows"])])
+    return to_markdown([Heading(title, 1), table, Paragraph(how(content))])
 
 
 def how(content: Mapping[str, Any]) -> str:

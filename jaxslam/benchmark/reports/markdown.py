@@ -1,9 +1,10 @@
-"""What a suite has shown, as Markdown; and the tables of which the HTML page is made too."""
+"""Reports of suites: tables of errors and times beside published figures, and warnings about them."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
+from jaxslam.benchmark.reports.document import Block, Bullets, Heading, Image, Paragraph, Table, to_markdown
 from jaxslam.benchmark.suites.aggregate import (
     ACCURACY,
     RUNNING,
@@ -40,32 +41,51 @@ _MARK = "*"
 
 
 def markdown_report(suite: Suite, results: Sequence[Mapping[str, Any]], missing: Mapping[str, str]) -> str:
-    """The report of a suite.
+    """Render the report of a suite as Markdown.
 
     Args:
-        suite: What was run.
-        results: Of every planned run, as `Collected.every` gives them.
-        missing: Names of what was not run, with the reason.
+        suite: Suite that was run.
+        results: Results of all planned runs, from `Collected.every`.
+        missing: Reasons why sequences were not run, by name.
     """
-    results = with_shown_labels(results)
-    rows = rows_of(results)
-    parts = [f"# {suite.name}\n", f"{suite.about}\n" if suite.about else ""]
-    parts.append(_markdown(overview_table(suite, rows)))
-    parts += [f"- {line}\n" for line in (*summary_lines(suite, rows), *warnings(suite, results))]
-    parts.append(_markdown(kitti_means(suite, rows)))
+    return to_markdown(suite_report(suite, with_shown_labels(results), missing))
+
+
+def suite_report(
+    suite: Suite,
+    results: Sequence[Mapping[str, Any]],
+    missing: Mapping[str, str],
+    images: Mapping[str, Sequence[Image]] | None = None,
+) -> Iterator[Block]:
+    """Make the report of a suite, block by block.
+
+    Args:
+        suite: Suite that was run.
+        results: Results of all planned runs, from `with_shown_labels`.
+        missing: Reasons why sequences were not run, by name.
+        images: Images of each sequence by its name, and images of the whole suite under an empty name.
+    """
+    rows, images = rows_of(results), images or {}
+    yield Heading(suite.name, 1)
+    yield Paragraph(suite.about)
+    yield Table(overview_table(suite, rows))
+    yield Bullets(summary_lines(suite, rows))
+    yield Bullets(warnings(suite, results), is_warning=True)
+    yield Table(kitti_means(suite, rows))
+    yield from images.get("", ())
     for sequence, of_it in by_sequence(rows).items():
-        parts.append(f"## {sequence}\n")
+        yield Heading(sequence)
         tables = (figure_table(of_it, ACCURACY), figure_table(of_it, RUNNING))
-        parts += [_markdown(found) for found in (*tables, *published_tables(suite, sequence, of_it))]
-        parts += [f"- {line}\n" for line in failures(of_it)]
+        yield from map(Table, (*tables, *published_tables(suite, sequence, of_it)))
+        yield Bullets(list(failures(of_it)), is_warning=True)
+        yield from images.get(sequence, ())
     if missing:
-        parts.append("## Not run\n")
-        parts += [f"- {name}: {why}\n" for name, why in missing.items()]
-    known = protocols(suite, rows)
-    if known:
-        parts += ["## How published figures came about\n", *(f"- {line}\n" for line in known)]
-    parts.append(how(results))
-    return "\n".join(part for part in parts if part)
+        yield Heading("Not run")
+        yield Bullets([f"{name}: {why}" for name, why in missing.items()])
+    if known := protocols(suite, rows):
+        yield Heading("How published figures came about")
+        yield Bullets(known)
+    yield Paragraph(how(results))
 
 
 def overview_table(suite: Suite, rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
@@ -240,17 +260,11 @@ def failures(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
             yield f"{row['label']}: {row['failed']} runs failed: {'; '.join(row['problems'])}"
 
 
-def table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown."""
-    lines = (columns, ["---"] * len(columns), *rows)
-    return "".join(f"| {' | '.join(text.replace('|', chr(92) + '|') for text in line)} |\n" for line in lines)
-
-
 def how(results: Sequence[Mapping[str, Any]]) -> str:
     """On what the runs were made, and what the figures mean."""
     done = [result for result in results if result["status"] == "done"]
     if not done:
-        return "No run was finished.\n"
+        return "No run was finished."
     machines = sorted({f"{result['cpu']}, {result['cores']} cores" for result in done})
     modes = sorted({_mode(result) for result in done})
     return (
@@ -262,12 +276,8 @@ def how(results: Sequence[Mapping[str, Any]]) -> str:
         f" First loss: the earliest of the runs; memory: the most. LK: OpenCV's optical flow of 1000 points in one"
         f" thread, on the same machine."
         f"{_INLINE if any(result['deterministic'] for result in done) else ''}"
-        f" Runs: {'; '.join(modes)}. Machine: {'; '.join(machines)}. jaxslam: {', '.join(_versions(done))}.\n"
+        f" Runs: {'; '.join(modes)}. Machine: {'; '.join(machines)}. jaxslam: {', '.join(_versions(done))}."
     )
-
-
-def _markdown(lines: Sequence[Sequence[str]]) -> str:
-    return table(lines[0], lines[1:]) if lines else ""
 
 
 def _counts(verdicts: Mapping[str, int]) -> str:

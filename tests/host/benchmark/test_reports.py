@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 from made_results import done, not_done
 
+from jaxslam.benchmark.reports.document import Bullets, Heading, Image, Paragraph, Table, to_html, to_markdown
 from jaxslam.benchmark.reports.html import html_report
 from jaxslam.benchmark.reports.markdown import (
     markdown_report,
@@ -14,7 +15,6 @@ from jaxslam.benchmark.reports.markdown import (
     published_table,
     published_tables,
     summary_lines,
-    table,
     warnings,
     without_network,
 )
@@ -253,7 +253,21 @@ class TestRemarks:
         ]
 
     def test_bar_in_a_label(self) -> None:
-        assert table(["a"], [["x|y"]]).splitlines()[-1] == r"| x\|y |"
+        assert to_markdown([Table([["a"], ["x|y"]])]).splitlines()[-1] == r"| x\|y |"
+
+    def test_both_renderings_of_a_report(self) -> None:
+        blocks = (Heading("<a>"), Paragraph("b & c"), Bullets(["d"], is_warning=True), Table([["e"], ["worse"]]))
+        image = Image(b"f", '"g"', "jpeg", is_folded=True)
+        empty = (Paragraph(""), Bullets([]), Table([]))
+        assert to_markdown([*blocks, image, *empty]) == (
+            '## <a>\n\nb & c\n\n- d\n\n| e |\n| --- |\n| worse |\n\n!["g"](data:image/jpeg;base64,Zg==)\n'
+        )
+        page = to_html("<t>", [*blocks, image, *empty])
+        assert "<title>&lt;t&gt;</title>" in page
+        assert '<h2>&lt;a&gt;</h2>\n<p>b &amp; c</p>\n<ul class="failed"><li>d</li></ul>\n' in page
+        assert '<td class="worse">worse</td>' in page
+        assert '<details><summary>&quot;g&quot;</summary><figure><img alt="&quot;g&quot;" src="data:image/jpeg' in page
+        assert to_html("t", empty) == to_html("t", [])
 
 
 def test_long_labels_leave_room() -> None:
