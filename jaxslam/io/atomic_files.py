@@ -1,4 +1,4 @@
-"""Writing files so that a reader sees all of one or nothing, and checking before hours of work that one can."""
+"""Write files atomically, and check before hours of work that they can be written."""
 
 import contextlib
 import os
@@ -12,16 +12,21 @@ from pathlib import Path
 from jaxslam.errors import JaxSlamError
 
 _SPACE_BYTES = 1 << 20
-"""Free space without which no work is begun: the trajectories and tables of a run of some minutes take as much."""
+"""Free space that must be available before work begins. The trajectories and tables of a run of a few minutes take
+this much."""
 
 
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike[str], error: type[JaxSlamError] = JaxSlamError) -> Iterator[Path]:
-    """A temporary name beside a file, to be written under; the file is moved to its place when the block ends well.
+    """Yield a temporary path beside a file; what is written there replaces the file if the block raises no error.
 
-    A crash leaves the old file as it was; what a killed process left under a temporary name is removed by the next one
-    that writes the same file. The content is on the disk before the file gets its name. A link stays, and the file it
-    leads to is replaced. The folder must exist; the file gets the usual permissions.
+    A crash leaves the old file unchanged. The temporary file of a killed process is removed by the next process that
+    writes the same file. The content is flushed to the disk before the file is renamed. A symbolic link is kept, and
+    the file that it points to is replaced. The folder must exist. The file gets the default permissions.
+
+    Args:
+        path: File to replace or create.
+        error: Class of the error to raise.
 
     Raises:
         JaxSlamError: Of class `error`, if the file cannot be written.
@@ -42,7 +47,12 @@ def replacing(path: str | os.PathLike[str], error: type[JaxSlamError] = JaxSlamE
 
 
 def write_atomically(path: str | os.PathLike[str], data: bytes, error: type[JaxSlamError] = JaxSlamError) -> None:
-    """Write a file as `replacing` does.
+    """Write a file atomically, as `replacing` does.
+
+    Args:
+        path: File to replace or create.
+        data: Content of the file.
+        error: Class of the error to raise.
 
     Raises:
         JaxSlamError: Of class `error`, if the file cannot be written.
@@ -52,10 +62,10 @@ def write_atomically(path: str | os.PathLike[str], data: bytes, error: type[JaxS
 
 
 def make_folder(path: Path, error: type[JaxSlamError] = JaxSlamError, option: str = "--out") -> None:
-    """Make a folder for results, if it is not there, and see whether files can be written in it: now, not after hours.
+    """Create a folder for results if it is missing, and check before hours of work that files can be written in it.
 
     Args:
-        path: The folder.
+        path: Folder to create.
         error: Class of the error to raise.
         option: Option of the command that named the folder, for the error message.
 
@@ -72,10 +82,10 @@ def make_folder(path: Path, error: type[JaxSlamError] = JaxSlamError, option: st
 
 
 def check_writable(path: Path, option: str, error: type[JaxSlamError] = JaxSlamError) -> None:
-    """See whether a file could be written with `replacing`: now, not after hours. Nothing is written to the file.
+    """Check before hours of work that a file could be written with `replacing`. The file is not changed.
 
     Args:
-        path: The file; it need not exist, its folder must.
+        path: File to check. It need not exist, but its folder must.
         option: Option of the command that named the file, for the error message.
         error: Class of the error to raise.
 
@@ -93,7 +103,7 @@ def check_writable(path: Path, option: str, error: type[JaxSlamError] = JaxSlamE
 
 
 def _target(path: str | os.PathLike[str], error: type[JaxSlamError]) -> Path:
-    """The regular file that a path leads to, through links, or will lead to.
+    """Follow a path through symbolic links to a regular file, which need not exist.
 
     Raises:
         JaxSlamError: Of class `error`, if the path is empty, or leads to a folder, a device, a pipe or in a circle.
@@ -117,7 +127,7 @@ def _target(path: str | os.PathLike[str], error: type[JaxSlamError]) -> Path:
 
 
 def _remove_leftovers(target: Path) -> None:
-    """Remove what processes of this machine that are no more left under temporary names of a file."""
+    """Remove the temporary files that killed processes of this machine left beside a file."""
     pattern = re.compile(rf"\.{re.escape(target.name)}\.(\d+)@{re.escape(platform.node())}\.tmp")
     with os.scandir(target.parent) as entries:
         found = [(entry.path, pattern.fullmatch(entry.name)) for entry in entries]
@@ -138,7 +148,7 @@ def _runs(process: int) -> bool:
 
 
 def _flush(path: Path) -> None:
-    """Wait until a file or folder is on the disk, so that a power cut leaves no empty file under a good name."""
+    """Flush a file or folder to the disk, so that a power failure cannot leave an empty file under the final name."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -147,7 +157,7 @@ def _flush(path: Path) -> None:
 
 
 def _write_probe(folder: Path) -> None:
-    """Write as much as a small result takes to a file in a folder, and remove it.
+    """Write a file of the size of a small result in a folder, and remove it.
 
     Raises:
         OSError: If there is no such folder, it cannot be written to, or its disk is full.
@@ -159,5 +169,5 @@ def _write_probe(folder: Path) -> None:
 
 
 def _reason(failure: OSError) -> str:
-    """What went wrong, without the temporary name of the file."""
+    """Return the reason of a failure, without the temporary name of the file."""
     return failure.strerror or str(failure)

@@ -1,4 +1,4 @@
-"""Fetching one file over the web: resumed where it was cut, checked, and in place as a whole or not at all."""
+"""Download a file: interrupted downloads are resumed, and only a complete and checked file appears."""
 
 import hashlib
 import http.client
@@ -18,55 +18,62 @@ from jaxslam.errors import DownloadError
 from jaxslam.io.http_deadline import TooSlowError, paced_opener
 
 Progress: TypeAlias = Callable[[int, int | None], None]
-"""Is told the bytes that are there and the bytes there will be, if that is known."""
+"""Function that is called with the bytes received so far, and the bytes of the whole file or `None` if unknown."""
 
 _CHUNK_BYTES = 1 << 16
-_TRANSIENT = frozenset({408, 425, 429, 500, 502, 503, 504})  # HTTP statuses that may be others in a moment
+_TRANSIENT = frozenset({408, 425, 429, 500, 502, 503, 504})  # HTTP statuses of temporary failures
 _TIMEOUT_S = 20.0
 _MAX_BYTES = 1 << 36
-"""Of a file whose length neither the server nor the caller knows; it could have no end."""
+"""Size limit of a file whose length neither the server nor the caller knows; such a response could be endless."""
 _CHANGED = "the file on the server has changed"
 
 
 class _TransientError(Exception):
-    """Worth another try; never leaves this file."""
+    """A temporary failure, after which the download is tried again. This error never leaves the module."""
 
 
 @dataclass(frozen=True)
 class _Version:
-    """What the server has, as it said; kept beside a part, so that it is not continued with something else."""
+    """Version of the file on the server, stored beside a partial download that only it may complete."""
 
     url: str
+    """Address of the file."""
     validator: str | None = None
-    """Strong ETag or date, for `If-Range` (RFC 9110, section 13.1.5)."""
+    """Strong ETag or date for `If-Range` (RFC 9110, section 13.1.5); `None` if the server gave none."""
     total: int | None = None
-    """Bytes of the whole."""
+    """Size of the whole file in bytes; `None` if the server did not give it."""
 
 
 @dataclass(frozen=True)
 class _Wanted:
-    """What to fetch, and where it grows."""
+    """A download in progress."""
 
     url: str
+    """Address of the file."""
     part: Path
+    """File that received bytes are appended to."""
     sha256: str | None
+    """Expected SHA-256 of the whole file; `None` if unknown."""
     size: int | None
+    """Expected size of the whole file in bytes; `None` if unknown."""
     progress: Progress | None
+    """Function that is called after every chunk; `None` for no calls."""
     timeout_s: float
+    """Timeout of the connection in seconds."""
 
     @property
     def note(self) -> Path:
-        """File that says which version the part is of."""
+        """File with the version of the partial download."""
         return self.part.with_name(f"{self.part.name}.json")
 
     @property
     def length(self) -> int:
-        """Bytes that are there."""
+        """Number of bytes received so far."""
         return self.part.stat().st_size if self.part.is_file() else 0
 
     def forget(self) -> None:
-        """Begin anew the next time."""
-        self.part.unlink(missing_ok=True)  # first, so that a note never speaks of another part
+        """Delete the partial download, so that the next try starts from the beginning."""
+        self.part.unlink(missing_ok=True)  # first, so that a note never describes another part
         self.note.unlink(missing_ok=True)
 
 
@@ -80,23 +87,25 @@ def download(
     timeout_s: float = _TIMEOUT_S,
     waits_s: Sequence[float] = (0.5, 2.0, 6.0),
 ) -> None:
-    """Fetch a file; an old one of that name is replaced once the new one is whole and has been checked.
+    """Download a file; an existing file is replaced once the new one is complete and checked.
 
-    Bytes go to `PATH.part`, which stays when the connection or the user ends it, and the next call goes on from there
-    unless the file on the server has changed. Proxies are those of the environment (`HTTPS_PROXY`, `NO_PROXY`, ...).
-    One process at a time for a path.
+    Received bytes are written to `PATH.part`, which is kept if the connection or the user interrupts the download. The
+    next call resumes from there unless the file on the server has changed. Proxies are taken from the environment
+    (`HTTPS_PROXY`, `NO_PROXY`, ...). Only one process may download to a path at a time.
 
     Args:
-        url: http or https.
-        path: Where the file goes; folders are made.
-        sha256: Of the whole file, 64 hexadecimal digits, if known.
-        size: Bytes of the whole file, if known.
-        progress: Called after each piece.
-        timeout_s: Longest silence of the server, seconds; and how long it may give less than 1 kB/s.
-        waits_s: Seconds before each further try after a passing failure; a try that got further starts them anew.
+        url: Address that begins with `http://` or `https://`.
+        path: File to write; its folders are created.
+        sha256: SHA-256 of the whole file as 64 hexadecimal digits; `None` if unknown.
+        size: Size of the whole file in bytes; `None` if unknown.
+        progress: Function that is called after every chunk.
+        timeout_s: Longest time in seconds that the server may send nothing, or less than 1 kB/s.
+        waits_s: Waiting times in seconds before each further try after a temporary failure. They start again after a
+            try that received more bytes than any before.
 
     Raises:
-        DownloadError: If it cannot be fetched or written, or is not the file expected; what came is deleted then.
+        DownloadError: If the file cannot be downloaded or written, or is not the expected one; then the received bytes
+            are deleted.
     """
     wanted = _Wanted(url, Path(f"{os.fspath(path)}.part"), sha256, size, progress, timeout_s)
     try:
@@ -112,17 +121,17 @@ def download(
 
 
 def sha256_of(path: str | os.PathLike[str]) -> str:
-    """The SHA-256 of a file, 64 lower-case hexadecimal digits.
+    """Compute the SHA-256 of a file as 64 lowercase hexadecimal digits.
 
     Raises:
-        OSError: If it cannot be read.
+        OSError: If the file cannot be read.
     """
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _fetch_with_retries(wanted: _Wanted, waits_s: Sequence[float]) -> None:
-    """Fetch until it is whole, or until as many tries as there are waits got no further than the best before."""
+    """Download until the file is complete, or until the last tries, one more than waits, received no further bytes."""
     tries, best = 0, wanted.length
     while True:
         try:
@@ -137,7 +146,7 @@ def _fetch_with_retries(wanted: _Wanted, waits_s: Sequence[float]) -> None:
 
 
 def _fetch(wanted: _Wanted) -> None:
-    """One try: ask for what is missing and append it, or begin anew if the server gives the whole file."""
+    """Request the missing bytes and append them, or start again if the server sends the whole file."""
     if not wanted.url.lower().startswith(("http://", "https://")):
         raise DownloadError("expected an address that begins with http:// or https://")
     known = _known(wanted)
@@ -162,7 +171,7 @@ def _fetch(wanted: _Wanted) -> None:
 
 
 def _known(wanted: _Wanted) -> _Version:
-    """What the part is of; without a part that could be checked and continued, there is none afterwards."""
+    """Read the version of the partial download; delete a partial download that cannot be resumed and checked."""
     fresh = _Version(wanted.url)
     try:
         known = _Version(**json.loads(wanted.note.read_text(encoding="utf-8")))
@@ -231,7 +240,7 @@ def _append(wanted: _Wanted, response: Any, offset: int, total: int | None) -> N
 
 
 def _read(response: Any) -> bytes:
-    """What has come, nothing at the end; a function of its own, for a failing disk is another matter."""
+    """Read a chunk, empty at the end; separate, so that disk errors are not taken for network errors."""
     try:
         return response.read1(_CHUNK_BYTES)
     except TooSlowError as failure:
@@ -241,7 +250,7 @@ def _read(response: Any) -> bytes:
 
 
 def _offered(url: str, response: Any) -> tuple[_Version, int | None]:
-    """What the server has, and where the part it sends begins; `None` if it sends the whole."""
+    """Return the version on the server, and the offset of the sent bytes; `None` if it sends the whole file."""
     etag, length = response.headers.get("ETag"), response.headers.get("Content-Length", "")
     strong = etag is not None and not etag.startswith("W/")
     validator = etag if strong else response.headers.get("Last-Modified")
@@ -255,13 +264,13 @@ def _offered(url: str, response: Any) -> tuple[_Version, int | None]:
 
 
 def _differ(known: _Version, now: _Version) -> bool:
-    """Whether two answers speak of different files; some servers do not look at `If-Range`."""
+    """Return whether two responses are about different files; some servers ignore `If-Range`."""
     pairs = ((known.validator, now.validator), (known.total, now.total))
     return any(old is not None and new is not None and old != new for old, new in pairs)
 
 
 def _check(wanted: _Wanted) -> None:
-    """Raise `DownloadError`, and delete what came, if it is not the file expected."""
+    """Raise `DownloadError` and delete the received bytes if they are not the expected file."""
     problem = None
     if wanted.size is not None and wanted.length != wanted.size:
         problem = f"expected {wanted.size} bytes, got {wanted.length}"

@@ -1,18 +1,18 @@
-"""Whether a folder is the user's own, so that what lies in it can be run."""
+"""Check that a folder belongs to the user alone, so that its files are safe to execute."""
 
 import os
 import stat
 from pathlib import Path
 
 OWN_MODE = 0o755
-"""Permissions of a folder to make that `why_not_own` accepts, whatever the umask is."""
+"""Permissions for a new folder that `why_not_own` accepts under every umask."""
 
 
 def why_not_own(folder: Path) -> str | None:
-    """Why others than the user may have put files into a folder, as the end of a sentence; `None` if nobody can have.
+    """Explain why other users may have written to a folder, as the end of a sentence; `None` if no other user can.
 
     Raises:
-        OSError: If the folder is not there or cannot be looked at.
+        OSError: If the folder is missing or cannot be read.
     """
     found = folder.stat()
     if found.st_uid != os.geteuid():

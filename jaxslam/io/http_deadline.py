@@ -1,4 +1,4 @@
-"""HTTP that gives up a server which sends bytes at a drip: `urllib` waits for each byte anew, and so for ever."""
+"""HTTP connections that abort if a server sends too slowly; the timeout of `urllib` restarts with every byte."""
 
 import http.client
 import io
@@ -8,32 +8,32 @@ import urllib.request
 from typing import Any
 
 _MIN_BYTES_PER_S = 1000
-"""A server that gives less would not be done with a recording in a month."""
+"""Slowest accepted rate; at a lower one, a recording would take more than a month."""
 
 
 class TooSlowError(TimeoutError):
-    """A server has given less than 1 kB/s for as long as the timeout of its connection."""
+    """A server has sent less than 1 kB/s for the duration of the connection's timeout."""
 
 
 def paced_opener() -> urllib.request.OpenerDirector:
-    """What opens addresses as `urllib.request.urlopen` does; reading headers or content may raise `TooSlowError`."""
+    """Make an opener like that of `urllib.request.urlopen`, except that reading may raise `TooSlowError`."""
     return urllib.request.build_opener(_HttpHandler, _HttpsHandler)
 
 
 class _PacedReader(io.RawIOBase):
-    """The bytes of a socket, counted."""
+    """Reader of a socket that measures the rate of its bytes."""
 
     def __init__(self, sock: socket.socket, timeout_s: float) -> None:
-        """Read from a file of the socket, which stays open until both are closed."""
+        """Open a file of the socket; the socket stays open until both are closed."""
         self._file, self._timeout_s = sock.makefile("rb", buffering=0), timeout_s
         self._began_s, self._num_bytes = time.monotonic(), 0
 
     def readable(self) -> bool:
-        """It is."""
+        """Return true."""
         return True
 
     def readinto(self, buffer: Any, /) -> int:
-        """Some bytes; 0 at the end."""
+        """Read some bytes into the buffer, and return their number; 0 at the end."""
         num_bytes = self._file.readinto(buffer) or 0
         self._num_bytes += num_bytes
         passed_s = time.monotonic() - self._began_s
@@ -44,13 +44,13 @@ class _PacedReader(io.RawIOBase):
         return num_bytes
 
     def close(self) -> None:
-        """The file of the socket too."""
+        """Close the file of the socket, too."""
         self._file.close()
         super().close()
 
 
 class _PacedResponse(http.client.HTTPResponse):
-    """Reads from the socket through a `_PacedReader`, if the socket has a timeout."""
+    """Response that is read through a `_PacedReader` if the socket has a timeout."""
 
     def __init__(self, sock: socket.socket, *arguments: Any, **options: Any) -> None:
         super().__init__(sock, *arguments, **options)

@@ -1,4 +1,4 @@
-"""Times as text: decimal seconds in files, int64 nanoseconds inside, and nothing lost in between."""
+"""Convert between decimal seconds, as in files, and int64 nanoseconds, without loss."""
 
 from decimal import Context, Decimal, InvalidOperation
 
@@ -6,18 +6,20 @@ from jaxslam.errors import JaxSlamError
 
 _LAST_S = 9_200_000_000  # int64 nanoseconds end in the year 2262
 _UNITS = ((10**17, "nanoseconds"), (10**14, "microseconds"), (10**11, "milliseconds"))
-"""From how many seconds on, in the year 5138 or later, a time rather counts something smaller."""
+"""Smallest numbers, in seconds the year 5138 or later, that are probably counts of smaller units."""
 _EXACT = Context(prec=60)
 
 
 def nanoseconds(text: str, place: str, error: type[JaxSlamError], *, least_s: int = -_LAST_S) -> int:
-    """Nanoseconds of decimal seconds: exact, rounded to even below one nanosecond. A float would lose digits.
+    """Convert decimal seconds to nanoseconds, exactly, with half nanoseconds rounded to even.
+
+    A float would lose digits.
 
     Args:
         text: Decimal seconds, with or without an exponent.
-        place: Where the text stands, for the message: `file:line`.
+        place: Place of the text, `file:line`, for the message.
         error: Class of the error to raise.
-        least_s: The earliest time that is taken for one, seconds.
+        least_s: Earliest accepted time in seconds.
 
     Raises:
         JaxSlamError: Of class `error`, if the text is not a number, not finite, too early, or too late for int64;
@@ -35,6 +37,6 @@ def nanoseconds(text: str, place: str, error: type[JaxSlamError], *, least_s: in
 
 
 def decimal_seconds(stamp_ns: int, digits: int = 9) -> str:
-    """Seconds with so many decimals, 1 to 9; what is finer is cut off."""
+    """Format nanoseconds as seconds with 1 to 9 decimals; further digits are cut off."""
     whole, rest = divmod(abs(stamp_ns), 10**9)
     return f"{'-' if stamp_ns < 0 else ''}{whole}.{rest:09d}"[: digits - 9 or None]

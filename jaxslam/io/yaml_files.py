@@ -1,4 +1,4 @@
-"""Reading YAML: plain safe YAML, strict about duplicate keys, tolerant of OpenCV's dialect."""
+"""Read safe YAML; duplicate keys are refused, and OpenCV's dialect is accepted."""
 
 import re
 import reprlib
@@ -11,7 +11,7 @@ import yaml
 from jaxslam.errors import JaxSlamError, nearest, one_line
 
 _MAX_CHARACTERS = 1 << 17
-"""Of a file: more take PyYAML longer than a second. What people write by hand has a tenth of it."""
+"""Size limit of a file. PyYAML takes longer than a second for more; files written by hand have a tenth of it."""
 _OPENCV_HEADER = re.compile(r"\A%YAML:[^\n]*")
 _FLOAT_TAG, _BOOL_TAG = "tag:yaml.org,2002:float", "tag:yaml.org,2002:bool"
 _NUMBER = r"[-+]?(?:\d+\.\d*|\.\d+|\d+(?=[eE]))(?:[eE][-+]?\d+)?"
@@ -28,7 +28,7 @@ class _Loader(yaml.SafeLoader):
     }
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
-        """A value; what PyYAML's constructors raise for a tag that does not fit, such as `!!bool z`, has a line."""
+        """Construct a value; errors about a tag that does not fit, such as `!!bool z`, get the number of the line."""
         try:
             value = super().construct_object(node, deep)
             if isinstance(value, int):
@@ -40,7 +40,7 @@ class _Loader(yaml.SafeLoader):
         return value
 
     def construct_mapping(self, node: yaml.Node, deep: bool = False) -> dict[Any, Any]:
-        """A mapping, refused when a key stands twice (PyYAML would keep the last)."""
+        """Construct a mapping; duplicate keys are refused (PyYAML would keep the last)."""
         if not isinstance(node, yaml.MappingNode):
             problem = f"expected `key: value` lines, got {node.value!r:.40}"
             raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark)
@@ -62,11 +62,16 @@ _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _Loader.construct_ope
 
 
 def parse_yaml(text: str, origin: str, error: type[JaxSlamError]) -> Any:
-    """What `text` holds: a scalar, list or mapping, or `None` if it is empty.
+    """Parse YAML into a scalar, list or mapping, or `None` if the text is empty.
+
+    Args:
+        text: The YAML.
+        origin: Name of the source in messages, such as the path of a file.
+        error: Class of the error to raise.
 
     Raises:
-        JaxSlamError: Of class `error`, naming `origin` and the line, if it is no YAML, a key stands twice, or it is too
-            long or nested too deep.
+        JaxSlamError: Of class `error`, naming `origin` and the line, if the text is no YAML, has a
+            duplicate key, or is too long or nested too deep.
     """
     if len(text) > _MAX_CHARACTERS:
         raise error(f"{origin}: expected at most {_MAX_CHARACTERS} characters of YAML, got {len(text)}")
@@ -86,14 +91,14 @@ def parse_yaml(text: str, origin: str, error: type[JaxSlamError]) -> Any:
 
 
 def _num_values(content: Any, known: dict[int, int]) -> int:
-    """How many values there are if each alias counts as what it stands for.
+    """Count the values, with every alias counted as often as it is used.
 
     Args:
-        content: A scalar, list or mapping.
-        known: The result for lists and mappings already seen, by their `id`.
+        content: Scalar, list or mapping.
+        known: Counts of the lists and mappings counted so far, by their `id`.
 
     Raises:
-        RecursionError: If it holds itself.
+        RecursionError: If a list or mapping holds itself.
     """
     if not isinstance(content, dict | list | tuple | set):
         return 1
@@ -104,10 +109,10 @@ def _num_values(content: Any, known: dict[int, int]) -> int:
 
 
 def read_yaml(path: Path, error: type[JaxSlamError]) -> Any:
-    """What a YAML file holds: a scalar, list or mapping, or `None` if it is empty.
+    """Read a YAML file as a scalar, list or mapping, or `None` if the file is empty.
 
     Raises:
-        JaxSlamError: Of class `error`, naming the file, if it is missing, no text or no YAML.
+        JaxSlamError: Of class `error`, naming the file, if the file is missing, no text or no YAML.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
@@ -119,10 +124,10 @@ def read_yaml(path: Path, error: type[JaxSlamError]) -> Any:
 
 
 def read_mapping(path: Path, error: type[JaxSlamError]) -> dict[str, Any]:
-    """The mapping that a YAML file holds; empty if the file holds nothing but comments.
+    """Read the mapping in a YAML file; it is empty if the file holds only comments.
 
     Raises:
-        JaxSlamError: Of class `error`, naming the file, if it is missing, no text, no YAML or no mapping.
+        JaxSlamError: Of class `error`, naming the file, if the file is missing, no text, no YAML or no mapping.
     """
     content = read_yaml(path, error)
     return {} if content is None else checked_mapping(content, str(path), error)
@@ -147,7 +152,14 @@ def checked_mapping(content: object, place: str, error: type[JaxSlamError]) -> d
 def check_keys(
     content: Mapping[str, Any], known: Collection[str], needed: Collection[str], place: str, error: type[JaxSlamError]
 ) -> None:
-    """Refuse a mapping with a key that is not known, or without one that is needed.
+    """Refuse a mapping that has an unknown key, or lacks a required one.
+
+    Args:
+        content: Mapping to check.
+        known: Keys that are allowed.
+        needed: Keys that are required.
+        place: File and section of the mapping, as errors name it.
+        error: Class of the error to raise.
 
     Raises:
         JaxSlamError: Of class `error`, naming `place` and the keys.

@@ -1,4 +1,4 @@
-"""What a run leaves behind of the dense map: points, octrees, a picture, and figures for the summary."""
+"""Write the dense map of a run: points, octrees, a picture, and figures for the summary."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,7 +16,7 @@ from jaxslam.trajectory.trajectory import Trajectory
 _POINTS = ("map.ply", "dense.png")
 _OCTREES = ("map.bt", "map.ot")
 DENSE_FILES = (*_POINTS, *_OCTREES)
-"""All that there is of a dense map; without depth at all, no octrees."""
+"""All files of a dense map. Octrees are written only if some depth was measured."""
 _PREFIX = "dense: "
 
 
@@ -26,13 +26,15 @@ def write_dense(
     """Write the dense map.
 
     Args:
-        folder: That is there.
-        dense: What made the map, if one was made.
-        path: Of the camera, for the picture.
-        ms: Times of stages; those of the dense map are `dense` and begin with `dense: `.
+        folder: Existing folder for the files.
+        dense: Dense mapping of the run; `None` if it was disabled.
+        path: Trajectory of the camera, which the picture shows.
+        ms: Durations of each stage in milliseconds. The stage `dense` is the dense map as a whole, and stages whose
+            names begin with `dense: ` are its parts.
 
     Returns:
-        Figures, and the names of the files; nothing without a map.
+        figures: Figures for `summary.json`; `None` without a dense map.
+        files: Names of the written files.
 
     Raises:
         MapFileError: If a file cannot be written.

@@ -1,4 +1,4 @@
-"""Tables of a run, a row a frame: what became of it, and how far its pose is from the truth. CSV files."""
+"""CSV tables of a run with one row per frame: its tracking status and times, and the error of its pose."""
 
 import csv
 import io
@@ -24,13 +24,13 @@ _EARLIER_NAMES = {"num_looked_up": "num_keyframe_matches"}
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Poses that were compared with the truth.
+    """Poses that were compared with the ground truth.
 
     Attributes:
-        timestamps_ns: `(m,)` when.
-        positions_m: `(m, 3)` where the camera was estimated to be, aligned with the truth.
-        reference_m: `(m, 3)` where it was.
-        errors_m: `(m,)` the distances.
+        timestamps_ns: `(m,)` timestamps in nanoseconds.
+        positions_m: `(m, 3)` estimated camera positions in meters, aligned with the ground truth.
+        reference_m: `(m, 3)` true camera positions in meters.
+        errors_m: `(m,)` distances between estimated and true positions in meters.
     """
 
     timestamps_ns: Int[np.ndarray, " m"]
@@ -40,7 +40,7 @@ class Errors:
 
 
 def write_frames(path: Path, records: Iterable[FrameRecord]) -> None:
-    """Write what became of every frame, under the names of `FrameRecord`; what a frame does not have is empty.
+    """Write the record of every frame, under the names of the fields of `FrameRecord`; missing values are empty.
 
     Raises:
         TrajectoryError: If the file cannot be written.
@@ -49,7 +49,7 @@ def write_frames(path: Path, records: Iterable[FrameRecord]) -> None:
 
 
 def write_errors(path: Path, evaluation: Evaluation) -> None:
-    """Write the poses that were compared with the truth, those of the estimate aligned.
+    """Write the estimated positions, aligned with the ground truth, beside the true ones.
 
     Raises:
         TrajectoryError: If the file cannot be written.
@@ -61,10 +61,10 @@ def write_errors(path: Path, evaluation: Evaluation) -> None:
 
 
 def read_errors(path: Path) -> Errors:
-    """Read what `write_errors` wrote.
+    """Read a file of `write_errors`.
 
     Raises:
-        TrajectoryError: If the file cannot be read, or holds something else.
+        TrajectoryError: If the file cannot be read or has other content.
     """
     rows = _read(path, _ERROR_COLUMNS)
     try:
@@ -76,10 +76,10 @@ def read_errors(path: Path) -> Errors:
 
 
 def read_track_ms(path: Path) -> Float[np.ndarray, " frames"]:
-    """How long tracking took, of every frame of a file of `write_frames` that has a time, milliseconds.
+    """Read the tracking times, in milliseconds, of all frames in a file of `write_frames` that have one.
 
     Raises:
-        TrajectoryError: If the file cannot be read, or holds something else.
+        TrajectoryError: If the file cannot be read or has other content.
     """
     column = _COLUMNS.index("track_ms")
     try:
@@ -113,7 +113,7 @@ def _write(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]])
 
 
 def _read(path: Path, columns: Sequence[str]) -> list[list[str]]:
-    """The rows below the heading."""
+    """Read the rows below the heading."""
     try:
         with path.open(newline="") as file:
             head, *rows = csv.reader(file)

@@ -1,4 +1,4 @@
-"""What a run leaves behind: trajectories, a log of its frames, a summary, the settings in effect, and pictures."""
+"""Write the results of a run: trajectories, a log of its frames, a summary, the settings in effect, and pictures."""
 
 import json
 from collections import Counter
@@ -34,19 +34,20 @@ _ERRORS, _FAILURES = "errors.csv", "failures.png"
 _OTHER_SUBMAP = "trajectory_submap_{}.txt"
 _OF_MASKS = ("masks.png", "masks.gif")
 RESULT_FILES = (*_ALWAYS, *_OF_THE_PATH, *_OF_THE_MAP, _ERRORS, _FAILURES, *_OF_MASKS, *DENSE_FILES)
-"""All that a run can leave behind: no path, no keyframes, no truth, no masks, no dense map, none of their files."""
+"""All files that a run can write. A run without a path, keyframes, ground truth, masks or a dense map writes none of
+the files about them."""
 
 
 @dataclass(frozen=True)
 class RunInfo:
-    """What the results of a run cannot tell by themselves.
+    """Facts about a run that its results do not hold.
 
     Attributes:
-        dataset: The recording.
+        dataset: Recording that was tracked.
         preset: Name of the preset.
-        wall_s: Duration of the run, seconds.
-        cut_short: Why the run ended before the recording did: "interrupted", "terminated", or an error; `None` if it
-            did not.
+        wall_s: Duration of the run in seconds.
+        cut_short: Reason why the run ended before the recording did: "interrupted", "terminated", or an error; `None`
+            if the run was complete.
     """
 
     dataset: Dataset
@@ -62,18 +63,19 @@ def write_results(
     info: RunInfo,
     pictures: RunPictures | None = None,
 ) -> tuple[dict[str, Any], Evaluation | None]:
-    """Write those of `RESULT_FILES` there is something for: trajectories, a summary, the settings, pictures.
+    """Write the files of `RESULT_FILES` that the run has content for: trajectories, a summary, settings and pictures.
 
     Args:
-        folder: Where they go; made if it is not there. Files of an earlier run are replaced, each in one piece, or
-            removed if this one has none.
-        slam: What tracked.
-        records: From `Slam.run`.
-        info: The recording and how it was run.
-        pictures: What was kept of its frames, to be shown.
+        folder: Folder of the files, which is created if missing. Files of an earlier run are replaced atomically, or
+            removed if this run does not write them.
+        slam: System that tracked the recording.
+        records: One record per frame, from `Slam.run`.
+        info: Recording, preset and duration of the run.
+        pictures: Frames that were kept to be shown.
 
     Returns:
-        The summary, and the evaluation if there is ground truth to compare with.
+        summary: Content of `summary.json`.
+        evaluation: Errors of the trajectory; `None` without ground truth.
     """
     folder.mkdir(parents=True, exist_ok=True)
     truth, trajectory = info.dataset.ground_truth, slam.trajectory  # made anew at each call
@@ -108,7 +110,7 @@ def write_results(
 
 
 def _write_other_submaps(folder: Path, slam: Slam) -> dict[str, int]:
-    """Write the trajectory of every submap that nothing links to the map's frame; gives files with numbers of poses."""
+    """Write the trajectory of every submap that is not linked to the world frame; return the poses in each file."""
     for file in folder.glob(_OTHER_SUBMAP.format("*")):
         file.unlink()
     others = {n: path for n, path in slam.trajectories.items() if n != slam.map.world_submap}
@@ -125,7 +127,7 @@ def _write_pictures(
     evaluation: Evaluation | None,
     pictures: RunPictures,
 ) -> list[str]:
-    """Write the pictures there is something for; gives the names of the files."""
+    """Write the pictures that the run has content for, and return the names of the files."""
     written: list[str] = []
     if len(trajectory):
         plot_trajectory(
@@ -153,13 +155,13 @@ def _write_pictures(
 
 
 def _title(slam: Slam, info: RunInfo) -> str:
-    """What was run, for a picture."""
+    """Return the title of the pictures: recording, preset, and why no network was used."""
     why = slam.without_network
     return f"{info.dataset.name}, {info.preset}" + ("" if why is None else f", without a network ({why})")
 
 
 def _worst(dataset: Dataset, evaluation: Evaluation | None) -> list[Snapshot]:
-    """The frame of the largest error, without points, if errors are known."""
+    """Return the frame with the largest error, without points; an empty list without an evaluation."""
     if evaluation is None:
         return []
     index = int(np.argmax(evaluation.errors_m))
@@ -172,11 +174,6 @@ def _worst(dataset: Dataset, evaluation: Evaluation | None) -> list[Snapshot]:
 def _summary(
     slam: Slam, records: Sequence[FrameRecord], info: RunInfo, evaluation: Evaluation | None
 ) -> dict[str, Any]:
-    statuses = Counter(record.status.name for record in records)
-    lost = [record for record in records if record.status in (TrackStatus.LOST, TrackStatus.REJECTED)]
-    dropped = statuses[TrackStatus.DROPPED.name]
-    given = len(records) - dropped
-    tracked = given - len(lost)
     figures = evaluation.summary() if evaluation is not None else {}
     wanted = ("ate_rmse_m", "ate_sim3_rmse_m", "sim3_scale", "rpe_trans_m_per_s", "rpe_rot_deg_per_s")
     return {
@@ -189,14 +186,7 @@ def _summary(
         "deterministic": slam.config.run.in_turn,
         "realtime": slam.config.run.realtime,
         "seed": slam.config.run.seed,
-        "frames": len(records),
-        "tracked": tracked,
-        "tracked_percent": round(100 * tracked / max(given, 1), 3),  # of the frames that were not dropped
-        "dropped": dropped,
-        "dropped_percent": round(100 * dropped / max(len(records), 1), 3),
-        "status_counts": dict(sorted(statuses.items())),
-        "first_loss_s": (lost[0].timestamp_ns - records[0].timestamp_ns) * 1e-9 if lost else None,
-        "relocalized": statuses[TrackStatus.RELOCALIZED.name],
+        **_frame_counts(records),
         "keyframes": len(slam.map.ids),
         "keyframes_made": sum(record.is_keyframe for record in records),
         "map_points": len(slam.map.points.ids),
@@ -219,8 +209,27 @@ def _summary(
     }
 
 
+def _frame_counts(records: Sequence[FrameRecord]) -> dict[str, Any]:
+    """Count the frames that were tracked, dropped or relocalized."""
+    statuses = Counter(record.status.name for record in records)
+    lost = [record for record in records if record.status in (TrackStatus.LOST, TrackStatus.REJECTED)]
+    dropped = statuses[TrackStatus.DROPPED.name]
+    given = len(records) - dropped
+    tracked = given - len(lost)
+    return {
+        "frames": len(records),
+        "tracked": tracked,
+        "tracked_percent": round(100 * tracked / max(given, 1), 3),  # of the frames that were not dropped
+        "dropped": dropped,
+        "dropped_percent": round(100 * dropped / max(len(records), 1), 3),
+        "status_counts": dict(sorted(statuses.items())),
+        "first_loss_s": (lost[0].timestamp_ns - records[0].timestamp_ns) * 1e-9 if lost else None,
+        "relocalized": statuses[TrackStatus.RELOCALIZED.name],
+    }
+
+
 def _occluded_shares(slam: Slam) -> list[float]:
-    """Share of the points of each keyframe that are OCCLUDED; nothing if the settings do not ask for it."""
+    """Return the share of the points of each keyframe that are OCCLUDED; empty if occlusion states are disabled."""
     return occluded_shares(slam.map).tolist() if slam.config.dynamics.occlusion.enabled else []
 
 
