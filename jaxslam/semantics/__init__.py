@@ -1,6 +1,6 @@
-"""Networks that find people and other movable things in an image, whatever family they are of.
+"""Networks of several families that find people and other movable objects in an image.
 
-A detector is any callable that takes an image and returns `Detections`; `load_detector` makes one of an ONNX file.
+A detector is any callable that takes an image and returns `Detections`; `load_detector` makes one from an ONNX file.
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-"""A detector whose answers are checked, and that notices swapped colors."""
+"""A detector whose results are checked, and that notices swapped color channels."""
 
 import numpy as np
 from jaxtyping import UInt8
@@ -10,28 +10,28 @@ from jaxslam.semantics.detector import OnnxDetector
 
 
 class CheckedDetector:
-    """Calls a detector and checks its answers.
+    """Detector that checks the results of another detector.
 
     Attributes:
-        color_suspicion: A sentence that says that red and blue look swapped; empty if they do not.
+        color_suspicion: Warning that red and blue look swapped; empty if they do not.
     """
 
     def __init__(self, detector: Detector) -> None:
-        """Begin with no image; only a network of jaxslam's own is asked twice about an image, to compare colors."""
+        """Wrap a detector. Colors are only checked for an `OnnxDetector`, which then runs twice on a few images."""
         self._detector = detector
         self.begin()
 
     def begin(self) -> None:
-        """Forget the images of the run before."""
+        """Forget the images of the previous run."""
         self.color_suspicion = ""
         self._color_order = ColorOrder(self._detector) if isinstance(self._detector, OnnxDetector) else None
 
     def __call__(self, image: UInt8[np.ndarray, "h w 3"], /) -> Detections:
-        """What the detector finds in an RGB image.
+        """Find objects in an RGB image.
 
         Raises:
-            ModelError: If the answer is not `Detections` of this image.
-            Exception: Whatever goes wrong in the detector.
+            ModelError: If the result is not `Detections` of this image.
+            Exception: Any error of the detector.
         """
         found = self._detector(image)
         check_answer(found, *image.shape[:2])

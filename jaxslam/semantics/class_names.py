@@ -1,4 +1,4 @@
-"""Names of the classes that public networks are trained on, and which ones a network has."""
+"""Names of the classes of public data sets, and of the classes of a network."""
 
 import ast
 from collections.abc import Iterable, Mapping
@@ -17,16 +17,16 @@ bed - dining_table - - toilet - tv laptop mouse remote keyboard cell_phone micro
 """
 
 COCO_IDS: tuple[str, ...] = ("", *(name.strip("-").replace("_", " ") for name in _COCO_IDS.split()))
-"""Name of each COCO category id, 0 to 90; empty where there is none."""
+"""Name of each COCO category id, 0 to 90; empty for unused ids."""
 
 COCO: tuple[str, ...] = tuple(name for name in COCO_IDS if name)
-"""The 80 classes of COCO, in the order networks number them."""
+"""The 80 classes of COCO, in the order of the outputs of networks."""
 
 VOC: tuple[str, ...] = (
     *("background", "airplane", "bicycle", "bird", "boat", "bottle", "bus", "car", "cat", "chair", "cow"),
     *("dining table", "dog", "horse", "motorcycle", "person", "potted plant", "sheep", "couch", "train", "tv"),
 )
-"""The 21 classes of PASCAL VOC's segmentation, with COCO's words."""
+"""The 21 classes of PASCAL VOC's segmentation, under COCO's names."""
 
 _SYNONYMS = {
     "aeroplane": "airplane",
@@ -39,28 +39,38 @@ _SYNONYMS = {
 
 
 def one_name(name: str) -> str:
-    """A class by COCO's word for it, so that a label means the same to every network."""
+    """Return COCO's name of a class, so that a label means the same for every network."""
     return _SYNONYMS.get(name.strip(), name.strip())
 
 
 def box_names(num_classes: int, stored: tuple[str, ...] | None) -> tuple[str, ...] | None:
-    """Names of the classes of a network that finds boxes; `None` if they cannot be known."""
+    """Return the names of the classes of a network for boxes; `None` if they are unknown.
+
+    Args:
+        num_classes: Number of classes in the network's outputs.
+        stored: Names in the network's metadata, if any.
+    """
     return stored if stored and len(stored) == num_classes else (COCO if num_classes == len(COCO) else None)
 
 
 def pixel_names(num_classes: int, stored: tuple[str, ...] | None) -> tuple[str, ...] | None:
-    """Names of the classes of a network that labels pixels; `None` if they cannot be known.
+    """Return the names of the classes of a network for pixels; `None` if they are unknown.
 
-    Only 21 classes are certain: 19 are Cityscapes' as well as those of parts of a face, 20 those of clothes.
+    Without stored names, only 21 classes are unambiguous: 19 may be those of Cityscapes or parts of a face, and 20 may
+    be clothes.
+
+    Args:
+        num_classes: Number of classes in the network's outputs.
+        stored: Names in the network's metadata, if any.
     """
     return stored if stored and len(stored) == num_classes else (VOC if num_classes == len(VOC) else None)
 
 
 def stored_names(metadata: Mapping[str, str]) -> tuple[str, ...] | None:
-    """The names that a model's metadata holds under `names`: `{0: 'person', ...}` or `['person', ...]`.
+    """Parse the entry `names` of a model's metadata: `{0: 'person', ...}` or `['person', ...]`.
 
     Raises:
-        ModelError: If something else stands there.
+        ModelError: If the entry has neither form.
     """
     text = metadata.get("names")
     if text is None:
@@ -78,5 +88,5 @@ def stored_names(metadata: Mapping[str, str]) -> tuple[str, ...] | None:
 
 
 def valid_labels(names: Iterable[str]) -> list[str]:
-    """The names that can be asked for."""
+    """Return the names that a caller may ask for, sorted."""
     return sorted({name for name in names if name})

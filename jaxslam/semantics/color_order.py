@@ -1,4 +1,4 @@
-"""Tells images whose red and blue are swapped, by the people that a network finds in them."""
+"""Recognize images with swapped red and blue channels by the people that a network finds in them."""
 
 import numpy as np
 from jaxtyping import Bool, UInt8
@@ -13,27 +13,27 @@ _MIN_COLOR = 10
 
 
 class ColorOrder:
-    """Compares the first images with people to the same images with red and blue swapped.
+    """Comparison of the first images with people to the same images with red and blue swapped.
 
     Two things must agree: the colors of skin (Kovač, Peer and Solina, "Human skin color clustering for face detection",
-    2003) cover twice as much of the people in the swapped images, and the network is surer of the people there.
+    2003) cover twice as much of the people in the swapped images, and the network gives the people there higher scores.
     Measured with YOLOX-nano on three of nine frames, at 52 places of Bonn `crowd` and `kitchen_people`: images in the
     right order are suspected at none, swapped ones at 41. Neither test alone is reliable: scores rise with a swap at 5
     places, and clothes are blue.
     """
 
     def __init__(self, detector: Detector) -> None:
-        """Begin with no image; `detector` looks at swapped ones."""
+        """Begin without an image; `detector` also runs on the swapped images."""
         self._detector = detector
         self._calls = self._looks = 0
         self._skin, self._score = np.zeros(2), np.zeros(2)
 
     def look(self, image: UInt8[np.ndarray, "h w 3"], found: Detections) -> bool:
-        """Take in one image; gives whether red and blue look swapped, which is decided with the last one looked at.
+        """Add an image, and return whether red and blue look swapped; the last compared image decides.
 
         Args:
-            image: As it was given to the detector.
-            found: What the detector found in it.
+            image: `(h, w, 3)` image that was given to the detector.
+            found: Detections in the image.
         """
         boxes = found.boxes[_people(found)]
         if self._looks == _LOOKS or not len(boxes) or not _is_colored(image):

@@ -1,4 +1,4 @@
-"""Checks what a detector answers, so that a detector of one's own is told what is wrong about its answer."""
+"""Check the results of a detector, so that errors of a user's own detector are explained."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,15 +10,15 @@ from jaxslam.semantics.detections import Detections
 
 
 def check_answer(found: object, height: int, width: int) -> None:
-    """Refuse an answer that is not `Detections` of an image.
+    """Refuse a result that is not `Detections` of an image.
 
     Args:
-        found: What the detector returned.
-        height: Rows of the image it was given.
-        width: Columns of that image.
+        found: Result of the detector.
+        height: Height of the image in pixels.
+        width: Width of the image in pixels.
 
     Raises:
-        ModelError: If the answer is of another type, or a field has another shape, type or range; the message names
+        ModelError: If the result has the wrong type, or a field has a wrong shape, type or range; the message names
             the field, what was expected and what came.
     """
     if not isinstance(found, Detections):

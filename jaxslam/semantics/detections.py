@@ -1,4 +1,4 @@
-"""What a detector says about one image."""
+"""Results of a detector for one image."""
 
 from typing import NamedTuple, Protocol
 
@@ -7,15 +7,16 @@ from jaxtyping import Bool, Float32, UInt8
 
 
 class Detections(NamedTuple):
-    """What was found in one image.
+    """Objects that were found in one image.
 
-    Boxes are measured from the image's top left corner, so that pixel column `c` reaches from `c` to `c + 1`:
-    `mask[top:bottom, left:right]` of rounded edges is what a box covers.
+    Boxes are measured from the top-left corner of the image, so that pixel column `c` spans `c` to `c + 1`. A box with
+    rounded edges covers `mask[top:bottom, left:right]`.
 
     Attributes:
-        boxes: `(k, 4)` left, top, right, bottom in pixels of the image; may reach past it. Best score first.
-        scores: `(k,)` 0 to 1.
-        labels: The name of each, such as "person".
+        boxes: `(k, 4)` left, top, right and bottom edges in pixels, in order of falling scores. Boxes may extend beyond
+            the image.
+        scores: `(k,)` scores from 0 to 1.
+        labels: Name of the class of each box, such as "person".
         masks: `(k, h, w)` instance masks at the image's size; `None` where the network gives none.
         class_mask: `(h, w)` pixels of any wanted class, where the network labels pixels (then there are no boxes);
             `None` where it does not.
@@ -29,17 +30,17 @@ class Detections(NamedTuple):
 
 
 class Detector(Protocol):
-    """Any callable that finds things in an image, be it a function."""
+    """Callable that finds objects in an image, such as a function."""
 
     def __call__(self, image: UInt8[np.ndarray, "h w 3"], /) -> Detections:
-        """Find things in an RGB image.
+        """Find objects in an RGB image.
 
         Raises:
-            Exception: Whatever goes wrong; the caller reports it and goes on.
+            Exception: Any error; the caller reports it and continues.
         """
         ...
 
 
 def no_detections() -> Detections:
-    """Nothing found."""
+    """Return the result for an image without objects."""
     return Detections(np.zeros((0, 4), np.float32), np.zeros(0, np.float32), (), None, None)

@@ -1,4 +1,4 @@
-"""A detector made of an ONNX file."""
+"""Detectors that run an ONNX network."""
 
 import os
 from collections.abc import Collection
@@ -17,33 +17,33 @@ from jaxslam.semantics.postprocess import Wanted
 
 
 class OnnxDetector:
-    """Finds things of the wanted classes in an image. The same image gives the same bytes."""
+    """Detector of objects of chosen classes. Results for equal images are equal to the byte."""
 
     def __init__(self, network: Network, adapter: Adapter, wanted: Wanted) -> None:
-        """Put together by `load_detector`."""
+        """Combine a network with its adapter and the wanted classes; call `load_detector` instead."""
         self._network, self._adapter, self._wanted = network, adapter, wanted
 
     @property
     def adapter(self) -> str:
-        """The name of the network's family."""
+        """Name of the network's adapter."""
         return self._adapter.name
 
     @property
     def path(self) -> Path:
-        """The network's file."""
+        """File of the network."""
         return self._network.path
 
     @property
     def input_size(self) -> tuple[int, int]:
-        """`(width, height)` in pixels of what the network sees."""
+        """Size `(width, height)` of the network's input in pixels."""
         return self._adapter.image.size
 
     def __call__(self, image: UInt8[np.ndarray, "h w 3"], /) -> Detections:
-        """Find things in an RGB image of any size.
+        """Find objects in an RGB image of any size.
 
         Raises:
-            FrameError: If it is no such image.
-            ModelError: If the network fails, or gives shapes or numbers that it cannot mean.
+            FrameError: If `image` is not such an image.
+            ModelError: If the network fails, or its outputs have wrong shapes or are not finite.
         """
         check_image(image)
         tensor, placement = self._adapter.prepare(image)
@@ -64,19 +64,20 @@ def load_detector(
     adapter: str | None = None,
     num_threads: int = 1,
 ) -> OnnxDetector:
-    """Open an ONNX file as a detector; its family is recognized from the graph.
+    """Open an ONNX file as a detector; the adapter is chosen by the graph's inputs and outputs.
 
     Args:
-        path: The file.
-        labels: What to find, by COCO's names ("person", "car", ...); VOC's words for the same are understood.
-        min_score: Least score kept, 0 to 1.
-        nms_iou: Overlap (intersection over union, 0 to 1) above which the worse of two boxes of a class is dropped.
-        adapter: The family, where it shall not be recognized; see `jaxslam.semantics.adapters.ADAPTERS`.
-        num_threads: Threads the network may use.
+        path: ONNX file.
+        labels: Classes to find, by COCO's names ("person", "car", ...) or VOC's names for the same classes.
+        min_score: Lowest score of results, 0 to 1.
+        nms_iou: Intersection over union, 0 to 1, above which the box with the lower score of two boxes of a class is
+            dropped.
+        adapter: Name in `jaxslam.semantics.adapters.ADAPTERS`; by default the adapter that fits the graph.
+        num_threads: Number of threads of the network.
 
     Raises:
-        ConfigError: If a label is none of the network's, or a number is out of range.
-        ModelError: If the file is missing or damaged, or of no family, or not of the one named.
+        ConfigError: If the network has no class of a label, or a number is out of range.
+        ModelError: If the file is missing or damaged, or fits no adapter or not the named one.
     """
     check_share("min_score", min_score)
     check_share("nms_iou", nms_iou)
@@ -119,7 +120,7 @@ def _fitting_hint(graph: Graph) -> str:
 
 
 def _wanted_classes(labels: Collection[str], names: tuple[str, ...]) -> np.ndarray:
-    """`(c,)` true for the classes asked for."""
+    """Return a mask `(c,)` of the wanted classes."""
     valid = valid_labels(names)
     if isinstance(labels, str) or not labels:
         raise ConfigError(f"labels: expected one or more names in a list, got {labels!r}")
@@ -131,30 +132,30 @@ def _wanted_classes(labels: Collection[str], names: tuple[str, ...]) -> np.ndarr
 
 
 def check_share(field: str, value: float) -> None:
-    """Refuse what is no number from 0 to 1.
+    """Refuse a value that is not a number from 0 to 1.
 
     Raises:
-        ConfigError: If it is none.
+        ConfigError: If the value is none.
     """
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= 1:
         raise ConfigError(f"{field}: expected a number from 0 to 1, got {value!r}")
 
 
 def check_threads(num_threads: int) -> None:
-    """Refuse what is no number of threads.
+    """Refuse a number of threads that is not a positive integer.
 
     Raises:
-        ConfigError: If it is none.
+        ConfigError: If the number is none.
     """
     if isinstance(num_threads, bool) or not isinstance(num_threads, int) or num_threads < 1:
         raise ConfigError(f"num_threads: expected an integer >= 1, got {num_threads!r}")
 
 
 def check_image(image: object) -> None:
-    """Refuse what is no image that a detector takes.
+    """Refuse an image that detectors do not accept.
 
     Raises:
-        FrameError: If it is none.
+        FrameError: If the image is not `(h, w, 3)` uint8.
     """
     expected = "image: expected (height, width, 3) RGB uint8"
     if not isinstance(image, np.ndarray):

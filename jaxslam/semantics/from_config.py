@@ -1,4 +1,4 @@
-"""The detector that the settings ask for."""
+"""Make the detector that the settings name."""
 
 import dataclasses
 import logging
@@ -23,7 +23,7 @@ from jaxslam.semantics.prompted import (
 )
 
 SCENE = "scene"
-"""The model that is no network: the truth of a rendered room, see `jaxslam.datasets.synthetic.with_true_masks`."""
+"""Value of `semantics.model` for the true masks of a rendered room, from `datasets.synthetic.with_true_masks`."""
 
 _NO_NETWORK = "no network finds what moves, geometry alone decides"
 _BY_DEPTH = "masks are made by depth"
@@ -32,15 +32,15 @@ _log = logging.getLogger(__name__)
 
 
 def detector_of(config: SemanticsConfig) -> Detector | None:
-    """The network of the settings, with masks by prompts if they ask for that.
+    """Load the detector of the settings, with a promptable segmenter if the settings name one.
 
     Returns:
-        `None` if they name none, or one that is not on this machine and that they allow to be missing.
+        The detector; `None` if the settings name no network, or one that is missing and may be.
 
     Raises:
-        ConfigError: If they name the truth of a rendered room, or settings of prompts do not fit together.
+        ConfigError: If the settings name the true masks of a rendered room, or settings of prompts contradict.
         MissingModelError: If a known network is not on this machine, and `missing_model` does not allow that.
-        ModelError: If a file is named that is not there, or that cannot be used.
+        ModelError: If a file is missing or cannot be used.
         DatasetError: If an image of an example cannot be read.
     """
     if config.model == SCENE:
@@ -61,7 +61,7 @@ def detector_of(config: SemanticsConfig) -> Detector | None:
 def _like_examples(
     config: SemanticsConfig, path: Path | None, segmenter: PromptSegmenter | None, examples: Sequence[Example]
 ) -> Detector | None:
-    """What finds things like those on images; the promptable segmenter only makes masks of those without."""
+    """Load an in-context segmenter; the promptable segmenter only makes the masks of examples without one."""
     if config.model is None:
         raise ConfigError("semantics.model: expected an in-context segmenter for semantics.examples, got null")
     if path is None:
@@ -76,7 +76,7 @@ def _prompted(
     segmenter: PromptSegmenter | None,
     prompts: Sequence[Prompt],
 ) -> Detector | None:
-    """A detector whose boxes, with the prompts of every frame, are made masks, if there is what makes them."""
+    """Add the promptable segmenter, if there is one, to a detector and the prompts of every frame."""
     if config.prompt_encoder is None:
         if prompts:
             expected = "images to find the like of, or semantics.prompt_encoder to segment boxes and points"
@@ -95,7 +95,7 @@ def _prompted(
 
 
 def _segmenter_of(config: SemanticsConfig) -> PromptSegmenter | None:
-    """The promptable segmenter of the settings; `None` if there is none, and a warning if it may be missing and is."""
+    """Load the promptable segmenter of the settings; `None` if there is none or it is missing and may be."""
     named = {"prompt_encoder": config.prompt_encoder, "prompt_decoder": config.prompt_decoder}
     if None in named.values():
         missing, given = sorted(named, key=lambda key: named[key] is not None)
@@ -109,21 +109,21 @@ def _segmenter_of(config: SemanticsConfig) -> PromptSegmenter | None:
 
 
 def network_files(config: SemanticsConfig) -> dict[str, Path | None]:
-    """The files of all networks that the settings name, by setting; `None` for one that may be missing and is.
+    """Find the files of all networks of the settings, by setting; `None` for one that is missing and may be.
 
     Raises:
         MissingModelError: If a known network is not on this machine, and `missing_model` does not allow that.
-        ModelError: If a file is named that is not there.
+        ModelError: If a named file does not exist.
     """
     settings = ("model", "prompt_encoder", "prompt_decoder")
     return {setting: _found(config, setting) for setting in settings if getattr(config, setting) not in (None, SCENE)}
 
 
 def why_no_network(config: SemanticsConfig) -> str | None:
-    """Why no network looks at frames with these settings, as a part of a sentence; `None` if one does.
+    """Explain, as a part of a sentence, why no network runs with these settings; `None` if one does.
 
     Raises:
-        ModelError: As `network_files`.
+        ModelError: For the same reasons as in `network_files`.
     """
     files = network_files(config)
     if config.model == SCENE or files.get("model") is not None:
@@ -135,22 +135,22 @@ def why_no_network(config: SemanticsConfig) -> str | None:
 
 
 def preset_needs_network(preset: str) -> bool:
-    """Whether a preset is a system built around a network, so that without one it is another system.
+    """Return whether a preset is a system built around a network, which without one would be another system.
 
     Raises:
-        ConfigError: If there is no such preset.
+        ConfigError: If the preset does not exist.
     """
     semantics = load_config(preset).semantics
     return semantics.model is not None and semantics.missing_model == "error"
 
 
 def _found(config: SemanticsConfig, setting: str, otherwise: str | None = None) -> Path | None:
-    """The file of the network that a setting names; `None` if it may be missing and is.
+    """Find the file of the network that a setting names; `None` if it is missing and may be.
 
     Args:
-        config: Settings.
-        setting: Name of the one that names the network.
-        otherwise: What is done without it, to be logged as a warning; `None` to log nothing.
+        config: Settings of the networks.
+        setting: Name of the setting.
+        otherwise: Consequence of a missing network, which is logged as a warning; `None` to log nothing.
     """
     name = getattr(config, setting)
     try:
@@ -166,10 +166,10 @@ def _found(config: SemanticsConfig, setting: str, otherwise: str | None = None) 
 
 
 def key_detector_of(config: Config) -> Detector | None:
-    """The detector of the objects that a dense map has at full density; `None` if the settings ask for none.
+    """Load the detector of the objects that the dense map holds at full density; `None` if the settings name none.
 
     Raises:
-        ModelError: As `detector_of`.
+        ModelError: For the same reasons as in `detector_of`.
     """
     dense, semantics = config.dense, config.semantics
     if not dense.enabled or not dense.key_classes:

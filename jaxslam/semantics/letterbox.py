@@ -1,4 +1,4 @@
-"""Where an image lies in a network's input, and the way back."""
+"""Fit images into the input of a network, and map results back to the image."""
 
 from typing import Literal, NamedTuple, TypeAlias
 
@@ -7,16 +7,17 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 Fit: TypeAlias = Literal["corner", "center", "stretch"]
-"""Keep the aspect and pad at the right and the bottom, or on both sides; or stretch to the whole input."""
+"""How an image fits the input: keep the aspect and pad right and below (`corner`) or on both sides (`center`), or
+stretch."""
 
 
 class Placement(NamedTuple):
-    """`input = image * scale + offset` in pixels from the top left corner, x before y.
+    """Transform from the image to the input, `input = image * scale + offset`, in pixels from the top-left corner.
 
     Attributes:
-        size: The image's width and height.
-        scale: Pixels of the input for one of the image.
-        offset: Where the image begins in the input.
+        size: Width and height of the image in pixels.
+        scale: Scale along x and y.
+        offset: Column and row of the image's top-left corner in the input.
     """
 
     size: tuple[int, int]
@@ -27,12 +28,12 @@ class Placement(NamedTuple):
 def place(
     image: UInt8[np.ndarray, "h w 3"], size: tuple[int, int], fit: Fit, pad: int
 ) -> tuple[UInt8[np.ndarray, "hi wi 3"], Placement]:
-    """An image as a network's input.
+    """Resize and pad an image to the input of a network.
 
     Args:
-        image: Any size.
-        size: `(width, height)` of the input.
-        fit: How the one is made the other.
+        image: `(h, w, 3)` image of any size.
+        size: Size `(width, height)` of the input in pixels.
+        fit: How the image fits the input.
         pad: Value of the pixels beside the image.
     """
     (height, width), (full_width, full_height) = image.shape[:2], size
@@ -53,7 +54,7 @@ def place(
 
 
 def boxes_to_image(boxes: Float32[np.ndarray, "k 4"], placement: Placement) -> Float32[np.ndarray, "k 4"]:
-    """Boxes in the input as boxes in the image; they are not cut at its edges."""
+    """Map boxes `(k, 4)` from the input to the image, without clipping."""
     offset, scale = (np.tile(np.asarray(pair, np.float32), 2) for pair in (placement.offset, placement.scale))
     return (boxes - offset) / scale
 
@@ -64,13 +65,13 @@ def plane_to_image(
     placement: Placement,
     window: tuple[int, int, int, int] | None = None,
 ) -> Float32[np.ndarray, "h w"]:
-    """A plane over the whole input, of any resolution, at the image's resolution (bilinear).
+    """Resample a plane over the whole input, of any resolution, at the pixels of the image (bilinear).
 
     Args:
-        plane: Values over the input.
-        input_size: `(width, height)` of the input.
-        placement: Where the image lies in it.
-        window: The part wanted: left, top, right, bottom pixels of the image; `None` for all of it.
+        plane: `(hp, wp)` values over the input.
+        input_size: Size `(width, height)` of the input in pixels.
+        placement: Transform from the image to the input.
+        window: Left, top, right and bottom of the wanted part of the image in pixels; `None` for the whole image.
     """
     left, top, right, bottom = window or (0, 0, *placement.size)
     per_input = (plane.shape[1] / input_size[0], plane.shape[0] / input_size[1])

@@ -1,4 +1,4 @@
-"""An ONNX file opened with onnxruntime on the CPU, so that it leaves the tracker its core."""
+"""Run ONNX networks with onnxruntime on the CPU, with a limited number of threads."""
 
 import ast
 import os
@@ -14,7 +14,7 @@ from jaxslam.semantics.class_names import stored_names
 from jaxslam.semantics.onnx_signature import Graph, Port, image_input
 
 FREE_SIZE = 416
-"""Width and height in pixels of an input that leaves them open: a multiple of 32, and small enough for a CPU."""
+"""Width and height in pixels for inputs of free size: a multiple of 32, and small enough for a CPU."""
 
 _WARNINGS_OFF = 3  # errors and worse are logged
 
@@ -25,30 +25,30 @@ _DTYPES: dict[str, str] = {"float": "float32", "double": "float64"}
 
 
 class Network:
-    """A network, of one image or of whatever inputs.
+    """An opened network.
 
     Attributes:
-        path: Its file.
-        graph: Its inputs and outputs.
+        path: File of the network.
+        graph: Inputs and outputs of the network.
     """
 
     def __init__(self, path: Path, num_threads: int, free_size: int = FREE_SIZE) -> None:
-        """Open a file; one that takes one image runs once on an empty one: declared sizes of outputs may be wrong.
+        """Open a file. A network of one image runs once on a black image, because declared output sizes may be wrong.
 
         Args:
-            path: The file.
-            num_threads: Threads it may use.
-            free_size: Width and height of an image whose size the network leaves open, pixels.
+            path: ONNX file.
+            num_threads: Number of threads of the network.
+            free_size: Width and height in pixels of images for a network with inputs of free size.
 
         Raises:
-            ModelError: If there is no such file, if it cannot be read, or if the network does not run.
+            ModelError: If the file is missing or cannot be read, or the network does not run.
         """
         self.path = path
         self._session = _open(path, num_threads)
         self.graph = self._look(free_size)
 
     def run(self, tensor: np.ndarray) -> list[Any]:
-        """All outputs for an input: arrays, or whatever else the graph declares.
+        """Run the network on one input, and return all outputs: arrays, or other types that the graph declares.
 
         Raises:
             ModelError: If onnxruntime fails.
@@ -56,7 +56,7 @@ class Network:
         return self.feed({self._session.get_inputs()[0].name: tensor})
 
     def feed(self, inputs: Mapping[str, np.ndarray]) -> list[Any]:
-        """All outputs for inputs by name.
+        """Run the network on inputs by name, and return all outputs.
 
         Raises:
             ModelError: If onnxruntime fails.
@@ -81,12 +81,12 @@ class Network:
 
 
 def check_outputs(outputs: list[np.ndarray], ports: tuple[Port, ...], varying: bool) -> None:
-    """Refuse what a network cannot have meant.
+    """Refuse outputs of the wrong shape, or with numbers that are not finite.
 
     Args:
-        outputs: What it gave.
-        ports: What it is expected to give.
-        varying: Whether sizes, though not the number of axes, may differ from image to image.
+        outputs: Outputs of the network.
+        ports: Expected outputs.
+        varying: Whether sizes, but not the number of axes, may differ between images.
 
     Raises:
         ModelError: If an output has another shape, or holds a number that is not finite.
@@ -101,7 +101,7 @@ def check_outputs(outputs: list[np.ndarray], ports: tuple[Port, ...], varying: b
 
 @cache
 def _ort_errors() -> tuple[type[Exception], ...]:
-    """What onnxruntime raises: its errors have no base of their own."""
+    """Return the errors of onnxruntime, which have no common base class."""
     from onnxruntime.capi import (  # noqa: PLC0415
         onnxruntime_pybind11_state as state,  # pyright: ignore[reportAttributeAccessIssue]
     )
@@ -131,7 +131,7 @@ def _open(path: Path, num_threads: int) -> "onnxruntime.InferenceSession":
 
 
 def _port(argument: Any) -> Port:
-    """An input or output as onnxruntime declares it; it writes a type as `tensor(float)`."""
+    """Convert an input or output of onnxruntime, which writes types as `tensor(float)`."""
     kind: str = argument.type
     if kind.startswith("tensor("):
         kind = kind[len("tensor(") : -1]
@@ -145,7 +145,7 @@ def _seen(port: Port, value: object) -> Port:
 
 
 def _free_size(metadata: dict[str, str], otherwise: int) -> int:
-    """The size a network was exported for, where its metadata says so (Ultralytics' `imgsz`, [height, width])."""
+    """Return the image size in the network's metadata (Ultralytics' `imgsz`, [height, width]), or else the default."""
     try:
         sizes = ast.literal_eval(metadata.get("imgsz", ""))
     except (ValueError, SyntaxError):

@@ -1,4 +1,4 @@
-"""A network's inputs and outputs: what adapters recognize it by."""
+"""Inputs and outputs of a network, by which adapters recognize it."""
 
 from typing import NamedTuple
 
@@ -9,12 +9,12 @@ _FLOATS = ("float16", "float32", "float64")
 
 
 class Port(NamedTuple):
-    """An input or output.
+    """An input or output of a network.
 
     Attributes:
-        name: As the graph has it.
-        shape: Sizes; `None` for one that is not fixed.
-        dtype: A NumPy type such as "float32", or what onnxruntime calls a type that is no array.
+        name: Name in the graph.
+        shape: Size of each axis; `None` for a free size.
+        dtype: NumPy type such as "float32", or onnxruntime's name of a type other than an array.
     """
 
     name: str
@@ -23,12 +23,12 @@ class Port(NamedTuple):
 
     @property
     def is_float(self) -> bool:
-        """Whether it holds real numbers."""
+        """Whether the type is a floating-point type."""
         return self.dtype in _FLOATS
 
     @property
     def is_integer(self) -> bool:
-        """Whether it holds whole numbers."""
+        """Whether the type is an integer type."""
         return self.dtype.removeprefix("u").startswith("int")
 
     def __str__(self) -> str:

@@ -1,4 +1,4 @@
-"""Segmenters that are told what to segment: by points and boxes (SAM), or by an image with its mask (SegGPT)."""
+"""Segmenters with prompts: points and boxes (SAM), or an image with its mask (SegGPT)."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""A promptable segmenter as a detector: prompts come from the boxes of another one, or are the same in every frame."""
+"""Use a promptable segmenter as a detector, with prompts from another detector or the same in every frame."""
 
 from collections.abc import Sequence
 
@@ -13,7 +13,7 @@ from jaxslam.semantics.prompted.segmenter import PromptSegmenter
 
 
 class PromptedDetector:
-    """Instance masks of what a detector finds, and of what is prompted for."""
+    """Detector that adds instance masks to the boxes of another detector, and to fixed prompts."""
 
     def __init__(
         self,
@@ -23,14 +23,14 @@ class PromptedDetector:
         prompts: Sequence[Prompt] = (),
         min_iou: float = 0.5,
     ) -> None:
-        """Prepare.
+        """Combine a segmenter with the sources of its prompts.
 
         Args:
-            segmenter: Makes the masks.
-            detector: Its boxes are prompts; a class map of its own is passed on.
-            prompts: Further ones, the same in every frame: for a camera that stands still, or a part of the robot.
-            min_iou: Masks that the network judges to fit less are dropped, 0 to 1. A box then keeps the mask that the
-                detector gave it, or none: whoever uses it makes one by depth.
+            segmenter: Segmenter that makes the masks.
+            detector: Detector whose boxes are prompts; its class map is kept. `None` for fixed prompts alone.
+            prompts: Prompts that are the same in every frame, for a static camera or a part of the robot.
+            min_iou: Lowest IoU, 0 to 1, that the segmenter predicts for a mask. Below it, a box keeps the detector's
+                mask or has none, and the caller makes one from depth.
 
         Raises:
             ConfigError: If there is neither a detector nor a prompt, or `min_iou` is out of range.
@@ -42,13 +42,13 @@ class PromptedDetector:
         self._min_iou = float(min_iou)
 
     def __call__(self, image: UInt8[np.ndarray, "h w 3"], /) -> Detections:
-        """Find things in an RGB image; where there is nothing to prompt for, no network of masks runs.
+        """Find objects in an RGB image; the segmenter runs only if there are prompts.
 
         Raises:
-            FrameError: If it is no such image.
+            FrameError: If `image` is not such an image.
             ConfigError: If a prompt for every frame is outside the image.
             ModelError: If a network fails.
-            Exception: Whatever the detector raises.
+            Exception: Any error of the detector.
         """
         check_image(image)
         found = no_detections() if self._detector is None else self._detector(image)
@@ -77,7 +77,7 @@ class PromptedDetector:
 
 
 def joined(found: Detections, further: Detections) -> Detections:
-    """Detections of one image, both with masks, the best first; of equal ones those of the first."""
+    """Merge detections of one image, both with masks, by falling score; ties keep the order of the arguments."""
     assert found.masks is not None  # as said
     assert further.masks is not None
     scores = np.concatenate([found.scores, further.scores])
@@ -93,6 +93,6 @@ def joined(found: Detections, further: Detections) -> Detections:
 
 
 def boxes_of(masks: np.ndarray) -> np.ndarray:
-    """`(k, 4)` float32 left, top, right, bottom of masks `(k, h, w)` that are not empty."""
+    """Return the bounding boxes `(k, 4)` float32 of nonempty masks `(k, h, w)`."""
     boxes = [[columns.min(), rows.min(), columns.max() + 1, rows.max() + 1] for rows, columns in map(np.nonzero, masks)]
     return np.array(boxes, np.float32).reshape(-1, 4)

@@ -1,4 +1,4 @@
-"""A small file, or a folder, of examples: what to segment, shown by masks, boxes or points.
+"""Read examples of objects to segment from a file or a folder: masks, boxes or points.
 
 ```yaml
 examples:
@@ -36,14 +36,14 @@ _IMAGES = (".png", ".jpg", ".jpeg")
 
 
 class Example(NamedTuple):
-    """One of them.
+    """An example of an object.
 
     Attributes:
-        origin: Where it stands, for messages.
-        label: What the thing is called.
-        image: `(h, w, 3)` RGB; `None` if it is about every frame.
-        mask: `(h, w)` true on the thing, where it has one.
-        prompts: Boxes and points, where it has no mask.
+        origin: File and entry of the example, for messages.
+        label: Name of the object's class.
+        image: `(h, w, 3)` RGB image; `None` for prompts of every frame.
+        mask: `(h, w)` mask of the object; `None` if the example has prompts.
+        prompts: Boxes and points; empty if the example has a mask.
     """
 
     origin: str
@@ -90,10 +90,10 @@ class _Row(ValidatedConfig):
 
 
 def read_examples(path: Path) -> list[Example]:
-    """The examples of a YAML file, or of a folder.
+    """Read the examples of a YAML file or a folder.
 
     Raises:
-        ConfigError: If there are none, or one is not as it should be.
+        ConfigError: If there are no examples, or one is wrong.
         DatasetError: If an image cannot be read.
     """
     if path.is_dir():
@@ -110,14 +110,14 @@ def read_examples(path: Path) -> list[Example]:
 
 
 def with_masks(examples: Sequence[Example], segmenter: PromptSegmenter | None) -> list[Example]:
-    """Examples whose masks a promptable segmenter has made of their boxes and points, as USD-SLAM makes them with SAM.
+    """Add the masks that a promptable segmenter makes from boxes and points, as USD-SLAM does with SAM.
 
     Args:
-        examples: With images.
-        segmenter: `None` if there is none.
+        examples: Examples with images.
+        segmenter: Segmenter for the examples without a mask; `None` if there is none.
 
     Raises:
-        ConfigError: If an example has no mask and there is no segmenter, or it finds nothing there.
+        ConfigError: If an example has no mask and there is no segmenter, or the segmenter finds nothing.
         ModelError: If the segmenter fails.
     """
     return [each if each.mask is not None else _segmented(each, segmenter) for each in examples]

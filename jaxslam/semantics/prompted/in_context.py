@@ -1,7 +1,7 @@
-"""In-context segmenters: an image and its mask are the prompt, and what is like it is found in other images.
+"""In-context segmenters: find objects that are similar to those in example images with masks.
 
-Wang et al., SegGPT (arXiv 2304.03284): the example lies above the image, its mask above what the network paints. Inputs
-and output are those of transformers' `SegGptForImageSegmentation`, which stacks them itself:
+Wang et al., SegGPT (arXiv 2304.03284): the example is stacked above the image, and its mask above the painted output.
+Inputs and output are those of transformers' `SegGptForImageSegmentation`, which stacks them itself:
 
     model = SegGptForImageSegmentation.from_pretrained("BAAI/seggpt-vit-large").eval()
     names = ["pixel_values", "prompt_pixel_values", "prompt_masks"]
@@ -37,10 +37,10 @@ _MIN_SHARE = 0.0005  # of the image: smaller pieces are specks
 
 
 class InContextDetector:
-    """Finds what is like the examples. The same image gives the same bytes."""
+    """Detector of objects that are similar to examples. Results for equal images are equal to the byte."""
 
     def __init__(self, network: Network, examples: Sequence[Example], min_score: float) -> None:
-        """Put together by `load_in_context`."""
+        """Combine a network with examples; call `load_in_context` instead."""
         ports = {port.name: port for port in network.graph.inputs}
         height, width = (side or _SIDE for side in ports[IMAGE].shape[-2:])
         self._network, self._min_score = network, min_score
@@ -50,15 +50,15 @@ class InContextDetector:
 
     @property
     def path(self) -> Path:
-        """The network's file."""
+        """File of the network."""
         return self._network.path
 
     def __call__(self, image: UInt8[np.ndarray, "h w 3"], /) -> Detections:
-        """Find things in an RGB image of any size: connected pixels are one.
+        """Find objects in an RGB image of any size; each connected component is one object.
 
         Raises:
-            FrameError: If it is no such image.
-            ModelError: If the network fails, or gives shapes or numbers that it cannot mean.
+            FrameError: If `image` is not such an image.
+            ModelError: If the network fails, or its outputs have wrong shapes or are not finite.
         """
         check_image(image)
         canvas, placement = place(image, self._image.size, "stretch", 0)
@@ -74,7 +74,7 @@ class InContextDetector:
         return Detections(boxes_of(masks), scores, tuple(label for _, label, _ in found), masks, None)
 
     def _stacked(self, examples: Sequence[Example], label: str, many: bool) -> list[dict[str, np.ndarray]]:
-        """The network's inputs of the examples of a class, all at once or one at a time."""
+        """Make the network's inputs for the examples of a class, all at once or one at a time."""
         rows = []
         for each in examples:
             if each.label == label:
@@ -89,7 +89,7 @@ class InContextDetector:
         return [{name: np.concatenate([row[name] for row in rows]) for name in (EXAMPLE, MASK)}]
 
     def _painted(self, pixels: np.ndarray, batches: list[dict[str, np.ndarray]]) -> Float32[np.ndarray, "h w"]:
-        """How white the network paints, 0 to 1, over its input; the mean over examples."""
+        """Return how white the network paints each pixel of its input, 0 to 1, as the mean over examples."""
         parts = []
         for batch in batches:
             num = len(batch[MASK])
@@ -112,7 +112,7 @@ class InContextDetector:
     def _things(
         self, white: Float32[np.ndarray, "h w"], placement: Placement
     ) -> list[tuple[float, Bool[np.ndarray, "_h _w"]]]:
-        """Connected pieces in the image, and how white they are."""
+        """Return the connected components in the image, and how white they are."""
         plane = plane_to_image(white, self._image.size, placement)
         num, piece, measures, _ = cv2.connectedComponentsWithStats((plane > _PAINTED).astype(np.uint8))
         masks = [piece == k for k in range(1, num) if measures[k, cv2.CC_STAT_AREA] >= _MIN_SHARE * plane.size]
@@ -121,7 +121,7 @@ class InContextDetector:
 
 
 def is_in_context(graph: Graph) -> bool:
-    """Whether a network takes an image, another one, and its mask."""
+    """Return whether a network takes an image, an example image, and the mask of the example."""
     inputs, outputs = {port.name: port for port in graph.inputs}, {port.name for port in graph.outputs}
     return inputs.keys() == {IMAGE, EXAMPLE, MASK} and OUTPUT in outputs and all(map(_is_image, inputs.values()))
 
@@ -129,16 +129,16 @@ def is_in_context(graph: Graph) -> bool:
 def load_in_context(
     path: Path, examples: Sequence[Example], *, min_score: float = 0.3, num_threads: int = 1
 ) -> InContextDetector:
-    """Open an ONNX file as a detector of what is like examples.
+    """Open an ONNX file as a detector of objects that are similar to examples.
 
     Args:
-        path: The file.
-        examples: Images with masks.
-        min_score: Things painted with less certainty are dropped, 0 to 1.
-        num_threads: Threads the network may use.
+        path: ONNX file.
+        examples: Examples with images and masks.
+        min_score: Lowest score of results, 0 to 1: the mean whiteness of an object.
+        num_threads: Number of threads of the network.
 
     Raises:
-        ConfigError: If there is no example, one has no image or no mask, or a number is out of range.
+        ConfigError: If there are no examples, an example has no image or mask, or a number is out of range.
         ModelError: If the file is missing or damaged, or no in-context segmenter.
     """
     check_share("min_score", min_score)

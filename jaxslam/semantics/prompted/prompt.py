@@ -1,4 +1,4 @@
-"""What a promptable segmenter is asked for: a thing in an image, by points and a box."""
+"""Prompts of a promptable segmenter: points and a box of an object in an image."""
 
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
@@ -7,18 +7,18 @@ import numpy as np
 from jaxtyping import Float32
 
 BESIDE, ON, TOP_LEFT, BOTTOM_RIGHT = range(4)
-"""SAM's numbers for points: on the thing or beside it, and two corners that make a box."""
+"""SAM's labels of points: on the object, beside it, and the two corners of a box."""
 NO_POINT = -1
-"""SAM's number for a row that holds no point."""
+"""SAM's label of a padding point."""
 
 
 class Prompt(NamedTuple):
-    """One thing in an image.
+    """Prompt of one object in an image.
 
     Attributes:
-        points: `(n, 2)` x and y in pixels from the image's top left corner, as boxes are measured.
-        kinds: What each point is: `ON`, `BESIDE`, or a corner of the box.
-        label: What the thing is called.
+        points: `(n, 2)` x and y in pixels from the top-left corner of the image, as in boxes.
+        kinds: Label of each point: `ON`, `BESIDE`, or a corner of the box.
+        label: Name of the object's class.
     """
 
     points: Float32[np.ndarray, "n 2"]
@@ -27,7 +27,7 @@ class Prompt(NamedTuple):
 
     @property
     def box(self) -> tuple[float, float, float, float] | None:
-        """Left, top, right, bottom, if it has a box."""
+        """Left, top, right and bottom of the box in pixels; `None` without a box."""
         if TOP_LEFT not in self.kinds:
             return None
         corners = [self.points[self.kinds.index(kind)].tolist() for kind in (TOP_LEFT, BOTTOM_RIGHT)]
@@ -41,13 +41,13 @@ def prompt(
     on: Iterable[Sequence[float]] = (),
     beside: Iterable[Sequence[float]] = (),
 ) -> Prompt:
-    """A prompt of a box, of points, or of both.
+    """Make a prompt from a box, points, or both.
 
     Args:
-        label: What the thing is called.
-        box: Left, top, right, bottom in pixels: `image[top:bottom, left:right]` is what it covers.
-        on: Pixels `(u, v)` of the thing, (0, 0) the center of the top left one.
-        beside: Pixels that are not of it.
+        label: Name of the object's class.
+        box: Left, top, right and bottom in pixels; the box covers `image[top:bottom, left:right]`.
+        on: Pixels `(u, v)` of the object; (0, 0) is the center of the top-left pixel.
+        beside: Pixels `(u, v)` beside the object.
     """
     rows = [(ON, u + 0.5, v + 0.5) for u, v in on] + [(BESIDE, u + 0.5, v + 0.5) for u, v in beside]
     if box is not None:
