@@ -36,8 +36,8 @@ class Room:
     """A clip with its truth.
 
     Attributes:
-        frames: Of the clip.
-        truth: Where the camera was.
+        frames: Frames of the clip.
+        truth: True poses of the camera.
     """
 
     frames: FrameArrays
@@ -59,12 +59,12 @@ class Way:
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What is tracked, and with what.
+    """Clips to track, and the settings of the tracker.
 
     Attributes:
-        rooms: Clips, of one size and length.
-        params: Camera and thresholds.
-        plan: Capacities.
+        rooms: Clips of equal image size and length.
+        params: Camera and thresholds of the tracker.
+        plan: Array capacities of the tracker.
     """
 
     rooms: Sequence[Room]
@@ -122,9 +122,9 @@ def measure(task: Task, count: int, rounds: int) -> list[dict[str, Any]]:
     The loop takes each different clip once: what one costs it does not depend on how many there are.
 
     Args:
-        task: What is tracked.
-        count: How many clips.
-        rounds: How often each way is timed.
+        task: Clips and settings.
+        count: Number of clips.
+        rounds: Number of timings of each way.
 
     Returns:
         A row of figures for each of `ways(count)`.

@@ -79,10 +79,10 @@ def compare(
     """Call both in turn, `rounds` times each, every thread on one core; JAX results are waited for.
 
     Args:
-        ours: One side.
-        theirs: The other.
-        rounds: How often each is timed.
-        warm_up: How often each is called before.
+        ours: Function of the first side.
+        theirs: Function of the second side.
+        rounds: Number of timings of each side.
+        warm_up: Number of calls of each side before the timings.
         prepare: What makes the arguments of each call of theirs, not timed: of a solver that changes its problem, say.
         most_s: After so many seconds no further round is begun, but of the first few.
     """

@@ -1,4 +1,4 @@
-"""Pictures of what a detector found: masks, boxes and labels, drawn with OpenCV."""
+"""Draw the masks, boxes and labels of detections with OpenCV."""
 
 from collections.abc import Sequence
 from typing import TypeAlias
@@ -18,11 +18,11 @@ _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 def draw_detections(image: np.ndarray, detections: Detections) -> np.ndarray:
-    """A copy of an image with what was found in it; the surest on top, each in a color of its own.
+    """Draw detections on a copy of an image, each in its own color, with the highest score on top.
 
     Args:
-        image: `(h, w, 3)` uint8 RGB.
-        detections: Boxes in its pixels, with labels and scores; masks are tinted, so is the class map.
+        image: `(h, w, 3)` uint8 RGB image.
+        detections: Detections in the image. Masks and the class map tint the pixels.
 
     Returns:
         `(h, w, 3)` uint8 RGB.

@@ -1,4 +1,4 @@
-"""What was left out of the frames of a run, to look at: an animation and a contact sheet of frames with masks."""
+"""Pictures of the masks of a run: an animation and a contact sheet."""
 
 import io
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ _SHEET_PICTURES, _SHEET_COLUMNS = 12, 4
 
 
 class MaskPictures:
-    """Keeps pictures of frames that had a mask, evenly over a run: an `on_frame` of `Slam.run`.
+    """Collects pictures of frames with a mask, evenly over a run: an `on_frame` of `Slam.run`.
 
     How many frames will have one is not known before, so that one of n is kept, and n doubles whenever there are too
     many. Which one of n is left to chance: a detector comes back every few frames, and every nth might be its own.
@@ -49,7 +49,7 @@ class MaskPictures:
         self._random = np.random.default_rng(0)
 
     def __call__(self, frame: Frame | None, result: FrameResult | Rejected) -> None:
-        """Look at one frame."""
+        """Add one frame."""
         if frame is not None and isinstance(result, FrameResult) and result.dynamic_mask.any():
             if self._masked % self._one_of == 0:
                 self._wanted = self._masked + int(self._random.integers(self._one_of))
@@ -66,12 +66,12 @@ class MaskPictures:
 
 
 def draw_mask(image: np.ndarray, tracked: FrameResult, title: str) -> np.ndarray:
-    """A small picture of a frame with its mask, and where that comes from, its age and share of the image in words.
+    """Draw a small picture of a frame with its mask, and the source, age and share of the mask in words.
 
     Args:
         image: `(h, w, 3)` RGB or `(h, w)` gray, uint8.
-        tracked: What became of the frame; its mask is of the image's size.
-        title: What to write first.
+        tracked: Result of the frame, with a mask of the image's size.
+        title: Beginning of the text.
 
     Returns:
         `(round(320 h / w) + 20, 320, 3)` uint8 RGB.
@@ -91,8 +91,8 @@ def write_mask_pictures(folder: Path, pictures: Sequence[np.ndarray]) -> None:
     """Write `masks.gif`, 3 MB at most, and `masks.png`, twelve of the pictures side by side.
 
     Args:
-        folder: Where they go; it must exist. Files that are there are replaced, each in one piece.
-        pictures: `(h, w, 3)` uint8 RGB, at least one, of one size.
+        folder: Existing folder for the files. Existing files are replaced atomically.
+        pictures: At least one `(h, w, 3)` uint8 RGB picture; all have the same size.
 
     Raises:
         JaxSlamError: If a file cannot be written.
@@ -131,7 +131,7 @@ def _sheet(pictures: Sequence[np.ndarray]) -> bytes:
 
 
 def _small_animation(pictures: Sequence[np.ndarray]) -> bytes:
-    """GIF of as many pictures as fit: all of them, or every 2nd, 4th, ... if it would be too large."""
+    """Encode a GIF of all pictures, or of every 2nd, 4th, ... if it would be too large."""
     data = _animation(pictures)
     while len(data) > _MAX_GIF_BYTES and len(pictures) > 1:
         pictures = pictures[::2]
@@ -140,7 +140,7 @@ def _small_animation(pictures: Sequence[np.ndarray]) -> bytes:
 
 
 def _animation(pictures: Sequence[np.ndarray]) -> bytes:
-    """GIF in one palette for all, so that a mask has the same color throughout."""
+    """Encode a GIF with one palette, so that a mask has the same color in all frames."""
     palette = Image.fromarray(np.concatenate(_spread(pictures, 8))).quantize(_GIF_COLORS)
     frames = [Image.fromarray(each).quantize(palette=palette, dither=Image.Dither.NONE) for each in pictures]
     file = io.BytesIO()

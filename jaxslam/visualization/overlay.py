@@ -1,4 +1,4 @@
-"""Masks drawn over images, in colors that color-blind eyes tell apart too."""
+"""Draw masks over images, in colors that color-blind people can distinguish."""
 
 from typing import TypeAlias
 

@@ -40,11 +40,11 @@ class Snapshot:
     """One frame and the points in it.
 
     Attributes:
-        title: What to write above it.
-        image: `(h, w, 3)` or `(h, w)` uint8.
-        uv: `(2, n)` points, pixels.
-        weights: `(n,)` how much each counts, 0 to 1; a point of weight 0 is not drawn.
-        followed: `(n,)` which came from the frame before; the others are new.
+        title: Title above the frame.
+        image: `(h, w, 3)` RGB or `(h, w)` gray image, uint8.
+        uv: `(2, n)` points in pixels.
+        weights: `(n,)` weight of each point, 0 to 1; points of weight 0 are not drawn.
+        followed: `(n,)` whether each point was tracked from the previous frame; the others are new.
     """
 
     title: str
@@ -69,12 +69,12 @@ def plot_trajectory(
     colored by error, and times without estimated poses are shaded; otherwise both paths are drawn as they are.
 
     Args:
-        estimate: What was estimated.
-        reference: The truth, if known.
-        evaluation: `evaluate(estimate, reference, ...)`, if it was done.
-        path: Where the picture goes; its ending, of `PICTURE_FORMATS`, says as what.
-        snapshots: Frames to show with their points.
-        title: One line to write above the picture; empty for none.
+        estimate: Estimated trajectory.
+        reference: True trajectory; `None` if unknown.
+        evaluation: Result of `evaluate(estimate, reference, ...)`; `None` without an evaluation.
+        path: File of the picture. Its suffix, one of `PICTURE_FORMATS`, selects the format.
+        snapshots: Frames that are shown with their points.
+        title: Line above the picture; empty for none.
 
     Raises:
         TrajectoryError: If there is nothing to draw or the file cannot be written.
@@ -107,9 +107,9 @@ def plot_map(slam_map: Map, trajectory: Trajectory, path: str | os.PathLike[str]
     first keyframe has it.
 
     Args:
-        slam_map: With a keyframe at least.
-        trajectory: Of the camera in the frame of the map.
-        path: Where the picture goes; its ending, of `PICTURE_FORMATS`, says as what.
+        slam_map: Map with at least one keyframe.
+        trajectory: Trajectory of the camera in the world frame of the map.
+        path: File of the picture. Its suffix, one of `PICTURE_FORMATS`, selects the format.
 
     Raises:
         TrajectoryError: If there is no keyframe, or the file cannot be written.
@@ -193,8 +193,8 @@ def plot_snapshots(snapshots: Sequence[Snapshot], path: str | os.PathLike[str]) 
     """Write one picture: frames with their points, two side by side.
 
     Args:
-        snapshots: One at least.
-        path: Where the picture goes; its ending, of `PICTURE_FORMATS`, says as what.
+        snapshots: At least one frame with its points.
+        path: File of the picture. Its suffix, one of `PICTURE_FORMATS`, selects the format.
 
     Raises:
         TrajectoryError: If the file cannot be written.
@@ -205,10 +205,10 @@ def plot_snapshots(snapshots: Sequence[Snapshot], path: str | os.PathLike[str]) 
 
 
 def picture_format(path: str | os.PathLike[str]) -> str:
-    """As what a picture is written, by the ending of its file.
+    """Return the format of a picture by the suffix of its file.
 
     Raises:
-        TrajectoryError: If it is none of `PICTURE_FORMATS`.
+        TrajectoryError: If the suffix is none of `PICTURE_FORMATS`.
     """
     ending = Path(path).suffix.lower().removeprefix(".")
     if ending not in PICTURE_FORMATS:
@@ -217,7 +217,7 @@ def picture_format(path: str | os.PathLike[str]) -> str:
 
 
 def png(figure: Figure) -> bytes:
-    """A figure as a picture."""
+    """Render a figure as a PNG."""
     _add_own_fonts()
     picture = io.BytesIO()
     FigureCanvasAgg(figure).print_png(picture, pil_kwargs={"compress_level": PNG_LEVEL})

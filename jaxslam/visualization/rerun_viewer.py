@@ -68,13 +68,14 @@ class Viewer:
         """Open the viewer, the file, or both.
 
         Args:
-            slam: That tracks; it is only read.
-            truth: Poses of the camera in another world, shown aligned to those tracked.
-            path: File to write, `.rrd` by custom; one that is there is replaced.
-            live: Open the viewer, or go on in one that is open.
+            slam: System whose run is shown; it is only read.
+            truth: True poses of the camera, which are aligned to the tracked ones; `None` if unknown.
+            path: File to write, usually `.rrd`; an existing file is replaced. `None` for no file.
+            live: Whether to open the viewer, or to use one that is open.
 
         Raises:
-            JaxSlamError: If neither is wanted, the file cannot be written, or there is no screen or no viewer.
+            JaxSlamError: If neither a file nor the viewer is wanted, the file cannot be written, or there is no screen or
+                viewer.
         """
         if path is None and not live:
             raise JaxSlamError("viewer: expected a file to write or a live viewer, got neither")

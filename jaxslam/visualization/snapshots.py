@@ -1,4 +1,4 @@
-"""Pictures kept of a run while it goes on: frames with their points, where it was lost, and frames with masks."""
+"""Collect pictures during a run: frames with their points, losses of tracking, and frames with masks."""
 
 from collections.abc import Sequence
 
@@ -24,7 +24,7 @@ class Snapshots:
         self.kept: list[Snapshot] = []
 
     def __call__(self, frame: Frame | None, result: FrameResult | Rejected) -> None:
-        """Look at one frame."""
+        """Add one frame."""
         if self._seen in self._wanted and frame is not None and isinstance(result, FrameResult):
             title = f"frame {self._seen}: {result.status.name}, {result.num_inliers} inliers"
             self.kept.append(_snapshot(title, frame, result))
@@ -40,7 +40,7 @@ class Losses:
         self.kept: list[Snapshot] = []
 
     def __call__(self, frame: Frame | None, result: FrameResult | Rejected) -> None:
-        """Look at one frame."""
+        """Add one frame."""
         lost = result.status == TrackStatus.LOST
         begins = lost and not self._lost and len(self.kept) < self._most
         if begins and frame is not None and isinstance(result, FrameResult):
@@ -57,13 +57,13 @@ class RunPictures:
         self._snapshots, self._losses, self._masks = Snapshots(num_frames), Losses(), MaskPictures()
 
     def __call__(self, frame: Frame | None, result: FrameResult | Rejected) -> None:
-        """Look at one frame."""
+        """Add one frame."""
         for watcher in (self._snapshots, self._losses, self._masks):
             watcher(frame, result)
 
     @property
     def snapshots(self) -> Sequence[Snapshot]:
-        """Frames evenly spread over the run."""
+        """Frames that are evenly spread over the run."""
         return self._snapshots.kept
 
     @property

@@ -1,4 +1,4 @@
-"""What a comparison of a kernel with another library consists of."""
+"""Comparisons of kernels with other libraries."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ class Problem:
     """One problem of a certain size, and both ways to solve it.
 
     Attributes:
-        ours: A function of arrays, not compiled but for `compile`.
-        arguments: What it is called with.
-        theirs: The same work by another library.
-        difference: How far the two results are apart, given both; infinite if theirs is none.
-        prepare: Makes what theirs is called with, anew for each call, not timed.
-        compile: Compiles what ours needs, where that works on the host and is called as it is.
+        ours: Function of arrays, which is not compiled yet.
+        arguments: Arguments of `ours`.
+        theirs: Function of the other library that does the same work.
+        difference: Function that returns the difference of both results; infinite if the other library found none.
+        prepare: Function that makes the arguments of `theirs` before each call, which is not timed.
+        compile: Function that compiles the programs of `ours` if `ours` runs on the host and is called as it is.
     """
 
     ours: Callable[..., Any]
@@ -32,16 +32,16 @@ class Case:
     """A kernel beside another library, over sizes.
 
     Attributes:
-        name: Of the kernel, and of what is varied where that is not its number of points.
-        axis: What the size counts.
-        sizes: From small to large, evenly spread on a logarithmic scale.
-        reference: What does the same work, as a user calls it.
-        compared: What is done on both sides, in one sentence.
-        difference: What is measured of two results to see that they are the same, with its unit.
-        limit: How much of that is normal.
-        problem: Makes one of a size.
-        packages: What has to be installed for the reference beside jaxslam's own dependencies.
-        label: What a size is called.
+        name: Name of the kernel, and of the varied quantity if it is not the number of points.
+        axis: Quantity that the size counts.
+        sizes: Ascending sizes, evenly spaced on a logarithmic scale.
+        reference: Function of the other library, as a user calls it.
+        compared: Work that both sides do, in one sentence.
+        difference: Measure of the difference between the two results, with its unit.
+        limit: Largest normal difference.
+        problem: Function that makes a problem of a size.
+        packages: Packages that the reference needs besides jaxslam's own dependencies.
+        label: Function that names a size.
     """
 
     name: str
@@ -56,12 +56,12 @@ class Case:
     label: Callable[[int], str] = str
 
     def missing(self) -> str | None:
-        """The first of the packages that is not installed."""
+        """Return the first package that is not installed; `None` if all are."""
         return next((name for name in self.packages if installed(name) is None), None)
 
 
 def installed(package: str) -> str | None:
-    """The version of a package, `None` if it is not installed."""
+    """Return the version of a package; `None` if it is not installed."""
     try:
         return version(package)
     except PackageNotFoundError:

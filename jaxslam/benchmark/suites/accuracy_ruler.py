@@ -69,16 +69,16 @@ class Measured(ValidatedConfig):
 
 @dataclass(frozen=True)
 class AccuracyBaseline(ValidatedConfig):
-    """What the ruler compares with.
+    """Figures that the ruler compares with.
 
     Attributes:
-        commit: Of jaxslam, that was measured.
-        reason: Why these figures are the ones to compare with.
+        commit: Commit of jaxslam that was measured.
+        reason: Reason why these are the figures to compare with.
         machine: CPU, vector instructions and cores.
-        versions: Of the libraries that computed them.
-        preset: What was run.
-        sequences: What each recording is (part, camera or rendered room), from `plan.fingerprint`.
-        recordings: What was measured, by name of the sequence.
+        versions: Versions of the libraries that computed the figures.
+        preset: Preset that was run.
+        sequences: Part, camera or rendered room of each recording, from `plan.fingerprint`.
+        recordings: Measured figures, by name of the sequence.
     """
 
     _error: ClassVar[type[JaxSlamError]] = BenchmarkError
@@ -97,9 +97,9 @@ class Compared:
     """One recording now and in the baseline.
 
     Attributes:
-        name: Of the sequence.
-        now: What was measured now.
-        before: What the baseline has; `None` for a recording that is new in the suite.
+        name: Name of the sequence.
+        now: Figures measured now.
+        before: Figures of the baseline; `None` for a recording that is new in the suite.
         by_chance: Ratios of medians between which 95 % lie if nothing has changed but the seeds.
     """
 
@@ -115,7 +115,7 @@ class Compared:
 
     @property
     def equal_runs(self) -> int:
-        """How many seeds gave the very bytes of the baseline."""
+        """Number of seeds whose trajectories are equal to those of the baseline, to the byte."""
         if self.before is None:
             return 0
         pairs = zip(self.now.trajectories_sha256, self.before.trajectories_sha256, strict=False)
@@ -127,10 +127,10 @@ class Accuracy:
     """The reading of the ruler.
 
     Attributes:
-        recordings: Those that were run, in the order of the suite.
+        recordings: Comparisons of the recordings that were run, in the order of the suite.
         mean_ratio: Geometric mean of the ratios; `None` if no recording is in the baseline.
         mean_by_chance: Geometric means between which 95 % lie if nothing has changed but the seeds.
-        worse: Why the result is worse than the baseline, a sentence each; empty if it is not.
+        worse: Reasons why the result is worse than the baseline, one sentence each; empty if it is not.
         left_out: Recordings of the baseline that were not run.
     """
 
@@ -142,10 +142,10 @@ class Accuracy:
 
 
 def measured(results: Sequence[Mapping[str, Any]], out: Path) -> dict[str, Measured]:
-    """The runs of a suite by sequence.
+    """Collect the runs of a suite by sequence.
 
     Args:
-        results: From `bench`, all of one preset.
+        results: Results of `bench`, all of one preset.
         out: Folder of the suite's results, which holds the trajectories.
 
     Raises:
@@ -155,15 +155,15 @@ def measured(results: Sequence[Mapping[str, Any]], out: Path) -> dict[str, Measu
 
 
 def compare_accuracy(now: Mapping[str, Measured], sequences: Mapping[str, Any], baseline: AccuracyBaseline) -> Accuracy:
-    """Read the ruler.
+    """Compare figures with a baseline.
 
     Args:
-        now: From `measured`.
-        sequences: What each recording is, as in the baseline.
-        baseline: What to compare with.
+        now: Figures from `measured`.
+        sequences: Part, camera or rendered room of each recording, as in the baseline.
+        baseline: Baseline to compare with.
 
     Raises:
-        BenchmarkError: If a recording or a network is another one than in the baseline, or the seeds are not as many.
+        BenchmarkError: If a recording, a network or the number of seeds differs from the baseline.
     """
     common = [name for name in now if name in baseline.recordings]
     different = plan_differences(*({name: which[name] for name in common} for which in (baseline.sequences, sequences)))
@@ -189,7 +189,7 @@ def load_accuracy_baseline(path: Path) -> AccuracyBaseline:
     """Read a baseline.
 
     Raises:
-        BenchmarkError: If it is missing, is no baseline, or one that nothing can be compared with.
+        BenchmarkError: If the file is missing, is no baseline, or is one that nothing can be compared with.
     """
     baseline = read_baseline(AccuracyBaseline, path, "bench accuracy --update")
     names = list(baseline.recordings)
@@ -202,7 +202,7 @@ def save_accuracy_baseline(path: Path, baseline: AccuracyBaseline) -> None:
     """Write a baseline.
 
     Raises:
-        BenchmarkError: If it cannot be written.
+        BenchmarkError: If the file cannot be written.
     """
     write_atomically(path, (json.dumps(asdict(baseline), indent=1) + "\n").encode(), BenchmarkError)
 
@@ -229,7 +229,7 @@ def _measured(name: str, runs: Sequence[Mapping[str, Any]], out: Path) -> Measur
 
 
 def _same(name: str, figure: str, runs: Sequence[Mapping[str, Any]]) -> Any:
-    """What all runs have in common."""
+    """Return the value that all runs have in common."""
     for run in runs:
         if run[figure] != runs[0][figure]:
             got = f"{runs[0][figure]} and {run[figure]}"
@@ -245,7 +245,7 @@ def _sha256(path: Path) -> str:
 
 
 def _check_same(name: str, now: Measured, before: Measured | None) -> None:
-    """Refuse to compare what cannot be compared."""
+    """Refuse runs that differ from the baseline in frames, data, network or number of seeds."""
     if before is None:
         return
     for what in ("frames", "data_sha256", "network_sha256"):

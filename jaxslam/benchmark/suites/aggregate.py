@@ -1,4 +1,4 @@
-"""What the runs of a sequence have in common: a row of a table."""
+"""Summarize the runs of a sequence in a row of a table."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -13,10 +13,10 @@ class Column(NamedTuple):
     """A column of figures.
 
     Attributes:
-        heading: What stands above it.
+        heading: Heading of the column.
         figure: Name of the figure in `figures_of`.
-        digits: Decimals.
-        which: `median`, `least` or `most` of the runs, or `range` for the last two.
+        digits: Number of decimals.
+        which: Statistic of the runs: `median`, `least`, `most`, or `range` for the last two.
     """
 
     heading: str

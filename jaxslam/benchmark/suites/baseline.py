@@ -1,4 +1,4 @@
-"""What a suite once showed, in a file: figures to keep to, and the plan of the runs that gave them."""
+"""Baselines of suites in files: figures to compare with, and the plan of the runs that gave them."""
 
 import json
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ from jaxslam.errors import BenchmarkError, JaxSlamError
 from jaxslam.io.atomic_files import write_atomically
 
 ATE = "ate_rmse_m"
-"""The figure that every row must have."""
+"""Name of the figure that every row must have."""
 _AGAIN = "--of SUITE --update REASON makes a new one"
 
 
@@ -103,21 +103,21 @@ def save_baseline(path: Path, baseline: Baseline) -> None:
     """Write a baseline.
 
     Raises:
-        BenchmarkError: If it cannot be written.
+        BenchmarkError: If the file cannot be written.
     """
     plain = {key: dict(value) if isinstance(value, Mapping) else value for key, value in vars(baseline).items()}
     write_atomically(path, (json.dumps(plain, indent=1) + "\n").encode(), BenchmarkError)
 
 
 def check_same_plan(baseline: Baseline, plan: Mapping[str, Any]) -> None:
-    """See whether what is going to be run is what a baseline is of.
+    """Refuse a plan that differs from the plan of a baseline.
 
     Args:
-        baseline: The figures to keep to.
-        plan: From `jaxslam.benchmark.suites.plan.fingerprint`.
+        baseline: Baseline to compare with.
+        plan: Sequences, presets and runs, from `jaxslam.benchmark.suites.plan.fingerprint`.
 
     Raises:
-        BenchmarkError: If not; it names the differences.
+        BenchmarkError: If the plans differ; the message names the differences.
     """
     different = plan_differences(baseline.plan, plan)
     if different:

@@ -40,10 +40,10 @@ class Complaint:
     """A figure that has become worse.
 
     Attributes:
-        row: Sequence and label.
-        figure: Which.
-        before: What it was; `None` if it is about something else than a figure.
-        now: What it is.
+        row: Sequence and label of the row.
+        figure: Name of the figure.
+        before: Value in the baseline; `None` for a complaint about something other than a figure.
+        now: Value now.
     """
 
     row: str
@@ -71,15 +71,15 @@ def make_baseline(
     results: Sequence[Mapping[str, Any]],
     plan: Mapping[str, Any],
 ) -> Baseline:
-    """The figures of runs, to keep to.
+    """Make a baseline from the figures of runs.
 
     Args:
         suite: Name of the suite, or its file.
-        presets: With what it was run.
-        runs: How often each.
-        reason: Why these figures are the ones to keep to.
-        results: Of all runs.
-        plan: What was run, from `jaxslam.benchmark.suites.plan.fingerprint`.
+        presets: Presets that the suite was run with.
+        runs: Number of runs of each sequence and preset.
+        reason: Reason why these are the figures to compare with.
+        results: Results of all runs.
+        plan: Sequences, presets and runs, from `jaxslam.benchmark.suites.plan.fingerprint`.
 
     Raises:
         BenchmarkError: If a run failed, none was made, one has no ATE, or no reason is given.
@@ -94,24 +94,24 @@ def make_baseline(
 
 
 def check_reason(reason: str) -> None:
-    """See whether a reason for new figures says anything.
+    """Refuse an empty reason for new figures.
 
     Raises:
-        BenchmarkError: If not.
+        BenchmarkError: If the reason is empty.
     """
     if not reason.strip():
         raise BenchmarkError("--update: expected a reason, got none")
 
 
 def differences(baseline: Baseline, results: Sequence[Mapping[str, Any]]) -> str:
-    """In what the machine of these runs differs from that of the baseline, in words; empty if in nothing."""
+    """Describe how the machine of these runs differs from that of the baseline; empty if it does not."""
     ours = machine_of(results), versions_of(results)
     theirs = baseline.machine, baseline.versions
     return "; ".join(f"{now}, not {before}" for now, before in zip(ours, theirs, strict=True) if now != before)
 
 
 def runs_at_once(baseline: Baseline) -> int:
-    """How many runs this machine has room for: one where times will be compared, else one on each core."""
+    """Return the number of parallel runs: one if times will be compared, or else one per core."""
     return 1 if machine_name(machine()) == baseline.machine else usable_cores()
 
 

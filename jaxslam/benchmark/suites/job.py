@@ -53,11 +53,11 @@ class Job:
     """One run.
 
     Attributes:
-        clip: What is tracked.
-        preset: With what.
-        variant: The name of further settings; empty for none.
-        settings: `key=value`, in the order in which they are applied.
-        seed: Of every random choice.
+        clip: Sequence to track.
+        preset: Preset to track with.
+        variant: Name of further settings; empty for none.
+        settings: Settings `key=value`, in the order in which they are applied.
+        seed: Seed of every random choice.
     """
 
     clip: Clip
@@ -97,10 +97,10 @@ class Job:
 
 
 def opened(clip: Clip, root: Path | None, rooms: Path | None = None) -> tuple[Dataset, Path | None]:
-    """What a job tracks, and the folder it is in, if it is a recording.
+    """Open the sequence of a job, and find its folder if it is a recording.
 
     Args:
-        clip: What is asked for.
+        clip: Sequence to open.
         root: Folder in which recordings are looked for first.
         rooms: Folder in which rendered frames are kept; all are rendered before anything is timed. `None` to render
             them as they are asked for.
@@ -173,10 +173,10 @@ def _checksum(result: Mapping[str, Any]) -> str:
 
 
 def run_in_process(job: Job, out: Path, root: Path | None, rooms: Path | None = None) -> dict[str, Any]:
-    """Run a job in a process of its own.
+    """Run a job in a separate process.
 
     Args:
-        job: What is run.
+        job: Job to run.
         out: Folder of the suite's results.
         root: Folder in which recordings are looked for first.
         rooms: Folder in which rendered frames are kept for others of the suite.
@@ -208,12 +208,12 @@ def run_in_process(job: Job, out: Path, root: Path | None, rooms: Path | None = 
 
 
 def failed(job: Job, problem: str) -> dict[str, Any]:
-    """What is said of a run that did not come to its end."""
+    """Make the result of a run that failed."""
     return about(job) | {"status": FAILED, "problem": problem}
 
 
 def not_run(job: Job) -> dict[str, Any]:
-    """What is said of a run that is planned and has not been made."""
+    """Make the result of a planned run that has not been made."""
     return about(job) | {"status": NOT_RUN, "problem": None}
 
 

@@ -43,15 +43,15 @@ class Sequence(ValidatedConfig):
     """A recording or a part of one, or a rendered room.
 
     Attributes:
-        name: What it is called in tables and folders.
-        recording: The name of its folder; empty for a room.
-        room: What is rendered; `None` for a recording.
+        name: Name in tables and of folders.
+        recording: Name of the recording's folder; empty for a room.
+        room: Settings of the rendered room; `None` for a recording.
         start: First frame.
-        stop: The frame after the last; `None` for all.
-        every: All frames, or every nth, as if the camera were slower.
-        camera: Known camera of the recording, or a camera file, seen from the suite's; `None` if its folder tells.
-        sensor: What it must have been taken with; `None` for whichever it was.
-        runs: How often it is run; `None` for as often as the suite says.
+        stop: Frame after the last one; `None` for the end of the recording.
+        every: Step between frames, as if the camera were slower; 1 for all frames.
+        camera: Known camera, or a camera file relative to the suite's; `None` for the camera of the recording.
+        sensor: Required sensor of the recording; `None` for any.
+        runs: Number of runs; `None` for that of the suite.
     """
 
     _error: ClassVar[type[JaxSlamError]] = BenchmarkError
@@ -80,7 +80,7 @@ class Sequence(ValidatedConfig):
 
     @property
     def whole(self) -> bool:
-        """Whether all of it is run, as published figures are of."""
+        """Whether the whole recording is run, as for published figures."""
         return self.start == 0 and self.stop is None and self.every == 1
 
 
@@ -136,15 +136,15 @@ class _SuiteFile(ValidatedConfig):
 
 
 def suites() -> dict[str, Path]:
-    """The suites that come with jaxslam: files by name."""
+    """Find the suites that come with jaxslam: files by name."""
     return {path.stem: path for path in sorted((configs_dir() / "benchmarks").glob("*.yaml"))}
 
 
 def load_suite(name_or_path: str) -> Suite:
-    """A suite that comes with jaxslam, one in a file, or all recordings in a folder.
+    """Load a suite that comes with jaxslam, a suite in a file, or all recordings in a folder.
 
     Args:
-        name_or_path: A name in `suites()`, a YAML file, or a folder of recordings, which are run with `static`, `ngd`
+        name_or_path: Name in `suites()`, a YAML file, or a folder of recordings, which are run with `static`, `ngd`
             and `default`.
 
     Raises:
@@ -167,10 +167,10 @@ def load_suite(name_or_path: str) -> Suite:
 
 
 def checked_presets(names: tuple[str, ...]) -> tuple[str, ...]:
-    """The names, each once, if all of them are presets.
+    """Check that all names are presets, and return each once.
 
     Raises:
-        BenchmarkError: If one is not, or there is none.
+        BenchmarkError: If a name is not a preset, or there are no names.
     """
     if not names:
         raise BenchmarkError("presets: expected at least one")
@@ -207,10 +207,10 @@ def _suite(file: _SuiteFile, name: str, sequences: tuple[Sequence, ...]) -> Suit
 
 
 def check_masks(sequences: Iterable[Sequence], config: Config) -> None:
-    """See whether true masks are asked for where there are any: nobody knows the truth of a recording.
+    """Refuse true masks for recordings, whose true masks are unknown.
 
     Raises:
-        BenchmarkError: If they are asked for of a recording.
+        BenchmarkError: If the settings ask for true masks of a recording.
     """
     recordings = [sequence.name for sequence in sequences if sequence.room is None]
     if config.semantics.model == SCENE and recordings:
