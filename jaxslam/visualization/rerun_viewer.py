@@ -74,8 +74,8 @@ class Viewer:
             live: Whether to open the viewer, or to use one that is open.
 
         Raises:
-            JaxSlamError: If neither a file nor the viewer is wanted, the file cannot be written, or there is no screen or
-                viewer.
+            JaxSlamError: If neither a file nor the viewer is wanted, the file cannot be written, or there is no screen
+                or viewer.
         """
         if path is None and not live:
             raise JaxSlamError("viewer: expected a file to write or a live viewer, got neither")
