@@ -1,5 +1,9 @@
 """What users import from `jaxslam`, used as they use it: pyright reads this file too."""
 
+import inspect
+from collections.abc import Iterator
+from typing import Any, get_args, get_type_hints
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -63,3 +67,41 @@ def test_index_is_whole() -> None:
     assert callable(enable_compile_cache)
     for name in ("follow_points", "track_followed", "track_step", "init_state"):
         assert getattr(jaxslam, name).__module__ == "jaxslam.tracking.step"
+
+
+def classes_in(hint: Any) -> Iterator[type]:
+    """All classes of jaxslam and its kernels in an annotation."""
+    if isinstance(hint, type) and hint.__module__.partition(".")[0] in ("jaxslam", "jaxslam_kernels"):
+        yield hint
+    for part in hint if isinstance(hint, list) else get_args(hint):
+        yield from classes_in(part)
+
+
+def signatures(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """The functions that a user calls through a public name: itself, or the methods and properties of a class."""
+    if inspect.isfunction(value):
+        yield name, value
+    if not isinstance(value, type) or not value.__module__.startswith("jaxslam"):
+        return
+    for member, static in inspect.getmembers_static(value):
+        function = static.fget if isinstance(static, property) else getattr(static, "__func__", static)
+        written = inspect.isfunction(function) and function.__code__.co_filename != "<string>"  # not a dataclass's
+        if written and (member in ("__init__", "__call__") or not member.startswith("_")):
+            yield f"{name}.{member}", function
+
+
+def test_types_of_signatures_are_exported() -> None:
+    """Users can name every type that they pass or get, and the type of every field of what they get to read."""
+    public = {name: getattr(jaxslam, name) for name in dir(jaxslam) if not name.startswith("_")}
+    annotated = [pair for name, value in public.items() for pair in signatures(name, value)]
+    annotated += [(kind.__name__, kind) for kind in (jaxslam.Map, jaxslam.FrameResult, TrackOutput, jaxslam.Evaluation)]
+    assert len(annotated) > 80
+    exported = list(public.values())
+    missing = {
+        f"{place}: {kind.__module__}.{kind.__name__}"
+        for place, function in annotated
+        for hint in get_type_hints(function).values()
+        for kind in classes_in(hint)
+        if kind not in exported
+    }
+    assert not missing
