@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Num
 
 from jaxslam.geometry.so3 import matrices, multiply
 from jaxslam.geometry.types import Points, Pose, Transforms
@@ -82,7 +82,7 @@ def angle(T: Transforms) -> Float[np.ndarray, "..."]:
     return np.asarray(2 * np.arctan2(np.linalg.norm(T[..., 1:4], axis=-1), np.abs(T[..., 0])))
 
 
-def retract(T: Pose, tangent: Float[np.ndarray, "6"]) -> Pose:
+def retract(T: Pose, tangent: Num[np.ndarray, "6"]) -> Pose:
     """Retract a `(6,)` tangent vector at a `(7,)` transform: the product of `T` and the small motion.
 
     The tangent holds a translation (meters) and a rotation vector (radians), both in the local axes of `T`. The two are
