@@ -1,4 +1,4 @@
-"""How fast many clips are tracked at once: `vmap` of `track_step` beside the same step clip by clip."""
+"""Throughput of tracking many clips at once: `vmap` of `track_step` compared with the same step clip by clip."""
 
 import statistics
 import time
@@ -72,13 +72,13 @@ class Task:
     plan: TrackPlan
 
     def clips(self, count: int) -> list[FrameArrays]:
-        """As many clips, the rooms in turn."""
+        """Return this many clips, from the rooms in turn."""
         return [self.rooms[index % len(self.rooms)].frames for index in range(count)]
 
 
 @dataclass(frozen=True)
 class _Times:
-    """Of a call, once a round."""
+    """Times of a call, one per round."""
 
     wall_s: list[float]
     processor_s: list[float]
@@ -88,7 +88,7 @@ class _Times:
         return frames / statistics.median(self.wall_s)
 
     def cores(self) -> float:
-        """How many were computing, on the average."""
+        """Average number of cores that computed."""
         return sum(self.processor_s) / sum(self.wall_s)
 
 
@@ -109,7 +109,7 @@ def make_task(count: int, frames: int, width: int, height: int) -> Task:
 
 
 def ways(count: int) -> list[Way]:
-    """How so many clips are tracked: all in one program, and shared by the threads that XLA has on a processor."""
+    """List the ways to track a number of clips: all in one program, and split over the threads of XLA on a CPU."""
     found, cores = [Way(count, 1)], threads()
     if jax.default_backend() == "cpu" and cores > 1 and count >= 2 * cores:
         found.append(Way(min(_AT_ONCE, count // cores), cores))

@@ -25,7 +25,7 @@ def corners_of(image: np.ndarray, seed: int = 0) -> Corners:
 
     Args:
         image: `(h, w, 3)` RGB or `(h, w)`.
-        seed: Of points anywhere.
+        seed: Seed of random points.
     """
     gray = to_gray(image)
     corners: Corners | None = cv2.goodFeaturesToTrack(gray, NUM_CORNERS, 0.001, 7)
@@ -36,7 +36,7 @@ def corners_of(image: np.ndarray, seed: int = 0) -> Corners:
 
 
 def opencv_flow(before: Gray, after: Gray, corners: Corners) -> Corners:
-    """Where the corners are in the next image, with both pyramids."""
+    """Track the corners into the next image, building both pyramids."""
     found, _, _ = cv2.calcOpticalFlowPyrLK(
         before,
         after,
@@ -57,7 +57,7 @@ def flow_ms(before: Gray, after: Gray, corners: Corners) -> float:
 
 
 def flow_time_ms(dataset: Dataset) -> float | None:
-    """What a frame costs on this machine, whatever is done with it.
+    """Cost of a frame on this machine, whatever is done with it.
 
     The median over pairs of frames all over the recording, in one thread. Frames that cannot be read are passed over.
 

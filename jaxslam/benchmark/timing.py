@@ -83,7 +83,8 @@ def compare(
         theirs: Function of the second side.
         rounds: Number of timings of each side.
         warm_up: Number of calls of each side before the timings.
-        prepare: What makes the arguments of each call of theirs, not timed: of a solver that changes its problem, say.
+        prepare: Function that makes the arguments of each call of theirs, not timed; for solvers that change their
+            problem.
         most_s: After so many seconds no further round is begun, but of the first few.
     """
     for _ in range(warm_up):
@@ -145,7 +146,7 @@ def _hold(thread: int, cores: set[int]) -> None:
 
 
 def _milliseconds(function: Callable[[], Any]) -> tuple[float, float]:
-    """Of one call: on the wall clock, and of processor time of all threads."""
+    """Times of one call: wall clock, and processor time of all threads."""
     began, processor_began = time.perf_counter(), time.process_time()
     jax.block_until_ready(function())
     return (time.perf_counter() - began) * 1e3, (time.process_time() - processor_began) * 1e3

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 
 class ExitCode(IntEnum):
-    """How every command ends."""
+    """Exit codes of all commands."""
 
     DONE = 0
     KNOWN_ERROR = 1
@@ -18,7 +18,7 @@ class ExitCode(IntEnum):
 
     @property
     def text(self) -> str:
-        """What the code says, in words."""
+        """Meaning of the code, in words."""
         return _EXIT_TEXTS[self]
 
 
@@ -34,10 +34,10 @@ class Command(NamedTuple):
     """One command.
 
     Attributes:
-        words: What is typed after `jaxslam`.
+        words: Words of the command after `jaxslam`.
         place: Module and class of its options, `module:Class`, in `jaxslam.cli`; `None` if it is nothing but
             the commands whose words begin with its own.
-        about: What it does, in one line.
+        about: Summary of the command in one line.
         more: More about it, for its own help.
     """
 
@@ -48,12 +48,12 @@ class Command(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What is typed after `jaxslam`, as one text."""
+        """Words of the command after `jaxslam`, as one text."""
         return " ".join(self.words)
 
     @property
     def description(self) -> str:
-        """What its own help says about it."""
+        """Description in the command's own help."""
         others = [f"jaxslam {command.name}: {command.about}" for command in below(self)]
         pointer = ["These have a --help of their own:", *others] if others else []
         return "\n\n".join(text for text in (self.about, self.more, *pointer) if text)

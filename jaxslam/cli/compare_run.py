@@ -1,4 +1,4 @@
-"""What `jaxslam compare` does: it runs the presets, collects their figures, and prints and writes the tables."""
+"""Work of `jaxslam compare`: run the presets, collect their figures, and print and write the tables."""
 
 import json
 import statistics

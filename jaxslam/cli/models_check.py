@@ -73,7 +73,7 @@ class CheckModel(WithJson):
         plain_console.print(f"Picture: {self.out}")
 
     def _detector(self, labels: tuple[str, ...]) -> tuple[Detector, list[Path]]:
-        """What finds, and the files of its networks. Unlike in a run, a known one that is not here is an error."""
+        """Return the detector and the files of its networks; unlike in a run, a missing known network is an error."""
         prompts = (self.prompt_encoder, self.prompt_decoder)
         if self.examples is None and prompts == (None, None):
             path = find_model(self.file)
@@ -98,7 +98,7 @@ class CheckModel(WithJson):
 
 
 def _timed(detector: Callable[[np.ndarray], Detections], image: np.ndarray) -> tuple[Detections, float, float]:
-    """What it finds, and milliseconds: of the first run, and the median of those after it."""
+    """Run a network; return what it finds, and the milliseconds of the first run and the median of later ones."""
     times_ms: list[float] = []
     found: Any = None
     for _ in range(_REPEATS + 1):
@@ -109,7 +109,7 @@ def _timed(detector: Callable[[np.ndarray], Detections], image: np.ndarray) -> t
 
 
 def _figures(found: Detections) -> dict[str, Any]:
-    """What was found, for `--json`: boxes in pixels, masks as shares of the image."""
+    """Describe detections for `--json`: boxes in pixels, masks as shares of the image."""
     shares = [None] * len(found.labels) if found.masks is None else found.masks.mean((1, 2)).tolist()
     rows = zip(found.labels, found.scores.tolist(), found.boxes.tolist(), shares, strict=True)
     return {

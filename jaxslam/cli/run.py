@@ -80,7 +80,7 @@ class Demo(WithJson):
 
 @dataclass(frozen=True)
 class OfRecording(WithJson):
-    """What the commands that track recordings share."""
+    """Base of the commands that track recordings."""
 
     recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
     """Folder of the recording."""
@@ -130,7 +130,7 @@ class OfRecording(WithJson):
         return Subset(dataset, self.start, None if self.max_frames is None else self.start + self.max_frames)
 
     def folder(self) -> Path:
-        """Where the results go."""
+        """Return the folder of the results."""
         return self.out or Path("results") / self.recording.resolve().name
 
 

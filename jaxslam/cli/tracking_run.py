@@ -1,4 +1,4 @@
-"""What `demo`, `run` and `compare` do with a tracker: a progress bar, the results, and a summary of them."""
+"""Run a tracker for `demo`, `run` and `compare`: a progress bar, the results, and a summary of them."""
 
 import logging
 import time
@@ -52,7 +52,7 @@ class _Meter:
 
 
 def make_viewer(slam: Slam, dataset: Dataset, *, live: bool, path: Path | None) -> "Viewer | None":
-    """What shows the run, if that is wanted; rerun is a large package that many will not have."""
+    """Make the viewer if one is wanted; rerun is a large package that many will not have."""
     if not live and path is None:
         return None
     from jaxslam.visualization.rerun_viewer import Viewer  # noqa: PLC0415

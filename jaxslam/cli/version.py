@@ -1,4 +1,4 @@
-"""What `jaxslam --version` prints."""
+"""Text of `jaxslam --version`."""
 
 import sys
 from importlib.metadata import version

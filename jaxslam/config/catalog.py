@@ -34,10 +34,10 @@ class CatalogEntry(ValidatedConfig):
         url: Address of the file; `None` if it cannot be downloaded.
         size_bytes: Size of the file at `url` in bytes; `None` if unknown.
         sha256: SHA-256 of the file at `url`, in hexadecimal; `None` if unknown.
-        how: How to obtain the file if there is no `url`.
+        how: Instructions to obtain the file if there is no `url`.
 
     Raises:
-        JaxSlamError: Of class `_error`, if a field has the wrong type or cannot be right.
+        JaxSlamError: An error of class `_error`, if a field has the wrong type or cannot be right.
     """
 
     name: str
@@ -76,8 +76,8 @@ def read_catalog(cls: type[_Entry], entries: str, path: Path | None = None) -> d
         The entries by name, in the order of the file.
 
     Raises:
-        JaxSlamError: Of the class that `cls` raises, if the file is unreadable, or an entry is incomplete, has an
-            unknown key or is listed twice.
+        JaxSlamError: An error of the class that `cls` raises, if the file is unreadable, or an entry is incomplete, has
+            an unknown key or is listed twice.
     """
     path, error = path or configs_dir() / f"{entries}.yaml", cls._error
     groups = read_yaml(path, error)

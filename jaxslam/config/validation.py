@@ -96,7 +96,7 @@ def checked_value(hint: Any, value: object, key: str, error: type[JaxSlamError] 
         The value, with lists converted to tuples and integers to floats where the annotation says so.
 
     Raises:
-        JaxSlamError: Of class `error`, if the value has the wrong type or is out of range.
+        JaxSlamError: An error of class `error`, if the value has the wrong type or is out of range.
     """
     try:
         return _converted(hint, value)
@@ -114,9 +114,9 @@ def from_mapping(cls: type[_Record], content: object, place: str) -> _Record:
         place: File and section that the content comes from, as errors name it.
 
     Raises:
-        JaxSlamError: Of the class that `cls` raises, if the content is no mapping, a key is unknown or missing, or a
-            value has the wrong type or is out of range. The message names the place, the key, what was expected and
-            what was given.
+        JaxSlamError: An error of the class that `cls` raises, if the content is no mapping, a key is unknown or
+            missing, or a value has the wrong type or is out of range. The message names the place, the key, what was
+            expected and what was given.
     """
     return _record(cls, content, place, cls._error)
 

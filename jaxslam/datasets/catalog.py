@@ -78,7 +78,7 @@ def known_recording(name: str) -> Recording:
 
 
 def recordings_dir() -> Path:
-    """Where downloads go: `recordings` in the user's cache folder for jaxslam."""
+    """Return the folder of downloads: `recordings` in the user's cache folder for jaxslam."""
     return Path(platformdirs.user_cache_dir("jaxslam", appauthor=False)) / "recordings"
 
 
@@ -86,9 +86,9 @@ def find_recording(name: str, root: str | os.PathLike[str] | None = None) -> Pat
     """The folder of a recording on this machine, or `None`.
 
     Args:
-        name: Of its folder, known or not; `kitti_05` is `sequences/05`.
-        root: Where to look first. Then come the folder that `JAXSLAM_DATA` names and `recordings_dir()`; each is looked
-            through three levels deep.
+        name: Name of its folder, listed or not; `kitti_05` is `sequences/05`.
+        root: Folder to search first. Then come the folder that `JAXSLAM_DATA` names and `recordings_dir()`; each is
+            searched three levels deep.
 
     Raises:
         DatasetError: If `root` or `JAXSLAM_DATA` is no folder.
@@ -161,5 +161,5 @@ def _subfolders(folder: Path) -> list[Path]:
 
 
 def name_of(folder: Path) -> str:
-    """What a recording is called: by its folder, and KITTI's `sequences/05` is `kitti_05`."""
+    """Name a recording by its folder; KITTI's `sequences/05` is `kitti_05`."""
     return f"kitti_{folder.name}" if folder.parent.name == "sequences" else folder.name

@@ -37,7 +37,7 @@ class Finding:
     Attributes:
         level: Its severity.
         topic: Its topic in a word.
-        text: What was found and, if it is unusual, what that would do to tracking.
+        text: Result of the check and, if it is unusual, its effect on tracking.
     """
 
     level: Level

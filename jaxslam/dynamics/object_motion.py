@@ -172,7 +172,7 @@ def classify_motion(
         T_world_cam: Camera pose.
         before: Memory of the previous frame.
         params: Thresholds.
-        as_published: As in `MotionPlan`; static.
+        as_published: Whether to follow the paper, see `MotionPlan`; static.
     """
     flow = scene_flow(points.X_world, points.X_cam, T_world_cam)
     flow = jnp.where(points.there[None, :], flow, 0)

@@ -29,7 +29,7 @@ def replacing(path: str | os.PathLike[str], error: type[JaxSlamError] = JaxSlamE
         error: Class of the error to raise.
 
     Raises:
-        JaxSlamError: Of class `error`, if the file cannot be written.
+        JaxSlamError: An error of class `error`, if the file cannot be written.
     """
     target = _target(path, error)
     temporary = target.with_name(f".{target.name}.{os.getpid()}@{platform.node()}.tmp")
@@ -55,7 +55,7 @@ def write_atomically(path: str | os.PathLike[str], data: bytes, error: type[JaxS
         error: Class of the error to raise.
 
     Raises:
-        JaxSlamError: Of class `error`, if the file cannot be written.
+        JaxSlamError: An error of class `error`, if the file cannot be written.
     """
     with replacing(path, error) as temporary:
         temporary.write_bytes(data)
@@ -70,7 +70,7 @@ def make_folder(path: Path, error: type[JaxSlamError] = JaxSlamError, option: st
         option: Option of the command that named the folder, for the error message.
 
     Raises:
-        JaxSlamError: Of class `error`, if it is a file, is read-only, or its disk is full.
+        JaxSlamError: An error of class `error`, if it is a file, is read-only, or its disk is full.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -90,8 +90,8 @@ def check_writable(path: Path, option: str, error: type[JaxSlamError] = JaxSlamE
         error: Class of the error to raise.
 
     Raises:
-        JaxSlamError: Of class `error`, if the folder does not exist, is read-only or its disk is full, or if the path
-            is that of a folder or device.
+        JaxSlamError: An error of class `error`, if the folder does not exist, is read-only or its disk is full, or if
+            the path is that of a folder or device.
     """
     try:
         target = _target(path, error)
@@ -106,7 +106,8 @@ def _target(path: str | os.PathLike[str], error: type[JaxSlamError]) -> Path:
     """Follow a path through symbolic links to a regular file, which need not exist.
 
     Raises:
-        JaxSlamError: Of class `error`, if the path is empty, or leads to a folder, a device, a pipe or in a circle.
+        JaxSlamError: An error of class `error`, if the path is empty, or leads to a folder, a device, a pipe or in a
+            circle.
     """
     given = os.fspath(path)
     if not given or "\0" in given:

@@ -22,8 +22,8 @@ def nanoseconds(text: str, place: str, error: type[JaxSlamError], *, least_s: in
         least_s: Earliest accepted time in seconds.
 
     Raises:
-        JaxSlamError: Of class `error`, if the text is not a number, not finite, too early, or too late for int64;
-            the message guesses another unit.
+        JaxSlamError: An error of class `error`, if the text is not a number, not finite, too early, or too late for
+            int64; the message guesses another unit.
     """
     problem = f"{place}: expected a timestamp in seconds, got '{text:.80}'"
     try:

@@ -70,7 +70,7 @@ def parse_yaml(text: str, origin: str, error: type[JaxSlamError]) -> Any:
         error: Class of the error to raise.
 
     Raises:
-        JaxSlamError: Of class `error`, naming `origin` and the line, if the text is no YAML, has a
+        JaxSlamError: An error of class `error`, naming `origin` and the line, if the text is no YAML, has a
             duplicate key, or is too long or nested too deep.
     """
     if len(text) > _MAX_CHARACTERS:
@@ -112,7 +112,7 @@ def read_yaml(path: Path, error: type[JaxSlamError]) -> Any:
     """Read a YAML file as a scalar, list or mapping, or `None` if the file is empty.
 
     Raises:
-        JaxSlamError: Of class `error`, naming the file, if the file is missing, no text or no YAML.
+        JaxSlamError: An error of class `error`, naming the file, if the file is missing, no text or no YAML.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
@@ -127,7 +127,8 @@ def read_mapping(path: Path, error: type[JaxSlamError]) -> dict[str, Any]:
     """Read the mapping in a YAML file; it is empty if the file holds only comments.
 
     Raises:
-        JaxSlamError: Of class `error`, naming the file, if the file is missing, no text, no YAML or no mapping.
+        JaxSlamError: An error of class `error`, naming the file, if the file is missing, or is no text, no YAML or no
+            mapping.
     """
     content = read_yaml(path, error)
     return {} if content is None else checked_mapping(content, str(path), error)
@@ -137,12 +138,12 @@ def checked_mapping(content: object, place: str, error: type[JaxSlamError]) -> d
     """Return a mapping with its keys as text.
 
     Args:
-        content: What was read.
+        content: Content of the file.
         place: File and section of the content, as errors name it.
         error: Class of the error to raise.
 
     Raises:
-        JaxSlamError: Of class `error`, naming `place`, if the content is no mapping.
+        JaxSlamError: An error of class `error`, naming `place`, if the content is no mapping.
     """
     if not isinstance(content, Mapping):
         raise error(f"{place}: expected `key: value` lines, got {reprlib.repr(content)}")
@@ -162,7 +163,7 @@ def check_keys(
         error: Class of the error to raise.
 
     Raises:
-        JaxSlamError: Of class `error`, naming `place` and the keys.
+        JaxSlamError: An error of class `error`, naming `place` and the keys.
     """
     for key in content:
         if key not in known:

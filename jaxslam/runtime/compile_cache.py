@@ -1,4 +1,4 @@
-"""How XLA, JAX's compiler, works for jaxslam: what it keeps between processes, and how many threads it uses."""
+"""Settings of XLA, JAX's compiler: the cache of compiled code, compiler options, and the number of threads."""
 
 import functools
 import logging
@@ -14,7 +14,7 @@ _log = logging.getLogger(__name__)
 
 
 def cache_dir() -> Path:
-    """Where jaxslam keeps compiled code: `xla` in the user's cache folder for jaxslam."""
+    """Return the default folder of compiled code: `xla` in the user's cache folder for jaxslam."""
     return Path(platformdirs.user_cache_dir("jaxslam", appauthor=False)) / "xla"
 
 
@@ -26,7 +26,7 @@ every time; with JAX's own limit, a second, even more."""
 
 
 def compile_cache_dir() -> Path:
-    """Where compiled code is kept: the user's own folder where one was chosen in JAX's settings, else `cache_dir()`."""
+    """Return the folder of compiled code: the one chosen in JAX's settings, else `cache_dir()`."""
     import jax  # noqa: PLC0415 - `usable_cores` and `cache_dir` need none
 
     chosen: str | None = jax.config.values["jax_compilation_cache_dir"]
@@ -120,7 +120,7 @@ def prefer_one_thread() -> None:
 
 
 def threads() -> int:
-    """How many threads XLA computes with, if `NPROC` is now what it was at the first array."""
+    """Return the number of threads XLA computes with, if `NPROC` is now what it was at the first array."""
     chosen = os.environ.get("NPROC", "")
     return int(chosen) if chosen.isdigit() and int(chosen) > 0 else usable_cores()
 

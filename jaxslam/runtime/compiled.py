@@ -21,8 +21,9 @@ class Program:
 
     Attributes:
         name: Module and name of the function.
-        when: When it is compiled.
-        num_compiled: For how many combinations of shapes, types and static arguments it was compiled in this process.
+        when: Time at which it is compiled.
+        num_compiled: Number of combinations of shapes, types and static arguments for which it was compiled in this
+            process.
     """
 
     name: str
@@ -47,7 +48,7 @@ def compiled(
     What is compiled takes NumPy arrays as well as JAX arrays.
 
     Args:
-        when: When it is compiled; whoever writes `warm-up` also calls it in `Slam.warm_up`, which a test checks.
+        when: Time at which it is compiled. `Slam.warm_up` must call every program marked `warm-up`; a test checks it.
         static: Names of the arguments that are no arrays: each value is compiled by itself.
         donate: Names of the arguments whose memory the result may take over; the caller must not use them again.
         options: Compiler options, one of the sets of `jaxslam.runtime.compile_cache`.

@@ -63,7 +63,7 @@ def cached_trace(function: Callable[P, R]) -> Callable[P, R]:
     was compiled for arguments which are not is compiled again for some that are.
 
     Args:
-        function: Of jaxslam, pure, of arrays in pytrees and of static arguments.
+        function: Pure function of jaxslam that takes arrays in pytrees and static arguments.
     """
 
     @functools.wraps(function)
@@ -129,7 +129,7 @@ def _key_of_parts(name: str, values: Iterable[Any]) -> str | None:
 
 
 def _file(program: str) -> Path | None:
-    """Where a program is kept; `None` if it is not."""
+    """Return the file of a program; `None` if it is not kept."""
     folder: str | None = jax.config.values["jax_compilation_cache_dir"]
     sources = _sources()
     if not folder or not jax.config.values["jax_enable_compilation_cache"] or sources is None or " at 0x" in program:
@@ -243,7 +243,7 @@ def _structure_to_json(value: Any) -> Any:
 
 
 def _structure_from_json(written: list[Any]) -> Any:
-    """What `_structure_to_json` wrote. No code of the classes is called.
+    """Read what `_structure_to_json` wrote. No code of the classes is called.
 
     Raises:
         LookupError: If a class is not loaded in this process, or is none of those.

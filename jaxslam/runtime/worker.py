@@ -23,7 +23,7 @@ _CLOSE_S = 1.8
 
 
 class _Failed(NamedTuple):
-    """What came of a job that raised."""
+    """Outcome of a job that raised."""
 
     error: BaseException
 
@@ -53,7 +53,7 @@ class Worker(Protocol[_Job_contra, _Result]):
         """The results that are there by frame number `frame`, in the order of their jobs, each given out once.
 
         Raises:
-            Exception: What a job raised, here and once; the jobs after it are done nevertheless.
+            Exception: Error of a job, raised here and once; later jobs are done nevertheless.
         """
         ...
 
@@ -195,7 +195,7 @@ class ThreadWorker(Generic[_Job, _Result]):
         self._jobs.put((self._work, job))
 
     def collect(self, frame: int) -> list[_Result]:
-        """What is done."""
+        """Return the results of finished jobs."""
         del frame
         return _results(self._outcomes)
 

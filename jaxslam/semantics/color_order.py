@@ -72,7 +72,7 @@ def _inside(boxes: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _skin_px(pixels: UInt8[np.ndarray, "n 3"]) -> int:
-    """How many RGB pixels have a color of skin."""
+    """Count RGB pixels with the color of skin."""
     red, green, blue = pixels.astype(np.int16).T
     bright = (red > 95) & (green > 40) & (blue > 20)
     return int(np.count_nonzero(bright & (red - np.minimum(green, blue) > 15) & (red > green) & (red > blue)))

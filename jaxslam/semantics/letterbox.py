@@ -33,7 +33,7 @@ def place(
     Args:
         image: `(h, w, 3)` image of any size.
         size: Size `(width, height)` of the input in pixels.
-        fit: How the image fits the input.
+        fit: Way in which the image is fitted to the input.
         pad: Value of the pixels beside the image.
     """
     (height, width), (full_width, full_height) = image.shape[:2], size

@@ -37,7 +37,7 @@ class Port(NamedTuple):
 
 
 class Colors(NamedTuple):
-    """How the values of an image enter a network of real numbers: `(value - mean) / std` of 0 to 255."""
+    """Normalization of image values for a network of floats: `(value - mean) / std` of 0 to 255."""
 
     bgr: bool = False
     mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -48,7 +48,7 @@ class ImageInput(NamedTuple):
     """The input of a network that takes one image.
 
     Attributes:
-        name: As the graph has it.
+        name: Name in the graph.
         width: Pixels.
         height: Pixels.
         channels_first: `(3, h, w)` rather than `(h, w, 3)`.
@@ -80,11 +80,11 @@ class ImageInput(NamedTuple):
 
 
 class Graph(NamedTuple):
-    """What can be known of a network from outside.
+    """Inputs, outputs and metadata of a network.
 
     Attributes:
         image: Its input; `None` if it is not one image.
-        inputs: As declared.
+        inputs: Declared inputs.
         outputs: With the sizes they had for an empty image.
         names: The names of its classes, where its metadata holds them.
     """

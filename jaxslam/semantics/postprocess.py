@@ -15,7 +15,7 @@ _SLACK = 0.01  # quantized networks reach a little past 0 and 1
 
 
 class Wanted(NamedTuple):
-    """What is asked of a detector.
+    """Request to a detector.
 
     Attributes:
         names: Every class of the network, by number.

@@ -27,8 +27,8 @@ class PreparedFrame(NamedTuple):
     """The current frame, prepared.
 
     Attributes:
-        frame: As it came.
-        pyramid: Of its image.
+        frame: Arrays of the frame.
+        pyramid: Pyramid of its image.
         depth: Its depth image, 0 where missing or not to be believed.
         elapsed_s: Seconds since the last good frame.
         right: Finest levels of the right image of a pair; `None` where depth is measured.
@@ -91,7 +91,7 @@ def measure(
         depth: Depth image, 0 where missing.
         depth_delay_s: Seconds from the time of the image to that of the depth.
         sensor: Camera and its readout time.
-        reach: As for `sample_depth`, static.
+        reach: Reach of `sample_depth` in pixels, static.
         matched: `(n,)` depth at the pixels by `match_depth`, which then is what was measured.
     """
     xy = normalize(sensor.intrinsics, uv)
@@ -113,7 +113,7 @@ def measure_points(
     sensor: SensorModel,
     matched: Weights | None = None,
 ) -> Measurements:
-    """What a frame says of map points, `(3, n)` meters, seen at pixels `uv` from about `pose`; `matched` as above."""
+    """Measure map points `(3, n)`, in meters, that are seen at pixels `uv` from about `pose`; `matched` as above."""
     expected = jnp.maximum(to_camera(pose, X_world)[2], sensor.min_depth_m)
     return measure(uv, expected, twist, view.depth, view.frame.depth_delay_s, sensor, matched=matched)
 
@@ -138,7 +138,7 @@ def match_depth(
         sensor: Camera, and the depths to be believed.
         known_point: Whether `expected_depth` is that of points of the map, static: where it is confirmed, a match needs
             no way back. Else it is rough depth of this very pair, which may be wrong in the same way.
-        plan: How rows are searched, static.
+        plan: Settings of the search along rows, static.
 
     Returns:
         `(n,)` meters, 0 where there is no match.
@@ -159,7 +159,7 @@ def match_depth(
 
 
 def predict_pixels(X_cam: Points, twist: Float[Array, "6"], height: int, sensor: SensorModel) -> Pixels:
-    """Where points appear in a frame of a rolling shutter, while the camera moves with `twist`."""
+    """Project points into a frame of a rolling shutter, while the camera moves with `twist`."""
     depth = jnp.maximum(X_cam[2], sensor.min_depth_m / 2)
     xy = X_cam[:2] / depth[None, :]
     v = to_pixels(sensor.intrinsics, distort(sensor.intrinsics, xy))[1]

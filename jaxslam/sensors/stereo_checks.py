@@ -26,8 +26,8 @@ class PairFinding(NamedTuple):
     Attributes:
         topic: The topic in a word.
         odd: Whether the result is unusual.
-        text: What was found.
-        consequence: What an unusual result would do to tracking.
+        text: Result of the check.
+        consequence: Effect of an unusual result on tracking.
     """
 
     topic: str

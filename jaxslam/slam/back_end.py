@@ -69,15 +69,15 @@ class BackEnd:
         """Start with a map, empty by default.
 
         Args:
-            camera: That takes the frames.
+            camera: Camera that takes the frames.
             sensor: Camera with its depth noise.
-            plan: Of the tracker.
+            plan: Static settings of the tracker.
             config: Settings.
             slam_map: To start with.
             localize_only: Leave the map as it is.
             detector: Finds in keyframes what may move, which leaves them and the map.
             dense: Gets keyframes once they are in the map, and where they go.
-            times: Where to keep how long the jobs of the threads take.
+            times: Record of the duration of every job.
         """
         self._times = times or StageTimes()
         self._sensor, self._track_plan = sensor, plan
@@ -160,7 +160,7 @@ class BackEnd:
 
         Raises:
             RuntimeError: If it is closed.
-            Exception: What went wrong in a thread. The state is as it was, and nothing else is lost.
+            Exception: Error of a job in a thread. The state is as it was, and nothing else is lost.
         """
         if self._closed:
             raise RuntimeError("the tracker is closed; Slam.reset() begins anew")
@@ -178,7 +178,7 @@ class BackEnd:
         return self._with_reloaded(state), correction
 
     def latest_error(self) -> str:
-        """What went wrong in the detector that looks at keyframes; told once, empty if nothing did."""
+        """Return the latest error of the detector of keyframes, once; empty if there is none."""
         error, self._detector_error = self._detector_error, ""
         return error
 
@@ -197,9 +197,9 @@ class BackEnd:
             timestamp_ns: Its time.
             image: `(h, w, 3)` RGB or `(h, w)`; copied if it is needed.
             arrays: The frame; it is copied.
-            output: What the tracker said of it.
+            output: Output of the tracker for it.
             frame: Its number.
-            recognized: Where it is, if tracking began at a place that was recognized.
+            recognized: Its pose, if tracking began at a recognized place.
         """
         keyframe = NONE
         if not self._localize_only:
@@ -291,7 +291,7 @@ class BackEnd:
         """Wait until everything handed over is in the map; once closed, take what was done until then.
 
         Raises:
-            Exception: What went wrong in a thread. The state is as it was, and nothing else is lost: finish again.
+            Exception: Error of a job in a thread. The state is as it was, and nothing else is lost: finish again.
         """
         if self._semantics is not None:
             self._take_movers(*self._semantics.flush(), 0)

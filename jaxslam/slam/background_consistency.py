@@ -41,7 +41,7 @@ _MAX_FRAMES = 90
 
 @dataclass(frozen=True)
 class PoseDoubt:
-    """How far a translation may be wrong.
+    """Bound on the error of a translation.
 
     Attributes:
         unsure_m: Meters that the camera has moved, by its pose, without the background saying so.
@@ -63,7 +63,7 @@ class BackgroundConsistency:
         """Begin with nothing to compare with.
 
         Args:
-            camera: That takes the frames.
+            camera: Camera that takes the frames.
             nearest_m: Nearest depth that is believed, meters.
             farthest_m: Farthest depth that is believed, meters.
         """
@@ -112,7 +112,7 @@ class BackgroundConsistency:
         return self._doubt(0.0)
 
     def _doubt(self, moved_m: float) -> PoseDoubt:
-        """What is unsure, with what the camera has moved since the background last had its say."""
+        """Add the motion since the background last confirmed a pose to the uncertainty."""
         return PoseDoubt(self._unsure_m + moved_m, self._unsure_m > _SMALL * self._depth_m)
 
     def _stop(self) -> None:

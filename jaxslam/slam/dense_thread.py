@@ -75,7 +75,7 @@ class DenseMapping:
         """Take a keyframe; it is put in when it is in the map.
 
         Args:
-            new: As local mapping gets it.
+            new: The keyframe, as local mapping gets it.
             image: `(h, w, 3)` RGB or `(h, w)`; copied.
             pose: `(7,)` where the tracker has it.
             frame: Its number.
@@ -139,7 +139,7 @@ class DenseMapping:
             return self._map.cloud()
 
     def cells(self) -> Occupancy:
-        """What is occupied and free, by all keyframes that are kept; from any thread.
+        """Return the occupied and free cells by all keyframes that are kept; from any thread.
 
         Raises:
             MapFileError: If there is none yet.
@@ -155,7 +155,7 @@ class DenseMapping:
             return self._map.sees_anything
 
     def figures(self) -> DenseFigures:
-        """How the map was made so far; from any thread."""
+        """Return figures of the map so far; from any thread."""
         with self._lock:
             return self._map.figures(self.worker.num_dropped)
 

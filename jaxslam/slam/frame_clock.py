@@ -46,7 +46,7 @@ class FrameClock:
 
         Args:
             fps: Nominal frames a second of the camera, until stamps tell the rate.
-            warnings: Where to say what looks wrong about the stamps.
+            warnings: Collector of warnings about the timestamps.
         """
         self._nominal_s = 1 / fps
         self._warnings = warnings
@@ -180,6 +180,6 @@ class FrameClock:
 
 
 def _num_odd(intervals_s: list[float], period_s: float) -> int:
-    """How many intervals are no whole number of periods, or shorter than one."""
+    """Count intervals that are not a whole number of periods, or shorter than one."""
     periods = [interval_s / period_s for interval_s in intervals_s]
     return sum(abs(number - max(round(number), 1)) > _OFF for number in periods)

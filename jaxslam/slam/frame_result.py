@@ -1,4 +1,4 @@
-"""What became of a frame: with all its arrays, rejected, or as one line of a log."""
+"""Result of a frame: with all arrays, rejected, or as one line of a log."""
 
 from dataclasses import dataclass, fields
 
@@ -11,7 +11,7 @@ from jaxslam.tracking.state import KeyframeReason, TrackOutput, TrackReason, Tra
 
 @dataclass(frozen=True, eq=False)
 class FrameResult:
-    """What became of one frame.
+    """Result of tracking one frame.
 
     Attributes:
         timestamp_ns: Its time.
@@ -20,7 +20,7 @@ class FrameResult:
             rotation (rad). It says how well the image fixes the pose among the points around; not how far the map has
             drifted since it began, nor where the world of another submap is. At the first frame of a submap, which is
             its origin by definition, 1e-12 on the diagonal; 100 where `status` is `LOST`.
-        status: What the pose is worth.
+        status: Quality of the pose.
         reason: Why it is not worth more, and of `RELOCALIZED` why flow had lost it; empty if it is `OK`.
         twist: `(6,)` velocity of the camera in its own axes: m/s, then rad/s.
         num_inliers: Followed points that agree with the pose.
@@ -36,13 +36,13 @@ class FrameResult:
         correction: `(7,)` how the map's frame changed since the frame before, from the old world to the new one, as
             `wxyz_xyz`: the part of the change of pose that is no motion of the camera.
         dynamic_mask: `(h, w)` bool, true where nothing was trusted because it moves or may.
-        mask_source: Where that comes from.
+        mask_source: Origin of `dynamic_mask`.
         mask_age: Frames since the one it was detected in; -1 if it was not.
-        detector_error: What went wrong in the detector, told once; empty if nothing did.
+        detector_error: Error of the detector, reported once; empty if there is none.
         track_ms: Time it took, in milliseconds.
         occluded_share: Share of the points of the keyframe it hangs on that something passed before and that were seen
             again; `None` if the settings do not ask for it, it was lost, or the map had no keyframe yet.
-        warnings: What looks wrong about the input, a sentence each, where it was noticed at this frame; each is said
+        warnings: Warnings about the input that were noticed at this frame, a sentence each; each is reported
             once. `Slam.warnings` has all of them.
         submap: Number of the submap that the pose is in. Poses of different submaps are in different worlds, which
             have nothing to do with each other until a place of both is recognized and they become one.
@@ -102,7 +102,7 @@ class Rejected:
 
     @property
     def reason(self) -> str:
-        """What was wrong."""
+        """Reason of the rejection."""
         return str(self.error)
 
 

@@ -22,8 +22,8 @@ class InputChecks:
         """Begin before the first frame.
 
         Args:
-            camera: That takes the frames.
-            warnings: Where to say what looks wrong.
+            camera: Camera that takes the frames.
+            warnings: Collector of warnings.
             detector: The detector that looks at the same frames, which notices swapped colors.
         """
         self._camera, self._warnings, self._detector = camera, warnings, detector

@@ -1,4 +1,4 @@
-"""What looks wrong about the input of a run, said once each: in the log, and with the frame at which it was noticed."""
+"""Warnings about the input of a run, reported once each: in the log, and with the frame that raised them."""
 
 import logging
 
@@ -21,7 +21,7 @@ class InputWarnings:
         """Say that something looks wrong, unless that was said before.
 
         Args:
-            topic: What it is about; of each topic only the first text is said.
+            topic: Topic of the warning; only the first text of a topic is reported.
             text: One sentence that names the field, what was expected and what came, and what to do.
         """
         if topic in self._by_topic:

@@ -68,12 +68,12 @@ class KeyframeSemantics:
         """Begin idle.
 
         Args:
-            camera: That takes the frames.
-            detector: What looks.
+            camera: Camera that takes the frames.
+            detector: Detector of movable objects.
             deterministic: Have it look in turn, what it finds `latency_frames` later; else in a thread.
             latency_frames: With 0, it is there with the next frame.
-            dilate_px: How far a mask reaches beyond what was found.
-            times: Where to keep how long a look takes.
+            dilate_px: Distance by which masks are dilated, in pixels.
+            times: Record of the duration of every detection.
         """
         self._detector, self._dilate_px = detector, dilate_px
         self._reduced, self._failures = Downscaler(ImageGrid.of(camera), WIDTH_PX), ErrorLog()
@@ -112,7 +112,7 @@ class KeyframeSemantics:
             _log.warning("the detector is slow: keyframes that waited too long are not looked at")
 
     def collect(self, frame: int) -> tuple[list[DynamicObservations], str]:
-        """What was found by a frame, in the order of the keyframes, and what went wrong last; told once."""
+        """Return the results that are ready by a frame, in the order of the keyframes, and the last error, once."""
         return self._collected(lambda: self.worker.collect(frame))
 
     def flush(self) -> tuple[list[DynamicObservations], str]:

@@ -1,4 +1,4 @@
-"""Where things that move are in every frame: what a detector finds, carried to the present, and what depth shows.
+"""Mask of movable objects in every frame: detections propagated to the present, and new surfaces in depth.
 
 The tracker never waits for the detector: while it looks at one frame, the mask of an earlier one is propagated. What
 goes wrong in the detector is told with the frame, and tracking goes on.
@@ -37,7 +37,7 @@ _pyramid = compiled(when="warm-up", options=SINGLE_THREAD)(partial(build_pyramid
 
 
 class MaskSource(enum.IntEnum):
-    """Where the mask of a frame comes from."""
+    """Origin of the mask of a frame."""
 
     NONE = 0
     """There is none: nothing found yet, or nothing that looks."""
@@ -54,13 +54,13 @@ class MaskSource(enum.IntEnum):
 
 
 class FrameMask(NamedTuple):
-    """What a frame's mask is.
+    """Mask of a frame.
 
     Attributes:
         mask: `(h, w)` true where something moves or may.
-        source: Where it comes from.
+        source: Origin of the mask.
         age: Frames since the one the detector looked at; 0 for that frame, -1 where it has no part in the mask.
-        error: What went wrong in the detector, told once; empty if nothing did.
+        error: Error of the detector, reported once; empty if there is none.
     """
 
     mask: Bool[np.ndarray, "h w"]
@@ -70,7 +70,7 @@ class FrameMask(NamedTuple):
 
 
 class _BufferedFrame:
-    """What is kept of a frame, at the size of masks."""
+    """Image and pyramid of a frame, at the size of masks."""
 
     def __init__(self, gray: np.ndarray) -> None:
         self.gray = gray
@@ -108,16 +108,16 @@ class MaskPipeline:
         """Start with no mask.
 
         Args:
-            camera: That takes the frames.
+            camera: Camera that takes the frames.
             detector: Finds what may move.
             deterministic: Run it in turn, its result `latency_frames` later; else in a thread.
             latency_frames: 0 has every frame wait for its own mask.
             propagate: Carry masks on from frame to frame; without it, an old mask is used where it was.
             new_surfaces: Add what has come before surfaces seen earlier.
             farthest_m: Depth beyond says nothing of those.
-            dilate_px: How far a mask reaches beyond what was found.
-            seed: Of random choices.
-            times: Where to keep how long the detector takes.
+            dilate_px: Distance by which masks are dilated, in pixels.
+            seed: Seed of random choices.
+            times: Record of the duration of every detection.
         """
         self._propagate, self._new_surfaces, self._dilate_px, self._seed = propagate, new_surfaces, dilate_px, seed
         self._reduced = Downscaler(ImageGrid.of(camera), WIDTH_PX)
@@ -176,10 +176,10 @@ class MaskPipeline:
         What stood outside the mask before leaves it, and new_surfaces are added.
 
         Args:
-            frame: That was tracked, the last one.
+            frame: Number of the last frame, which was tracked.
             time_s: Its time.
-            T_world_cam: Where the camera was when the depth of the frame was taken,
-            turn_rad_per_s: and how fast it turned.
+            T_world_cam: `(7,)` pose of the camera when the depth of the frame was taken.
+            turn_rad_per_s: Angular speed of the camera.
         """
         seen = self._surfaces.compare(time_s, T_world_cam, turn_rad_per_s, self._depth, self._carried_from)
         if self._carried_from is not None and self._propagate:

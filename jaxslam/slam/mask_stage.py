@@ -97,7 +97,7 @@ class MaskStage:
             arrays: Its arrays.
 
         Raises:
-            Exception: What a job of the worker raised.
+            Exception: Error of a job of the worker.
         """
         self._worker.flush()
         assert self._found is not None

@@ -41,7 +41,7 @@ class DetectionJob(NamedTuple):
 
 
 class DetectedMask(NamedTuple):
-    """What the detector has found.
+    """Result of the detector.
 
     Attributes:
         frame: The frame it looked at.
@@ -53,14 +53,14 @@ class DetectedMask(NamedTuple):
 
 
 class ErrorLog:
-    """What goes wrong in a detector: told every time, in the log only when it changes."""
+    """Errors of a detector: returned every time, and logged when they change."""
 
     def __init__(self) -> None:
         """Begin with nothing wrong."""
         self._said = ""
 
     def report(self, error: str) -> str:
-        """What went wrong, as it is told."""
+        """Log a detector error when it changes, and return it."""
         if error != self._said:
             _log.warning("detector failed: %s", error)
         self._said = error
@@ -75,7 +75,7 @@ def rgb_copy(image: np.ndarray) -> np.ndarray:
 def detect_mask(
     detector: Detector, reduced: Downscaler, rgb: UInt8[np.ndarray, "h w 3"], depth: Float[np.ndarray, "_h _w"]
 ) -> Bool[np.ndarray, "_h _w"]:
-    """What a detector finds in an image, as a mask of the size of masks, no wider than it was found."""
+    """Run a detector on an image and return its undilated mask, at the size of masks."""
     return mask_of_detections(reduced_detections(detector(rgb), reduced), depth, dilate_px=0)
 
 
@@ -99,12 +99,12 @@ class SemanticThread:
         """Begin idle.
 
         Args:
-            detector: What looks.
+            detector: Detector of movable objects.
             reduced: The size of masks.
             deterministic: Have it look in turn, its masks `latency_frames` later; else in a thread.
             latency_frames: 0 has every frame wait for its mask, in a thread too.
-            seed: Of random choices.
-            times: Where to keep how long a look takes.
+            seed: Seed of random choices.
+            times: Record of the duration of every detection.
         """
         self.looking_at: int | None = None
         self._offered: int | None = None

@@ -83,16 +83,16 @@ class Slam:
     their own, and `close` (or `with`) ends them.
 
     Attributes:
-        camera: That takes the frames.
+        camera: Camera that takes the frames.
         config: Settings in effect.
         without_network: Why no network looks at frames, as a part of a sentence; `None` if one or a `detector` does.
-        dense_mapping: What makes the dense map; `None` without `dense.enabled`.
+        dense_mapping: Thread of the dense map; `None` without `dense.enabled`.
         compile_s: Seconds that compiling took.
-        times: Of the stages of every frame: `take over` what mapping has done, `flow`, `wait for mask`, `pose`,
-            `match with map`, `hand over` to mapping and the detector; and of the jobs beside them: `match pair` of a
-            stereo camera, `masks`, `detector`, `mapping`, `places`, `dense` and its parts. In a deterministic run those
-            are parts of stages: `match pair` in `flow`, `masks` there and in `hand over`, the others in `hand over` or
-            `take over`.
+        times: Durations of the stages of every frame: `take over` what mapping has done, `flow`, `wait for mask`,
+            `pose`, `match with map`, `hand over` to mapping and the detector; and of the jobs in other threads: `match
+            pair` of a stereo camera, `masks`, `detector`, `mapping`, `places`, `dense` and its parts. In a
+            deterministic run those are parts of stages: `match pair` in `flow`, `masks` there and in `hand over`, the
+            others in `hand over` or `take over`.
     """
 
     def __init__(
@@ -108,7 +108,7 @@ class Slam:
         """Prepare for frames of a camera. Compiling happens at the first frame or in `warm_up`.
 
         Args:
-            camera: That takes the frames.
+            camera: Camera that takes the frames.
             config: Settings; the default preset if not given.
             slam_map: To start with: the first frame is `LOST` until its place is recognized.
             localize_only: Leave the map as it is.
@@ -164,7 +164,7 @@ class Slam:
 
         Args:
             path: The file.
-            camera: That takes the frames; the one that made the map if not given.
+            camera: Camera that takes the frames; the one that made the map if not given.
             config: Settings.
             localize_only: Leave the map as it is.
 
@@ -226,7 +226,7 @@ class Slam:
             FrameError: If the frame does not fit the camera, or its time is not later than the last one's. Nothing
                 has happened then; go on with the next frame.
             RuntimeError: After `close`.
-            Exception: What went wrong in a thread of the map, if something did.
+            Exception: Error of a job in a thread of the map.
         """
         check_frame(frame, self.camera.width, self.camera.height, pair=self.camera.is_stereo)
         self._clock.check(frame.timestamp_ns, frame.depth_timestamp_ns)
@@ -317,7 +317,7 @@ class Slam:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What looks wrong about the input so far, a sentence each."""
+        """Warnings about the input so far, a sentence each."""
         return self._warnings.all
 
     @property
@@ -403,7 +403,7 @@ class Slam:
         self._status = TrackStatus.OK
 
     def _new_dense_mapping(self) -> DenseMapping | None:
-        """What makes the dense map, if the settings ask for one and the map may grow."""
+        """Make the thread of the dense map, if the settings ask for one and the map may grow."""
         if not self.config.dense.enabled or self._localize_only:
             return None
         dense_map = DenseMap(

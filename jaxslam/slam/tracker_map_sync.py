@@ -124,9 +124,9 @@ class TrackerMapSync:
 
         Args:
             timestamp_ns: Time of the frame.
-            frame: As the tracker got it.
-            output: What it said.
-            recognized: Where it is in the map, if tracking began at a place that was recognized.
+            frame: Arrays of the frame.
+            output: Output of the tracker for it.
+            recognized: Its pose in the map, if tracking began at a recognized place.
         """
         pose = pose_of(output)
         first = int(output.status) == TrackStatus.STARTED and recognized is None
@@ -193,7 +193,7 @@ class TrackerMapSync:
         return [id for id in self._slots[: self._plan.num_keyframes] if id != NONE]
 
     def slot_for(self, keyframe_id: int, keep: set[int]) -> int | None:
-        """Where to put a reloaded keyframe, not in place of those to keep; `None` if it is there or gone."""
+        """Choose a slot, not among those to keep, for a reloaded keyframe; `None` if it is loaded already or gone."""
         if keyframe_id in self._slots or not knows(self.map, keyframe_id):
             return None
         free = range(self._plan.num_keyframes, len(self._slots))
@@ -208,7 +208,7 @@ class TrackerMapSync:
         return _reloaded(state, np.int32(slot), keyframe.image, *places, keyframe.weight, keyframe.id)
 
     def _in_map(self, keyframe_id: int) -> np.ndarray:
-        """Where a keyframe is in the map; one on its way there hangs on the one before."""
+        """Return the pose of a keyframe in the map; one on its way there is placed relative to the one before."""
         anchored = self._on_the_way.get(keyframe_id)
         if anchored is None:
             return self.map.pose(keyframe_id)

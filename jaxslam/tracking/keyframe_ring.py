@@ -109,7 +109,7 @@ def _visible(uv: Pixels, depth: Weights, height: int, width: int) -> Mask:
 
 
 def _similar_views(keyframes: KeyframeRing, T_world_cam: SE3) -> Bool[Array, "k n"]:
-    """Which points are seen from about the same direction and distance as in their keyframe."""
+    """Tell which points are seen from about the same direction and distance as in their keyframe."""
     then = keyframes.X_world - keyframes.T_world_cam[:, 4:, None]
     now = keyframes.X_world - T_world_cam.translation()[None, :, None]
     far_then, far_now = jnp.sum(jnp.square(then), axis=1), jnp.sum(jnp.square(now), axis=1)

@@ -43,7 +43,7 @@ def detect_new_points(
     surface (two people 145).
 
     Args:
-        points: As they are.
+        points: Current points.
         next_id: Number of the first new one.
         view: The frame.
         T_world_cam: Its pose.

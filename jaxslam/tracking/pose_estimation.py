@@ -104,7 +104,7 @@ def worse_status(coarse: Code, refined: Code) -> Code:
 
 
 def _close(T_world_cam: SE3, X_world: Points, xy: Pixels, params: TrackParams) -> Mask:
-    """Which points are seen within the outlier threshold of where the pose puts them."""
+    """Tell which points are seen within the outlier threshold of where the pose puts them."""
     X_cam = to_camera(T_world_cam, X_world)
     front = X_cam[2] > params.sensor.min_depth_m / 2
     predicted = X_cam[:2] / jnp.where(front, X_cam[2], 1)[None, :]
@@ -115,7 +115,7 @@ def _close(T_world_cam: SE3, X_world: Points, xy: Pixels, params: TrackParams) -
 def fits(
     state: TrackState, view: PreparedFrame, uv: Pixels, pose: SE3, twist: Float[Array, "6"], params: TrackParams
 ) -> Mask:
-    """Which points are where a pose puts them, in the picture and in depth where that is measured."""
+    """Tell which points are where a pose puts them, in the image and in depth where that is measured."""
     X_world = state.points.X_world
     seen = measure_points(X_world, uv, pose, twist, view, params.sensor, view.matched)
     apart_m = jnp.abs(to_camera(pose, X_world)[2] - seen.depth)

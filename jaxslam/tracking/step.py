@@ -350,7 +350,7 @@ def _widened(params: TrackParams, before: Pixels, after: Pixels, followed: Mask)
 
 
 def _trust(points: TrackedPoints, params: TrackParams) -> Weights:
-    """How much each point counts: its weight, less while it is on probation; 0 for a slot without a point."""
+    """Weight of each point, lower while it is on probation; 0 for a slot without a point."""
     served = (points.age + 1).astype(points.weight.dtype) / params.probation_frames
     return jnp.where(points.valid, points.weight * jnp.minimum(served, 1), 0)
 

@@ -151,7 +151,7 @@ def plot_map(slam_map: Map, trajectory: Trajectory, path: str | os.PathLike[str]
 
 
 class _View(NamedTuple):
-    """How the world is seen along one of its axes.
+    """View of the world along one of its axes.
 
     Attributes:
         title: From where, as the first keyframe has it.

@@ -175,7 +175,7 @@ class Viewer:
             self._stream.log(entity, rr.Scalars(float(figure)))
 
     def _log_status(self, result: FrameResult | Rejected) -> None:
-        """What became of the frame, where it is not what became of the one before."""
+        """Log the status of the frame where it differs from that of the frame before."""
         said = result.status, result.reason
         if said != self._said:
             text = ": ".join(filter(None, (result.status.name, result.reason)))

@@ -1,4 +1,4 @@
-"""What cues to what moves add to a frame, beside the optical flow of a frame by OpenCV."""
+"""Cases for the cost of dynamic cues, compared with the optical flow of a frame by OpenCV."""
 
 from collections.abc import Callable
 from typing import Any
@@ -127,7 +127,7 @@ def _of_empty_room(views: RoomViews, num_points: int) -> np.ndarray:
 
 
 def _under(views: RoomViews, X_world: np.ndarray) -> np.ndarray:
-    """Which points the person hides in the second picture."""
+    """Tell which points the person hides in the second image."""
     uv, _ = projected(views.camera, to_local(views.now.T_world_cam, X_world))
     inside, (column, row) = in_picture(views.camera, uv)
     return inside & (views.now.instance_mask[row, column] > 0)

@@ -24,10 +24,10 @@ def measure(case: Case, size: int, device: Any, rounds: int) -> dict[str, Any]:
     """One row: calls of ours on a device and of theirs on the processor in turn, every thread on one core.
 
     Args:
-        case: What is compared.
+        case: Case to measure.
         size: One of its sizes.
         device: JAX's, where ours computes; its arrays are there already.
-        rounds: How often each is called at most; rounds that take long are fewer, but not below 5.
+        rounds: Maximum number of calls of each; fewer, but at least 5, where a round takes long.
 
     Returns:
         Times in milliseconds, medians and all of them, and how far the two results are apart. Figures of theirs are
@@ -77,7 +77,7 @@ def _program(problem: Problem, arguments: tuple[Any, ...]) -> tuple[Callable[...
 
 
 def _difference(problem: Problem, ours: Any) -> float | None:
-    """How far both results are apart; `None` if they cannot be compared, as one of them found nothing."""
+    """Return the distance between both results; `None` if one of them found nothing."""
     difference = problem.difference(ours, problem.theirs(*problem.prepare()))
     return difference if math.isfinite(difference) else None
 

@@ -17,7 +17,7 @@ CASES: dict[str, Case] = {
 
 
 def versions() -> dict[str, str | None]:
-    """Of the libraries that jaxslam is compared with, beside those that every run names."""
+    """Versions of the libraries that jaxslam is compared with, beyond those that every run names."""
     names = dict.fromkeys(("scipy", *(name for case in CASES.values() for name in case.packages)))
     return {name: installed(name) for name in names}
 

@@ -1,4 +1,4 @@
-"""What comparisons of kernels have shown: a table in Markdown, a picture with both axes logarithmic, slopes."""
+"""Report on comparisons of kernels: a table in Markdown, a log-log plot, and slopes."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -55,7 +55,7 @@ def slopes(rows: Rows) -> dict[str, float]:
 
 
 def about(case: Case, rows: Rows) -> str:
-    """What is compared, in one line, and what else the table does not say."""
+    """Say in one line what is compared, and add what the table does not say."""
     problem = next((f" ({row['problem']})" for row in rows if row["problem"]), "")
     return f"beside {case.reference}{problem}: {case.compared}; size: {case.axis}; difference: {case.difference}"
 

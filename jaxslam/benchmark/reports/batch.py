@@ -1,4 +1,4 @@
-"""What tracking many clips at once has shown: a table in Markdown, and throughput over the number of clips."""
+"""Report on tracking many clips at once: a table in Markdown, and throughput over the number of clips."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -50,7 +50,7 @@ def cells(row: Mapping[str, Any]) -> list[str]:
 
 
 def markdown_report(content: Mapping[str, Any]) -> str:
-    """What `batch.json` holds, as a table, and how it was measured."""
+    """Return the content of `batch.json` as a table, and how it was measured."""
     width, height = content["size"]
     title = f"Many clips at once: {content['frames']} frames of {width} x {height} each"
     table = Table([COLUMNS, *map(cells, content["rows"])])
@@ -58,7 +58,7 @@ def markdown_report(content: Mapping[str, Any]) -> str:
 
 
 def how(content: Mapping[str, Any]) -> str:
-    """What the figures mean, and on what they were taken."""
+    """Say what the figures mean, and on which machine they were measured."""
     repeated = max(row["clips"] for row in content["rows"]) > content["different"]
     on_device = any(row["peak_device_mb"] is not None for row in content["rows"])
     memory = "of the accelerator" if on_device else "of the process"

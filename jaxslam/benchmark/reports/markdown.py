@@ -107,7 +107,7 @@ def overview_table(suite: Suite, rows: Sequence[Mapping[str, Any]]) -> list[list
 
 
 def summary_lines(suite: Suite, rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """How each label stands against what has been published, wins and losses."""
+    """Compare each label with published figures: wins and losses."""
     lines = []
     for label in dict.fromkeys(row["label"] for row in rows):
         best, every = counted(suite, [row for row in rows if row["label"] == label])
@@ -132,7 +132,7 @@ def warnings(suite: Suite, results: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def progress_lines(results: Sequence[Mapping[str, Any]]) -> list[str]:
-    """How many of the planned runs are done, unless all are."""
+    """Count the planned runs that are done, unless all are."""
     statuses = Counter(result["status"] for result in results)
     if statuses["done"] == len(results):
         return []
@@ -166,7 +166,7 @@ def note_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def mixture_lines(results: Sequence[Mapping[str, Any]]) -> list[str]:
-    """What differs between runs of several calls: jaxslam, the data of a sequence, or the networks of a label."""
+    """List what differs between runs of several calls: jaxslam, the data of a sequence, or the networks of a label."""
     done = [result for result in results if result["status"] == "done"]
     lines = []
     if len({result.get("sources_sha256") for result in done}) > 1:
@@ -200,10 +200,10 @@ def figure_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]) -
 
 
 def published_tables(suite: Suite, sequence: str, rows: Sequence[Mapping[str, Any]]) -> list[list[list[str]]]:
-    """What has been published about a sequence, a table for each of `METRICS` that papers have.
+    """Tables of published figures of a sequence, one for each of `METRICS` that papers have.
 
     Args:
-        suite: What was run.
+        suite: Suite that was run.
         sequence: Its name in the suite; of a part of a recording nothing has been published.
         rows: Those of `rows_of` that are of the sequence.
     """
@@ -214,13 +214,13 @@ def published_tables(suite: Suite, sequence: str, rows: Sequence[Mapping[str, An
 def published_table(
     suite: Suite, sequence: str, rows: Sequence[Mapping[str, Any]], metric: PublishedMetric = ATE
 ) -> list[list[str]]:
-    """What has been published about a sequence, best first, and how each of our rows compares; headings first.
+    """List the published figures of a sequence, best first, and how each of our rows compares; headings first.
 
     Args:
-        suite: What was run.
+        suite: Suite that was run.
         sequence: Its name in the suite.
         rows: Those of `rows_of` that are of the sequence.
-        metric: Which figure.
+        metric: Name of the figure.
 
     Returns:
         Lines of as many texts; none if nothing has been published.
@@ -240,7 +240,7 @@ def published_table(
 
 
 def protocols(suite: Suite, rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Of every paper whose figures stand beside ours: which frames, and what was taken of how many runs."""
+    """Note for every paper with figures next to ours: its frames, and which statistic of how many runs."""
     sequences = by_sequence(rows)
     figures = [f for name in sequences for metric in METRICS for f in published_of(suite, name, metric.figure)]
     names = {name for figure in figures for name in (figure.reported_by or figure.system).split(", ")}

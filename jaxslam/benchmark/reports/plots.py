@@ -208,7 +208,7 @@ def _color(index: int) -> str:
 
 
 def folder_of(run: Mapping[str, Any], out: Path) -> Path:
-    """Where the files of a run are."""
+    """Return the folder of the files of a run."""
     return out / (run.get("folder") or run_folder(run["sequence"], run["label"], run["seed"]))
 
 

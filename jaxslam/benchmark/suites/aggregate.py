@@ -61,7 +61,7 @@ _FIGURES = (*(column.figure for column in (*ACCURACY, *RUNNING)), *COVERAGE)
 
 
 def row_name(sequence: str, label: str) -> str:
-    """What a row is called."""
+    """Return the name of a row."""
     return f"{sequence}, {label}"
 
 
@@ -98,7 +98,7 @@ def by_sequence(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str
 
 
 def median_run(results: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
-    """Of results of one row that are done, at least one: the run of median error, the better of two."""
+    """Choose the run of median error, the better of two, from the finished results of one row."""
     ates = [np.inf if result["ate_rmse_m"] is None else result["ate_rmse_m"] for result in results]
     return results[int(np.argsort(ates, kind="stable")[(len(results) - 1) // 2])]
 

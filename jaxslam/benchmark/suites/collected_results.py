@@ -32,7 +32,7 @@ class Collected:
         """Begin with planned runs.
 
         Args:
-            jobs: What is planned now.
+            jobs: Planned runs.
             earlier: From `read_results`; what is planned again is replaced.
         """
         self._results: dict[_Key, dict[str, Any]] = {_key(result): result for result in earlier}

@@ -60,8 +60,8 @@ class _Cluster:
     """A cluster as an executor.
 
     Attributes:
-        client: Of its scheduler.
-        root: Where recordings are looked for first.
+        client: Client of its scheduler.
+        root: Folder in which to look for recordings first.
         recordings: Hosts that have them, by name; `None` for all hosts, also those that come later.
     """
 

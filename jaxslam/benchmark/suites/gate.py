@@ -116,7 +116,7 @@ def runs_at_once(baseline: Baseline) -> int:
 
 
 def complaints(baseline: Baseline, results: Sequence[Mapping[str, Any]]) -> list[Complaint]:
-    """What has become worse: errors by over 2 %, tracked frames at all, time by over 20 %; and what is missing.
+    """List what has become worse: errors by over 2 %, tracked frames at all, time by over 20 %; and what is missing.
 
     Of times, the fastest run is compared.
 
@@ -183,7 +183,7 @@ def _limits(baseline: Baseline, results: Sequence[Mapping[str, Any]]) -> Callabl
 
 
 def _noise_of(results: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Of every label, over all sequences that were run more than once."""
+    """Compute the relative spread of errors of every label, over all sequences that were run more than once."""
     shares: dict[str, list[float]] = {}
     for row in rows_of(results):
         runs = [run for run in results if (run["sequence"], run["label"]) == (row["sequence"], row["label"])]

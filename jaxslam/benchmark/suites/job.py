@@ -73,7 +73,7 @@ class Job:
 
     @property
     def folder(self) -> Path:
-        """Where its results go, seen from those of the suite."""
+        """Folder of its results, relative to the results of the suite."""
         return run_folder(self.clip.name, self.label, self.seed)
 
     @property
@@ -82,7 +82,7 @@ class Job:
         return load_config(self.preset, overrides=(*self.settings, f"run.seed={self.seed}"))
 
     def to_json(self) -> str:
-        """As text, from which `of_json` makes an equal one."""
+        """Return the job as text, from which `of_json` makes an equal job."""
         return json.dumps(dataclasses.asdict(self), sort_keys=True)
 
     @classmethod
@@ -259,7 +259,7 @@ def run_here(folder: Path, root: Path | None, rooms: Path | None) -> None:
 
 
 def _num_images(whole: Dataset) -> int:
-    """How many color images, or pairs, the recording has; also those that no depth image was taken with."""
+    """Count the color images, or pairs, of the recording, including those without a depth image."""
     return len(whole) + (whole.unmatched.color if isinstance(whole, Associated) else 0)
 
 
@@ -270,7 +270,7 @@ def _rate_hz(dataset: Dataset) -> float:
 
 
 def about(job: Job) -> dict[str, Any]:
-    """What a result says of its job."""
+    """Return the part of a result that describes its job."""
     return {
         "sequence": job.clip.name,
         "label": job.label,

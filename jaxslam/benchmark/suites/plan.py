@@ -24,9 +24,9 @@ def plan(
     """All runs of a suite.
 
     Args:
-        suite: What is run.
+        suite: Suite to run.
         presets: Instead of its own, if there are any.
-        runs: How often each, instead of as often as the suite and its sequences say.
+        runs: Number of runs of each, instead of the number that the suite and its sequences give.
         settings: `key=value` each, applied last: they beat those of the suite and of its variants.
     """
     variants = suite.variants or {"": ()}
@@ -44,7 +44,7 @@ def missing(suite: Suite, found: Collection[str]) -> dict[str, str]:
     """Recordings that are not there, by name, and how to get them.
 
     Args:
-        suite: What is run.
+        suite: Suite to run.
         found: Names of the recordings that are there.
     """
     names = [clip.recording for clip in suite.sequences if clip.recording and clip.recording not in found]
@@ -57,7 +57,7 @@ def swept(suite: Suite, sweeps: Iterable[str]) -> Suite:
     """The suite with every combination of values as a variant.
 
     Args:
-        suite: What is run.
+        suite: Suite to run.
         sweeps: `key=v1,v2,...` each. Commas inside brackets or quotes belong to a value: `dynamics.cues=[],[a,b]` has
             two values.
 
@@ -84,10 +84,10 @@ def swept(suite: Suite, sweeps: Iterable[str]) -> Suite:
 
 
 def replaced_settings(suite: Suite, settings: Sequence[str], sweeps: Sequence[str] = ()) -> list[str]:
-    """What the command line changes about a suite's own settings, a line each.
+    """List what the command line changes about a suite's own settings, a line each.
 
     Args:
-        suite: As its file says it, without sweeps.
+        suite: Suite as in its file, without sweeps.
         settings: `key=value` each, of `--set`.
         sweeps: `key=v1,v2,...` each, of `--sweep`.
 
@@ -111,7 +111,7 @@ def replaced_settings(suite: Suite, settings: Sequence[str], sweeps: Sequence[st
 
 
 def fingerprint(jobs: Sequence[Job]) -> dict[str, Any]:
-    """What was planned, as plain data that a file can keep and `plan_differences` compares.
+    """Describe what was planned, as plain data that a file can keep and `plan_differences` compares.
 
     Settings are those that a suite and a command line give, not those of presets: a preset that is changed is what a
     comparison is for. Of rooms and recordings it says what is not as `SyntheticConfig` and `Sequence` have it.
@@ -153,7 +153,7 @@ def _shown(leaves: Mapping[str, Any], key: str) -> str:
 
 
 def _values(text: str) -> list[str]:
-    """What commas separate, but for those inside brackets or quotes."""
+    """Split a text at commas, except those inside brackets or quotes."""
     values, depth, quote = [""], 0, ""
     for letter in text:
         if quote:

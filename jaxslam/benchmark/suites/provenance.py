@@ -1,4 +1,4 @@
-"""What the figures of a run depend on besides its settings: sources and libraries, recording, camera file, networks.
+"""Inputs of a run besides its settings: sources and libraries, recording, camera file, networks.
 
 Each result keeps it, so that a later call knows whether the run would be the same now.
 """
@@ -29,7 +29,7 @@ class Run(Protocol):
 
     @property
     def clip(self) -> Clip:
-        """What is tracked."""
+        """Sequence that is tracked."""
         ...
 
     @property
@@ -39,10 +39,10 @@ class Run(Protocol):
 
 
 def identities(runs: Sequence[Run], root: Path | None) -> list[dict[str, Any]]:
-    """What the figures of runs depend on, here and now; equal for equal figures on one kind of processor.
+    """Return the current inputs of runs; they are equal for equal figures on one kind of processor.
 
     Args:
-        runs: Whose recordings are on this machine.
+        runs: Runs whose recordings are on this machine.
         root: Folder in which recordings are looked for first.
 
     Returns:
@@ -73,7 +73,7 @@ def changes(result: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     The sources decide, not the commit: a checkout with changes that are not committed is known by them.
 
     Args:
-        result: Of an earlier run.
+        result: Result of an earlier run.
         now: Its identity, from `identities`.
     """
     found = []
@@ -139,7 +139,7 @@ def networks_sha256(config: SemanticsConfig) -> dict[str, str | None]:
 
 
 def _networks_or_problem(config: SemanticsConfig) -> dict[str, str | None]:
-    """As `networks_sha256`; a file that is named and not there is the problem of the run, which will say so."""
+    """Return `networks_sha256`; a named file that does not exist is left for the run to report."""
     try:
         return networks_sha256(config)
     except ModelError as problem:

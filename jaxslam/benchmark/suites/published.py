@@ -44,16 +44,16 @@ class Figure(ValidatedConfig):
     """One published number.
 
     Attributes:
-        system: Whose it is.
+        system: Name of the system.
         sequence: Name of the recording's folder, `kitti_NN` for KITTI odometry.
-        metric: What was measured; the unit is in its name.
+        metric: Name of the figure; it contains the unit.
         value: The number.
-        sensor: What the system was fed with.
-        alignment: What was fitted before measuring: a rigid motion or, laxer, a similarity.
+        sensor: Sensor that the system was run with.
+        alignment: Transform fitted before measuring: a rigid motion or, laxer, a similarity.
         alignment_stated: Whether the paper says so; otherwise it is what is usual for the sensor.
         source: The table.
         reported_by: The papers of other systems it is from, with commas between; `None` if from the system's own.
-        variant: Which part of the system ran, in an ablation; `None` for the whole.
+        variant: Part of the system that ran, in an ablation; `None` for the whole system.
         note: A reservation about it; empty if there is none.
     """
 
@@ -85,7 +85,7 @@ class _Paper(ValidatedConfig):
         alignment: Alignment of trajectories before errors are measured, unless a table names another.
         alignment_stated: Whether the paper states the alignment.
         protocol: Frames and number of runs, as far as the paper states them.
-        source: Where in the paper the figures are.
+        source: Place of the figures in the paper.
     """
 
     name: str
@@ -196,7 +196,7 @@ def read_published(path: Path) -> PublishedSystem:
 
 
 def published_for(sequence: str, metric: str = "ate_rmse_m", *, variants: bool = False) -> list[Figure]:
-    """What has been published about a recording, from best to worst.
+    """List the published figures of a recording, from best to worst.
 
     A system's own paper goes before what others report of it. Without one, the same number from several papers is
     one figure that names them all; different numbers are all there.
@@ -224,7 +224,7 @@ def published_for(sequence: str, metric: str = "ate_rmse_m", *, variants: bool =
 
 
 def verdict(ours_best: float, ours_worst: float, published: float) -> Verdict:
-    """How our runs compare with a published figure of which smaller is better.
+    """Compare our runs with a published figure of which smaller is better.
 
     Args:
         ours_best: The smallest figure of our runs.

@@ -29,8 +29,8 @@ class PublishedMetric(NamedTuple):
 
     Attributes:
         figure: Its name, of ours and of theirs.
-        name: What it is called in tables.
-        unit: Of its numbers.
+        name: Name in tables.
+        unit: Unit of its numbers.
     """
 
     figure: Metric
@@ -81,7 +81,7 @@ def reservations(suite: Suite, row: Mapping[str, Any]) -> list[str]:
     """Why the figures of a row may not be compared with published ones, in words; none if they may.
 
     Args:
-        suite: What was run.
+        suite: Suite that was run.
         row: From `rows_of`.
     """
     found = [f"{row['done']} of {row['runs']} planned runs are done"] if row["done"] < row["runs"] else []
@@ -106,11 +106,11 @@ def length_is_known(recording: str) -> bool:
 
 
 def verdict_on(row: Mapping[str, Any], metric: Metric, published: float, reasons: Sequence[str]) -> str:
-    """How the runs of a row compare with a published figure: one of `VERDICTS`, or `NO_VERDICT`.
+    """Compare the runs of a row with a published figure: one of `VERDICTS`, or `NO_VERDICT`.
 
     Args:
         row: From `rows_of`.
-        metric: What is compared.
+        metric: Figure to compare.
         published: The figure of others.
         reasons: From `reservations`; with one there is no verdict.
     """

@@ -11,12 +11,12 @@ _LONGEST, _KEPT, _MARK = 100, 80, 8
 
 
 def run_folder(sequence: str, label: str, seed: int) -> Path:
-    """Where the files of a run are, seen from the folder of the results.
+    """Return the folder of the files of a run, relative to the folder of the results.
 
     Args:
         sequence: Name of the sequence in its suite.
         label: Preset and variant, as in tables. A value in it may hold slashes, or be longer than a name of a file.
-        seed: Of the run.
+        seed: Seed of the run.
     """
     return Path(sequence) / _folder_name(label) / str(seed)
 

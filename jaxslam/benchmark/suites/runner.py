@@ -19,7 +19,7 @@ _ROOMS = ".rooms"
 
 
 class Executor(Protocol):
-    """Where runs are made: on this machine, `local`, or on others, `cluster`."""
+    """Place where runs are made: this machine, `local`, or others, `cluster`."""
 
     @property
     def recordings(self) -> Collection[str]:
@@ -27,7 +27,7 @@ class Executor(Protocol):
         ...
 
     def identities(self, jobs: Sequence[Job]) -> list[dict[str, Any]]:
-        """What the figures of jobs depend on where they would be run now: `provenance.identities`."""
+        """Return the inputs of jobs where they would be run now: `provenance.identities`."""
         ...
 
     def run(self, jobs: Sequence[Job], out: Path) -> Iterator[tuple[Job, dict[str, Any]]]:
@@ -48,7 +48,7 @@ def run_jobs(
     Args:
         jobs: From `plan`.
         out: Folder of the results, each job's in one of its own.
-        executor: Where they are run.
+        executor: Executor that runs them.
         on_result: Called with each result, those of earlier runs first.
         on_stale: Called with each job that is run anew, and why, before any is run.
 
@@ -73,7 +73,7 @@ def local(workers: int, root: Path | None) -> Iterator[Executor]:
     """Processes on this machine; what has not begun when it is left is not begun any more.
 
     Args:
-        workers: How many at a time.
+        workers: Number of runs at a time.
         root: Folder in which recordings are looked for first.
 
     Raises:

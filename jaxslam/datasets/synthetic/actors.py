@@ -1,4 +1,4 @@
-"""Who moves in the room: walking people of capsules, boxes that are carried or pushed, and people who sit.
+"""Actors of the room: walking people made of capsules, boxes that are carried or pushed, and seated people.
 
 Each actor has a frame of its own: origin on the floor under it (a person) or in its center (a box), x forward, z up.
 Motions are closed forms of time in float64, so that ground truth is exact and any frame can be asked for.
@@ -65,10 +65,10 @@ def cast(path: str, people: int, boxes: int, seated: int, parked: int, seed: int
 
     Args:
         path: The camera's path.
-        people: How many people walk; they are actors 1 to `people`.
-        boxes: How many boxes are carried; the actors after them.
-        seated: How many people sit, see `seated`; the actors after those.
-        parked: How many boxes stand and are pushed now and then, see `parked`; the last actors.
+        people: Number of walking people; they are actors 1 to `people`.
+        boxes: Number of carried boxes; the actors after the people.
+        seated: Number of seated people, see `seated_people`; the actors after the boxes.
+        parked: Number of boxes that stand and are pushed now and then, see `parked_boxes`; the last actors.
         seed: Chooses where they start, their sizes and clothes.
     """
     lanes = _ROUND_DESK if path == "loop" else _ACROSS_VIEW

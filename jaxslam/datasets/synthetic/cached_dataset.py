@@ -16,8 +16,8 @@ class StoredRoom(SyntheticDataset):
     Rendering takes 0.1 s a frame of 640x480 pixels, and reading one of 4.6 MB 2 ms. Processes may share a folder.
 
     Args:
-        config: What to record.
-        folder: Where the frames are kept, for this room alone; made if it is not there.
+        config: Settings of the recording.
+        folder: Folder of the frames, for this room alone; created if it does not exist.
     """
 
     def __init__(self, config: SyntheticConfig, folder: Path) -> None:

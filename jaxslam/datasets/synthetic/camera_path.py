@@ -1,4 +1,4 @@
-"""Where the hand-held camera is at any time: smooth closed forms, in the manner of the TUM RGB-D recordings.
+"""Paths of the hand-held camera: smooth closed forms, in the manner of the TUM RGB-D recordings.
 
 World axes: x forward from the camera's usual place, y to the left, z up, origin on the floor in the middle of the
 room. Poses are `T_world_cam`, wxyz_xyz, with OpenCV camera axes.

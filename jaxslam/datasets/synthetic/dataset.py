@@ -29,12 +29,12 @@ _START_NS = 1_600_000_000_000_000_000
 
 @dataclass(frozen=True)
 class SyntheticConfig(ValidatedConfig):
-    """What to record. Frame `i` does not depend on how many frames there are.
+    """Settings of a synthetic recording. Frame `i` does not depend on the number of frames.
 
     Attributes:
         seed: Chooses textures, clothes, where things lie, the phases of all motions, and the noise.
         frames: Number of frames.
-        path: How the camera moves; see `camera_path.CameraPathKind`. `loop` comes back after 32 s.
+        path: Path of the camera; see `camera_path.CameraPathKind`. `loop` comes back after 32 s.
         people: Number of walking people: actors 1 to `people`. Two or three at times fill half of the picture.
         boxes: Number of carried boxes: the actors after the people.
         seated: Number of people who sit at the ends of the desk and move a little, as in the `sitting` recordings of
@@ -47,7 +47,7 @@ class SyntheticConfig(ValidatedConfig):
         fy: Focal length along a column in pixels; `None` for the same as `fx`.
         cx: Principal point in pixels; `None` for the middle of the image.
         cy: Principal point in pixels; `None` for the middle of the image.
-        baseline_m: Of a rectified stereo pair instead of a camera that measures depth; `None` for that.
+        baseline_m: Baseline of a rectified stereo pair, in meters; `None` for a camera that measures depth.
         sensor: The faults of the camera, of both if there are two.
 
     Raises:
@@ -106,7 +106,7 @@ class SyntheticFrame:
 
     @property
     def measured(self) -> Frame:
-        """What a camera would deliver of it: no mask of what moves, and of a pair no depth."""
+        """Return what a camera would deliver: no mask of moving objects, and no depth for a stereo pair."""
         return Frame(self.timestamp_ns, self.rgb, self.depth_m if self.right is None else None, right=self.right)
 
 
@@ -116,7 +116,7 @@ class SyntheticDataset:
     Two datasets of the same configuration give the same bytes on the same machine, in any order of frames.
 
     Args:
-        config: What to record; everything has a default.
+        config: Settings of the recording; everything has a default.
     """
 
     def __init__(self, config: SyntheticConfig | None = None) -> None:

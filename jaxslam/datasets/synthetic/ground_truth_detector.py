@@ -33,7 +33,7 @@ class SceneDetector:
         Args:
             dataset: The recording.
             rendered: Frames of it that are rendered already: they need not be once more.
-            labels: What to find: `person`, which networks know, and `box`, carried boxes, which they do not.
+            labels: Labels to find: `person`, which networks know, and `box`, carried boxes, which they do not.
 
         Raises:
             ConfigError: A label is neither.
@@ -65,7 +65,7 @@ class SceneDetector:
         return self._detections(numbers)
 
     def _found(self, image: np.ndarray) -> bytes | None:
-        """Where everybody is in an image; `None` if it is not of the recording."""
+        """Return the mask of every actor in an image; `None` if it is not of the recording."""
         if image.shape != (self._dataset.height, self._dataset.width, 3):
             return None
         key = _digest(image)

@@ -15,12 +15,12 @@ from jaxslam.trajectory.trajectory import Trajectory
 
 
 def with_true_masks(dataset: Dataset, config: SemanticsConfig) -> tuple[Dataset, SceneDetector | None]:
-    """What to track, and what finds what moves in it, if that is the truth by the settings.
+    """Recording to track, and the detector of moving objects where the settings ask for the ground truth.
 
     `labels` say of what: `[person]` is a perfect network that is blind to boxes, `[person, box]` knows all.
 
     Args:
-        dataset: What is to be tracked.
+        dataset: Recording to track.
         config: The settings.
 
     Returns:

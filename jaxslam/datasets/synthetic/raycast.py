@@ -1,4 +1,4 @@
-"""Which solid each ray of a tile of the image meets first.
+"""Intersection of rays with solids: the first solid that each ray of a tile of the image meets.
 
 A tile only looks at the solids whose bounds reach into it, in loops of data-dependent length: what is out of sight
 costs nothing. Each loop carries one plane of integers, the depth's bits with the index of the solid in the lowest of

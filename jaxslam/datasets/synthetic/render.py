@@ -57,7 +57,7 @@ class CameraView(NamedTuple):
         solid_from_cam: Rigid transforms from camera coordinates to those of each solid.
         world_from_cam: Rigid transform from camera to world coordinates.
         intrinsics: `fx, fy, cx, cy` in pixels.
-        offset: Where in its pixel each ray passes, `(u, v)`, 0 for the center.
+        offset: Position of each ray in its pixel, `(u, v)`, 0 for the center.
     """
 
     solid_from_cam: Float[Array, "n 3 4"]
@@ -67,7 +67,7 @@ class CameraView(NamedTuple):
 
 
 class Rendering(NamedTuple):
-    """What the camera sees, before any sensor.
+    """Image and depth before any sensor model.
 
     Attributes:
         color: Packed color; see `shading.unpack_color`.
@@ -124,7 +124,7 @@ def render(scene: RenderScene, view: CameraView, *, height: int, width: int) -> 
     """Cast one ray a pixel.
 
     Args:
-        scene: What there is.
+        scene: Solids and light of the scene.
         view: From where it is seen.
         height: Rows of the image, static.
         width: Columns of the image, static.

@@ -27,7 +27,7 @@ _ARM_AT_REST, _ARM_RAISED = np.array([-0.35, -1.60]), np.array([-0.75, -2.65])
 
 
 class _Place(NamedTuple):
-    """Where somebody sits: the point on the floor under the hips, in meters, and where to."""
+    """Seat of a person: the point on the floor under the hips, in meters, and the direction."""
 
     x: float
     y: float
@@ -48,8 +48,8 @@ class SeatedPerson:
         """Choose size, clothes and the phases of the motions.
 
         Args:
-            place: Which chair, from 0 to below `MAX_SEATED`.
-            seed: Of the scene.
+            place: Number of the chair, from 0 to below `MAX_SEATED`.
+            seed: Seed of the scene.
         """
         rng = np.random.default_rng([seed, 500, place])
         self._place = _PLACES[place]
@@ -92,7 +92,7 @@ def chairs(seated: int, seed: int) -> list[PlacedSolid]:
     """The chairs of those who sit, which are not there without them: static.
 
     Args:
-        seated: How many people sit.
+        seated: Number of seated people.
         seed: Chooses textures.
     """
     rng = np.random.default_rng([seed, 501])
@@ -124,7 +124,7 @@ def _trunk(sway: np.ndarray, turn: np.ndarray) -> list[np.ndarray]:
 
 
 def _swayed(rotation: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Where a place on the trunk is, `(t, 3)`, when that is turned by `(t, 3, 3)` about the hips."""
+    """Rotate a place on the trunk about the hips by `(t, 3, 3)`; its positions are `(t, 3)`."""
     hip = np.array([0.0, 0.0, _HIP_M])
     return hip + rotation @ (place - hip)
 

@@ -1,4 +1,4 @@
-"""What a Kinect-like camera makes of a perfect picture: noise, holes and quantization, each part on its own switch."""
+"""Sensor model of a Kinect-like camera: noise, holes and quantization, each with its own switch."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

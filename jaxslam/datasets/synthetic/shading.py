@@ -26,7 +26,7 @@ _LEVELS = 800.0
 
 
 class Hits(NamedTuple):
-    """What the rays `(x, y, 1)` of a tile have met.
+    """Hits of the rays `(x, y, 1)` of a tile.
 
     Attributes:
         x: First component of the rays.
@@ -53,10 +53,10 @@ def shade(
     """Color and exact place of hits.
 
     Args:
-        table: Of each solid: the 12 numbers of its map from camera to unit coordinates (`raycast.Shapes`), its size
+        table: Row of each solid: the 12 numbers of its map from camera to unit coordinates (`raycast.Shapes`), its size
             in meters, its stem, the direction to the sun in its coordinates.
         surfaces: `texture.surface_row`s, six a solid.
-        hits: What is to be shaded.
+        hits: Hits to shade.
         world_from_cam: Rigid transform from camera to world coordinates.
         focal: Focal length in pixels.
 
@@ -99,7 +99,7 @@ def _gather(table: Shaped[Array, "n k"], which: Int[Array, " p"]) -> Shaped[Arra
 
 
 def _newton_step(point: Vectors, ray: Vectors, stem: Plane, hits: Hits) -> Plane:
-    """How much too deep each hit is: the digits of the depth that made room for the index of the solid."""
+    """Return the excess depth of each hit: the digits of the depth that made room for the index of the solid."""
     axis = _largest(point)
     along = _component(point, axis)
     flat = (jnp.abs(along) - 1.0) * jnp.sign(along) / _component(ray, axis)

@@ -27,22 +27,22 @@ _ACROSS, _ALONG = np.uint32(0x9E3779B1), np.uint32(0x85EBCA77)
 
 
 class Material(NamedTuple):
-    """How a surface looks; colors are RGB from 0 to 1.
+    """Texture of a surface; colors are RGB from 0 to 1.
 
     Attributes:
-        color: Where the noise is low.
-        second: Where the noise is high.
-        dark: Of one half of the bricks and patches.
-        bright: Of the other half.
+        color: Color where the noise is low.
+        second: Color where the noise is high.
+        dark: Color of one half of the bricks and patches.
+        bright: Color of the other half.
         noise_per_m: Cells a meter of the coarsest octave; each of the `N_OCTAVES` next ones has twice as many.
-        stretch: How many times longer the noise is along the second axis of the surface.
+        stretch: Factor by which the noise is longer along the second axis of the surface.
         noise: Strength of the noise, 0 to 1.
         cell_m: Width and height of bricks, tiles or planks.
         joint_m: Width of the joints between them; 0 for none.
-        cell_contrast: How much bricks differ, 0 to 1.
+        cell_contrast: Contrast between bricks, 0 to 1.
         patch_m: Cell of the coarsest layer of patches; each of the `N_PATCH_LAYERS` next ones is about a quarter.
         patch_density: Probability that a cell holds a patch.
-        patch_contrast: How far the color of a patch is from what it covers, 0 to 1.
+        patch_contrast: Contrast of a patch to the surface that it covers, 0 to 1.
     """
 
     color: Rgb

@@ -27,8 +27,8 @@ def write_tum(
     name is complete, and what an interrupted run has left is overwritten by the next.
 
     Args:
-        dataset: What to write.
-        folder: Where to; must not exist, or be empty.
+        dataset: Recording to write.
+        folder: Folder to write to; it must not exist, or be empty.
         progress: Called after each frame with the number of frames written and to be written.
 
     Raises:

@@ -27,7 +27,7 @@ def map_sizes(image: ImageInput, strides: tuple[int, ...]) -> list[tuple[int, in
 
 
 def num_cells(image: ImageInput, strides: tuple[int, ...]) -> int:
-    """How many there are in all."""
+    """Total number of anchors."""
     return sum(columns * rows for columns, rows in map_sizes(image, strides))
 
 

@@ -1,4 +1,4 @@
-"""What a family of networks is to the detector."""
+"""Interface of a family of networks to the detector."""
 
 from abc import ABC, abstractmethod
 from typing import ClassVar
@@ -15,12 +15,12 @@ class Adapter(ABC):
     """One family of networks; an instance is for one graph that fits it.
 
     Attributes:
-        name: What it is called in settings.
+        name: Name in settings.
         interface: Its outputs, for messages.
         varying: Whether the sizes of outputs depend on the image.
-        fit: How the image enters the input.
+        fit: Way in which the image is fitted to the input.
         pad: Value of the pixels beside it.
-        colors: How its values do.
+        colors: Order and scale of the color values in the input.
         image: The graph's input.
         graph: The graph.
         names: Every class by number; empty where a number has none.
@@ -57,12 +57,12 @@ class Adapter(ABC):
 
     @abstractmethod
     def decode(self, outputs: list[np.ndarray], placement: Placement, wanted: Wanted) -> Detections:
-        """What the network's outputs say.
+        """Decode the outputs of the network.
 
         Args:
-            outputs: Of the expected shapes, and finite.
-            placement: Where the image lies in the input.
-            wanted: What to keep.
+            outputs: Outputs of the network, of the expected shapes and finite.
+            placement: Position of the image in the input.
+            wanted: Labels and scores to keep.
 
         Raises:
             ModelError: If they hold what they cannot mean.

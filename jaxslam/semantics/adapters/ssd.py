@@ -46,7 +46,7 @@ _MAX_SHARE = 4.0
 
 
 class _Layout(NamedTuple):
-    """Which output is which, and how it is meant."""
+    """Roles of the outputs, and their units."""
 
     boxes: int
     scores: int
@@ -111,7 +111,7 @@ class Ssd(BoxAdapter):
 
 
 def _layout(graph: Graph) -> _Layout | None:
-    """How to read a graph's outputs; `None` if their names or shapes do not tell."""
+    """Find out how to read the outputs of a graph; `None` if their names or shapes do not tell."""
     places = {port.name.removesuffix(":0"): place for place, port in enumerate(graph.outputs)}
     for family in _FAMILIES:
         numbers = [places[name] for name in family[:3] if name in places]

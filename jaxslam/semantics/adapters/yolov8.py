@@ -36,12 +36,12 @@ class YoloV8(BoxAdapter):
         return None
 
     def candidates(self, outputs: list[np.ndarray], wanted: Wanted) -> Candidates:
-        """As they are."""
+        """Decode boxes and scores, which need no activation."""
         return _candidates(outputs[0][0].T, len(self.names), wanted)
 
 
 class YoloV8Seg(Adapter):
-    """As `YoloV8`, with coefficients for prototypes of masks behind the classes."""
+    """`YoloV8` with coefficients for prototypes of masks behind the classes."""
 
     name: ClassVar[str] = "yolov8_seg"
     interface: ClassVar[str] = "1x(4+C+K)xA and 1xKxHxW, K prototypes of masks"
@@ -88,7 +88,7 @@ def _is_boxes(port: Port, image: ImageInput) -> bool:
 
 
 def _candidates(output: np.ndarray, num_classes: int, wanted: Wanted) -> Candidates:
-    """Of `(a, 4 + c + k)` center x, y, width, height, classes and anything behind them."""
+    """Decode `(a, 4 + c + k)`: center x, y, width, height, classes and anything behind them."""
     rows, scores, classes = best_rows(probabilities(output[:, 4 : 4 + num_classes], "classes"), wanted)
     boxes = output[rows, :4].astype(np.float32, copy=False)
     return Candidates(corners(boxes[:, :2], boxes[:, 2:]), scores, classes, rows)

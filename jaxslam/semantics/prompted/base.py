@@ -1,4 +1,4 @@
-"""What a family of promptable segmenters is to `PromptSegmenter`: an encoder of images and a decoder of prompts."""
+"""Interface of a family of promptable segmenters to `PromptSegmenter`: an image encoder and a prompt decoder."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ Kinds: TypeAlias = Int[np.ndarray, "k n"]
 
 
 class Planes(NamedTuple):
-    """What a decoder says to `k` prompts: `m` masks of each to choose from.
+    """Answer of a decoder to `k` prompts: `m` masks for each to choose from.
 
     Attributes:
         logits: `(k, m, h, w)`, positive on the thing.
@@ -37,9 +37,9 @@ class PromptAdapter(ABC):
     """One family; an instance is for two graphs that fit it.
 
     Attributes:
-        name: What it is called in settings.
+        name: Name in settings.
         interface: Inputs and outputs, for messages.
-        fit: How the image enters the encoder.
+        fit: Way in which the image is fitted to the input of the encoder.
         embeddings: Inputs of the decoder that the encoder gives.
         points: The decoder's input of points; an axis before those of the points is that of prompts.
         kinds: Its input of what they are.
@@ -116,14 +116,14 @@ class PromptAdapter(ABC):
         """The decoder's inputs for prompts of one kind, all with as many points; their numbers are cast later.
 
         Args:
-            embedding: Of the image.
+            embedding: Embedding of the image.
             points: In pixels of the image, from its corner.
-            kinds: What they are.
-            placement: Where the image lies in the encoder's input.
+            kinds: Kind of each point.
+            placement: Position of the image in the encoder's input.
         """
 
     def read(self, outputs: Arrays, num_prompts: int) -> Planes:
-        """What the decoder's outputs say.
+        """Decode the outputs of the decoder.
 
         Raises:
             ModelError: If they are not masks and scores of so many prompts, or not finite.
@@ -144,7 +144,7 @@ class PromptAdapter(ABC):
         )
 
     def padded(self, points: Points, kinds: Kinds) -> tuple[Points, Kinds]:
-        """As many rows of points as the decoder takes, if it takes a fixed number.
+        """Pad points to the number that the decoder takes, if that is fixed.
 
         Raises:
             ModelError: If there are more.

@@ -39,7 +39,7 @@ class EfficientSam(PromptAdapter):
         return super().fits(encoder, decoder) and any(port.name == cls.size for port in decoder.inputs)
 
     def prepare(self, pixels: np.ndarray) -> tuple[np.ndarray, Placement]:
-        """As it is where the encoder takes any size, else stretched."""
+        """Keep the size where the encoder takes any, else stretch the image."""
         height, width = pixels.shape[:2]
         image = self.image
         if None in self.encoder.inputs[0].shape[-2:]:

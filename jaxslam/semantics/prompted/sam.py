@@ -64,5 +64,5 @@ class Sam2(Sam):
     embeddings: ClassVar[tuple[str, ...]] = ("high_res_feats_0", "high_res_feats_1", "image_embed")
 
     def feed(self, embedding: Arrays, points: Points, kinds: Kinds, placement: Placement) -> dict[str, np.ndarray]:
-        """As they are."""
+        """Return the inputs of the decoder, with points in pixels of the encoder's input."""
         return self._fed(embedding, in_input(points, placement), kinds, placement)

@@ -33,7 +33,7 @@ class Embedding(NamedTuple):
 
     Attributes:
         values: By the names of the decoder's inputs.
-        placement: Where the image lies in the encoder's input.
+        placement: Position of the image in the encoder's input.
     """
 
     values: dict[str, np.ndarray]
@@ -41,7 +41,7 @@ class Embedding(NamedTuple):
 
 
 class Segments(NamedTuple):
-    """What prompts are answered with, in their order.
+    """Answers to prompts, in their order.
 
     Attributes:
         masks: `(k, h, w)` of the image's size, the best of those that the network offers.
@@ -116,7 +116,7 @@ class PromptSegmenter:
         return segments
 
     def _decoded(self, embedding: Embedding, prompts: Sequence[Prompt]) -> Planes:
-        """What the decoder says to prompts of one kind."""
+        """Run the decoder on prompts of one kind."""
         unknown = [kind for kind in prompts[0].kinds if kind not in self._adapter.knows]
         if unknown:
             raise ModelError(f"{self._decoder.path.name}: {self.adapter} knows no points beside a thing, got one")

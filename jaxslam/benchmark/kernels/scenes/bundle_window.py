@@ -16,7 +16,7 @@ FOCAL_PX, CENTER_PX = 500.0, (320.0, 240.0)
 
 
 class Window(NamedTuple):
-    """What bundle adjustment starts with, and the truth.
+    """Initial values of a bundle adjustment, and the truth.
 
     Attributes:
         truth: `(k, 7)` `wxyz_xyz` of T_world_cam.

@@ -15,12 +15,12 @@ class Warp(NamedTuple):
     homography: np.ndarray
 
     def move(self, points: np.ndarray) -> np.ndarray:
-        """Where `(2, n)` points of the first image are in the second."""
+        """Map `(2, n)` points of the first image to the second."""
         moved = self.homography @ np.vstack([points, np.ones_like(points[:1])])
         return moved[:2] / moved[2]
 
     def visible(self, points: np.ndarray) -> np.ndarray:
-        """Which points stay inside the image."""
+        """Tell which points stay inside the image."""
         height, width = self.current.shape
         u, v = self.move(points)
         return (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
