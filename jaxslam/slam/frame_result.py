@@ -1,6 +1,6 @@
 """Result of a frame: with all arrays, rejected, or as one line of a log."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -108,7 +108,7 @@ class Rejected:
 
 @dataclass(frozen=True)
 class FrameRecord:
-    """One line of a run's log: a frame's fate without its arrays.
+    """One line of a run's log: the result of a frame without its arrays.
 
     Attributes are those of `FrameResult`; a rejected frame has only a time, a status and a reason.
     """
@@ -132,8 +132,27 @@ class FrameRecord:
 
     @classmethod
     def of(cls, result: "FrameResult | Rejected") -> "FrameRecord":
-        """The record of a result."""
-        return cls(**{field.name: getattr(result, field.name) for field in fields(cls) if hasattr(result, field.name)})
+        """Make the record of a result."""
+        if isinstance(result, Rejected):
+            return cls(result.timestamp_ns, result.status, result.reason)
+        return cls(
+            timestamp_ns=result.timestamp_ns,
+            status=result.status,
+            reason=result.reason,
+            num_inliers=result.num_inliers,
+            inlier_ratio=result.inlier_ratio,
+            num_keyframe_matches=result.num_keyframe_matches,
+            num_matched=result.num_matched,
+            residual_px=result.residual_px,
+            is_keyframe=result.is_keyframe,
+            dynamic_ratio=result.dynamic_ratio,
+            mask_source=result.mask_source,
+            mask_age=result.mask_age,
+            detector_error=result.detector_error,
+            track_ms=result.track_ms,
+            occluded_share=result.occluded_share,
+            submap=result.submap,
+        )
 
 
 def frame_result(
