@@ -29,7 +29,7 @@ from jaxslam.features.orb import FeaturePlan, Features
 from jaxslam.features.pose_from_matches import FeaturePose
 from jaxslam.geometry.se3 import IDENTITY, between, to_local
 from jaxslam.map.edit import with_keyframe, with_observations, with_points, with_states, without_points
-from jaxslam.map.npz_file import load_map, save_map
+from jaxslam.map.npz_file import _name_in_version, load_map, save_map
 from jaxslam.map.partial_map import extract_around, merge_back
 from jaxslam.map.point_fusion import with_fused_points
 from jaxslam.map.types import NONE, Keyframe, Map, empty_map, rows
@@ -328,9 +328,11 @@ class TestMap:
         save_map(path, slam_map)
         with zipfile.ZipFile(path) as archive:
             members = {name: archive.read(name) for name in archive.namelist()}
-        header = json.loads(members["header.json"]) | {"version": 1}
-        old = members | {"header.json": json.dumps(header).encode()}
-        del old["points.state.npy"]
+        header = json.loads(members["header.json"])
+        counts = {_name_in_version(name, 1): count for name, count in header["counts"].items()}
+        arrays = {f"{_name_in_version(name.removesuffix('.npy'), 1)}.npy": data for name, data in members.items()}
+        old = arrays | {"header.json": json.dumps(header | {"version": 1, "counts": counts}).encode()}
+        del old["points.state.npy"], old["header.json.npy"]
         path.write_bytes(_packed(old))
         points = slam_map.points._replace(state=np.zeros(len(slam_map.points.ids), np.int8))
         assert same(load_map(path), slam_map._replace(points=points))
