@@ -6,11 +6,11 @@ A table stands between the comments `<!-- NAME: begin ... -->` and `<!-- NAME: e
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxslam.benchmark.reports.markdown import table
+from jaxslam.benchmark.reports.document import Table, to_markdown
 from jaxslam.benchmark.suites.accuracy_ruler import AccuracyBaseline, load_accuracy_baseline
 from jaxslam.benchmark.suites.published import Figure, published_for
 from jaxslam.config.loading import configs_dir
@@ -30,6 +30,11 @@ def tables() -> dict[str, str]:
         "published": "\n".join(published_tables(baselines)),
         "results": results_table(baselines[0]),
     }
+
+
+def table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Make a Markdown table."""
+    return to_markdown([Table([columns, *rows])])
 
 
 def accuracy_table(baseline: AccuracyBaseline) -> str:

@@ -40,7 +40,7 @@ def check_arguments(
         if detector is not None and not callable(detector):
             raise TypeError(f"{name}: expected a callable that takes an image, got {type(detector).__name__}")
     if slam_map is not None:
-        slam_map = _require("map", slam_map, Map, "; Slam.load(path) reads a map file")
+        slam_map = _require("slam_map", slam_map, Map, "; Slam.load(path) reads a map file")
         _check_size(slam_map.camera, camera)
     if localize_only and (slam_map is None or not len(slam_map.ids)):
         got = "no map" if slam_map is None else "a map without keyframes"

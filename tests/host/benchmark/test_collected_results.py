@@ -147,7 +147,7 @@ def test_broken_off(
     def broken(workers: int, root: Path | None) -> Iterator[Broken]:
         yield Broken(problem)
 
-    monkeypatch.setattr("jaxslam.cli.bench.local", broken)
+    monkeypatch.setattr("jaxslam.cli.suite_run.local", broken)
     (tmp_path / "suite.yaml").write_text(SUITE)
     with pytest.raises(SystemExit):
         main(

@@ -253,7 +253,7 @@ class TestSeenThrough:
 
     def test_a_keyframe_that_contradicts_its_surroundings_is_not_taken(self, truth, monkeypatch):
         before = drifted(truth, 0.006, 0.004)
-        monkeypatch.setattr(module, "seen_through", lambda *_: 0.5)
+        monkeypatch.setattr(module, "see_through_ratio", lambda *_: 0.5)
         assert look_at_all(before) == []
 
 

@@ -182,7 +182,7 @@ class TestConstructor:
     @pytest.mark.parametrize(
         ("keyword", "value", "words"),
         [
-            ("map", "room.npz", r"map: expected a jaxslam.Map, got str; Slam.load\(path\)"),
+            ("slam_map", "room.npz", r"slam_map: expected a jaxslam.Map, got str; Slam.load\(path\)"),
             ("detector", 3, "detector: expected a callable that takes an image, got int"),
             ("key_detector", "person", "key_detector: expected a callable that takes an image, got str"),
         ],
