@@ -112,11 +112,13 @@ def progress_bar(text: str, *columns: ProgressColumn, elapsed: bool = True, redr
     return Progress(*shown, console=console, auto_refresh=redraw)
 
 
-def download_bar(text: str) -> Progress:
-    """Make a progress bar that counts bytes on `plain_console`.
-
-    Args:
-        text: Text before the bar; it may name fields of a task, such as `{task.description}`.
-    """
-    columns = (text_column(text), BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
+def download_bar() -> Progress:
+    """Make a progress display on `plain_console` whose tasks count bytes."""
+    columns = (
+        text_column("{task.description}"),
+        BarColumn(),
+        DownloadColumn(),
+        TransferSpeedColumn(),
+        TimeRemainingColumn(),
+    )
     return Progress(*columns, console=plain_console)

@@ -9,8 +9,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from jaxslam.cli.console import make_table, plain_console, print_json
-from jaxslam.cli.fetch import byte_progress, fetch
+from jaxslam.cli.console import download_bar, make_table, plain_console, print_json
+from jaxslam.cli.fetch import fetch
 from jaxslam.cli.shared_options import WithJson
 from jaxslam.datasets.catalog import (
     Recording,
@@ -112,7 +112,7 @@ def _print_next(recording: Recording, folder: Path) -> None:
 
 
 def _fetch_and_unpack(recording: Recording, url: str, archive: Path, target: Path) -> None:
-    with byte_progress() as progress:
+    with download_bar() as progress:
         if archive.is_file():
             _check(recording, archive)
         else:

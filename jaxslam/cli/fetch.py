@@ -3,17 +3,10 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColumn, TransferSpeedColumn
+from rich.progress import Progress
 
-from jaxslam.cli.console import plain_console, text_column
 from jaxslam.config.catalog import CatalogEntry
 from jaxslam.io.download import download
-
-
-def byte_progress() -> Progress:
-    """Make a progress display for tasks that count bytes."""
-    columns = (BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
-    return Progress(text_column("{task.description}"), *columns, console=plain_console)
 
 
 def fetch(

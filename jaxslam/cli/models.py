@@ -6,8 +6,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from jaxslam.cli.console import make_table, plain_console, print_json
-from jaxslam.cli.fetch import byte_progress, fetch
+from jaxslam.cli.console import download_bar, make_table, plain_console, print_json
+from jaxslam.cli.fetch import fetch
 from jaxslam.cli.shared_options import WithJson
 from jaxslam.errors import ModelError
 from jaxslam.io.download import sha256_of
@@ -69,7 +69,7 @@ class GetModel:
         target = models_dir() / model.file
         if model.url is None:
             raise ModelError(f"{model.name} cannot be downloaded; {model.how}. Then place the file at {target}")
-        with byte_progress() as progress:
+        with download_bar() as progress:
             fetch(model, model.url, target, progress, title=model.name)
         checked = "as expected" if model.sha256 else "which nobody has checked: no published one is known"
         plain_console.print(f"{model.name}: {target}, {model.license}, see {model.page}")
