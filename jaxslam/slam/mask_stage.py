@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 
 from jaxslam.config.schema import Config
 from jaxslam.dynamics.point_mask import mask_around, moving_points
-from jaxslam.geometry.se3 import IDENTITY
+from jaxslam.geometry.se3 import IDENTITY, retract
 from jaxslam.masks.depth_instances import InstanceFinder
 from jaxslam.runtime.aligned_memory import aligned_array
 from jaxslam.runtime.stage_timer import StageTimes
@@ -130,18 +130,26 @@ class MaskStage:
         return self._memory.ignoring(arrays, mask.mask), mask
 
     def frame_tracked(
-        self, number: int, time_s: float, T_world_cam: Float[np.ndarray, "7"], turn_rad_per_s: float
+        self,
+        number: int,
+        time_s: float,
+        T_world_cam: Float[np.ndarray, "7"],
+        twist: Float[np.ndarray, "6"],
+        depth_delay_s: float,
     ) -> None:
         """Compare the depth of a tracked frame with the surfaces seen before, in the worker.
 
         Args:
             number: Number of the frame.
             time_s: Its time in seconds.
-            T_world_cam: `(7,)` pose of the camera when the depth of the frame was taken.
-            turn_rad_per_s: Angular speed of the camera.
+            T_world_cam: `(7,)` pose of the camera when the image of the frame was taken.
+            twist: Velocity of the camera in its own axes: translation (m/s), then rotation (rad/s).
+            depth_delay_s: Time from the image to the depth of the frame, in seconds.
         """
         if self._pipeline is not None:
-            job = partial(self._pipeline.frame_tracked, number, time_s, T_world_cam, turn_rad_per_s)
+            when_depth_was_taken = retract(T_world_cam, twist * depth_delay_s)
+            turn_rad_per_s = float(np.linalg.norm(twist[3:]))
+            job = partial(self._pipeline.frame_tracked, number, time_s, when_depth_was_taken, turn_rad_per_s)
             self._worker.submit(("masks", job), number)
 
     def frame_lost(self, number: int) -> None:
@@ -180,7 +188,7 @@ class MaskStage:
         given = frame.dynamic_mask
         if self._pipeline is None:
             source = MaskSource.NONE if given is None else MaskSource.CALLER
-            self._found = FrameMask(np.array(arrays.ignore), source, -1, "")
+            self._found = FrameMask(np.asarray(arrays.ignore), source, -1, "")
             return
         if not np.array_equal(correction, IDENTITY):
             self._pipeline.apply_map_correction(correction)

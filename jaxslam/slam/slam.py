@@ -16,7 +16,6 @@ from jaxslam.datasets import Dataset
 from jaxslam.dense.coverage import SeenArea
 from jaxslam.dense.dense_map import DenseMap
 from jaxslam.dense.point_cloud import DenseCloud
-from jaxslam.geometry.se3 import retract
 from jaxslam.map.npz_file import load_map, save_map
 from jaxslam.map.types import Map
 from jaxslam.masks.depth_instances import InstanceFinder
@@ -529,9 +528,8 @@ class Slam:
             self._motion.lost(dt_s, tracked.correction)
             self._masks.frame_lost(self._frame)
             return replace(tracked, T_world_cam=self._motion.now()) if self.config.run.on_loss == "predict" else tracked
-        when_depth_was_taken = retract(tracked.T_world_cam, tracked.twist * depth_delay_s)
         time_s = self._clock.continuous_ns(tracked.timestamp_ns) * 1e-9
-        self._masks.frame_tracked(self._frame, time_s, when_depth_was_taken, _turn(tracked.twist))
+        self._masks.frame_tracked(self._frame, time_s, tracked.T_world_cam, tracked.twist, depth_delay_s)
         self._unrecognized = 0
         self._motion.tracked(tracked.T_world_cam, tracked.twist)
         self._back.localize(tracked.T_world_cam, self._frame)
@@ -548,8 +546,3 @@ def _awaiting_relocalization(state: TrackState) -> TrackState:
     """A state that waits for its place to be recognized instead of starting by itself."""
     # Where the others are: with `jnp.zeros`, which is on no device for certain, the step was compiled anew.
     return state._replace(lost_frames=jax.device_put(np.int32(0), *state.twist.devices()))
-
-
-def _turn(twist: np.ndarray) -> float:
-    """Angular speed, rad/s."""
-    return float(np.linalg.norm(twist[3:]))
