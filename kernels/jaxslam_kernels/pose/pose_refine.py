@@ -34,6 +34,7 @@ from jaxslam_kernels.pose.pose_cost import (
     tangent_basis,
     with_idle,
 )
+from jaxslam_kernels.positive_definite import is_determined, unit_diagonal
 from jaxslam_kernels.robust import Loss
 from jaxslam_kernels.types import Code, Flag, Pixels, Points, Scalar, Weights
 
@@ -149,7 +150,7 @@ def refine_problem(
         [
             ~finite_initial,
             jnp.sum(problem.weights > 0) < MIN_POINTS,
-            ~_is_determined(solver.hessian),
+            ~is_determined(solver.hessian),
             ~solver.converged,
         ],
         [PoseStatus.BAD_INITIAL, PoseStatus.TOO_FEW_POINTS, PoseStatus.DEGENERATE, PoseStatus.NOT_CONVERGED],
@@ -210,8 +211,8 @@ def _optimum_shift_jvp(loss: Loss, primals: tuple, tangents: tuple) -> tuple[Arr
     reweighted = pose_cost(optimum, problem, loss).equations.hessian
     # The exact Hessian is positive definite at a strict minimum. Where the solver stopped short of one the
     # reweighted one stands in, and where the pose is undetermined the derivative is zero.
-    hessian = jnp.where(_is_determined(exact), exact, reweighted)
-    determined = _is_determined(hessian)
+    hessian = jnp.where(is_determined(exact), exact, reweighted)
+    determined = is_determined(hessian)
     shift = -_solve(hessian, determined, jnp.where(determined, gradient_change, 0.0))
     return zero, shift
 
@@ -249,7 +250,7 @@ def _figures_at(at_pose: PoseCost, problem: PoseProblem, status: Array) -> _Figu
     freedom = jnp.sum(total * residuals_a_point)
     variance = jnp.sum(total * at_pose.chi2) / jnp.where(freedom > 0, freedom, 1.0)
     hessian, identity = at_pose.equations.hessian, jnp.eye(6, dtype=total.dtype)
-    determined = _is_determined(hessian) & (status <= PoseStatus.NOT_CONVERGED)
+    determined = is_determined(hessian) & (status <= PoseStatus.NOT_CONVERGED)
     covariance = jnp.where(determined, _solve(hessian, determined, identity), UNKNOWN_VARIANCE * identity)
     residual_scale = jnp.where(variance > 0, jnp.sqrt(jnp.where(variance > 0, variance, 1.0)), 0.0)
     return _Figures(at_pose.cost, covariance, residual_scale)
@@ -284,21 +285,8 @@ def usable_pose(T: SE3) -> tuple[SE3, Flag]:
     return SE3(jnp.where(usable, parameters, identity)).normalize(), usable
 
 
-def _is_determined(hessian: Float[Array, "6 6"]) -> Flag:
-    """Whether no direction is free: the pivots of the Hessian scaled to unit diagonal stand clear of rounding."""
-    factor, _ = cho_factor(_scaled(lax.stop_gradient(hessian))[0])
-    pivots = jnp.square(jnp.diagonal(factor))
-    return jnp.isfinite(factor).all() & (pivots.min() > float(jnp.finfo(hessian.dtype).eps) ** 0.75)
-
-
 def _solve(hessian: Float[Array, "6 6"], determined: Flag, right: Array) -> Array:
     """`H⁻¹ right` for a positive definite H; anything finite if it is not determined."""
-    scaled, unit = _scaled(jnp.where(determined, hessian, jnp.eye(6, dtype=hessian.dtype)))
+    scaled, unit = unit_diagonal(jnp.where(determined, hessian, jnp.eye(6, dtype=hessian.dtype)))
     unit = unit.reshape(6, *(1,) * (right.ndim - 1))
     return unit * cho_solve(cho_factor(scaled), unit * right)
-
-
-def _scaled(hessian: Float[Array, "6 6"]) -> tuple[Array, Array]:
-    diagonal = jnp.diagonal(hessian)
-    unit = lax.rsqrt(jnp.where(diagonal > 1e-12, diagonal, 1.0))
-    return hessian * unit[:, None] * unit[None, :], unit

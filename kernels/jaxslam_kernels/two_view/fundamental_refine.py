@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 
 from jaxslam_kernels.first_order import first_order
 from jaxslam_kernels.levenberg_marquardt import ManifoldLevenbergMarquardt, NormalEquations
+from jaxslam_kernels.positive_definite import is_determined, unit_diagonal
 from jaxslam_kernels.robust import Loss, loss_value, loss_weight
 from jaxslam_kernels.two_view.epipolar import MIN_SLOPE, adjugate, sampson_squared
 from jaxslam_kernels.types import Flag, Pixels, Scalar, Weights
@@ -71,7 +72,7 @@ def refine_matrix(
     """
     optimum, hessian, converged = solve_matrix(F, views, loss, scale, max_steps)
     refined = _retract(optimum, _optimum_shift(optimum, views, idle, loss, scale))
-    return refined.matrix(), converged, _is_determined(hessian)
+    return refined.matrix(), converged, is_determined(hessian)
 
 
 def solve_matrix(
@@ -203,25 +204,12 @@ def _optimum_shift_jvp(loss: Loss, scale: float, primals: tuple, tangents: tuple
     exact = 0.5 * (exact + exact.T)
     reweighted = _equations(optimum, views, loss, scale)[1].hessian
     # Where the solver stopped short of a minimum the reweighted Hessian stands in; undetermined, nothing moves.
-    hessian = jnp.where(_is_determined(exact), exact, reweighted)
-    determined = _is_determined(hessian)
-    scaled, unit = _scaled(jnp.where(determined, hessian, jnp.eye(7, dtype=hessian.dtype)))
+    hessian = jnp.where(is_determined(exact), exact, reweighted)
+    determined = is_determined(hessian)
+    scaled, unit = unit_diagonal(jnp.where(determined, hessian, jnp.eye(7, dtype=hessian.dtype)))
     return zero, -unit * cho_solve(cho_factor(scaled), unit * jnp.where(determined, change, 0.0))
 
 
 def _cost(F: FramedMatrix, views: TwoViews, loss: Loss, scale: float) -> Scalar:
     squared = sampson_squared(F.matrix(), views.before, views.after) / jnp.square(views.threshold)
     return 0.5 * jnp.sum(views.weights * loss_value(squared, scale, loss))
-
-
-def _is_determined(hessian: Float[Array, "7 7"]) -> Flag:
-    """Whether no direction is free: the pivots of the Hessian scaled to unit diagonal stand clear of rounding."""
-    factor, _ = cho_factor(_scaled(lax.stop_gradient(hessian))[0])
-    pivots = jnp.square(jnp.diagonal(factor))
-    return jnp.isfinite(factor).all() & (pivots.min() > float(jnp.finfo(hessian.dtype).eps) ** 0.75)
-
-
-def _scaled(hessian: Float[Array, "7 7"]) -> tuple[Array, Array]:
-    diagonal = jnp.diagonal(hessian)
-    unit = lax.rsqrt(jnp.where(diagonal > 1e-12, diagonal, 1.0))
-    return hessian * unit[:, None] * unit[None, :], unit

@@ -15,6 +15,7 @@ from jaxslam_kernels.bundle.cost import Observations, observe
 from jaxslam_kernels.camera import make_intrinsics
 from jaxslam_kernels.pose.pose_cost import UNKNOWN_CHI2
 from jaxslam_kernels.robust import Loss
+from linearized import differentiate
 from quick_compile import quick_compile
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
@@ -144,8 +145,7 @@ def _differentiate(inputs: Inputs, links: Links, direction: Inputs):
         result = _adjust(inputs, links)
         return _summary(result), result
 
-    (_, result), gradient = jax.value_and_grad(f, has_aux=True)(inputs)
-    return result, gradient, jax.jvp(lambda i: f(i)[0], (inputs,), (direction,))[1]
+    return differentiate(f, inputs, direction)
 
 
 # Compiled once for float32 and once for float64, whatever changes from call to call.

@@ -18,6 +18,7 @@ from jaxslam_kernels.pose.p3p import p3p
 from jaxslam_kernels.pose.pnp import PnpResult, draw_samples, ransac_pnp, score_poses
 from jaxslam_kernels.pose.pose_cost import pose_cost, pose_problem
 from jaxslam_kernels.pose.pose_refine import PoseStatus
+from linearized import differentiate
 from quick_compile import quick_compile
 from scipy.spatial.transform import Rotation
 
@@ -223,10 +224,7 @@ def _differentiate(key: jax.Array, initial: SE3, inputs: Inputs, direction: Inpu
         result = _solve(key, initial, inputs)
         return _mixture(result), result
 
-    (_, result), gradient = jax.value_and_grad(f, has_aux=True)(inputs)
-    if direction is None:
-        return result, gradient, jnp.zeros(())
-    return result, gradient, jax.jvp(lambda i: f(i)[0], (inputs,), (direction,))[1]
+    return differentiate(f, inputs, direction)
 
 
 # Compiled once for float32 and once, with a direction, for float64, whatever changes from call to call.

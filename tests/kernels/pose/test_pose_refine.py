@@ -17,6 +17,7 @@ from jaxslam_kernels.camera import Intrinsics
 from jaxslam_kernels.pose.pose_cost import PosePrior, pose_cost, pose_problem, retract
 from jaxslam_kernels.pose.pose_refine import UNKNOWN_VARIANCE, PoseRefinement, PoseStatus, refine_pose, solve_pose
 from jaxslam_kernels.robust import Loss
+from linearized import differentiate
 from quick_compile import quick_compile
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
@@ -102,17 +103,9 @@ def _differentiate(T: SE3, inputs: Inputs, direction: Inputs | None):
 
     def f(inputs):
         result = _refine(T, inputs)
-        return _summary(result), result
+        return (_summary(result), result.T_world_cam.wxyz_xyz), result
 
-    (_, result), gradient = jax.value_and_grad(f, has_aux=True)(inputs)
-    if direction is None:
-        return result, gradient, None
-
-    def summary_and_pose(inputs):
-        result = _refine(T, inputs)
-        return _summary(result), result.T_world_cam.wxyz_xyz
-
-    return result, gradient, jax.jvp(summary_and_pose, (inputs,), (direction,))[1]
+    return differentiate(f, inputs, direction)
 
 
 # Compiled once for float32 and once, with a direction, for float64, whatever changes from call to call.

@@ -1,0 +1,39 @@
+"""Small symmetric matrices of normal equations: scaling, and whether they determine every unknown."""
+
+import jax.numpy as jnp
+from jax import lax
+from jax.scipy.linalg import cho_factor, solve_triangular
+from jaxtyping import Array, Float
+
+from jaxslam_kernels.types import Flag
+
+_MIN_DIAGONAL = 1e-12  # an unknown with less information than this keeps its unit
+
+
+def unit_diagonal(hessian: Float[Array, "d d"]) -> tuple[Float[Array, "d d"], Float[Array, " d"]]:
+    """Scale a Hessian to a diagonal of ones.
+
+    Args:
+        hessian: Symmetric positive semi-definite matrix.
+
+    Returns:
+        `(d, d)` the scaled matrix, and `(d,)` the units `u` of the unknowns, `scaled = hessian * u uᵀ`.
+    """
+    diagonal = jnp.diagonal(hessian)
+    unit = lax.rsqrt(jnp.where(diagonal > _MIN_DIAGONAL, diagonal, 1.0))
+    return hessian * unit[:, None] * unit[None, :], unit
+
+
+def is_determined(hessian: Float[Array, "d d"]) -> Flag:
+    """Whether a Hessian leaves no direction free, clear of rounding; false if it is not finite or not definite.
+
+    Compares the variance of every unknown with the variance it would have if all others were known (the variance
+    inflation factor: the diagonal of the inverse of the scaled matrix). The smallest pivot of a Cholesky
+    decomposition is no substitute: it depends on the order of the unknowns, and for points on a line, in float32, an
+    eigenvalue of 2e-8 left a pivot of 7e-6.
+    """
+    scaled, _ = unit_diagonal(lax.stop_gradient(hessian))
+    root, _ = cho_factor(scaled)
+    inverse_root = solve_triangular(root, jnp.eye(root.shape[0], dtype=root.dtype), trans="T")
+    inflation = jnp.square(inverse_root).sum(axis=0)
+    return (inflation < float(jnp.finfo(root.dtype).eps) ** -0.75).all()  # NaN compares false
