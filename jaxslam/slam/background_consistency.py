@@ -7,13 +7,17 @@ that does not would have to be very far away. Over a short way the background te
 moved since it last had its say is unsure.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from jaxslam.geometry.se3 import between, compose, rotate
 from jaxslam.sensors.camera import Camera
+from jaxslam.sensors.frame_arrays import FrameArrays
+from jaxslam.sensors.sensor_model import SensorModel
+from jaxslam.slam.frame_result import FrameResult
+from jaxslam.tracking.state import TrackReason, TrackStatus
 
 _MEASURED = 0.65
 """Share of the picture with depth from which on the background has its vote in the pose already. Recordings of sensors
@@ -59,23 +63,42 @@ class BackgroundConsistency:
     be `OK` (four camera paths, two seeds), none is wrong by more than 5 standard deviations, where all were.
     """
 
-    def __init__(self, camera: Camera, nearest_m: float, farthest_m: float) -> None:
+    def __init__(self, camera: Camera, sensor: SensorModel) -> None:
         """Begin with nothing to compare with.
 
         Args:
             camera: Camera that takes the frames.
-            nearest_m: Nearest depth that is believed, meters.
-            farthest_m: Farthest depth that is believed, meters.
+            sensor: Camera with the limits of its depth.
         """
         self._K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
         self._distortion = np.array(camera.distortion)
-        self._nearest_m, self._farthest_m = nearest_m, farthest_m
+        self._nearest_m, self._farthest_m = float(sensor.min_depth_m), float(sensor.max_depth_m)
         self.forget()
 
     def forget(self) -> None:
         """Begin anew: the pose is that of a place that was recognized, or the origin of a submap."""
         self._unsure_m = self._depth_m = 0.0
         self._stop()
+
+    def check(self, tracked: FrameResult, arrays: FrameArrays) -> FrameResult:
+        """Return the result with the covariance and the status that the background leaves it.
+
+        Args:
+            tracked: Result of a frame.
+            arrays: The frame, with its mask.
+        """
+        if tracked.status == TrackStatus.LOST:
+            return tracked
+        if tracked.status in (TrackStatus.STARTED, TrackStatus.RELOCALIZED):
+            self.forget()
+        gray, depth, ignore = np.asarray(arrays.image), np.asarray(arrays.depth), np.asarray(arrays.ignore)
+        doubt = self.look(gray, depth, ignore, tracked.T_world_cam, tracked.correction)
+        if not doubt.unsure_m:
+            return tracked
+        covariance = tracked.covariance + np.diag(np.repeat(np.array([doubt.unsure_m**2, 0], np.float32), 3))
+        if not doubt.is_weak or tracked.status != TrackStatus.OK:
+            return replace(tracked, covariance=covariance)
+        return replace(tracked, covariance=covariance, status=TrackStatus.WEAK, reason=TrackReason.UNCONFIRMED.text)
 
     def look(
         self, gray: np.ndarray, depth_m: np.ndarray, ignore: np.ndarray, T_world_cam: np.ndarray, correction: np.ndarray

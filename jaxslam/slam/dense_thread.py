@@ -9,7 +9,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from jaxslam.config.schema import DenseConfig
+from jaxslam.config.schema import Config, DenseConfig
 from jaxslam.dense.coverage import SeenArea
 from jaxslam.dense.dense_map import DenseFigures, DenseKeyframe, DenseMap, DepthGlance
 from jaxslam.dense.key_objects import Neighbors
@@ -19,8 +19,12 @@ from jaxslam.geometry.se3 import IDENTITY, retract
 from jaxslam.map.dynamic_removal import DynamicObservations
 from jaxslam.map.types import NONE, Map
 from jaxslam.mapping.local_mapping import NewKeyframe
+from jaxslam.runtime.stage_timer import StageTimes
 from jaxslam.runtime.worker import Worker, make_worker
+from jaxslam.semantics import Detector
+from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame_arrays import FrameArrays
+from jaxslam.sensors.sensor_model import SensorModel
 from jaxslam.slam.tracker_map_sync import pose_of
 from jaxslam.tracking.state import TrackOutput
 
@@ -179,3 +183,23 @@ class DenseMapping:
 def _is_keyframe(job: _Job) -> bool:
     """Whether a job may be dropped: a keyframe may, but what was removed from another one must not be lost."""
     return isinstance(job, DenseKeyframe)
+
+
+def dense_mapping_of(
+    camera: Camera, sensor: SensorModel, config: Config, key_detector: Detector | None, times: StageTimes
+) -> DenseMapping:
+    """Make the dense map that the settings describe, empty, and its thread.
+
+    Args:
+        camera: Camera that takes the frames.
+        sensor: Camera with the limits of its depth.
+        config: Settings in effect.
+        key_detector: Finds what the map has at full density; `None` for nothing.
+        times: Record of the duration of every job.
+    """
+    nearest_m, farthest_m = float(sensor.min_depth_m), float(sensor.max_depth_m)
+    dense_map = DenseMap(
+        camera, config.dense, nearest_m=nearest_m, farthest_m=farthest_m, key_detector=key_detector, times=times
+    )
+    seen = SeenArea(camera, nearest_m, farthest_m)
+    return DenseMapping(dense_map, seen, config.dense, deterministic=config.run.in_turn)

@@ -7,20 +7,15 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.config.schema import Config
 from jaxslam.datasets import Dataset
-from jaxslam.dense.coverage import SeenArea
-from jaxslam.dense.dense_map import DenseMap
 from jaxslam.dense.point_cloud import DenseCloud
 from jaxslam.map.npz_file import load_map, save_map
 from jaxslam.map.types import Map
 from jaxslam.masks.depth_instances import InstanceFinder
-from jaxslam.runtime.compile_cache import FAST_COMPILE, SINGLE_THREAD, enable_compile_cache
-from jaxslam.runtime.compiled import compiled
+from jaxslam.runtime.compile_cache import enable_compile_cache
 from jaxslam.runtime.stage_timer import StageTimes
 from jaxslam.semantics import Detector
 from jaxslam.semantics.checked_detector import CheckedDetector
@@ -32,7 +27,7 @@ from jaxslam.slam.argument_checks import check_arguments, warn_of_other_camera
 from jaxslam.slam.back_end import BackEnd
 from jaxslam.slam.background_consistency import BackgroundConsistency
 from jaxslam.slam.call_guard import one_at_a_time, refuse_after_fork
-from jaxslam.slam.dense_thread import DenseMapping
+from jaxslam.slam.dense_thread import dense_mapping_of
 from jaxslam.slam.frame_clock import FrameClock
 from jaxslam.slam.frame_localizer import LocalizedPose
 from jaxslam.slam.frame_result import FrameRecord, FrameResult, Rejected, frame_result
@@ -41,36 +36,15 @@ from jaxslam.slam.input_warnings import InputWarnings
 from jaxslam.slam.mask_stage import MaskStage
 from jaxslam.slam.pose_history import ConstantVelocity, PoseHistory, ordered_trajectory
 from jaxslam.slam.recording_run import run_recording
-from jaxslam.tracking.cue_registry import with_cue_params, with_cues
-from jaxslam.tracking.from_config import track_params, track_plan, with_dense_keyframes
-from jaxslam.tracking.state import TrackOutput, TrackParams, TrackPlan, TrackReason, TrackState, TrackStatus
-from jaxslam.tracking.step import FlowResult, follow_points, init_state, track_followed
+from jaxslam.slam.tracker import Tracker
+from jaxslam.tracking.state import TrackOutput, TrackReason, TrackStatus
+from jaxslam.tracking.step import FlowResult
 from jaxslam.trajectory.trajectory import PathLike, Trajectory
 
 _log = logging.getLogger(__name__)
 
-_RESTART_DISABLED = 1e6
-"""Value of `restart_after` with which the tracker never starts a new submap by itself. It must stay below the number
-of lost frames in a fresh state (2**20, `init_state`), which starts at once."""
-_PATIENT_S = 0.5
-"""Seconds from one keyframe to the next for want of points, while mapping is behind. With the preset `ngd` at the rate
-of the camera there was one every tenth of a second, and the threads held each other up."""
-_ALL_IS_NEW = 2.0
-"""More than the whole of a keyframe's points: a frame that shows them all is kept too."""
 _MASKED = 0.95
 """Share of the picture under a mask beyond which that is why a frame is lost."""
-_new_state = compiled(when="warm-up", static=("height", "width", "plan"))(init_state)
-"""One program instead of some fifty."""
-
-
-_follow_points = compiled(when="warm-up", static="plan", options=SINGLE_THREAD)(follow_points)
-
-
-@compiled(when="warm-up", static="plan", donate="state", options=FAST_COMPILE)
-def _track_followed(
-    state: TrackState, frame: FrameArrays, followed: FlowResult, params: TrackParams, plan: TrackPlan
-) -> tuple[TrackState, TrackOutput]:
-    return track_followed(state, frame, followed, params, plan)
 
 
 class Slam:
@@ -136,23 +110,15 @@ class Slam:
             slam_map if slam_map is not None and len(slam_map.ids) else None,
             localize_only,
         )
-        params = track_params(camera, with_dense_keyframes(self.config))._replace(
-            restart_after=jnp.float32(_RESTART_DISABLED)
-        )
-        self._params = with_cue_params(params, self.config.dynamics)
-        # ORB-SLAM's local mapping does not accept keyframes either while it is busy.
-        patient = max(_PATIENT_S, self.config.track.keyframe_weak_after_s)
-        self._patient_params = self._params._replace(keyframe_weak_after_s=jnp.float32(patient))
-        self._eager_params = self._params._replace(keyframe_below=jnp.float32(_ALL_IS_NEW))
-        self._plan = with_cues(track_plan(self.config.track), self.config.dynamics, pairs=camera.is_stereo)
+        enable_compile_cache()
+        self._tracker = Tracker(camera, self.config)
         self._detector = _watched(detector or detector_of(self.config.semantics))
         self.without_network = None if self._detector is not None else why_no_network(self.config.semantics)
         self._key_detector = _watched(key_detector or key_detector_of(self.config))
-        motion = self._plan.motion
+        motion = self._tracker.plan.motion
         self._memory = FrameMemory(camera.height, camera.width, pairs=camera.is_stereo, movable=motion is not None)
         self._instances = None if motion is None else InstanceFinder(camera, motion.num_objects)
         self._ready = False
-        enable_compile_cache()
         self._begin()
 
     @classmethod
@@ -200,10 +166,8 @@ class Slam:
             nothing = self._memory.hold(Frame(0, black, np.zeros(shape, np.float32), right=pair), 0.0)
             # In two threads: traced anew it took 5.9 s instead of 7.4 from XLA's cache, 31 instead of 34 without.
             with ThreadPoolExecutor(1, thread_name_prefix="jaxslam-compile") as beside:
-                back_end = beside.submit(self._back.compile, nothing, self._fresh_state())
-                state = self._fresh_state()
-                followed = _follow_points(state, nothing, self._params, self._plan)
-                jax.block_until_ready(_track_followed(state, nothing, followed, self._params, self._plan))
+                back_end = beside.submit(self._back.compile, nothing, self._tracker.fresh_state())
+                self._tracker.compile(nothing)
                 self._masks.compile()
                 back_end.result()
             self.compile_s = time.perf_counter() - began
@@ -234,14 +198,14 @@ class Slam:
         self._input_checks.look(frame)
 
         # 1. Take over what mapping and loop closing have corrected since the frame before.
-        self._state, correction = self._back.update(self._state, self._frame)
+        self._tracker.state, correction = self._back.update(self._tracker.state, self._frame)
         dt_s = self._clock.elapsed_s(frame.timestamp_ns)
         arrays = self._memory.hold(frame, dt_s, depth_follows=frame.depth_m is None)
         watch.ends("take over")
 
         # 2. Optical flow; beside it, a worker computes the stereo depth and the mask.
         self._masks.begin(self._frame, frame, arrays, correction)
-        flow = _follow_points(self._state, arrays, self._params, self._plan)
+        flow = self._tracker.follow(arrays)
         watch.ends("flow")
 
         # 3. Mask: ignore pixels of movable objects.
@@ -263,7 +227,9 @@ class Slam:
         self._hand_over_keyframe(frame, arrays, output, localized)
         mask = mask._replace(error=mask.error or self._back.latest_error())
         result = frame_result(frame.timestamp_ns, output, correction, num_matched, mask, share)
-        result = self._checked_by_background(self._in_submap(result), arrays)
+        result = self._in_submap(result)
+        if self._background is not None:
+            result = self._background.check(result, arrays)
         self._clock.advance(frame.timestamp_ns)
         result = self._recorded(result, dt_s, float(arrays.depth_delay_s))
         self._masks.submit_for_detection(self._frame, frame.image)
@@ -294,9 +260,8 @@ class Slam:
 
         So has a detector that looks at keyframes alone, then.
         """
-        if any(leaf.is_deleted() for leaf in jax.tree.leaves(self._state)):  # a step that Ctrl-C ended took it along
-            self._state = _awaiting_relocalization(self._fresh_state())
-        self._state = self._back.finish(self._state)
+        self._tracker.recover()  # from a step that Ctrl-C ended
+        self._tracker.state = self._back.finish(self._tracker.state)
 
     def close(self) -> None:
         """End the threads, in two seconds at most; nothing can be tracked after that but from a `reset`."""
@@ -370,11 +335,14 @@ class Slam:
         if self._start_map is not None:
             warn_of_other_camera(self._start_map.camera, self.camera, self._warnings)
         every = self._detector if self.config.semantics.frames == "every" else None
-        self.dense_mapping = self._new_dense_mapping()
+        sensor, has_dense = self._tracker.params.sensor, self.config.dense.enabled and not self._localize_only
+        self.dense_mapping = (
+            dense_mapping_of(self.camera, sensor, self.config, self._key_detector, self.times) if has_dense else None
+        )
         self._back = BackEnd(
             self.camera,
-            self._params.sensor,
-            self._plan,
+            sensor,
+            self._tracker.plan,
             self.config,
             self._start_map,
             localize_only=self._localize_only,
@@ -387,48 +355,21 @@ class Slam:
             self.config,
             self._memory,
             every,
-            max_depth_m=float(self._params.sensor.max_depth_m),
+            max_depth_m=float(sensor.max_depth_m),
             instances=self._instances,
             times=self.times,
         )
-        self._state = self._fresh_state()
-        if self._start_map is not None:
-            self._state = _awaiting_relocalization(self._state)
+        self._tracker.begin(await_relocalization=self._start_map is not None)
         self._frame = self._unrecognized = 0
         self._clock = FrameClock(self.camera.fps, self._warnings)
-        limits = float(self._params.sensor.min_depth_m), float(self._params.sensor.max_depth_m)
-        self._background = None if self.camera.is_stereo else BackgroundConsistency(self.camera, *limits)
+        self._background = None if self.camera.is_stereo else BackgroundConsistency(self.camera, sensor)
         self._history, self._motion = PoseHistory(), ConstantVelocity()
         self._status = TrackStatus.OK
 
-    def _new_dense_mapping(self) -> DenseMapping | None:
-        """Make the thread of the dense map, if the settings ask for one and the map may grow."""
-        if not self.config.dense.enabled or self._localize_only:
-            return None
-        dense_map = DenseMap(
-            self.camera,
-            self.config.dense,
-            nearest_m=float(self._params.sensor.min_depth_m),
-            farthest_m=float(self._params.sensor.max_depth_m),
-            key_detector=self._key_detector,
-            times=self.times,
-        )
-        seen = SeenArea(self.camera, float(self._params.sensor.min_depth_m), float(self._params.sensor.max_depth_m))
-        return DenseMapping(dense_map, seen, self.config.dense, deterministic=self.config.run.in_turn)
-
-    def _fresh_state(self) -> TrackState:
-        state = _new_state(self.camera.height, self.camera.width, self._plan, seed=self.config.run.seed)
-        # Committed from the beginning, as after any `cached_trace`: else all is compiled again when the first one is.
-        return jax.device_put(state, *state.twist.devices())
-
     def _advance(self, arrays: FrameArrays, followed: FlowResult) -> TrackOutput:
-        params = self._params
-        if self._back.is_behind:
-            params = self._patient_params
-        elif self.dense_mapping is not None and self.dense_mapping.wants_keyframe:
-            params = self._eager_params
-        self._state, output = _track_followed(self._state, arrays, followed, params, self._plan)
-        return jax.tree.map(np.asarray, output)  # as `device_get`, in a tenth of its time
+        """Track a frame, with more or fewer keyframes as the maps ask for."""
+        wanted = self.dense_mapping is not None and self.dense_mapping.wants_keyframe
+        return self._tracker.advance(arrays, followed, mapping_is_behind=self._back.is_behind, wants_keyframe=wanted)
 
     def _localize(
         self, arrays: FrameArrays, output: TrackOutput, dt_s: float
@@ -442,7 +383,7 @@ class Slam:
             output, localized = self._relocalize(arrays, output, dt_s)
             return output, localized, 0 if localized is None else localized.num_matched
         if self._needs_map_match(output):
-            self._state, output, num_matched = self._back.match_local_map(self._state, arrays, output)
+            self._tracker.state, output, num_matched = self._back.match_local_map(self._tracker.state, arrays, output)
             return output, None, num_matched
         return output, None, 0
 
@@ -470,17 +411,18 @@ class Slam:
         placed, unknown = self._back.relocalize(arrays, predicted)
         self._unrecognized += unknown
         if placed is not None:
-            self._state = self._back.reset_at_pose(self._state, placed.anchored)
+            self._tracker.state = self._back.reset_at_pose(self._tracker.state, placed.anchored)
         elif self._may_begin_submap and self._unrecognized > self.config.track.restart_after:
-            self._state = self._back.start_submap(self._state, np.asarray(lost.T_world_cam.wxyz_xyz))
+            pose = np.asarray(lost.T_world_cam.wxyz_xyz)
+            self._tracker.state = self._back.start_submap(self._tracker.state, pose)
         elif unknown and len(self.map.ids) and (self._status == TrackStatus.LOST or not self._history):
             # Nothing was followed into the frame: that is not why.
             return lost._replace(reason=np.int32(TrackReason.PLACE_NOT_IN_MAP)), None
         else:
             return lost, None
-        output = self._advance(arrays, _follow_points(self._state, arrays, self._params, self._plan))
+        output = self._advance(arrays, self._tracker.follow(arrays))
         if int(output.status) != TrackStatus.STARTED:
-            self._state = _awaiting_relocalization(self._state)  # not to start by itself
+            self._tracker.await_relocalization()  # not to start by itself
         if placed is None:
             return output, None
         # If nothing here has a depth from which to go on, what the map shows is a pose all the same.
@@ -507,21 +449,6 @@ class Slam:
             _log.info("frame %d: submap %d begins", self._frame, submap)
         return replace(tracked, submap=submap, in_map_frame=submap == self.map.world_submap)
 
-    def _checked_by_background(self, tracked: FrameResult, arrays: FrameArrays) -> FrameResult:
-        """The result with what the background says of its pose, where too little has depth to have a vote there."""
-        if self._background is None or tracked.status == TrackStatus.LOST:
-            return tracked
-        if tracked.status in (TrackStatus.STARTED, TrackStatus.RELOCALIZED):
-            self._background.forget()
-        gray, depth, ignore = np.asarray(arrays.image), np.asarray(arrays.depth), np.asarray(arrays.ignore)
-        doubt = self._background.look(gray, depth, ignore, tracked.T_world_cam, tracked.correction)
-        if not doubt.unsure_m:
-            return tracked
-        covariance = tracked.covariance + np.diag(np.repeat(np.array([doubt.unsure_m**2, 0], np.float32), 3))
-        if not doubt.is_weak or tracked.status != TrackStatus.OK:
-            return replace(tracked, covariance=covariance)
-        return replace(tracked, covariance=covariance, status=TrackStatus.WEAK, reason=TrackReason.UNCONFIRMED.text)
-
     def _recorded(self, tracked: FrameResult, dt_s: float, depth_delay_s: float) -> FrameResult:
         """The result as it is given out, and remembered."""
         if tracked.status == TrackStatus.LOST:
@@ -540,9 +467,3 @@ class Slam:
 
 def _watched(detector: Detector | None) -> CheckedDetector | None:
     return None if detector is None else CheckedDetector(detector)
-
-
-def _awaiting_relocalization(state: TrackState) -> TrackState:
-    """A state that waits for its place to be recognized instead of starting by itself."""
-    # Where the others are: with `jnp.zeros`, which is on no device for certain, the step was compiled anew.
-    return state._replace(lost_frames=jax.device_put(np.int32(0), *state.twist.devices()))

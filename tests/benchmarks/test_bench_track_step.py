@@ -25,7 +25,7 @@ def test_step_is_not_slower_than_opencv_flow(data_dir, capsys):
     for index in range(FIRST):
         slam.track(dataset[index])
     step = jax.jit(track_step, static_argnames="plan", donate_argnames="state")
-    state, statuses = slam._state, []
+    state, statuses = slam._tracker.state, []
     frames = [dataset[index] for index in range(FIRST - 1, FIRST + ROUNDS + WARM_UP)]
     arrays = iter([frame_arrays(frame, 1 / 30) for frame in frames[1:]])
     gray = [to_gray(frame.image) for frame in frames]

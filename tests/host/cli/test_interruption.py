@@ -23,7 +23,7 @@ from jaxslam.cli.tracking_run import track
 from jaxslam.io.atomic_files import write_atomically
 from jaxslam.map.npz_file import load_map
 from jaxslam.results.run_results import RESULT_FILES
-from jaxslam.slam import slam as slam_module
+from jaxslam.slam import tracker as tracker_module
 from jaxslam.slam.slam import Slam
 from jaxslam.tracking.state import TrackStatus
 from jaxslam.trajectory.trajectory import read_tum
@@ -307,7 +307,7 @@ class TestSlam:
     def test_interrupted_within_a_step(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """The step has taken its state with it; the map is there, and the next frame is found in it."""
         recording = clip()
-        slam, step = Slam(recording.camera, CONFIG), slam_module._track_followed
+        slam, step = Slam(recording.camera, CONFIG), tracker_module._track_followed
         for frame in recording.frames[:FRAMES]:
             slam.track(frame)
 
@@ -315,7 +315,7 @@ class TestSlam:
             step(*arguments)
             raise KeyboardInterrupt
 
-        monkeypatch.setattr(slam_module, "_track_followed", interrupted)
+        monkeypatch.setattr(tracker_module, "_track_followed", interrupted)
         with pytest.raises(KeyboardInterrupt):
             slam.track(recording.frames[FRAMES])
         monkeypatch.undo()

@@ -72,7 +72,7 @@ class TestKidnap:
         frames.frames[41] = replace(frames[41], depth_m=np.zeros_like(frames[41].depth_m))
         with Slam(frames.camera, CONFIG) as slam:
             before = Played(slam, frames, range(41), FPS)
-            slam._state = slam._back.start_submap(slam._state, before.results[-1].T_world_cam)
+            slam._tracker.state = slam._back.start_submap(slam._tracker.state, before.results[-1].T_world_cam)
             after = Played(slam, frames, range(41, 46), FPS)
         assert after.statuses == [*[TrackStatus.RELOCALIZED] * 2, *[TrackStatus.OK] * 3]
         found = after.results[0]

@@ -19,7 +19,8 @@ from jaxslam.map.types import empty_map
 from jaxslam.results.run_results import RunInfo, write_results
 from jaxslam.sensors.frame import Frame
 from jaxslam.slam.frame_result import FrameRecord
-from jaxslam.slam.slam import Slam, _track_followed
+from jaxslam.slam.slam import Slam
+from jaxslam.slam.tracker import _track_followed
 from jaxslam.tracking.state import TrackReason, TrackStatus
 from jaxslam.trajectory.trajectory import read as read_trajectory
 

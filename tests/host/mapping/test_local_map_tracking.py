@@ -239,8 +239,8 @@ class TestWeakFrames:
         slam = Slam(room().camera, CONFIG)
         for frame in room().frames[:40]:
             slam.track(frame)
-        weak = slam._params._replace(weak_inliers=np.float32(1e6))
-        monkeypatch.setattr(slam, "_params", weak)
+        weak = slam._tracker.params._replace(weak_inliers=np.float32(1e6))
+        monkeypatch.setattr(slam._tracker, "params", weak)
         result = slam.track(room()[40])
         assert result.num_matched >= CONFIG.track.weak_inliers
         assert (result.status, result.reason) == (TrackStatus.OK, TrackReason.NONE.text)
@@ -252,8 +252,8 @@ class TestWeakFrames:
             slam.track(frame)
         pose = slam._motion.now()
         wrong = compose(pose, np.array([1.0, 0, 0, 0, 0.04, 0, 0]))
-        state = slam._back._link.apply_correction(slam._state, compose(wrong, inverse(pose)), is_keyframe=False)
-        slam._state = state._replace(keyframes=state.keyframes._replace(weight=0 * state.keyframes.weight))
+        state = slam._back._link.apply_correction(slam._tracker.state, compose(wrong, inverse(pose)), is_keyframe=False)
+        slam._tracker.state = state._replace(keyframes=state.keyframes._replace(weight=0 * state.keyframes.weight))
         result = slam.track(room()[LATER])
         assert result.num_matched > 0
         off = np.linalg.norm(between(mapped()[1][LATER].T_world_cam, result.T_world_cam)[4:])
@@ -280,8 +280,8 @@ class TestLostFrames:
         with Slam(room().camera, CONFIG) as slam:
             for frame in room().frames[:LATER]:
                 slam.track(frame)
-            slam._state = slam._state._replace(
-                points=slam._state.points._replace(valid=np.zeros(TRACK.num_points, bool))
+            slam._tracker.state = slam._tracker.state._replace(
+                points=slam._tracker.state.points._replace(valid=np.zeros(TRACK.num_points, bool))
             )
             result = slam.track(room()[LATER])
             assert result.status is TrackStatus.RELOCALIZED

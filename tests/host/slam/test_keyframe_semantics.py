@@ -168,11 +168,11 @@ class TestRun:
     def test_keyframes_of_the_tracker_lose_them_too(self) -> None:
         with Slam(source().camera, config(latency_frames=0), detector=Looks()) as slam:
             track(slam, 1)
-            kept = jax.device_get(slam._state.keyframes)
+            kept = jax.device_get(slam._tracker.state.keyframes)
             hidden = under(dilated_truth(0), kept.uv[0])
             before = (hidden & (kept.weight[0] > 0)).sum(), (~hidden & (kept.weight[0] > 0)).sum()
             slam.finish()
-            weight = np.array(slam._state.keyframes.weight[0])
+            weight = np.array(slam._tracker.state.keyframes.weight[0])
         assert before[0] > 20
         assert ((hidden & (weight > 0)).sum(), (~hidden & (weight > 0)).sum()) == (0, before[1])
 
@@ -181,7 +181,7 @@ class TestRun:
         with Slam(source().camera, config(), detector=Looks()) as slam:
             track(slam)
             slam.finish()
-            kept, slam_map = jax.device_get(slam._state.keyframes), slam.map
+            kept, slam_map = jax.device_get(slam._tracker.state.keyframes), slam.map
             slots, index = list(slam._back._link._slots), slam._back._index
         held = [slot for slot, keyframe in enumerate(slots) if keyframe != NONE]
         assert len(held) >= 2

@@ -1,0 +1,120 @@
+"""The compiled tracker of one camera: its settings, its state, and the programs that advance it by a frame."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam.config.schema import Config
+from jaxslam.runtime.compile_cache import FAST_COMPILE, SINGLE_THREAD
+from jaxslam.runtime.compiled import compiled
+from jaxslam.sensors.camera import Camera
+from jaxslam.sensors.frame_arrays import FrameArrays
+from jaxslam.tracking.cue_registry import with_cue_params, with_cues
+from jaxslam.tracking.from_config import track_params, track_plan, with_dense_keyframes
+from jaxslam.tracking.state import TrackOutput, TrackParams, TrackPlan, TrackState
+from jaxslam.tracking.step import FlowResult, follow_points, init_state, track_followed
+
+_RESTART_DISABLED = 1e6
+"""Value of `restart_after` with which the tracker never starts a new submap by itself. It must stay below the number
+of lost frames in a fresh state (2**20, `init_state`), which starts at once."""
+_PATIENT_S = 0.5
+"""Seconds from one keyframe to the next for want of points, while mapping is behind. With the preset `ngd` at the rate
+of the camera there was one every tenth of a second, and the threads held each other up."""
+_ALL_IS_NEW = 2.0
+"""More than the whole of a keyframe's points: a frame that shows them all is kept too."""
+
+_new_state = compiled(when="warm-up", static=("height", "width", "plan"))(init_state)  # one program instead of fifty
+_follow_points = compiled(when="warm-up", static="plan", options=SINGLE_THREAD)(follow_points)
+
+
+@compiled(when="warm-up", static="plan", donate="state", options=FAST_COMPILE)
+def _track_followed(
+    state: TrackState, frame: FrameArrays, followed: FlowResult, params: TrackParams, plan: TrackPlan
+) -> tuple[TrackState, TrackOutput]:
+    return track_followed(state, frame, followed, params, plan)
+
+
+class Tracker:
+    """Advances the state of tracking frame by frame; starts no submap by itself, except at the first frame.
+
+    Attributes:
+        params: Settings that are traced.
+        plan: Settings that are compiled in.
+        state: State after the latest frame. Programs that change it take it over (its buffers are donated).
+    """
+
+    def __init__(self, camera: Camera, config: Config) -> None:
+        """Prepare the settings and a fresh state.
+
+        Args:
+            camera: Camera that takes the frames.
+            config: Settings in effect.
+        """
+        params = track_params(camera, with_dense_keyframes(config))._replace(
+            restart_after=jnp.float32(_RESTART_DISABLED)
+        )
+        self.params = with_cue_params(params, config.dynamics)
+        self.plan = with_cues(track_plan(config.track), config.dynamics, pairs=camera.is_stereo)
+        # ORB-SLAM's local mapping does not accept keyframes either while it is busy.
+        patient_s = max(_PATIENT_S, config.track.keyframe_weak_after_s)
+        self._patient_params = self.params._replace(keyframe_weak_after_s=jnp.float32(patient_s))
+        self._eager_params = self.params._replace(keyframe_below=jnp.float32(_ALL_IS_NEW))
+        self._height, self._width, self._seed = camera.height, camera.width, config.run.seed
+        self.state = self.fresh_state()
+
+    def fresh_state(self) -> TrackState:
+        """Return a state before the first frame."""
+        state = _new_state(self._height, self._width, self.plan, seed=self._seed)
+        # Committed from the beginning, as after any `cached_trace`: else all is compiled again when the first one is.
+        return jax.device_put(state, *state.twist.devices())
+
+    def begin(self, *, await_relocalization: bool) -> None:
+        """Forget all frames.
+
+        Args:
+            await_relocalization: Stay lost until the place of a frame is recognized, instead of starting at the next.
+        """
+        self.state = self.fresh_state()
+        if await_relocalization:
+            self.await_relocalization()
+
+    def await_relocalization(self) -> None:
+        """Stay lost until the place of a frame is recognized."""
+        # Where the others are: with `jnp.zeros`, which is on no device for certain, the step was compiled anew.
+        lost_frames = jax.device_put(np.int32(0), *self.state.twist.devices())
+        self.state = self.state._replace(lost_frames=lost_frames)
+
+    def recover(self) -> None:
+        """Begin anew, awaiting relocalization, if an interrupted step took the state along."""
+        if any(leaf.is_deleted() for leaf in jax.tree.leaves(self.state)):
+            self.begin(await_relocalization=True)
+
+    def compile(self, frame: FrameArrays) -> None:
+        """Compile the programs for frames like this one; the state stays as it is."""
+        state = self.fresh_state()
+        followed = _follow_points(state, frame, self.params, self.plan)
+        jax.block_until_ready(_track_followed(state, frame, followed, self.params, self.plan))
+
+    def follow(self, frame: FrameArrays) -> FlowResult:
+        """Follow the points of the state into a frame by optical flow."""
+        return _follow_points(self.state, frame, self.params, self.plan)
+
+    def advance(
+        self, frame: FrameArrays, followed: FlowResult, *, mapping_is_behind: bool, wants_keyframe: bool
+    ) -> TrackOutput:
+        """Estimate the pose of a frame and update the state.
+
+        Args:
+            frame: The frame.
+            followed: Result of `follow` for it.
+            mapping_is_behind: Make fewer keyframes.
+            wants_keyframe: Make this frame a keyframe if it can be one; without effect while mapping is behind.
+
+        Returns:
+            Output of the tracker, in NumPy arrays.
+        """
+        params = self._eager_params if wants_keyframe else self.params
+        if mapping_is_behind:
+            params = self._patient_params
+        self.state, output = _track_followed(self.state, frame, followed, params, self.plan)
+        return jax.tree.map(np.asarray, output)  # as `device_get`, in a tenth of its time
