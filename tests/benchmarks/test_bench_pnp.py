@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxslam_kernels.pose.pnp import draw_samples, ransac_pnp, score_poses
+from jaxslam_kernels.pose.pnp import SAMPLE_SIZE, ransac_pnp, score_poses
 from jaxslam_kernels.pose.pose_cost import pose_problem
+from jaxslam_kernels.ransac_sampling import draw_samples
 from scipy.spatial.transform import Rotation
 
 from jaxslam.benchmark.kernels.scenes.single_view import (
@@ -81,11 +82,11 @@ def test_time_of_parts():
     X_world, uv, depth, sigma = scene.arrays()
     problem = pose_problem(X_world, uv, INTRINSICS, None, depth, 1.0, sigma, 3.0, None)[0]
     poses = jax.random.normal(jax.random.key(0), (3, 4, HYPOTHESES))
-    score, draw = jax.jit(score_poses), jax.jit(draw_samples, static_argnums=2)
+    score, draw = jax.jit(score_poses), jax.jit(draw_samples, static_argnums=(2, 3))
     key = jax.random.key(0)
     for name, f in (
         (f"score {HYPOTHESES} hypotheses x {N} points", lambda: score(poses, problem)),
-        (f"draw {HYPOTHESES} samples of {N} points", lambda: draw(key, problem.weights, HYPOTHESES)),
+        (f"draw {HYPOTHESES} samples of {N} points", lambda: draw(key, problem.weights, HYPOTHESES, SAMPLE_SIZE)),
     ):
         comparison = compare(f, lambda: _opencv(scene, 8.0), rounds=100)
         print(f"\n{name}\n{comparison}")

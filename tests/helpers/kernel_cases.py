@@ -23,6 +23,7 @@ from jaxslam_kernels.pose import absolute_orientation, p3p, pnp, pose_refine
 from jaxslam_kernels.pose.pose_cost import PosePrior, PoseProblem
 from jaxslam_kernels.pose_graph import cost as pose_graph_cost
 from jaxslam_kernels.pose_graph import pose_graph
+from jaxslam_kernels.ransac_sampling import draw_samples
 from jaxslam_kernels.trajectory import alignment
 from jaxslam_kernels.trajectory import kitti_drift as segments
 from jaxslam_kernels.two_view import epipolar, fundamental
@@ -209,7 +210,7 @@ def cases(n: int = 11) -> dict[str, Case]:
             "initial": transforms(),
             "threshold_px": f(),
         },
-        partial(pnp.draw_samples, num_samples=3): {"key": KEY, "weights": f(n)},
+        partial(draw_samples, num_samples=3, size=3): {"key": KEY, "weights": f(n)},
         pnp.score_poses: {"T_cam_world": f(3, 4, 2), "problem": problem},
         partial(pose_graph.optimize_pose_graph, group_size=16): {
             "T_world_cam": transforms(n),

@@ -8,7 +8,6 @@ differentiation; the last refinement carries the gradient (see `pose_refine`).
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.typing import DTypeLike
@@ -21,6 +20,7 @@ from jaxslam_kernels.pose.absolute_orientation import absolute_orientation
 from jaxslam_kernels.pose.p3p import p3p
 from jaxslam_kernels.pose.pose_cost import PoseProblem, pose_problem
 from jaxslam_kernels.pose.pose_refine import PoseStatus, refine_problem, solve_pose, usable_pose
+from jaxslam_kernels.ransac_sampling import draw_samples
 from jaxslam_kernels.robust import Loss
 from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Points, Scalar, Weights
 
@@ -108,7 +108,7 @@ def ransac_pnp(
     problem, idle = pose_problem(X_world, uv, intrinsics, weights, depth, sigma_px, sigma_depth, _GATE_SIGMAS, None)
     fixed = lax.stop_gradient(problem)
     fallback, has_initial = _fallback(initial, X_world.dtype)
-    hypotheses, real = _hypotheses(fixed, draw_samples(key, fixed.weights, num_hypotheses))
+    hypotheses, real = _hypotheses(fixed, draw_samples(key, fixed.weights, num_hypotheses, SAMPLE_SIZE))
     hypotheses = jnp.concatenate([hypotheses, _as_transform(fallback)], axis=2)
     scores = jnp.where(jnp.append(real, has_initial), score_poses(hypotheses, fixed, averaged), -1.0)
     best, _ = usable_pose(_as_pose(hypotheses[:, :, jnp.argmax(scores)]))
@@ -118,50 +118,6 @@ def ransac_pnp(
     idle = _agreeing_idle(consensus, idle)
     refined = refine_problem(consensus, on_inliers, idle, loss, max_steps)
     return _result(refined.T_world_cam, refined.status, fixed, fallback, scores.max() >= 0, min_inliers, averaged)
-
-
-_MAX_COMPARED = 2**15
-"""Up to so many weights times samples comparing with all is faster than halving, and twenty times less code."""
-
-
-@checked
-def draw_samples(
-    key: Key[Array, ""], weights: Weights, num_samples: int, size: int = SAMPLE_SIZE
-) -> Int[Array, "size h"]:
-    """Draws samples of `size` different points, each in proportion to its weight among those left.
-
-    Exact sequential sampling without replacement: a draw lands on the line of stacked weights from which the ones
-    drawn before have been cut out. With fewer points of positive weight than the sample has, some come twice.
-
-    Raises:
-        ValueError: While tracing, if there is no point at all.
-    """
-    if weights.size == 0:
-        raise ValueError("draw_samples: weights: expected at least one, got none")
-    search = "compare_all" if weights.size * num_samples <= _MAX_COMPARED else "scan"
-    ends = jnp.cumsum(weights)
-    starts, total = ends - weights, ends[-1]
-    uniform = jax.random.uniform(key, (size, num_samples), weights.dtype)
-    drawn: list[Array] = []
-    taken: list[tuple[Array, Array]] = []  # where each one drawn starts on the line, in its order, and its weight
-    for position in range(size):
-        target = uniform[position] * (total - sum(weight for _, weight in taken))
-        for start, weight in taken:  # every cut ahead of the target moves it on
-            target = target + jnp.where(target >= start, weight, 0.0)
-        chosen = jnp.searchsorted(ends, target, side="right", method=search).astype(jnp.int32)
-        drawn.append(jnp.minimum(chosen, weights.size - 1))
-        taken = _inserted(taken, starts[drawn[-1]], weights[drawn[-1]])
-    return jnp.stack(drawn)
-
-
-def _inserted(line: list[tuple[Array, Array]], start: Array, weight: Array) -> list[tuple[Array, Array]]:
-    """The pieces of a line in their order, with one more; elementwise, where a sort is a call of its own."""
-    longer: list[tuple[Array, Array]] = []
-    for other_start, other_weight in line:
-        first = start < other_start
-        longer.append((jnp.where(first, start, other_start), jnp.where(first, weight, other_weight)))
-        start, weight = jnp.where(first, other_start, start), jnp.where(first, other_weight, weight)
-    return [*longer, (start, weight)]
 
 
 @checked

@@ -17,7 +17,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxslam_kernels.checks import checked
-from jaxslam_kernels.pose.pnp import draw_samples
+from jaxslam_kernels.ransac_sampling import draw_samples
 from jaxslam_kernels.two_view.epipolar import sampson_squared, seven_point
 from jaxslam_kernels.two_view.fundamental_refine import Matrix, TwoViews, refine_matrix, score_matrices, solve_matrix
 from jaxslam_kernels.two_view.homography import homography_suffices

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, Key
 
-from jaxslam_kernels.pose.pnp import draw_samples
+from jaxslam_kernels.ransac_sampling import draw_samples
 from jaxslam_kernels.two_view.epipolar import sampson_squared
 from jaxslam_kernels.two_view.fundamental_refine import Matrix, TwoViews
 from jaxslam_kernels.types import Flag, Weights

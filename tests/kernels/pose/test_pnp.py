@@ -15,7 +15,7 @@ from jaxlie import SE3
 from jaxslam_kernels.camera import Intrinsics
 from jaxslam_kernels.pose.absolute_orientation import absolute_orientation
 from jaxslam_kernels.pose.p3p import p3p
-from jaxslam_kernels.pose.pnp import PnpResult, draw_samples, ransac_pnp, score_poses
+from jaxslam_kernels.pose.pnp import PnpResult, ransac_pnp, score_poses
 from jaxslam_kernels.pose.pose_cost import pose_cost, pose_problem
 from jaxslam_kernels.pose.pose_refine import PoseStatus
 from linearized import differentiate
@@ -39,7 +39,6 @@ seeded = given(seed=st.integers(0, 2**32 - 1))
 few_examples = settings(max_examples=6, deadline=None, derandomize=True)
 
 _p3p, _align = quick_compile(p3p), quick_compile(absolute_orientation)
-_draw = quick_compile(draw_samples, static_argnums=2)
 
 
 def _triples(seed: int, h: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -159,24 +158,6 @@ class TestAbsoluteOrientation:
             jax.grad(lambda *a: sum(x.sum() for x in absolute_orientation(*a)[:2]), argnums=(0, 1))
         )
         assert all(np.isfinite(x).all() for x in (R, t, *gradients(source, target)))
-
-
-class TestSamples:
-    def test_matches_reference(self):
-        """First draws follow the weights; a second one follows the weights without the first."""
-        weights = jnp.asarray([0.1, 0.0, 0.2, 0.3, 0.4])
-        samples = np.asarray(_draw(jax.random.key(0), weights, 20_000))
-        assert samples.shape == (4, 20_000)
-        assert all(len(set(column)) == 4 for column in samples.T)
-        first = np.bincount(samples[0], minlength=5) / 20_000
-        np.testing.assert_allclose(first, weights, atol=0.015)
-        after_four = samples[1][samples[0] == 4]
-        np.testing.assert_allclose(np.bincount(after_four, minlength=4) / after_four.size, weights[:4] / 0.6, atol=0.02)
-
-    @pytest.mark.parametrize("weights", [[0.0] * 5, [0.0, 1.0, 0.0, 0.0, 0.0], [1e-30] * 5])
-    def test_degenerate(self, weights):
-        samples = np.asarray(_draw(jax.random.key(1), jnp.asarray(weights), 16))
-        assert ((samples >= 0) & (samples < 5)).all()
 
 
 class Inputs(NamedTuple):

@@ -293,7 +293,7 @@ def _polished(F: jax.Array, inputs: Inputs) -> jax.Array:
     views = views._replace(weights=jnp.where(_agree(start, views), views.weights, 0.0))
 
     def step(F: FramedMatrix, _: None) -> tuple[FramedMatrix, None]:
-        _, equations = _equations(F, views, "huber", 0.5)
+        equations = _equations(F, views, "huber", 0.5)[1]
         return _retract(F, -jnp.linalg.solve(equations.hessian, equations.gradient)), None
 
     return _mixture(_in_pixels(lax.scan(step, _framed(start), length=40)[0].matrix(), shift, scale))
