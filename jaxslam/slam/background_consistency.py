@@ -92,7 +92,7 @@ class BackgroundConsistency:
         if tracked.status in (TrackStatus.STARTED, TrackStatus.RELOCALIZED):
             self.forget()
         gray, depth, ignore = np.asarray(arrays.image), np.asarray(arrays.depth), np.asarray(arrays.ignore)
-        doubt = self.look(gray, depth, ignore, tracked.T_world_cam, tracked.correction)
+        doubt = self._compare(gray, depth, ignore, tracked.T_world_cam, tracked.correction)
         if not doubt.unsure_m:
             return tracked
         covariance = tracked.covariance + np.diag(np.repeat(np.array([doubt.unsure_m**2, 0], np.float32), 3))
@@ -100,7 +100,7 @@ class BackgroundConsistency:
             return replace(tracked, covariance=covariance)
         return replace(tracked, covariance=covariance, status=TrackStatus.WEAK, reason=TrackReason.UNCONFIRMED.text)
 
-    def look(
+    def _compare(
         self, gray: np.ndarray, depth_m: np.ndarray, ignore: np.ndarray, T_world_cam: np.ndarray, correction: np.ndarray
     ) -> PoseDoubt:
         """Compare a frame that was tracked with those before.

@@ -40,11 +40,14 @@ class Tracker:
     Attributes:
         params: Settings that are traced.
         plan: Settings that are compiled in.
-        state: State after the latest frame. Programs that change it take it over (its buffers are donated).
+        state: State after the latest frame, from `begin` on. Programs that change it take it over (its buffers are
+            donated).
     """
 
+    state: TrackState
+
     def __init__(self, camera: Camera, config: Config) -> None:
-        """Prepare the settings and a fresh state.
+        """Prepare the settings; `begin` makes the state.
 
         Args:
             camera: Camera that takes the frames.
@@ -60,7 +63,6 @@ class Tracker:
         self._patient_params = self.params._replace(keyframe_weak_after_s=jnp.float32(patient_s))
         self._eager_params = self.params._replace(keyframe_below=jnp.float32(_ALL_IS_NEW))
         self._height, self._width, self._seed = camera.height, camera.width, config.run.seed
-        self.state = self.fresh_state()
 
     def fresh_state(self) -> TrackState:
         """Return a state before the first frame."""

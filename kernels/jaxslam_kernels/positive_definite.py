@@ -1,8 +1,8 @@
-"""Small symmetric matrices of normal equations: scaling, and whether they determine every unknown."""
+"""Small symmetric matrices of normal equations: scaling, solving, and whether they determine every unknown."""
 
 import jax.numpy as jnp
 from jax import lax
-from jax.scipy.linalg import cho_factor, solve_triangular
+from jax.scipy.linalg import cho_factor, cho_solve, solve_triangular
 from jaxtyping import Array, Float
 
 from jaxslam_kernels.types import Flag
@@ -25,7 +25,7 @@ def unit_diagonal(hessian: Float[Array, "d d"]) -> tuple[Float[Array, "d d"], Fl
 
 
 def is_determined(hessian: Float[Array, "d d"]) -> Flag:
-    """Whether a Hessian leaves no direction free, clear of rounding; false if it is not finite or not definite.
+    """Tell whether a Hessian determines every unknown, clear of rounding; false if it is not finite or not definite.
 
     Compares the variance of every unknown with the variance it would have if all others were known (the variance
     inflation factor: the diagonal of the inverse of the scaled matrix). The smallest pivot of a Cholesky
@@ -37,3 +37,19 @@ def is_determined(hessian: Float[Array, "d d"]) -> Flag:
     inverse_root = solve_triangular(root, jnp.eye(root.shape[0], dtype=root.dtype), trans="T")
     inflation = jnp.square(inverse_root).sum(axis=0)
     return (inflation < float(jnp.finfo(root.dtype).eps) ** -0.75).all()  # NaN compares false
+
+
+def solve_determined(hessian: Float[Array, "d d"], determined: Flag, right: Array) -> Array:
+    """Solve `H x = right` for a positive definite H.
+
+    Args:
+        hessian: Symmetric matrix H.
+        determined: Result of `is_determined` for it; where false, the solution is meaningless but finite.
+        right: `(d,)` right-hand side, or `(d, k)` several.
+
+    Returns:
+        The solution, of the shape of `right`.
+    """
+    scaled, unit = unit_diagonal(jnp.where(determined, hessian, jnp.eye(hessian.shape[0], dtype=hessian.dtype)))
+    unit = unit.reshape(-1, *(1,) * (right.ndim - 1))
+    return unit * cho_solve(cho_factor(scaled), unit * right)

@@ -210,7 +210,7 @@ def cases(n: int = 11) -> dict[str, Case]:
             "initial": transforms(),
             "threshold_px": f(),
         },
-        partial(draw_samples, num_samples=3, size=3): {"key": KEY, "weights": f(n)},
+        partial(draw_samples, num_samples=3, size=4): {"key": KEY, "weights": f(n)},
         pnp.score_poses: {"T_cam_world": f(3, 4, 2), "problem": problem},
         partial(pose_graph.optimize_pose_graph, group_size=16): {
             "T_world_cam": transforms(n),

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxslam_kernels.positive_definite import is_determined, unit_diagonal
+from jaxslam_kernels.positive_definite import is_determined, solve_determined, unit_diagonal
 
 
 def _hessian(seed: int, smallest: float, size: int = 6) -> np.ndarray:
@@ -34,6 +34,17 @@ def test_unit_diagonal():
     scaled, unit = map(np.asarray, unit_diagonal(jnp.asarray(hessian, jnp.float32)))
     np.testing.assert_allclose(np.diag(scaled), 1.0, rtol=1e-6)
     np.testing.assert_allclose(scaled, hessian * unit * unit[:, None], rtol=1e-5)
+
+
+def test_solve():
+    """A vector and a matrix, in units far apart; finite where nothing is determined."""
+    hessian, right = _hessian(1, 0.1), np.random.default_rng(1).normal(size=(6, 2))
+    with jax.enable_x64(True):
+        for b in (right, right[:, 0]):
+            solution = solve_determined(jnp.asarray(hessian), jnp.asarray(True), jnp.asarray(b))
+            np.testing.assert_allclose(solution, np.linalg.solve(hessian, b), rtol=1e-9)
+        nothing = solve_determined(jnp.full((6, 6), jnp.nan), jnp.asarray(False), jnp.asarray(right))
+    assert np.isfinite(nothing).all()
 
 
 @pytest.mark.parametrize("value", [0.0, np.nan, np.inf])

@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jax import lax
-from jax.scipy.linalg import cho_factor, cho_solve
 from jaxlie import SE3
 from jaxtyping import Array, Float, Int
 
@@ -34,7 +33,7 @@ from jaxslam_kernels.pose.pose_cost import (
     tangent_basis,
     with_idle,
 )
-from jaxslam_kernels.positive_definite import is_determined, unit_diagonal
+from jaxslam_kernels.positive_definite import is_determined, solve_determined
 from jaxslam_kernels.robust import Loss
 from jaxslam_kernels.types import Code, Flag, Pixels, Points, Scalar, Weights
 
@@ -213,7 +212,7 @@ def _optimum_shift_jvp(loss: Loss, primals: tuple, tangents: tuple) -> tuple[Arr
     # reweighted one stands in, and where the pose is undetermined the derivative is zero.
     hessian = jnp.where(is_determined(exact), exact, reweighted)
     determined = is_determined(hessian)
-    shift = -_solve(hessian, determined, jnp.where(determined, gradient_change, 0.0))
+    shift = -solve_determined(hessian, determined, jnp.where(determined, gradient_change, 0.0))
     return zero, shift
 
 
@@ -251,7 +250,7 @@ def _figures_at(at_pose: PoseCost, problem: PoseProblem, status: Array) -> _Figu
     variance = jnp.sum(total * at_pose.chi2) / jnp.where(freedom > 0, freedom, 1.0)
     hessian, identity = at_pose.equations.hessian, jnp.eye(6, dtype=total.dtype)
     determined = is_determined(hessian) & (status <= PoseStatus.NOT_CONVERGED)
-    covariance = jnp.where(determined, _solve(hessian, determined, identity), UNKNOWN_VARIANCE * identity)
+    covariance = jnp.where(determined, solve_determined(hessian, determined, identity), UNKNOWN_VARIANCE * identity)
     residual_scale = jnp.where(variance > 0, jnp.sqrt(jnp.where(variance > 0, variance, 1.0)), 0.0)
     return _Figures(at_pose.cost, covariance, residual_scale)
 
@@ -283,10 +282,3 @@ def usable_pose(T: SE3) -> tuple[SE3, Flag]:
     usable = jnp.isfinite(parameters).all() & (jnp.sum(jnp.square(parameters[:4])) > 1e-6)
     identity = jnp.zeros_like(parameters).at[0].set(1.0)
     return SE3(jnp.where(usable, parameters, identity)).normalize(), usable
-
-
-def _solve(hessian: Float[Array, "6 6"], determined: Flag, right: Array) -> Array:
-    """`H⁻¹ right` for a positive definite H; anything finite if it is not determined."""
-    scaled, unit = unit_diagonal(jnp.where(determined, hessian, jnp.eye(6, dtype=hessian.dtype)))
-    unit = unit.reshape(6, *(1,) * (right.ndim - 1))
-    return unit * cho_solve(cho_factor(scaled), unit * right)

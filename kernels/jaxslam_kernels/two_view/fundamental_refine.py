@@ -16,12 +16,11 @@ import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jax import lax
-from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Float
 
 from jaxslam_kernels.first_order import first_order
 from jaxslam_kernels.levenberg_marquardt import ManifoldLevenbergMarquardt, NormalEquations
-from jaxslam_kernels.positive_definite import is_determined, unit_diagonal
+from jaxslam_kernels.positive_definite import is_determined, solve_determined
 from jaxslam_kernels.robust import Loss, loss_value, loss_weight
 from jaxslam_kernels.two_view.epipolar import MIN_SLOPE, adjugate, sampson_squared
 from jaxslam_kernels.types import Flag, Pixels, Scalar, Weights
@@ -206,8 +205,7 @@ def _optimum_shift_jvp(loss: Loss, scale: float, primals: tuple, tangents: tuple
     # Where the solver stopped short of a minimum the reweighted Hessian stands in; undetermined, nothing moves.
     hessian = jnp.where(is_determined(exact), exact, reweighted)
     determined = is_determined(hessian)
-    scaled, unit = unit_diagonal(jnp.where(determined, hessian, jnp.eye(7, dtype=hessian.dtype)))
-    return zero, -unit * cho_solve(cho_factor(scaled), unit * jnp.where(determined, change, 0.0))
+    return zero, -solve_determined(hessian, determined, jnp.where(determined, change, 0.0))
 
 
 def _cost(F: FramedMatrix, views: TwoViews, loss: Loss, scale: float) -> Scalar:
