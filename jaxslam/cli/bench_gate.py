@@ -126,12 +126,12 @@ def _complaints_after_repeats(
 
 
 def _write_baseline(path: Path, reason: str, options: Gate, suite: str, planned: Mapping[str, Any]) -> None:
-    """Run the suite and write its figures as the new baseline."""
+    """Run the suite, with enough seeds to tell the spread of its errors, and write its figures as the new baseline."""
     from jaxslam.benchmark.suites.baseline import save_baseline  # noqa: PLC0415
-    from jaxslam.benchmark.suites.gate import check_reason, make_baseline  # noqa: PLC0415
+    from jaxslam.benchmark.suites.gate import SEEDS_OF_NOISE, check_reason, make_baseline  # noqa: PLC0415
 
     check_reason(reason)
-    results = options.results(suite)
+    results = replace(options, runs=max(planned["runs"], SEEDS_OF_NOISE)).results(suite)
     presets = tuple(dict.fromkeys(label["preset"] for label in planned["presets"].values()))
     save_baseline(path, make_baseline(suite, presets, planned["runs"], reason, results, planned))
     plain_console.print(f"Baseline: {path}")

@@ -9,8 +9,6 @@ keyframes must agree on the correction, and the change of the keyframes in betwe
 their relative poses (`essential_graph`).
 """
 
-import threading
-from contextlib import AbstractContextManager
 from typing import NamedTuple
 
 import numpy as np
@@ -70,15 +68,8 @@ class _Candidate(NamedTuple):
 class LoopClosing:
     """Detects loops, keyframe by keyframe."""
 
-    def __init__(
-        self,
-        index: PlaceIndex,
-        sensor: SensorModel,
-        plan: FeaturePlan,
-        lock: AbstractContextManager[bool] | None = None,
-    ) -> None:
-        """Share a place index, which is filled here and only used while the lock is held."""
-        self._lock = lock or threading.Lock()
+    def __init__(self, index: PlaceIndex, sensor: SensorModel, plan: FeaturePlan) -> None:
+        """Share a place index, to which keyframes are added here."""
         self._index, self._sensor, self._plan = index, sensor, plan
         self._candidates: list[_Candidate] = []
         self._closed: tuple[int, int] | None = None
@@ -109,7 +100,7 @@ class LoopClosing:
 
     def replace(self, slam_map: Map, keyframe_id: int) -> None:
         """Update the place index after a keyframe of the map has lost features."""
-        with self._lock:
+        with self._index.lock:
             if keyframe_id in self._index and has(slam_map.ids, np.array([keyframe_id]))[0]:
                 self._index.replace(keyframe_id, slam_map.keyframe(keyframe_id).features)
 
@@ -117,7 +108,7 @@ class LoopClosing:
         """Recognize a place seen long ago in a keyframe, and add the keyframe to the place index."""
         features = slam_map.keyframe(keyframe_id).features
         exclude = _familiar(slam_map, keyframe_id)
-        with self._lock:
+        with self._index.lock:
             found = recognize(slam_map, self._index, features, self._sensor, exclude=exclude, plan=self._plan)
             self._index.add(keyframe_id, features)
             for gone in self._index.ids() - set(slam_map.ids.tolist()):

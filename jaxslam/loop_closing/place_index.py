@@ -7,6 +7,7 @@ Hamming Space with Multi-Index Hashing, 2014) and the weights of a bag of words 
 2003).
 """
 
+import threading
 from collections.abc import Set
 from itertools import islice
 from typing import NamedTuple
@@ -37,13 +38,18 @@ class _Block(NamedTuple):
 
 
 class PlaceIndex:
-    """Index of keyframes by appearance. Not thread-safe.
+    """Index of keyframes by appearance.
 
     The results depend on the keyframes it holds, not on the order in which they were added. A keyframe of 1000 features
     takes 52 kB.
+
+    Attributes:
+        lock: Lock that a thread must hold while it calls a method of an index that it shares with other threads.
     """
 
     def __init__(self) -> None:
+        """Start without keyframes."""
+        self.lock = threading.Lock()
         self._blocks: list[_Block] = []
         self._alive: set[int] = set()
         self._added: set[int] = set()

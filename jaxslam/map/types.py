@@ -152,7 +152,7 @@ class Map(NamedTuple):
         """Number of the earliest submap, into whose frame the others are merged."""
         return int(self.submap.min()) if len(self.submap) else 0
 
-    def row(self, keyframe_id: int) -> int:
+    def row(self, keyframe_id: int | np.integer) -> int:
         """Return the row of a keyframe.
 
         Raises:

@@ -61,13 +61,19 @@ def _peak_working_set_mb() -> float:
 
 
 def cpu_model() -> str:
-    """Return the name of the processor, or its architecture if the system does not report a name."""
+    """Return the name of the processor, or its architecture if the system does not report a name.
+
+    A virtual machine may hide the model ("AMD EPYC"); family and model numbers are added to such a name.
+    """
     info = Path("/proc/cpuinfo")
-    if info.is_file():
-        for line in info.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
+    lines = info.read_text().splitlines() if info.is_file() else []
+    told = {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in reversed(lines))}
+    if "model name" not in told:
+        return platform.processor() or platform.machine()
+    name = told["model name"]
+    if any(letter.isdigit() for letter in name) or not {"cpu family", "model"} <= told.keys():
+        return name
+    return f"{name} family {told['cpu family']} model {told['model']}"
 
 
 def _vectors() -> str:

@@ -5,41 +5,40 @@ Every exchange happens in the tracker's thread, in `update`: jobs and results ar
 but their queues and the index of places, which has a lock.
 """
 
-import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import numpy as np
-from jaxlie import SE3
 
 from jaxslam.config.schema import Config
-from jaxslam.geometry.se3 import IDENTITY, compose, inverse, transform
+from jaxslam.geometry.se3 import IDENTITY, compose, inverse
 from jaxslam.loop_closing.essential_graph import GraphCompiler
 from jaxslam.loop_closing.loop_detector import LoopClosing, LoopClosure
 from jaxslam.loop_closing.place_index import PlaceIndex
 from jaxslam.loop_closing.place_recognition import compile_recognition
 from jaxslam.map.dynamic_removal import DynamicObservations
-from jaxslam.map.types import NONE, Map, empty_map, has
+from jaxslam.map.types import NONE, Map, empty_map
 from jaxslam.mapping.local_mapping import mapping_plan
 from jaxslam.mapping.occlusion_states import PointStates
-from jaxslam.mapping.track_table import TrackId
 from jaxslam.runtime.compiled import compiled
 from jaxslam.runtime.preload import import_scipy
 from jaxslam.runtime.stage_timer import StageTimes
 from jaxslam.runtime.worker import Worker, close_all, make_worker
 from jaxslam.semantics import Detector
 from jaxslam.sensors.camera import Camera
+from jaxslam.sensors.frame import Frame
 from jaxslam.sensors.frame_arrays import FrameArrays
 from jaxslam.sensors.sensor_model import SensorModel
-from jaxslam.slam.dense_thread import DenseMapping
-from jaxslam.slam.frame_localizer import FrameLocalizer, LocalizedPose
-from jaxslam.slam.keyframe_reload import MapKeyframe
+from jaxslam.slam.dense_thread import dense_mapping_of
+from jaxslam.slam.frame_localizer import FrameLocalizer, LocalizedPose, output_at_pose
 from jaxslam.slam.keyframe_semantics import KeyframeSemantics
 from jaxslam.slam.map_jobs import MapJob, MapUpdate, MapWriter
 from jaxslam.slam.place_jobs import IndexUpdate, LoopSearch, PlaceJob, PlaceResult, PlaceSearch, Reload
+from jaxslam.slam.reload_queue import ReloadQueue
+from jaxslam.slam.tracker import KeyframeDemand
 from jaxslam.slam.tracker_map_sync import AnchoredPose, TrackerMapSync, pose_of, tracks_of
-from jaxslam.tracking.state import TrackOutput, TrackPlan, TrackReason, TrackState, TrackStatus
+from jaxslam.tracking.state import TrackOutput, TrackPlan, TrackState, TrackStatus
 from jaxslam.tracking.state_updates import reset_at_pose
 
 _relocated = compiled(when="warm-up", donate="state")(reset_at_pose)
@@ -51,7 +50,11 @@ _MAX_ON_THE_WAY = 2
 
 
 class BackEnd:
-    """Owns the map and the threads that make it."""
+    """Owns the map and the threads that make it.
+
+    Attributes:
+        dense: Thread of the dense map; `None` without `dense.enabled`, or if the map is to stay as it is.
+    """
 
     def __init__(
         self,
@@ -63,7 +66,7 @@ class BackEnd:
         *,
         localize_only: bool = False,
         detector: Detector | None = None,
-        dense: DenseMapping | None = None,
+        key_detector: Detector | None = None,
         times: StageTimes | None = None,
     ) -> None:
         """Start with a map, empty by default.
@@ -76,7 +79,7 @@ class BackEnd:
             slam_map: To start with.
             localize_only: Leave the map as it is.
             detector: Finds in keyframes what may move, which leaves them and the map.
-            dense: Gets keyframes once they are in the map, and where they go.
+            key_detector: Finds what the dense map has at full density; `None` for nothing.
             times: Record of the duration of every job.
         """
         self._times = times or StageTimes()
@@ -85,27 +88,27 @@ class BackEnd:
         self._camera, self._config, self._localize_only = camera, config, localize_only
         start = empty_map(camera) if slam_map is None else slam_map
         self._writer = MapWriter(camera, sensor, self._plan, start)
-        self._index, self._lock = PlaceIndex.from_map(start), threading.Lock()
-        loops = LoopClosing(self._index, sensor, self._plan.features, self._lock)
+        self._index = PlaceIndex.from_map(start)
+        loops = LoopClosing(self._index, sensor, self._plan.features)
         self._searches = PlaceSearch(loops, plan)
         self._to_mapping: Worker[MapJob, MapUpdate] = self._worker(self._writer.do, "mapping", 1)
         self._to_places: Worker[PlaceJob, PlaceResult] = self._worker(self._searches.do, "places", 2)
-        self._semantics = None if detector is None else self._semantics_of(detector)
-        self._dense = dense
+        self._semantics = None if detector is None else KeyframeSemantics(camera, detector, config, self._times)
+        has_dense = config.dense.enabled and not localize_only
+        self.dense = dense_mapping_of(camera, sensor, config, key_detector, self._times) if has_dense else None
         self._graphs = GraphCompiler()
         self._link = TrackerMapSync(plan, start)
         most = config.mapping.num_features + self._num_tracks
         occlusion = config.dynamics.occlusion
         self._states = PointStates(occlusion, sensor, start, most) if occlusion.enabled else None
-        self._localizer = FrameLocalizer(sensor, self._plan.features, self._link, self._index, self._lock, self._states)
-        self._states_in_map = 0  # number of the changes that the newest map has
+        self._localizer = FrameLocalizer(sensor, self._plan.features, self._link, self._index, self._states)
         self._arrived: Map | None = None
-        self._waiting: list[MapKeyframe] = []
-        self._wanted: set[int] = set()
+        self._reloads = ReloadQueue(self._link, points_may_leave=self._semantics is not None)
         self._correction = IDENTITY
         self._gone: list[np.ndarray] = []  # numbers of points that the tracker is to forget
         self._detector_error = ""
         self._loops_closed = self._removed = 0
+        self._states_in_map = 0  # number of the changes that the newest map has
         self._closed = False
 
     @property
@@ -135,9 +138,12 @@ class BackEnd:
         return plan.num_points + plan.num_sources * plan.points_per_source
 
     @property
-    def is_behind(self) -> bool:
-        """Whether keyframes wait that mapping has not begun with; never on the schedule of a deterministic run."""
-        return not self._config.run.in_turn and self._link.num_on_the_way > _MAX_ON_THE_WAY
+    def keyframe_demand(self) -> KeyframeDemand:
+        """How much the maps want the next frame to be a keyframe."""
+        # Keyframes wait that mapping has not begun with; never on the schedule of a deterministic run.
+        if not self._config.run.in_turn and self._link.num_on_the_way > _MAX_ON_THE_WAY:
+            return KeyframeDemand.FEWER
+        return KeyframeDemand.NOW if self.dense is not None and self.dense.wants_keyframe else KeyframeDemand.NORMAL
 
     def compile(self, frame: FrameArrays, state: TrackState) -> None:
         """Compile all that is needed while frames of this kind come, with a state that is not needed any more."""
@@ -147,8 +153,8 @@ class BackEnd:
             self._states.compile(frame)
         compile_recognition(self._sensor, self._plan.features)
         self._compile_edits(state)
-        if self._dense is not None:
-            self._dense.compile()
+        if self.dense is not None:
+            self.dense.compile()
         if not self._config.run.in_turn:
             self._graphs.compile_now()  # while frames come, it would take seconds from them
 
@@ -169,48 +175,35 @@ class BackEnd:
             self._take_movers(*self._semantics.collect(frame), frame)
         self._take_places(self._to_places.collect(frame), frame)
         more = self._take_maps(self._to_mapping.collect(frame), frame)
-        if self._dense is not None:
-            self._dense.collect(frame)
+        if self.dense is not None:
+            self.dense.collect(frame)
         state = self._carried(state)
         if more:
             self._request_reload(self._link.tracker_pose(self._link.reference), frame)
         correction, self._correction = self._correction, IDENTITY
-        return self._with_reloaded(state), correction
+        return self._reloads.load_next(state), correction
 
     def latest_error(self) -> str:
         """Return the latest error of the detector of keyframes, once; empty if there is none."""
         error, self._detector_error = self._detector_error, ""
         return error
 
-    def insert_keyframe(
-        self,
-        timestamp_ns: int,
-        image: np.ndarray,
-        arrays: FrameArrays,
-        output: TrackOutput,
-        frame: int,
-        recognized: AnchoredPose | None,
+    def hand_over(
+        self, frame: Frame, arrays: FrameArrays, output: TrackOutput, number: int, recognized: AnchoredPose | None
     ) -> None:
-        """Hand over a keyframe of the tracker.
+        """Give a keyframe to the map, and every tracked frame to the dense map.
 
         Args:
-            timestamp_ns: Its time.
-            image: `(h, w, 3)` RGB or `(h, w)`; copied if it is needed.
-            arrays: The frame; it is copied.
-            output: Output of the tracker for it.
-            frame: Its number.
-            recognized: Its pose, if tracking began at a recognized place.
+            frame: The frame; its images are copied where they are needed.
+            arrays: Arrays of the frame; copied too.
+            output: Output of the tracker for the frame.
+            number: Number of the frame.
+            recognized: Pose of the frame in the map if it was relocalized.
         """
-        keyframe = NONE
-        if not self._localize_only:
-            new = self._link.register_keyframe(timestamp_ns, _copied(arrays), output, recognized)
-            keyframe = new.id
-            states = None if self._states is None else self._states.handed_over()
-            if self._dense is not None:
-                self._dense.insert_keyframe(new, image, pose_of(output), frame)
-            self._to_mapping.submit(new._replace(features=self._localizer.features, states=states), frame)
-        if self._semantics is not None:
-            self._semantics.submit(keyframe, image, np.asarray(arrays.depth), tracks_of(output), frame)
+        if output.keyframe:
+            self._insert_keyframe(frame, arrays, output, number, recognized)
+        if self.dense is not None and int(output.status) != TrackStatus.LOST:
+            self.dense.frame_tracked(number, frame.image, arrays, output)
 
     def match_local_map(
         self, state: TrackState, arrays: FrameArrays, output: TrackOutput
@@ -232,7 +225,7 @@ class BackEnd:
         T_world_cam = self._link.pose(localized.anchored)
         change = compose(T_world_cam, inverse(pose_of(output)))
         state = self._link.apply_correction(state, change, is_keyframe=bool(output.keyframe))
-        output = _at_refined_pose(output, T_world_cam, change, localized, self._config.track.weak_inliers)
+        output = output_at_pose(output, T_world_cam, change, localized, self._config.track.weak_inliers)
         return state, output, localized.num_matched
 
     def update_occlusion(self, arrays: FrameArrays, output: TrackOutput) -> float | None:
@@ -254,19 +247,17 @@ class BackEnd:
         self._link.set_reference_keyframe(recognized.keyframe)
         pose = self._link.pose(recognized)
         state = self.start_submap(state, pose)
-        self._wait_for(self._searches.reload(Reload(self.map, pose, self._link.submap_now(), frozenset())))
-        while self._waiting:
-            state = self._with_reloaded(state)
-        return state
+        self._reloads.replace(self._searches.reload(Reload(self.map, pose, self._link.submap_now(), frozenset())))
+        return self._reloads.load_all(state)
 
     def start_submap(self, state: TrackState, T_world_cam: np.ndarray) -> TrackState:
         """The state of the tracker begun anew at a pose."""
         self._link.forget_slots()
-        self._wait_for(())
+        self._reloads.replace(())
         return _relocated(state, T_world_cam.astype(np.float32))
 
-    def localize(self, T_world_cam: np.ndarray, frame: int) -> None:
-        """Look now and then for keyframes to recall, when none are made any more."""
+    def frame_tracked(self, T_world_cam: np.ndarray, frame: int) -> None:
+        """Look now and then for keyframes to reload, where no new ones ask for it."""
         if self._localize_only and frame % _RECALL_EVERY == 0:
             self._request_reload(T_world_cam, frame)
 
@@ -300,16 +291,30 @@ class BackEnd:
         self._take_places(self._to_places.flush(), 0)
         while self._take_maps(self._to_mapping.flush(), 0):
             self._take_places(self._to_places.flush(), 0)
-        if self._dense is not None:
-            self._dense.finish()
+        if self.dense is not None:
+            self.dense.finish()
         return self._carried(state)
 
     def close(self) -> None:
         """End the threads, with the jobs they have not begun, in less than two seconds."""
         self._closed = True
         looking = () if self._semantics is None else (self._semantics.worker,)
-        dense = () if self._dense is None else (self._dense.worker,)
+        dense = () if self.dense is None else (self.dense.worker,)
         close_all((self._to_mapping, self._to_places, *looking, *dense))
+
+    def _insert_keyframe(
+        self, frame: Frame, arrays: FrameArrays, output: TrackOutput, number: int, recognized: AnchoredPose | None
+    ) -> None:
+        keyframe = NONE
+        if not self._localize_only:
+            new = self._link.register_keyframe(frame.timestamp_ns, _copied(arrays), output, recognized)
+            keyframe = new.id
+            states = None if self._states is None else self._states.handed_over()
+            if self.dense is not None:
+                self.dense.insert_keyframe(new, frame.image, pose_of(output), number)
+            self._to_mapping.submit(new._replace(features=self._localizer.features, states=states), number)
+        if self._semantics is not None:
+            self._semantics.submit(keyframe, frame.image, np.asarray(arrays.depth), tracks_of(output), number)
 
     def _compile_edits(self, state: TrackState) -> None:
         """Compile the changes to the tracker's state."""
@@ -317,17 +322,6 @@ class BackEnd:
         if self._semantics is not None:
             state = self._link.drop_points(state, np.zeros(1, np.int64))
         jax.block_until_ready(state)
-
-    def _semantics_of(self, detector: Detector) -> KeyframeSemantics:
-        settings = self._config.semantics
-        return KeyframeSemantics(
-            self._camera,
-            detector,
-            deterministic=self._config.run.in_turn,
-            latency_frames=settings.latency_frames,
-            dilate_px=settings.dilate_px,
-            times=self._times,
-        )
 
     def _worker(self, work: Callable[[Any], Any], name: str, turn: int) -> Worker[Any, Any]:
         latency_frames = turn * self._config.mapping.latency_frames
@@ -345,8 +339,8 @@ class BackEnd:
             self._loops_closed += update.loops
             self._removed += update.removed
             self._graphs.keep_ahead(len(update.map.ids))
-            if self._dense is not None and not self._closed:
-                self._dense.map_made(update.map, update.keyframe, frame)
+            if self.dense is not None and not self._closed:
+                self.dense.map_made(update.map, update.keyframe, frame)
             self._states_in_map = max(self._states_in_map, update.states)
             if update.gone is not None:
                 self._gone.append(update.gone)
@@ -373,8 +367,8 @@ class BackEnd:
         self._detector_error = error or self._detector_error
         for movers in found:
             self._gone.append(movers.tracks)
-            if self._dense is not None and movers.mask.any() and not self._closed:
-                self._dense.remove(movers, frame)
+            if self.dense is not None and movers.mask.any() and not self._closed:
+                self.dense.remove(movers, frame)
             if movers.keyframe != NONE and movers.mask.any() and not self._closed:
                 self._to_mapping.submit(movers, frame)
 
@@ -390,60 +384,14 @@ class BackEnd:
                 if not self._closed:
                     self._to_mapping.submit(result, frame)
             elif result:
-                self._wait_for(result)
-
-    def _wait_for(self, keyframes: Iterable[MapKeyframe]) -> None:
-        """Have keyframes put back into the tracker, one a frame."""
-        self._waiting = list(keyframes)
-        self._wanted = {keyframe.keyframe for keyframe in self._waiting}
+                self._reloads.replace(result)
 
     def _request_reload(self, T_world_cam: np.ndarray, frame: int) -> None:
         if self._track_plan.num_reloaded and self._link.reference != NONE:
             known = frozenset(self._link.latest())
             self._to_places.submit(Reload(self.map, T_world_cam, self._link.submap_now(), known), frame)
 
-    def _with_reloaded(self, state: TrackState) -> TrackState:
-        """The state with one more of the keyframes that wait; one a frame, so that none takes long."""
-        while self._waiting:
-            keyframe = self._waiting.pop(0)
-            if self._semantics is not None:
-                keyframe = _without_removed(keyframe, self.map)
-            slot = self._link.slot_for(keyframe.keyframe, self._wanted)
-            if slot is not None:
-                return self._link.load_keyframe(state, slot, keyframe)
-        return state
-
-
-def _without_removed(keyframe: MapKeyframe, slam_map: Map) -> MapKeyframe:
-    """A keyframe that was prepared from an earlier map, without the points that have left it since."""
-    there = has(slam_map.points.ids, TrackId.map_points(keyframe.id))
-    return keyframe._replace(weight=np.where(there, keyframe.weight, np.float32(0)))
-
 
 def _copied(arrays: FrameArrays) -> FrameArrays:
     """A frame's own copy, for use after the caller has got its images back."""
     return FrameArrays(*jax.tree.map(np.array, tuple(arrays)))
-
-
-def _at_refined_pose(
-    output: TrackOutput, T_world_cam: np.ndarray, change: np.ndarray, localized: LocalizedPose, weak_inliers: float
-) -> TrackOutput:
-    """Return the output of a frame at the pose from the local map; it is `OK` if enough points agree with that pose.
-
-    Args:
-        output: Output of the tracker for the frame.
-        T_world_cam: `(7,)` refined pose.
-        change: `(7,)` transform of the world from the tracked pose to the refined one.
-        localized: Refined pose with its covariance and number of matches.
-        weak_inliers: Number of matches from which the frame is no longer `WEAK`.
-    """
-    X_world = transform(change, np.asarray(output.X_world, np.float64))
-    enough = localized.num_matched >= weak_inliers
-    wxyz_xyz: Any = T_world_cam.astype(np.float32)
-    return output._replace(
-        T_world_cam=SE3(wxyz_xyz),
-        X_world=X_world.astype(np.float32),
-        covariance=localized.covariance.astype(np.float32),
-        status=TrackStatus.OK if enough else output.status,
-        reason=TrackReason.NONE if enough else output.reason,
-    )

@@ -1,12 +1,13 @@
 """Localizes a frame in the map: against the local map from an approximate pose, or by place recognition."""
 
-import threading
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from jaxlie import SE3
 
 from jaxslam.features.orb import FeaturePlan, Features, features_of
 from jaxslam.features.pose_from_matches import MIN_INLIERS
+from jaxslam.geometry.se3 import transform
 from jaxslam.loop_closing.place_index import PlaceIndex
 from jaxslam.loop_closing.place_recognition import recognize
 from jaxslam.mapping.local_map_tracking import match_local_map
@@ -14,7 +15,7 @@ from jaxslam.mapping.occlusion_states import PointStates
 from jaxslam.sensors.frame_arrays import FrameArrays
 from jaxslam.sensors.sensor_model import SensorModel
 from jaxslam.slam.tracker_map_sync import AnchoredPose, TrackerMapSync, pose_of
-from jaxslam.tracking.state import TrackOutput
+from jaxslam.tracking.state import TrackOutput, TrackReason, TrackStatus
 
 _PATIENCE_S = 0.02
 """Longest wait for the lock of the place index while lost; the next frame tries again."""
@@ -34,6 +35,30 @@ class LocalizedPose(NamedTuple):
     covariance: np.ndarray
 
 
+def output_at_pose(
+    output: TrackOutput, T_world_cam: np.ndarray, change: np.ndarray, localized: LocalizedPose, weak_inliers: float
+) -> TrackOutput:
+    """Return the output of a frame at the pose from the local map; it is `OK` if enough points agree with that pose.
+
+    Args:
+        output: Output of the tracker for the frame.
+        T_world_cam: `(7,)` refined pose.
+        change: `(7,)` transform of the world from the tracked pose to the refined one.
+        localized: Refined pose with its covariance and number of matches.
+        weak_inliers: Number of matches from which the frame is no longer `WEAK`.
+    """
+    X_world = transform(change, np.asarray(output.X_world, np.float64))
+    enough = localized.num_matched >= weak_inliers
+    wxyz_xyz: Any = T_world_cam.astype(np.float32)
+    return output._replace(
+        T_world_cam=SE3(wxyz_xyz),
+        X_world=X_world.astype(np.float32),
+        covariance=localized.covariance.astype(np.float32),
+        status=TrackStatus.OK if enough else output.status,
+        reason=TrackReason.NONE if enough else output.reason,
+    )
+
+
 class FrameLocalizer:
     """Localizes frames in the map as the tracker knows it.
 
@@ -47,7 +72,6 @@ class FrameLocalizer:
         plan: FeaturePlan,
         link: TrackerMapSync,
         index: PlaceIndex,
-        lock: threading.Lock,
         states: PointStates | None,
     ) -> None:
         """Keep what localization needs.
@@ -56,12 +80,11 @@ class FrameLocalizer:
             sensor: Noise model of the camera.
             plan: Static sizes of feature extraction.
             link: Map and reference keyframe of the tracker.
-            index: Place index.
-            lock: Lock of the place index.
+            index: Place index, shared with the thread that adds keyframes to it.
             states: Occlusion states of map points; `None` if the settings do not ask for them.
         """
         self._sensor, self._plan, self._link = sensor, plan, link
-        self._index, self._lock, self._states = index, lock, states
+        self._index, self._states = index, states
         self.features: Features | None = None
 
     def begin_frame(self) -> None:
@@ -94,12 +117,12 @@ class FrameLocalizer:
             return near, False
         if np.count_nonzero(features.depth) < MIN_INLIERS:
             return None, False
-        if not self._lock.acquire(timeout=_PATIENCE_S):
+        if not self._index.lock.acquire(timeout=_PATIENCE_S):
             return None, False
         try:
             found = recognize(self._link.map, self._index, features, self._sensor, plan=self._plan)
         finally:
-            self._lock.release()
+            self._index.lock.release()
         if found is None:
             return None, True
         anchored = AnchoredPose(found.keyframe, found.T_keyframe_cam)

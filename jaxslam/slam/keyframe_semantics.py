@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxslam.config.schema import Config
 from jaxslam.map.dynamic_removal import DynamicObservations, under
 from jaxslam.mapping.local_mapping import TrackedObservations
 from jaxslam.masks.box_to_mask import dilated
@@ -59,10 +60,7 @@ class KeyframeSemantics:
         self,
         camera: Camera,
         detector: Detector,
-        *,
-        deterministic: bool,
-        latency_frames: int,
-        dilate_px: int,
+        config: Config,
         times: StageTimes | None = None,
     ) -> None:
         """Begin idle.
@@ -70,19 +68,18 @@ class KeyframeSemantics:
         Args:
             camera: Camera that takes the frames.
             detector: Detector of movable objects.
-            deterministic: Have it look in turn, what it finds `latency_frames` later; else in a thread.
-            latency_frames: With 0, it is there with the next frame.
-            dilate_px: Distance by which masks are dilated, in pixels.
+            config: Settings in effect: masks are dilated by `semantics.dilate_px`. A deterministic run has results
+                `semantics.latency_frames` later, or with the next frame if that is 0; others use a thread.
             times: Record of the duration of every detection.
         """
-        self._detector, self._dilate_px = detector, dilate_px
+        self._detector, self._dilate_px = detector, config.semantics.dilate_px
         self._reduced, self._failures = Downscaler(ImageGrid.of(camera), WIDTH_PX), ErrorLog()
         self._has_warned = False
         self.worker: Worker[_KeyframeImage, DynamicObservations] = make_worker(
             (times or StageTimes()).timed("detector", self._look),
             "jaxslam-semantics",
-            deterministic=deterministic,
-            latency_frames=latency_frames,
+            deterministic=config.run.in_turn,
+            latency_frames=config.semantics.latency_frames,
             max_waiting=_MAX_WAITING,
         )
 

@@ -13,6 +13,7 @@ import numpy as np
 from jaxslam_kernels.image.pyramid import Pyramid, build_pyramid
 from jaxtyping import Bool, Float
 
+from jaxslam.config.schema import Config
 from jaxslam.masks.background_depth import SurfaceMemory
 from jaxslam.masks.box_to_mask import dilated
 from jaxslam.masks.propagation import PYRAMID_LEVELS, follow, make_origin, predicted_mask
@@ -95,44 +96,25 @@ class MaskPipeline:
         self,
         camera: Camera,
         detector: Detector | None,
+        config: Config,
         *,
-        deterministic: bool,
-        latency_frames: int,
-        propagate: bool = True,
-        new_surfaces: bool = True,
         farthest_m: float = math.inf,
-        dilate_px: int = 2,
-        seed: int = 0,
         times: StageTimes | None = None,
     ) -> None:
         """Start with no mask.
 
         Args:
             camera: Camera that takes the frames.
-            detector: Finds what may move.
-            deterministic: Run it in turn, its result `latency_frames` later; else in a thread.
-            latency_frames: 0 has every frame wait for its own mask.
-            propagate: Carry masks on from frame to frame; without it, an old mask is used where it was.
-            new_surfaces: Add what has come before surfaces seen earlier.
-            farthest_m: Depth beyond says nothing of those.
-            dilate_px: Distance by which masks are dilated, in pixels.
-            seed: Seed of random choices.
+            detector: Detector of movable objects; `None` for none.
+            config: Settings of the run, the detector and the masks, of which `dynamics.new_surfaces` adds what has
+                come before surfaces seen earlier.
+            farthest_m: Largest depth that tells of such surfaces, meters.
             times: Record of the duration of every detection.
         """
-        self._propagate, self._new_surfaces, self._dilate_px, self._seed = propagate, new_surfaces, dilate_px, seed
+        self._propagate, self._new_surfaces = config.semantics.propagate, config.dynamics.new_surfaces
+        self._dilate_px, self._seed = config.semantics.dilate_px, config.run.seed
         self._reduced = Downscaler(ImageGrid.of(camera), WIDTH_PX)
-        self._semantics = (
-            None
-            if detector is None
-            else SemanticThread(
-                detector,
-                self._reduced,
-                deterministic=deterministic,
-                latency_frames=latency_frames,
-                seed=seed,
-                times=times,
-            )
-        )
+        self._semantics = None if detector is None else SemanticThread(detector, self._reduced, config, times)
         self._surfaces = SurfaceMemory(self._reduced.raster, farthest_m)
         self._seen: dict[int, _BufferedFrame] = {}
         self._next: DetectedMask | None = None

@@ -214,15 +214,4 @@ def _mask_pipeline(
     """Make the mask pipeline, if a detector looks at every frame or new surfaces count as moving."""
     if detector is None and not config.dynamics.new_surfaces:
         return None
-    return MaskPipeline(
-        camera,
-        detector,
-        deterministic=config.run.in_turn,
-        latency_frames=config.semantics.latency_frames,
-        propagate=config.semantics.propagate,
-        new_surfaces=config.dynamics.new_surfaces,
-        farthest_m=max_depth_m,
-        dilate_px=config.semantics.dilate_px,
-        seed=config.run.seed,
-        times=times,
-    )
+    return MaskPipeline(camera, detector, config, farthest_m=max_depth_m, times=times)

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from jaxslam.config.schema import Config
 from jaxslam.masks.box_to_mask import mask_of_detections, reduced_detections
 from jaxslam.masks.propagation import TrackedMask, make_origin
 from jaxslam.runtime.stage_timer import StageTimes
@@ -90,10 +91,7 @@ class SemanticThread:
         self,
         detector: Detector,
         reduced: Downscaler,
-        *,
-        deterministic: bool,
-        latency_frames: int,
-        seed: int = 0,
+        config: Config,
         times: StageTimes | None = None,
     ) -> None:
         """Begin idle.
@@ -101,19 +99,19 @@ class SemanticThread:
         Args:
             detector: Detector of movable objects.
             reduced: The size of masks.
-            deterministic: Have it look in turn, its masks `latency_frames` later; else in a thread.
-            latency_frames: 0 has every frame wait for its mask, in a thread too.
-            seed: Seed of random choices.
+            config: Settings in effect. A deterministic run has masks `semantics.latency_frames` later; others use a
+                thread. With 0, every frame waits for its mask, in a thread too.
             times: Record of the duration of every detection.
         """
         self.looking_at: int | None = None
         self._offered: int | None = None
-        self._detector, self._reduced, self._seed = detector, reduced, seed
+        self._detector, self._reduced, self._seed = detector, reduced, config.run.seed
+        latency_frames = config.semantics.latency_frames
         self._all_wait, self._begun, self._failures = latency_frames == 0, False, ErrorLog()
         self._worker: Worker[DetectionJob, DetectedMask] = make_worker(
             (times or StageTimes()).timed("detector", self._look),
             "jaxslam-semantics",
-            deterministic=deterministic,
+            deterministic=config.run.in_turn,
             latency_frames=latency_frames,
         )
 

@@ -1,6 +1,5 @@
 """`Slam`: what a robot calls with every frame, and what runs a whole recording."""
 
-import logging
 import threading
 import time
 from collections.abc import Callable
@@ -22,26 +21,24 @@ from jaxslam.semantics.checked_detector import CheckedDetector
 from jaxslam.semantics.from_config import detector_of, key_detector_of, why_no_network
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame, check_frame
-from jaxslam.sensors.frame_arrays import FrameArrays, FrameMemory
+from jaxslam.sensors.frame_arrays import FrameMemory
 from jaxslam.slam.argument_checks import check_arguments, warn_of_other_camera
 from jaxslam.slam.back_end import BackEnd
 from jaxslam.slam.background_consistency import BackgroundConsistency
 from jaxslam.slam.call_guard import one_at_a_time, refuse_after_fork
-from jaxslam.slam.dense_thread import dense_mapping_of
+from jaxslam.slam.dense_thread import DenseMapping
 from jaxslam.slam.frame_clock import FrameClock
-from jaxslam.slam.frame_localizer import LocalizedPose
 from jaxslam.slam.frame_result import FrameRecord, FrameResult, Rejected, frame_result
 from jaxslam.slam.input_checks import InputChecks
 from jaxslam.slam.input_warnings import InputWarnings
+from jaxslam.slam.localization_stage import LocalizationStage
 from jaxslam.slam.mask_stage import MaskStage
-from jaxslam.slam.pose_history import ConstantVelocity, PoseHistory, ordered_trajectory
+from jaxslam.slam.pose_history import PoseHistory, ordered_trajectory
 from jaxslam.slam.recording_run import run_recording
+from jaxslam.slam.status_log import StatusLog
 from jaxslam.slam.tracker import Tracker
-from jaxslam.tracking.state import TrackOutput, TrackReason, TrackStatus
-from jaxslam.tracking.step import FlowResult
+from jaxslam.tracking.state import TrackReason, TrackStatus
 from jaxslam.trajectory.trajectory import PathLike, Trajectory
-
-_log = logging.getLogger(__name__)
 
 _MASKED = 0.95
 """Share of the picture under a mask beyond which that is why a frame is lost."""
@@ -59,7 +56,6 @@ class Slam:
         camera: Camera that takes the frames.
         config: Settings in effect.
         without_network: Why no network looks at frames, as a part of a sentence; `None` if one or a `detector` does.
-        dense_mapping: Thread of the dense map; `None` without `dense.enabled`.
         compile_s: Seconds that compiling took.
         times: Durations of the stages of every frame: `take over` what mapping has done, `flow`, `wait for mask`,
             `pose`, `match with map`, `hand over` to mapping and the detector; and of the jobs in other threads: `match
@@ -213,18 +209,18 @@ class Slam:
         watch.ends("wait for mask")
 
         # 4. Pose: dynamic cues, RANSAC PnP and refinement; what was found moving joins the mask.
-        output = self._advance(arrays, flow)
+        output = self._tracker.advance(arrays, flow, self._back.keyframe_demand)
         arrays, mask = self._masks.exclude_moving(arrays, mask, flow, output)
         watch.ends("pose")
 
         # 5. Relocalize a lost frame, or match a weak one with the local map.
-        output, localized, num_matched = self._localize(arrays, output, dt_s)
+        output, num_matched, recognized = self._localization.localize(arrays, output, dt_s)
         lost = int(output.status) == TrackStatus.LOST
         share = None if lost else self._back.update_occlusion(arrays, output)
         watch.ends("match with map")
 
         # 6. Hand over: keyframe to the map, frame to the dense map and the detector.
-        self._hand_over_keyframe(frame, arrays, output, localized)
+        self._back.hand_over(frame, arrays, output, self._frame, recognized)
         mask = mask._replace(error=mask.error or self._back.latest_error())
         result = frame_result(frame.timestamp_ns, output, correction, num_matched, mask, share)
         result = self._in_submap(result)
@@ -290,6 +286,11 @@ class Slam:
         return None if self.dense_mapping is None else self.dense_mapping.cloud()
 
     @property
+    def dense_mapping(self) -> DenseMapping | None:
+        """Thread of the dense map; `None` without `dense.enabled`, or if the map is to stay as it is."""
+        return self._back.dense
+
+    @property
     def loops_closed(self) -> int:
         """Loops closed so far, submaps that became one included."""
         return self._back.loops_closed
@@ -335,10 +336,7 @@ class Slam:
         if self._start_map is not None:
             warn_of_other_camera(self._start_map.camera, self.camera, self._warnings)
         every = self._detector if self.config.semantics.frames == "every" else None
-        sensor, has_dense = self._tracker.params.sensor, self.config.dense.enabled and not self._localize_only
-        self.dense_mapping = (
-            dense_mapping_of(self.camera, sensor, self.config, self._key_detector, self.times) if has_dense else None
-        )
+        sensor = self._tracker.params.sensor
         self._back = BackEnd(
             self.camera,
             sensor,
@@ -347,7 +345,7 @@ class Slam:
             self._start_map,
             localize_only=self._localize_only,
             detector=self._detector if every is None else None,
-            dense=self.dense_mapping,
+            key_detector=self._key_detector,
             times=self.times,
         )
         self._masks = MaskStage(
@@ -360,106 +358,35 @@ class Slam:
             times=self.times,
         )
         self._tracker.begin(await_relocalization=self._start_map is not None)
-        self._frame = self._unrecognized = 0
+        self._localization = LocalizationStage(
+            self._tracker, self._back, self.config, localize_only=self._localize_only
+        )
+        self._frame = 0
         self._clock = FrameClock(self.camera.fps, self._warnings)
         self._background = None if self.camera.is_stereo else BackgroundConsistency(self.camera, sensor)
-        self._history, self._motion = PoseHistory(), ConstantVelocity()
-        self._status = TrackStatus.OK
-
-    def _advance(self, arrays: FrameArrays, followed: FlowResult) -> TrackOutput:
-        """Track a frame, with more or fewer keyframes as the maps ask for."""
-        wanted = self.dense_mapping is not None and self.dense_mapping.wants_keyframe
-        return self._tracker.advance(arrays, followed, mapping_is_behind=self._back.is_behind, wants_keyframe=wanted)
-
-    def _localize(
-        self, arrays: FrameArrays, output: TrackOutput, dt_s: float
-    ) -> tuple[TrackOutput, LocalizedPose | None, int]:
-        """Relocalize a frame that is lost, and match one that is weak with the local map.
-
-        Returns:
-            The output, the pose of a relocalization, and the number of map points that agree with it.
-        """
-        if int(output.status) == TrackStatus.LOST:
-            output, localized = self._relocalize(arrays, output, dt_s)
-            return output, localized, 0 if localized is None else localized.num_matched
-        if self._needs_map_match(output):
-            self._tracker.state, output, num_matched = self._back.match_local_map(self._tracker.state, arrays, output)
-            return output, None, num_matched
-        return output, None, 0
-
-    def _hand_over_keyframe(
-        self, frame: Frame, arrays: FrameArrays, output: TrackOutput, localized: LocalizedPose | None
-    ) -> None:
-        """Give a keyframe to the map, and every tracked frame to the dense map."""
-        if output.keyframe:
-            anchored = None if localized is None else localized.anchored
-            self._back.insert_keyframe(frame.timestamp_ns, frame.image, arrays, output, self._frame, anchored)
-        if self.dense_mapping is not None and int(output.status) != TrackStatus.LOST:
-            self.dense_mapping.frame_tracked(self._frame, frame.image, arrays, output)
-
-    def _needs_map_match(self, output: TrackOutput) -> bool:
-        """Whether a frame that was tracked is matched with the map too."""
-        status, frames = int(output.status), self.config.track.match_map
-        chosen = frames == "always" or (frames == "keyframes" and bool(output.keyframe))
-        return status == TrackStatus.WEAK or (chosen and status != TrackStatus.STARTED)
-
-    def _relocalize(
-        self, arrays: FrameArrays, lost: TrackOutput, dt_s: float
-    ) -> tuple[TrackOutput, LocalizedPose | None]:
-        """The frame once more, from where the map shows it; or from the pose held, if the settings say so."""
-        predicted = self._motion.after(dt_s) if self._history else None
-        placed, unknown = self._back.relocalize(arrays, predicted)
-        self._unrecognized += unknown
-        if placed is not None:
-            self._tracker.state = self._back.reset_at_pose(self._tracker.state, placed.anchored)
-        elif self._may_begin_submap and self._unrecognized > self.config.track.restart_after:
-            pose = np.asarray(lost.T_world_cam.wxyz_xyz)
-            self._tracker.state = self._back.start_submap(self._tracker.state, pose)
-        elif unknown and len(self.map.ids) and (self._status == TrackStatus.LOST or not self._history):
-            # Nothing was followed into the frame: that is not why.
-            return lost._replace(reason=np.int32(TrackReason.PLACE_NOT_IN_MAP)), None
-        else:
-            return lost, None
-        output = self._advance(arrays, self._tracker.follow(arrays))
-        if int(output.status) != TrackStatus.STARTED:
-            self._tracker.await_relocalization()  # not to start by itself
-        if placed is None:
-            return output, None
-        # If nothing here has a depth from which to go on, what the map shows is a pose all the same.
-        covariance = placed.covariance.astype(np.float32)
-        return output._replace(status=TrackStatus.RELOCALIZED, reason=lost.reason, covariance=covariance), placed
-
-    @property
-    def _may_begin_submap(self) -> bool:
-        """Whether a place that is not in the map may become a part of it."""
-        known = bool(self._history or len(self.map.ids))  # else the tracker starts by itself
-        return known and self.config.run.on_loss == "submap" and not self._localize_only
+        self._history = PoseHistory()
+        self._status_log = StatusLog()
 
     def _in_submap(self, tracked: FrameResult) -> FrameResult:
-        """The result with the submap that its pose is in; changes of its status go to the log, once each."""
+        """Return the result with the submap of its pose, and log what changed."""
         submap = self._back.submap_now
         if tracked.status == TrackStatus.LOST and tracked.dynamic_mask.mean() > _MASKED:
             tracked = replace(tracked, reason=TrackReason.MASKED.text)
-        before, self._status = self._status, tracked.status
-        if tracked.status == TrackStatus.LOST and before != TrackStatus.LOST:
-            _log.info("frame %d: lost: %s", self._frame, tracked.reason)
-        elif tracked.status == TrackStatus.RELOCALIZED:
-            _log.info("frame %d: relocalized in submap %d after %.2f s", self._frame, submap, self._motion.lost_s)
-        elif tracked.status == TrackStatus.STARTED:
-            _log.info("frame %d: submap %d begins", self._frame, submap)
-        return replace(tracked, submap=submap, in_map_frame=submap == self.map.world_submap)
+        tracked = replace(tracked, submap=submap, in_map_frame=submap == self.map.world_submap)
+        self._status_log.look(self._frame, tracked, self._localization.lost_s)
+        return tracked
 
     def _recorded(self, tracked: FrameResult, dt_s: float, depth_delay_s: float) -> FrameResult:
         """The result as it is given out, and remembered."""
         if tracked.status == TrackStatus.LOST:
-            self._motion.lost(dt_s, tracked.correction)
+            self._localization.frame_lost(dt_s, tracked.correction)
             self._masks.frame_lost(self._frame)
-            return replace(tracked, T_world_cam=self._motion.now()) if self.config.run.on_loss == "predict" else tracked
+            predicts = self.config.run.on_loss == "predict"
+            return replace(tracked, T_world_cam=self._localization.predicted()) if predicts else tracked
         time_s = self._clock.continuous_ns(tracked.timestamp_ns) * 1e-9
         self._masks.frame_tracked(self._frame, time_s, tracked.T_world_cam, tracked.twist, depth_delay_s)
-        self._unrecognized = 0
-        self._motion.tracked(tracked.T_world_cam, tracked.twist)
-        self._back.localize(tracked.T_world_cam, self._frame)
+        self._localization.frame_tracked(tracked.T_world_cam, tracked.twist)
+        self._back.frame_tracked(tracked.T_world_cam, self._frame)
         anchored = self._back.anchor(tracked.T_world_cam)
         self._history.add(tracked.timestamp_ns, tracked.T_world_cam, anchored, in_map_frame=tracked.in_map_frame)
         return tracked

@@ -1,5 +1,7 @@
 """The compiled tracker of one camera: its settings, its state, and the programs that advance it by a frame."""
 
+from enum import Enum
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -34,6 +36,17 @@ def _track_followed(
     return track_followed(state, frame, followed, params, plan)
 
 
+class KeyframeDemand(Enum):
+    """How much the maps want a frame to be a keyframe."""
+
+    NORMAL = "normal"
+    """As the settings say."""
+    FEWER = "fewer"
+    """Less than that, since mapping is behind."""
+    NOW = "now"
+    """In any case, since the dense map lacks what the frame shows."""
+
+
 class Tracker:
     """Advances the state of tracking frame by frame; starts no submap by itself, except at the first frame.
 
@@ -60,8 +73,11 @@ class Tracker:
         self.plan = with_cues(track_plan(config.track), config.dynamics, pairs=camera.is_stereo)
         # ORB-SLAM's local mapping does not accept keyframes either while it is busy.
         patient_s = max(_PATIENT_S, config.track.keyframe_weak_after_s)
-        self._patient_params = self.params._replace(keyframe_weak_after_s=jnp.float32(patient_s))
-        self._eager_params = self.params._replace(keyframe_below=jnp.float32(_ALL_IS_NEW))
+        self._params_for = {
+            KeyframeDemand.NORMAL: self.params,
+            KeyframeDemand.FEWER: self.params._replace(keyframe_weak_after_s=jnp.float32(patient_s)),
+            KeyframeDemand.NOW: self.params._replace(keyframe_below=jnp.float32(_ALL_IS_NEW)),
+        }
         self._height, self._width, self._seed = camera.height, camera.width, config.run.seed
 
     def fresh_state(self) -> TrackState:
@@ -101,22 +117,17 @@ class Tracker:
         """Follow the points of the state into a frame by optical flow."""
         return _follow_points(self.state, frame, self.params, self.plan)
 
-    def advance(
-        self, frame: FrameArrays, followed: FlowResult, *, mapping_is_behind: bool, wants_keyframe: bool
-    ) -> TrackOutput:
+    def advance(self, frame: FrameArrays, followed: FlowResult, demand: KeyframeDemand) -> TrackOutput:
         """Estimate the pose of a frame and update the state.
 
         Args:
             frame: The frame.
             followed: Result of `follow` for it.
-            mapping_is_behind: Make fewer keyframes.
-            wants_keyframe: Make this frame a keyframe if it can be one; without effect while mapping is behind.
+            demand: How much the maps want this frame to be a keyframe.
 
         Returns:
             Output of the tracker, in NumPy arrays.
         """
-        params = self._eager_params if wants_keyframe else self.params
-        if mapping_is_behind:
-            params = self._patient_params
+        params = self._params_for[demand]
         self.state, output = _track_followed(self.state, frame, followed, params, self.plan)
         return jax.tree.map(np.asarray, output)  # as `device_get`, in a tenth of its time

@@ -28,7 +28,7 @@ class Baseline(ValidatedConfig):
         reason: Reason why these are the figures to compare with.
         machine: Machine that the figures were measured on.
         versions: Versions of the libraries that computed the figures.
-        noise: Standard deviation of the errors over seeds by label, as a share of the error; empty for a single run.
+        noise: Standard deviation of the errors of a row over seeds, as a share of their mean, by row.
         rows: Figures by name within each row; a row is a sequence and a label.
         plan: Sequences, presets and runs, from `jaxslam.benchmark.suites.plan.fingerprint`.
 
@@ -65,6 +65,8 @@ class Baseline(ValidatedConfig):
         for row in sorted(planned ^ set(self.rows)):
             where = "planned, and not in rows" if row in planned else "in rows, and not planned"
             raise BenchmarkError(f"rows: expected those of the plan; {row} is {where}")
+        if set(self.noise) != set(self.rows):
+            raise BenchmarkError(f"noise: expected a share for each row, got {sorted(self.noise)}; {_AGAIN}")
 
 
 def load_baseline(path: Path) -> Baseline:

@@ -7,7 +7,8 @@ beside it the fastest run of each row is compared with the median run of the bas
 virtual machine, a row differed by 8 % at the median and 22 % at most so; ratios run by run by up to 50 %.
 
 Another processor rounds otherwise, and so do other releases of the compiler: that changes errors as another seed does.
-There, what counts as worse is more than the seeds' own spread explains, and times of other processors are left alone.
+There, what counts as worse is more than the spread over seeds of that row explains, and times of other processors are
+left alone.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -28,6 +29,9 @@ _WORSE_ATE, _WORSE_TIME = 0.02, 0.2
 _NOISE, _ROUNDING = 4.0, 0.05
 """Where rounding differs: so many standard deviations of the errors over seeds, or this share of them. With XLA held to
 AVX2, AVX and SSE4.2 on one processor, errors of `smoke` differ by 0.02, 0.8 and 2.2 % at most."""
+SEEDS_OF_NOISE = 8
+"""Least number of seeds from which a baseline takes the spread of errors. Of ten seeds of one row, any two could differ
+by 0.03 % or by a factor of 3.7: from two, a spread cannot be told."""
 _MIN_ATE_M = 1e-5
 """Smaller differences are of no interest to anybody."""
 _MIN_PERCENT = 1e-6
@@ -76,9 +80,9 @@ def make_baseline(
     Args:
         suite: Name of the suite, or its file.
         presets: Presets that the suite was run with.
-        runs: Number of runs of each sequence and preset.
+        runs: Number of seeds, from 0, of each sequence and preset whose figures later runs are compared with.
         reason: Reason why these are the figures to compare with.
-        results: Results of all runs.
+        results: Results of all runs; those with further seeds add to the spread of errors alone.
         plan: Sequences, presets and runs, from `jaxslam.benchmark.suites.plan.fingerprint`.
 
     Raises:
@@ -88,7 +92,7 @@ def make_baseline(
     failed = [result for result in results if result["status"] != "done"]
     if failed or not results:
         raise BenchmarkError(f"baseline: expected runs that all ended well, got {len(failed)} of {len(results)} failed")
-    figures = _figures_of(results, "median")
+    figures = _figures_of([result for result in results if result["seed"] < runs], "median")
     machines, versions, noise = machine_of(results), versions_of(results), _noise_of(results)
     return Baseline(suite, tuple(presets), runs, reason, machines, versions, noise, figures, plan)
 
@@ -173,21 +177,19 @@ def _limits(baseline: Baseline, results: Sequence[Mapping[str, Any]]) -> Callabl
             return before - _MIN_PERCENT
         if figure == _TIME:
             return before * (1 + _WORSE_TIME) if same_machine else np.inf
-        noise = _NOISE * max(
-            (share for label, share in baseline.noise.items() if row.endswith(f", {label}")), default=0.0
-        )
-        share = _WORSE_ATE if same_rounding else max(_ROUNDING, noise)
+        share = _WORSE_ATE if same_rounding else max(_ROUNDING, _NOISE * baseline.noise[row])
         return before * (1 + share) + _MIN_ATE_M
 
     return limit
 
 
 def _noise_of(results: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Compute the relative spread of errors of every label, over all sequences that were run more than once."""
-    shares: dict[str, list[float]] = {}
-    for row in rows_of(results):
-        runs = [run for run in results if (run["sequence"], run["label"]) == (row["sequence"], row["label"])]
-        ates = [run[ATE] for run in runs if run.get(ATE) is not None]
-        if len(ates) > 1:
-            shares.setdefault(row["label"], []).append(float(np.std(ates, ddof=1) / np.mean(ates)))
-    return {label: round(float(np.sqrt(np.mean(np.square(of_it)))), 4) for label, of_it in shares.items()}
+    """Compute the relative standard deviation of the errors of every row over its seeds; 0 for a single run."""
+    errors: dict[str, list[float]] = {}
+    for run in results:
+        if run.get(ATE) is not None:
+            errors.setdefault(row_name(run["sequence"], run["label"]), []).append(run[ATE])
+    return {
+        row: round(float(np.std(of_row, ddof=1) / np.mean(of_row)), 4) if len(of_row) > 1 else 0.0
+        for row, of_row in errors.items()
+    }

@@ -102,12 +102,26 @@ class TestComplaints:
     @pytest.mark.parametrize("other", [{"cpu": "another"}, {"jaxlib": "2"}])
     def test_where_rounding_differs(self, other: dict[str, Any]) -> None:
         """Seeds differ by 12.9 % here, so that 50 % may be chance and 60 % are not."""
-        assert baseline().noise == {label: pytest.approx(np.sqrt(2) * 0.001 / 0.011, abs=1e-4) for label in LABELS}
+        noise = pytest.approx(np.sqrt(2) * 0.001 / 0.011, abs=1e-4)
+        assert baseline().noise == {f"room, {label}": noise for label in LABELS}
         assert not complaints(baseline(), results(ate=1.5, **other))
         assert {complaint.figure for complaint in complaints(baseline(), results(ate=1.6, **other))} == {"ate_rmse_m"}
         assert {complaint.figure for complaint in complaints(baseline(), results(tracked=99.0, **other))} == {
             "tracked_percent"
         }
+
+    def test_spread_of_a_row_is_its_own(self) -> None:
+        """A row that is a matter of luck makes no other one pass, and seeds beyond those compared tell its spread."""
+        lucky = [
+            {**run, "seed": seed, "ate_rmse_m": run["ate_rmse_m"] * (1 + 3 * (seed > 1))}
+            for run in results()
+            if run["label"] == "static"
+            for seed in (run["seed"], run["seed"] + 2)
+        ]
+        before = make_baseline("smoke", LABELS, 2, "first", [*lucky, *results()[2:]], PLAN)
+        assert before.rows == baseline().rows
+        found = complaints(before, results(ate=2.5, cpu="another"))
+        assert [complaint.row for complaint in found] == ["room, default"]
 
     def test_times_are_those_of_a_machine(self) -> None:
         assert not complaints(baseline(), results(time=2.0, cpu="another"))
@@ -180,6 +194,7 @@ class TestFile:
             ("rows", {"room, static": {"tracked_percent": 100.0}}, "room, static: expected ate_rmse_m, got none"),
             ("rows", {"room, static": {"ate_rmse_m": 0.1}}, "room, default is planned, and not in rows"),
             ("noise", {"static": float("inf")}, "noise: static: expected a finite number >= 0, got inf"),
+            ("noise", {"static": 0.1}, "noise: expected a share for each row, got ['static']"),
         ],
     )
     def test_nothing_can_be_held_to_it(self, tmp_path: Path, key: str, value: object, message: str) -> None:

@@ -98,7 +98,7 @@ def test_nothing_matches_nothing():
         assert match_descriptors(a, b).shape == (2, 0)
     np.testing.assert_array_equal(match_descriptors(one, one), [[0], [0]])
     for points, features in ((none, some), (some, none)):
-        found = match_by_projection(points.uv, points.octave, points.descriptor, features, radius_px=10)
+        found = match_by_projection(points.uv, points.octave, points.descriptor, features, radius_px=10.0)
         assert found.shape == (2, 0)
 
 

@@ -74,10 +74,12 @@ def test_weak_corners_count_only_where_there_are_no_others():
 
 def test_cells_take_turns():
     """Two cells of 10 x 10: one has a strong corner and so gives no weak one, the other has weak ones alone."""
-    uv = np.array([[1, 3, 6, 12, 14, 17, 18.0], [1, 5, 2, 8, 1, 4, 4.0]])
+    uv = np.array([[1, 3, 6, 12, 14, 17, 18.0], [1, 5, 2, 8, 1, 4, 4.0]], np.float32)
     response = np.array([10, 25, 40, 9, 8, 15, 15], np.float32)
     assert module._spread(uv, response, (10, 20), 2, fast_threshold=20).tolist() == [2, 5]
-    stacked = np.concatenate([uv + np.array([[0], [v]]) for v in (0, 10, 20)], axis=1)  # thrice as many cells
+    stacked = np.concatenate(
+        [uv + np.array([[0], [v]], np.float32) for v in (0, 10, 20)], axis=1
+    )  # thrice as many cells
     found = module._spread(stacked, np.tile(response, 3), (30, 20), 6, fast_threshold=20)
     assert found.tolist() == [2, 9, 16, 5, 12, 19]
     alone = module._spread(uv, response, (10, 20), 7, fast_threshold=41)
@@ -85,7 +87,8 @@ def test_cells_take_turns():
 
 
 def test_a_second_round_gives_the_second_best():
-    uv, response = np.array([[1, 3, 6, 12.0], [1, 5, 2, 8.0]]), np.array([30, 25, 40, 9], np.float32)
+    uv = np.array([[1, 3, 6, 12], [1, 5, 2, 8]], np.float32)
+    response = np.array([30, 25, 40, 9], np.float32)
     assert module._spread(uv, response, (40, 40), 4, fast_threshold=20).tolist() == [2, 0, 1]
     assert module._spread(uv, response, (40, 40), 4, fast_threshold=7).tolist() == [2, 0, 1, 3]
 

@@ -37,7 +37,7 @@ SECOND = len(A) + 3
 def played(tmp_path_factory: pytest.TempPathFactory) -> tuple[Played, Path, list[str]]:
     """Two unlinked worlds tracked; the file of their map; what was logged."""
     lines: list[str] = []
-    log, handler = logging.getLogger("jaxslam.slam.slam"), logging.Handler()
+    log, handler = logging.getLogger("jaxslam.slam.status_log"), logging.Handler()
     handler.emit = lambda record: lines.append(record.getMessage())  # type: ignore[method-assign]
     log.addHandler(handler)
     level, _ = log.level, log.setLevel(logging.INFO)

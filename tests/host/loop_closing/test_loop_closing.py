@@ -179,7 +179,7 @@ class TestWrongLoops:
             target,
             between(truth.pose(source), truth.pose(target)),
             25 * TIGHT,
-            *(np.zeros(0), np.zeros((0, 7))),
+            *(np.zeros(0, np.int64), np.zeros((0, 7))),
         )
         wrong = np.r_[0.1, np.zeros(5)]
         assert self.accepted(before, wrong)

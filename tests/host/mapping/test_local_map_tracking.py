@@ -250,7 +250,7 @@ class TestWeakFrames:
         slam = Slam(room().camera, ALWAYS_WEAK)
         for frame in room().frames[:LATER]:
             slam.track(frame)
-        pose = slam._motion.now()
+        pose = slam._localization.predicted()
         wrong = compose(pose, np.array([1.0, 0, 0, 0, 0.04, 0, 0]))
         state = slam._back._link.apply_correction(slam._tracker.state, compose(wrong, inverse(pose)), is_keyframe=False)
         slam._tracker.state = state._replace(keyframes=state.keyframes._replace(weight=0 * state.keyframes.weight))
@@ -268,7 +268,7 @@ class TestLostFrames:
         with Slam(room().camera, CONFIG) as slam:
             for frame in room().frames[:40]:
                 slam.track(frame)
-            last, arrays = slam._motion.now(), frame_arrays(room()[40], 1 / 15)
+            last, arrays = slam._localization.predicted(), frame_arrays(room()[40], 1 / 15)
             placed, _ = slam._back.relocalize(arrays, last)
             assert placed is not None
             assert np.linalg.norm((slam._back.pose(placed.anchored) - mapped()[1][40].T_world_cam)[4:]) < 0.015

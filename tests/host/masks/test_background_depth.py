@@ -29,6 +29,8 @@ BOX = (slice(60, 160), slice(100, 180))
 STEP_PX = 2
 """A pixel of the coarse size in those of the image."""
 AGO_S = 0.27
+MASKS = Config(semantics=SemanticsConfig(latency_frames=2, dilate_px=0), dynamics=DynamicsConfig(new_surfaces=True))
+"""Settings of masks alone, not dilated, with new surfaces."""
 TRACKER = Config(
     track=replace(TRACK, num_points=256, points_per_source=96, cell_px=16),
     semantics=SemanticsConfig(model=None),
@@ -316,7 +318,7 @@ def rendered(
 
 def masks_at_true_poses(source: SyntheticDataset, frames: tuple[SyntheticFrame, ...]) -> list[FrameMask]:
     """The masks that depth alone makes when it is known where the camera is."""
-    masks = MaskPipeline(source.camera, None, deterministic=True, latency_frames=2, dilate_px=0)
+    masks = MaskPipeline(source.camera, None, MASKS)
     turns = np.array([angle(between(a.T_world_cam, b.T_world_cam)) for a, b in itertools.pairwise(frames)])
     turns = np.append(turns, turns[-1:]) * source.fps
     made = []

@@ -20,7 +20,7 @@ from tiny_segmenters import SURE
 from jaxslam.benchmark.suites.job import networks_sha256
 from jaxslam.cli.entry_point import main
 from jaxslam.config.loading import load_config
-from jaxslam.config.schema import SemanticsConfig
+from jaxslam.config.schema import Config, SemanticsConfig
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.errors import ConfigError, FrameError, JaxSlamError, MissingModelError, ModelError
 from jaxslam.io.download import sha256_of
@@ -418,9 +418,7 @@ class TestSettings:
         room = SyntheticDataset(SyntheticConfig(frames=1, width=192, height=128, people=0))
         frame, detector = room[0], detector_of(SemanticsConfig(model=yolox, **pair))
         assert frame.depth_m is not None
-        made = MaskPipeline(
-            room.camera, detector, deterministic=True, latency_frames=0, propagate=True, new_surfaces=False, dilate_px=0
-        )
+        made = MaskPipeline(room.camera, detector, Config(semantics=SemanticsConfig(latency_frames=0, dilate_px=0)))
         try:
             mask = made.mask_frame(0, frame.image, to_gray(frame.image), frame.depth_m)
         finally:

@@ -28,7 +28,7 @@ class TestRecall:
         keyframe = reload_keyframe(made, 1, 120)
         assert keyframe.keyframe == 1
         np.testing.assert_array_equal(keyframe.image, cv2.imdecode(np.frombuffer(png(1), np.uint8), 0))
-        ids = -1 - keyframe.id[:POINTS]
+        ids = -1 - keyframe.id[:POINTS].astype(np.int64)
         np.testing.assert_array_equal(TrackId.of_map_points(ids), keyframe.id[:POINTS])
         np.testing.assert_array_equal(ids, [*range(1, POINTS, 2), *range(0, POINTS, 2)])
         np.testing.assert_allclose(

@@ -30,9 +30,7 @@ from jaxslam.mapping.track_table import TrackId
 from jaxslam.results.run_results import RunInfo, write_results
 from jaxslam.semantics import Detections, no_detections
 from jaxslam.sensors.frame import Frame
-from jaxslam.slam.back_end import _without_removed
 from jaxslam.slam.frame_result import FrameResult
-from jaxslam.slam.keyframe_reload import reload_keyframe
 from jaxslam.slam.keyframe_semantics import KeyframeSemantics
 from jaxslam.slam.mask_pipeline import MaskSource
 from jaxslam.slam.slam import Slam
@@ -345,7 +343,8 @@ class TestLate:
 def semantics_of(
     detector: Callable[[np.ndarray], Detections], *, deterministic: bool, latency_frames: int = 0
 ) -> KeyframeSemantics:
-    return KeyframeSemantics(CAMERA, detector, deterministic=deterministic, latency_frames=latency_frames, dilate_px=2)
+    settings = config(deterministic=deterministic, latency_frames=latency_frames)
+    return KeyframeSemantics(CAMERA, detector, replace(settings, semantics=replace(settings.semantics, dilate_px=2)))
 
 
 def tracks_at(u: list[float], weight: list[float]) -> TrackedObservations:
@@ -617,20 +616,6 @@ class TestMapping:
         after, gone = mapping.remove(DynamicObservations(1, np.zeros_like(mask), TrackId.of_map_points(some)))
         assert same(after, without_points(maps[-1], some))
         assert set(TrackId.of_map_points(some).tolist()) <= set(gone.tolist())
-
-
-class TestRecall:
-    def test_points_that_have_left_since(self) -> None:
-        """A keyframe was prepared for the tracker from a map that had them: they do not count."""
-        slam_map = small_map()
-        keyframe = reload_keyframe(slam_map, 1, 16)
-        gone = TrackId.map_points(keyframe.id)[keyframe.weight > 0][::2]
-        left = _without_removed(keyframe, without_points(slam_map, gone))
-        assert len(gone) > 2
-        stays = ~np.isin(TrackId.map_points(keyframe.id), gone)
-        np.testing.assert_array_equal(left.weight, np.where(stays, keyframe.weight, 0))
-        assert left.weight.dtype == np.float32
-        np.testing.assert_array_equal(_without_removed(keyframe, slam_map).weight, keyframe.weight)
 
 
 class TestPlaces:

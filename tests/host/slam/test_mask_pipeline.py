@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from small_scene import TRACK, Clip
 
-from jaxslam.config.schema import Config, DynamicsConfig, SemanticsConfig
+from jaxslam.config.schema import Config, DynamicsConfig, RunConfig, SemanticsConfig
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.errors import ModelError
 from jaxslam.geometry.se3 import angle, between
@@ -60,11 +60,11 @@ def masks_of(
     made = MaskPipeline(
         source().camera,
         detector,
-        deterministic=deterministic,
-        latency_frames=latency_frames,
-        propagate=propagate,
-        new_surfaces=new_surfaces,
-        dilate_px=0,
+        Config(
+            run=RunConfig(deterministic=deterministic),
+            semantics=SemanticsConfig(latency_frames=latency_frames, propagate=propagate, dilate_px=0),
+            dynamics=DynamicsConfig(new_surfaces=new_surfaces),
+        ),
     )
     try:
         return [mask_of(made, index) for index in range(num)]
@@ -183,7 +183,10 @@ class TestWorld:
 
     @staticmethod
     def made() -> MaskPipeline:
-        return MaskPipeline(source().camera, None, deterministic=True, latency_frames=2, dilate_px=0)
+        settings = SemanticsConfig(latency_frames=2, dilate_px=0)
+        return MaskPipeline(
+            source().camera, None, Config(semantics=settings, dynamics=DynamicsConfig(new_surfaces=True))
+        )
 
     def test_corrected(self) -> None:
         """The world is moved by a meter between two frames: it is as if nothing had happened."""

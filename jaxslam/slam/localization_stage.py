@@ -1,0 +1,142 @@
+"""The stage after pose estimation: localize in the map the frames whose pose alone is not enough."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxslam.config.schema import Config
+from jaxslam.sensors.frame_arrays import FrameArrays
+from jaxslam.slam.back_end import BackEnd
+from jaxslam.slam.frame_localizer import LocalizedPose
+from jaxslam.slam.pose_history import ConstantVelocity
+from jaxslam.slam.tracker import Tracker
+from jaxslam.slam.tracker_map_sync import AnchoredPose
+from jaxslam.tracking.state import TrackOutput, TrackReason, TrackStatus
+
+
+class LocalizedOutput(NamedTuple):
+    """The output of the tracker for a frame after localization in the map.
+
+    Attributes:
+        output: Output of the tracker, with the pose from the map if there is one.
+        num_matched: Number of map points that agree with the pose; 0 if the frame was not localized.
+        recognized: Pose at which a lost frame was relocalized; `None` if it was not.
+    """
+
+    output: TrackOutput
+    num_matched: int = 0
+    recognized: AnchoredPose | None = None
+
+
+class LocalizationStage:
+    """Relocalizes frames that are lost, and matches frames that are weak with the local map.
+
+    The order of calls for a frame is `localize`, then `frame_tracked` or `frame_lost`.
+    """
+
+    def __init__(self, tracker: Tracker, back_end: BackEnd, config: Config, *, localize_only: bool) -> None:
+        """Start before the first frame.
+
+        Args:
+            tracker: Tracker, whose state moves to the pose from the map.
+            back_end: Owner of the map.
+            config: Settings in effect.
+            localize_only: Begin no submaps where a place is unknown.
+        """
+        self._tracker, self._back = tracker, back_end
+        self._match_map, self._restart_after = config.track.match_map, config.track.restart_after
+        self._begins_submaps = config.run.on_loss == "submap" and not localize_only
+        self._motion = ConstantVelocity()
+        self._any_tracked = self._was_lost = False
+        self._unrecognized = 0
+        """Frames since the last one that was tracked whose place is not in the map."""
+
+    @property
+    def lost_s(self) -> float:
+        """Time since the last frame that was tracked, in seconds."""
+        return self._motion.lost_s
+
+    def predicted(self) -> Float[np.ndarray, "7"]:
+        """Predict the pose of the latest frame, from at most one second of constant velocity."""
+        return self._motion.now()
+
+    def localize(self, arrays: FrameArrays, output: TrackOutput, dt_s: float) -> LocalizedOutput:
+        """Relocalize a frame that is lost, or match one that is weak with the local map.
+
+        Args:
+            arrays: The frame.
+            output: Output of the tracker for the frame.
+            dt_s: Time since the frame before, in seconds.
+        """
+        if int(output.status) == TrackStatus.LOST:
+            return self._relocalize(arrays, output, dt_s)
+        if self._needs_map_match(output):
+            self._tracker.state, output, num_matched = self._back.match_local_map(self._tracker.state, arrays, output)
+            return LocalizedOutput(output, num_matched)
+        return LocalizedOutput(output)
+
+    def frame_tracked(self, T_world_cam: Float[np.ndarray, "7"], twist: Float[np.ndarray, "6"]) -> None:
+        """Take in the pose and the velocity of a frame that was tracked."""
+        self._any_tracked, self._was_lost, self._unrecognized = True, False, 0
+        self._motion.tracked(T_world_cam, twist)
+
+    def frame_lost(self, dt_s: float, correction: Float[np.ndarray, "7"]) -> None:
+        """Take in that a frame was lost.
+
+        Args:
+            dt_s: Time since the frame before, in seconds.
+            correction: Correction of the world `(7,)` that came with the frame.
+        """
+        self._was_lost = True
+        self._motion.lost(dt_s, correction)
+
+    def _needs_map_match(self, output: TrackOutput) -> bool:
+        """Whether a frame that was tracked is matched with the map too."""
+        status = int(output.status)
+        chosen = self._match_map == "always" or (self._match_map == "keyframes" and bool(output.keyframe))
+        return status == TrackStatus.WEAK or (chosen and status != TrackStatus.STARTED)
+
+    def _relocalize(self, arrays: FrameArrays, lost: TrackOutput, dt_s: float) -> LocalizedOutput:
+        """Track a lost frame again from where the map recognizes its place, or from the last pose in a new submap."""
+        predicted = self._motion.after(dt_s) if self._any_tracked else None
+        found, unknown = self._back.relocalize(arrays, predicted)
+        self._unrecognized += unknown
+        if found is not None:
+            self._tracker.state = self._back.reset_at_pose(self._tracker.state, found.anchored)
+            return self._relocalized(self._track_again(arrays), found, lost)
+        if self._may_begin_submap and self._unrecognized > self._restart_after:
+            pose = np.asarray(lost.T_world_cam.wxyz_xyz)
+            self._tracker.state = self._back.start_submap(self._tracker.state, pose)
+            return LocalizedOutput(self._track_again(arrays))
+        # Where the frame before was tracked, that nothing could be followed from it says more.
+        if unknown and len(self._back.map.ids) and (self._was_lost or not self._any_tracked):
+            lost = lost._replace(reason=np.int32(TrackReason.PLACE_NOT_IN_MAP))
+        return LocalizedOutput(lost)
+
+    def _track_again(self, arrays: FrameArrays) -> TrackOutput:
+        """Track the frame from the state that was just reset."""
+        output = self._tracker.advance(arrays, self._tracker.follow(arrays), self._back.keyframe_demand)
+        if int(output.status) != TrackStatus.STARTED:
+            self._tracker.await_relocalization()  # not to start by itself
+        return output
+
+    @staticmethod
+    def _relocalized(output: TrackOutput, found: LocalizedPose, lost: TrackOutput) -> LocalizedOutput:
+        """Return the output of a relocalized frame.
+
+        The pose from the map stands even if nothing in the frame has a depth from which to track on.
+
+        Args:
+            output: Output of the tracker that was reset at the pose.
+            found: The pose.
+            lost: Output of the tracker before, with the reason for the loss.
+        """
+        covariance = found.covariance.astype(np.float32)
+        output = output._replace(status=TrackStatus.RELOCALIZED, reason=lost.reason, covariance=covariance)
+        return LocalizedOutput(output, found.num_matched, found.anchored)
+
+    @property
+    def _may_begin_submap(self) -> bool:
+        """Whether a place that is not in the map may become a part of it; before the map, the tracker starts itself."""
+        return self._begins_submaps and (self._any_tracked or len(self._back.map.ids) > 0)
