@@ -26,7 +26,6 @@ from jaxslam.slam.argument_checks import check_arguments, warn_of_other_camera
 from jaxslam.slam.back_end import BackEnd
 from jaxslam.slam.background_consistency import BackgroundConsistency
 from jaxslam.slam.call_guard import one_at_a_time, refuse_after_fork
-from jaxslam.slam.dense_thread import DenseMapping
 from jaxslam.slam.frame_clock import FrameClock
 from jaxslam.slam.frame_result import FrameRecord, FrameResult, Rejected, frame_result
 from jaxslam.slam.input_checks import InputChecks
@@ -56,6 +55,7 @@ class Slam:
         camera: Camera that takes the frames.
         config: Settings in effect.
         without_network: Why no network looks at frames, as a part of a sentence; `None` if one or a `detector` does.
+        dense_mapping: Thread of the dense map; `None` without `dense.enabled`, or if the map is to stay as it is.
         compile_s: Seconds that compiling took.
         times: Durations of the stages of every frame: `take over` what mapping has done, `flow`, `wait for mask`,
             `pose`, `match with map`, `hand over` to mapping and the detector; and of the jobs in other threads: `match
@@ -286,11 +286,6 @@ class Slam:
         return None if self.dense_mapping is None else self.dense_mapping.cloud()
 
     @property
-    def dense_mapping(self) -> DenseMapping | None:
-        """Thread of the dense map; `None` without `dense.enabled`, or if the map is to stay as it is."""
-        return self._back.dense
-
-    @property
     def loops_closed(self) -> int:
         """Loops closed so far, submaps that became one included."""
         return self._back.loops_closed
@@ -348,6 +343,7 @@ class Slam:
             key_detector=self._key_detector,
             times=self.times,
         )
+        self.dense_mapping = self._back.dense
         self._masks = MaskStage(
             self.camera,
             self.config,

@@ -233,7 +233,7 @@ def _write_made_up_run(folder: Path) -> None:
     assert all(hasattr(jaxslam.Slam, name) for name in replaced)
     config = jaxslam.load_config(overrides=("dynamics.occlusion.enabled=true", "semantics.model=null"))
     slam: Any = type("MadeUpSlam", (jaxslam.Slam,), replaced)(map.camera, config)
-    slam._back.dense = _Answers(DenseMapping)
+    slam.dense_mapping = _Answers(DenseMapping)
     for stage in _stages():
         slam.times.add(stage, 0.01)
     size = map.camera.height, map.camera.width

@@ -209,6 +209,7 @@ def test_a_plan_with_motion_needs_labels() -> None:
         track_step(state, arrays, PARAMS, PLAN)
 
 
+@pytest.mark.slow
 def test_what_the_caller_masks_is_left_out_in_any_case() -> None:
     rng = np.random.default_rng(0)
     image = (rng.uniform(size=(240, 320)) * 255).astype(np.uint8)

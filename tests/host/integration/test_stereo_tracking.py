@@ -149,6 +149,7 @@ class TestRoom:
         assert difference(back) < 0.4 * difference(right)
         assert frame.measured.depth_m is None
 
+    @pytest.mark.slow
     def test_every_frame_is_tracked(self) -> None:
         dataset = _room(0.1)
         with Slam(dataset.camera, _settings()) as slam:

@@ -49,6 +49,7 @@ def test_votes_of_points_follow_a_box() -> None:
     assert ate_m("default", "semantics.model=null", *WITHOUT) > 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["default", "trs-geometry"])
 def test_as_good_as_with_true_masks(preset: str) -> None:
     in_every_frame = "semantics.frames=every", "semantics.latency_frames=0"

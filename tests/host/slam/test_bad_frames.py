@@ -120,6 +120,7 @@ class TestBadImages:
         assert {result.status for result in results[22:]} == {TrackStatus.OK}
         assert moved_m(results[22:], undisturbed).max() < MOVED_BY_BAD_FRAMES_M
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("choice", [5, 10, 11])
     def test_half_of_the_frames_dropped(self, without_cues: Slam, choice: int) -> None:
         """The last two choices are the worst of the first twelve. Errors are compared, not poses: drift differs.

@@ -68,7 +68,7 @@ def table() -> Iterator[list[Row]]:
         print(f"| {' | '.join(names)} | {ours:.9f} | {evo:.9f} | {abs(ours - evo):.1e} |")
 
 
-@pytest.fixture(scope="module", params=[*FILES, *RUNS])
+@pytest.fixture(scope="module", params=[*FILES, *(pytest.param(name, marks=pytest.mark.slow) for name in RUNS)])
 def pair(request: pytest.FixtureRequest, data_dir: Path) -> Pair:
     name = request.param
     if name in FILES:
