@@ -71,6 +71,12 @@ def check_gray_range(name: str, image: ArrayLike, error: type[Exception] = Value
         raise error(f"{name}: expected gray values from 0 to 255, got {least:.3g} to {most:.3g}; multiply them by 255")
 
 
+def own_copy(arrays: FrameArrays) -> FrameArrays:
+    """Copy the arrays of a frame, for use after their buffers are used again."""
+    copies: list[Any] = [None if array is None else np.array(array) for array in arrays]
+    return FrameArrays(*copies)
+
+
 class FrameMemory:
     """Reusable buffers for the arrays of one frame, overwritten by each frame.
 

@@ -1,8 +1,8 @@
-"""All that goes on beside tracking: mapping, loop closing, recall, and a detector that looks at keyframes alone.
+"""The back end: mapping, loop closing, reloading of keyframes, and a detector that runs on keyframes only.
 
-It runs in threads or on a fixed schedule. The tracker hands over keyframes and takes what is there; it never waits.
-Every exchange happens in the tracker's thread, in `update`: jobs and results are immutable, so threads share nothing
-but their queues and the index of places, which has a lock.
+It runs in threads, or on a fixed schedule. The tracker hands over keyframes and takes results that are ready; it never
+waits. Results are exchanged in the tracker's thread, in `update`: jobs and results are immutable, so that threads share
+nothing but their queues and the place index, which has a lock.
 """
 
 from collections.abc import Callable
@@ -28,7 +28,7 @@ from jaxslam.runtime.worker import Worker, close_all, make_worker
 from jaxslam.semantics import Detector
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame
-from jaxslam.sensors.frame_arrays import FrameArrays
+from jaxslam.sensors.frame_arrays import FrameArrays, own_copy
 from jaxslam.sensors.sensor_model import SensorModel
 from jaxslam.slam.dense_thread import dense_mapping_of
 from jaxslam.slam.frame_localizer import FrameLocalizer, LocalizedPose, output_at_pose
@@ -44,16 +44,16 @@ from jaxslam.tracking.state_updates import reset_at_pose
 _relocated = compiled(when="warm-up", donate="state")(reset_at_pose)
 
 _RECALL_EVERY = 10
-"""Frames after which a tracker that only localizes gets other keyframes."""
+"""Number of frames after which a tracker that only localizes requests keyframes of its surroundings."""
 _MAX_ON_THE_WAY = 2
-"""Keyframes: one that mapping is at, and one that is done when it is looked for next."""
+"""Number of keyframes: one that mapping works on, and one whose result waits for the next `update`."""
 
 
 class BackEnd:
-    """Owns the map and the threads that make it.
+    """Owns the map and the threads that change it.
 
     Attributes:
-        dense: Thread of the dense map; `None` without `dense.enabled`, or if the map is to stay as it is.
+        dense: Thread of the dense map; `None` without `dense.enabled`, or with `localize_only`.
     """
 
     def __init__(
@@ -69,23 +69,22 @@ class BackEnd:
         key_detector: Detector | None = None,
         times: StageTimes | None = None,
     ) -> None:
-        """Start with a map, empty by default.
+        """Start with a map, which is empty by default.
 
         Args:
             camera: Camera that takes the frames.
             sensor: Camera with its depth noise.
             plan: Static settings of the tracker.
             config: Settings.
-            slam_map: To start with.
-            localize_only: Leave the map as it is.
-            detector: Finds in keyframes what may move, which leaves them and the map.
-            key_detector: Finds what the dense map has at full density; `None` for nothing.
+            slam_map: Map to start with.
+            localize_only: Leave the map unchanged.
+            detector: Detector of movable objects that runs on keyframes only; `None` for none.
+            key_detector: Detector of objects that the dense map keeps at full density; `None` for none.
             times: Record of the duration of every job.
         """
         self._times = times or StageTimes()
-        self._sensor, self._track_plan = sensor, plan
-        self._plan = mapping_plan(camera, config)
-        self._camera, self._config, self._localize_only = camera, config, localize_only
+        self._sensor, self._track_plan, self._plan = sensor, plan, mapping_plan(camera, config)
+        self._config, self._localize_only = config, localize_only
         start = empty_map(camera) if slam_map is None else slam_map
         self._writer = MapWriter(camera, sensor, self._plan, start)
         self._index = PlaceIndex.from_map(start)
@@ -98,44 +97,38 @@ class BackEnd:
         self.dense = dense_mapping_of(camera, sensor, config, key_detector, self._times) if has_dense else None
         self._graphs = GraphCompiler()
         self._link = TrackerMapSync(plan, start)
-        most = config.mapping.num_features + self._num_tracks
-        occlusion = config.dynamics.occlusion
+        self._num_tracks = plan.num_points + plan.num_sources * plan.points_per_source  # at most, in a frame
+        most, occlusion = config.mapping.num_features + self._num_tracks, config.dynamics.occlusion
         self._states = PointStates(occlusion, sensor, start, most) if occlusion.enabled else None
         self._localizer = FrameLocalizer(sensor, self._plan.features, self._link, self._index, self._states)
         self._arrived: Map | None = None
         self._reloads = ReloadQueue(self._link, points_may_leave=self._semantics is not None)
         self._correction = IDENTITY
-        self._gone: list[np.ndarray] = []  # numbers of points that the tracker is to forget
+        self._gone: list[np.ndarray] = []  # track ids of points that the tracker must drop
         self._detector_error = ""
         self._loops_closed = self._removed = 0
-        self._states_in_map = 0  # number of the changes that the newest map has
+        self._states_in_map = 0  # number of the latest `StateChanges` in the newest map
         self._closed = False
 
     @property
     def map(self) -> Map:
-        """The map as it is now."""
+        """The current map."""
         return self._link.map
 
     @property
     def loops_closed(self) -> int:
-        """Loops that have been closed, submaps that became one included."""
+        """Number of loops closed so far, including those that merged two submaps."""
         return self._loops_closed
 
     @property
     def removed_by_semantics(self) -> int:
-        """Points that have left the map because a keyframe saw them where something may move."""
+        """Number of map points removed so far because the detector found them on a movable object."""
         return self._removed
 
     @property
     def keyframes_passed_over(self) -> int:
-        """Keyframes that the detector has never looked at, because too many waited."""
+        """Number of keyframes that the detector skipped because too many waited."""
         return 0 if self._semantics is None else self._semantics.num_passed_over
-
-    @property
-    def _num_tracks(self) -> int:
-        """Points that the tracker sees in a frame at most."""
-        plan = self._track_plan
-        return plan.num_points + plan.num_sources * plan.points_per_source
 
     @property
     def keyframe_demand(self) -> KeyframeDemand:
@@ -146,7 +139,12 @@ class BackEnd:
         return KeyframeDemand.NOW if self.dense is not None and self.dense.wants_keyframe else KeyframeDemand.NORMAL
 
     def compile(self, frame: FrameArrays, state: TrackState) -> None:
-        """Compile all that is needed while frames of this kind come, with a state that is not needed any more."""
+        """Compile every program that tracking may call.
+
+        Args:
+            frame: Any frame of the camera.
+            state: Any state of the tracker; it is used up.
+        """
         import_scipy()
         self._writer.compile(frame, self._num_tracks)
         if self._states is not None:
@@ -159,14 +157,18 @@ class BackEnd:
             self._graphs.compile_now()  # while frames come, it would take seconds from them
 
     def update(self, state: TrackState, frame: int) -> tuple[TrackState, np.ndarray]:
-        """Take in what is ready by a frame: carry the tracker along with the map, and give it keyframes back.
+        """Take over the results that are ready: correct the tracker's state as the map, and reload a keyframe.
+
+        Args:
+            state: State of the tracker.
+            frame: Number of the frame to come.
 
         Returns:
             The state, and the correction of the world `(7,)` at the camera since the last update.
 
         Raises:
-            RuntimeError: If it is closed.
-            Exception: Error of a job in a thread. The state is as it was, and nothing else is lost.
+            RuntimeError: After `close`.
+            Exception: Error of a job in a thread. The state is unchanged, and nothing else is lost.
         """
         if self._closed:
             raise RuntimeError("the tracker is closed; Slam.reset() begins anew")
@@ -229,10 +231,10 @@ class BackEnd:
         return state, output, localized.num_matched
 
     def update_occlusion(self, arrays: FrameArrays, output: TrackOutput) -> float | None:
-        """Take in which points of the reference keyframe a frame that was tracked shows, and which are blocked in it.
+        """Update the occlusion states of the points of the reference keyframe from a tracked frame.
 
         Returns:
-            The share of them that are OCCLUDED; `None` if the settings do not ask for it, or the map has no keyframe.
+            Share of the points that are OCCLUDED; `None` if `dynamics.occlusion` is off or the map has no keyframe.
         """
         if self._states is None or (anchored := self._link.in_map(pose_of(output))) is None:
             return None
@@ -243,7 +245,7 @@ class BackEnd:
         return self._localizer.relocalize(arrays, predicted)
 
     def reset_at_pose(self, state: TrackState, recognized: AnchoredPose) -> TrackState:
-        """The state of the tracker begun anew where the map recognized a place, with keyframes of it at hand."""
+        """Return the tracker's state reset to a recognized pose, with keyframes of that place loaded."""
         self._link.set_reference_keyframe(recognized.keyframe)
         pose = self._link.pose(recognized)
         state = self.start_submap(state, pose)
@@ -251,38 +253,44 @@ class BackEnd:
         return self._reloads.load_all(state)
 
     def start_submap(self, state: TrackState, T_world_cam: np.ndarray) -> TrackState:
-        """The state of the tracker begun anew at a pose."""
+        """Return the tracker's state reset to a pose `(7,)`, with which a new submap begins."""
         self._link.forget_slots()
         self._reloads.replace(())
         return _relocated(state, T_world_cam.astype(np.float32))
 
     def frame_tracked(self, T_world_cam: np.ndarray, frame: int) -> None:
-        """Look now and then for keyframes to reload, where no new ones ask for it."""
+        """Request keyframes of the surroundings at intervals, if no new keyframes are made that request them."""
         if self._localize_only and frame % _RECALL_EVERY == 0:
             self._request_reload(T_world_cam, frame)
 
     def anchor(self, T_world_cam: np.ndarray) -> AnchoredPose:
-        """A pose of the tracker, tied to the map."""
+        """Express a pose `(7,)` of the tracker relative to the reference keyframe."""
         return self._link.anchor(T_world_cam)
 
     def pose(self, anchored: AnchoredPose) -> np.ndarray:
-        """`(7,)` where it is in the map now."""
+        """Return the current pose `(7,)` in the map of an anchored pose."""
         return self._link.pose(anchored)
 
     def submap_of(self, anchored: AnchoredPose) -> int:
-        """Number of the submap that a pose is in now."""
+        """Return the number of the submap that an anchored pose is in now."""
         return self._link.submap_of(anchored.keyframe)
 
     @property
     def submap_now(self) -> int:
-        """Number of the submap that the present frame is in."""
+        """Number of the submap of the current frame."""
         return self._link.submap_now()
 
     def finish(self, state: TrackState) -> TrackState:
-        """Wait until everything handed over is in the map; once closed, take what was done until then.
+        """Wait for all jobs and take over their results; after `close`, take over those of jobs done until then.
+
+        Args:
+            state: State of the tracker.
+
+        Returns:
+            The state, corrected as the map.
 
         Raises:
-            Exception: Error of a job in a thread. The state is as it was, and nothing else is lost: finish again.
+            Exception: Error of a job in a thread. The state is unchanged, and nothing else is lost; call it again.
         """
         if self._semantics is not None:
             self._take_movers(*self._semantics.flush(), 0)
@@ -296,7 +304,7 @@ class BackEnd:
         return self._carried(state)
 
     def close(self) -> None:
-        """End the threads, with the jobs they have not begun, in less than two seconds."""
+        """End the threads within two seconds, and discard jobs that have not begun."""
         self._closed = True
         looking = () if self._semantics is None else (self._semantics.worker,)
         dense = () if self.dense is None else (self.dense.worker,)
@@ -307,7 +315,7 @@ class BackEnd:
     ) -> None:
         keyframe = NONE
         if not self._localize_only:
-            new = self._link.register_keyframe(frame.timestamp_ns, _copied(arrays), output, recognized)
+            new = self._link.register_keyframe(frame.timestamp_ns, own_copy(arrays), output, recognized)
             keyframe = new.id
             states = None if self._states is None else self._states.handed_over()
             if self.dense is not None:
@@ -317,7 +325,7 @@ class BackEnd:
             self._semantics.submit(keyframe, frame.image, np.asarray(arrays.depth), tracks_of(output), number)
 
     def _compile_edits(self, state: TrackState) -> None:
-        """Compile the changes to the tracker's state."""
+        """Compile the programs that change the tracker's state."""
         state = self._link.compile(_relocated(state, np.asarray(IDENTITY, np.float32)))
         if self._semantics is not None:
             state = self._link.drop_points(state, np.zeros(1, np.int64))
@@ -333,7 +341,7 @@ class BackEnd:
         )
 
     def _take_maps(self, updates: list[MapUpdate], frame: int) -> bool:
-        """Keep the newest map until the state is carried along, and look for loops; whether there was one."""
+        """Keep the newest map until the state is corrected, and submit loop searches; return whether one came."""
         for update in updates:
             self._arrived = update.map
             self._loops_closed += update.loops
@@ -363,7 +371,7 @@ class BackEnd:
         return state
 
     def _take_movers(self, found: list[DynamicObservations], error: str, frame: int) -> None:
-        """Have what may move leave the keyframes it was found in, the map, and the tracker's state."""
+        """Remove the observations on movable objects from their keyframes, the map, and the tracker's state."""
         self._detector_error = error or self._detector_error
         for movers in found:
             self._gone.append(movers.tracks)
@@ -373,7 +381,7 @@ class BackEnd:
                 self._to_mapping.submit(movers, frame)
 
     def _offer_states(self, states: PointStates) -> None:
-        """Hand over what has changed since the last keyframe."""
+        """Submit the occlusion states that changed since the last keyframe."""
         changes = states.handed_over()
         if len(changes.ids):
             self._to_mapping.submit(changes, 0)
@@ -390,8 +398,3 @@ class BackEnd:
         if self._track_plan.num_reloaded and self._link.reference != NONE:
             known = frozenset(self._link.latest())
             self._to_places.submit(Reload(self.map, T_world_cam, self._link.submap_now(), known), frame)
-
-
-def _copied(arrays: FrameArrays) -> FrameArrays:
-    """A frame's own copy, for use after the caller has got its images back."""
-    return FrameArrays(*jax.tree.map(np.array, tuple(arrays)))

@@ -1,7 +1,7 @@
-"""The dense map in the making, in a thread of its own.
+"""The thread that makes the dense map.
 
-The tracker's thread hands over copies and goes on. At most so many keyframes wait; when more come, the oldest of them
-is never looked at.
+The tracker's thread hands over copies and goes on. The number of waiting keyframes is limited; when more come, the
+oldest one is dropped.
 """
 
 import threading
@@ -29,32 +29,34 @@ from jaxslam.slam.tracker_map_sync import pose_of
 from jaxslam.tracking.state import TrackOutput
 
 _MAX_WAITING = 8
-"""Keyframes that wait: 2.5 MB each at 640x480, and more than two seconds of a tracker that makes three a second."""
+"""Largest number of waiting keyframes: 2.5 MB each at 640x480, over two seconds of a tracker that makes three a second.
+"""
 _LOOK_EVERY = 5
-"""Frames, of which one has its look at what is not there any more, and at what is new: with keyframes alone, twice as
-many ghosts stay. A keyframe of a camera that measures depth has none of its own besides."""
+"""Every so many frames, free space is carved and the share of new surface is measured. With keyframes alone, twice as
+many ghosts stay; so keyframes of a depth camera do not carve themselves."""
 
 _Job: TypeAlias = DenseKeyframe | DepthGlance | DynamicObservations | None
-"""`None`: look at the newest map."""
+"""`None`: move the points with the keyframes of the newest map."""
 
 
 class DenseMapping:
-    """Makes the dense map of keyframes that are in the map.
+    """Makes the dense map from the keyframes of the map.
 
-    All but `cloud`, `cells` and `figures` is called from the tracker's thread.
+    The tracker's thread calls the methods; `cloud`, `cells`, `figures` and `sees_anything` may be called from any
+    thread.
 
     Attributes:
-        wants_keyframe: Whether much is in the picture that no keyframe shows.
+        wants_keyframe: Whether a large share of the image shows surface that no keyframe shows.
     """
 
     def __init__(self, slam_map: DenseMap, seen: SeenArea, config: DenseConfig, *, deterministic: bool) -> None:
-        """Begin.
+        """Start with an empty dense map.
 
         Args:
-            slam_map: Empty; from now on nobody else's.
-            seen: Without keyframes; nobody else's either.
-            config: Settings that it was made with.
-            deterministic: Work in turn; else in a thread.
+            slam_map: Empty dense map, of which this object becomes the only user.
+            seen: Area seen by keyframes, empty, of which this object becomes the only user.
+            config: Settings that the dense map was made with.
+            deterministic: Run jobs in the caller's thread instead of a thread of its own.
         """
         self._map, self._carves = slam_map, config.carve
         self._seen, self._least_seen, self.wants_keyframe = seen, config.keyframe_below, False
@@ -71,18 +73,18 @@ class DenseMapping:
         )
 
     def compile(self) -> None:
-        """Compile all that is needed."""
+        """Compile the programs of the dense map."""
         with self._lock:
             self._map.compile()
 
     def insert_keyframe(self, new: NewKeyframe, image: np.ndarray, pose: np.ndarray, frame: int) -> None:
-        """Take a keyframe; it is put in when it is in the map.
+        """Keep a keyframe, which is added to the dense map when local mapping has inserted it.
 
         Args:
-            new: The keyframe, as local mapping gets it.
-            image: `(h, w, 3)` RGB or `(h, w)`; copied.
-            pose: `(7,)` where the tracker has it.
-            frame: Its number.
+            new: Keyframe, as local mapping gets it.
+            image: `(h, w, 3)` RGB or `(h, w)` gray image; copied.
+            pose: `(7,)` pose of the keyframe as the tracker estimated it.
+            frame: Number of the frame.
         """
         arrays = new.frame
         self._seen.add(pose)
@@ -98,9 +100,13 @@ class DenseMapping:
         )
 
     def frame_tracked(self, frame: int, image: np.ndarray, arrays: FrameArrays, output: TrackOutput) -> None:
-        """Take in a frame that was tracked.
+        """Use a tracked frame: it may show key objects of the next keyframe, and it carves free space.
 
-        It may show key objects of a keyframe to come, and what it sees past is not there.
+        Args:
+            frame: Number of the frame.
+            image: `(h, w, 3)` RGB or `(h, w)` gray image; copied if it is kept.
+            arrays: Arrays of the frame; copied if they are kept.
+            output: Output of the tracker for the frame.
         """
         depth, ignore, pose = np.asarray(arrays.depth), np.asarray(arrays.ignore), pose_of(output)
         if self._neighbors is not None:
@@ -114,13 +120,13 @@ class DenseMapping:
             self._add_job(self._map.look_of(depth, ignore, pose), frame)
 
     def map_made(self, slam_map: Map, keyframe: int, frame: int) -> None:
-        """Take in a new map, and the keyframe that is new in it, or `NONE`."""
+        """Take over a new map, with the id of the keyframe that was inserted into it, or `NONE`."""
         self._map.sparse = slam_map
         shown = self._on_the_way.pop(keyframe, None)
         self._add_job(shown, frame)
 
     def remove(self, movers: DynamicObservations, frame: int) -> None:
-        """Take in what may move in a keyframe."""
+        """Remove the pixels of movable objects of a keyframe."""
         shown = self._on_the_way.get(movers.keyframe)
         if shown is not None:
             self._on_the_way[movers.keyframe] = shown._replace(ignore=shown.ignore | movers.mask)
@@ -128,25 +134,25 @@ class DenseMapping:
             self._add_job(movers, frame)
 
     def collect(self, frame: int) -> None:
-        """Raise what went wrong, if something did."""
+        """Raise the error of a job, if there was one."""
         self.worker.collect(frame)
 
     def finish(self) -> None:
-        """Wait until all is in, and every keyframe where the map has it."""
+        """Wait for all jobs, and move all points with the keyframes of the newest map."""
         self.worker.flush()
         with self._lock:
             self._map.correct_all()
 
     def cloud(self) -> DenseCloud:
-        """The points as they are now, in the submap with most keyframes; from any thread."""
+        """Return the current points of the submap with most keyframes; from any thread."""
         with self._lock:
             return self._map.cloud()
 
     def cells(self) -> Occupancy:
-        """Return the occupied and free cells by all keyframes that are kept; from any thread.
+        """Return the occupied and free cells according to all stored keyframes; from any thread.
 
         Raises:
-            MapFileError: If there is none yet.
+            MapFileError: If no keyframe is stored yet.
         """
         with self._lock:
             depths, poses = self._map.depths()
@@ -154,12 +160,12 @@ class DenseMapping:
 
     @property
     def sees_anything(self) -> bool:
-        """Whether a keyframe that is kept has depth."""
+        """Whether any stored keyframe has depth."""
         with self._lock:
             return self._map.sees_anything
 
     def figures(self) -> DenseFigures:
-        """Return figures of the map so far; from any thread."""
+        """Return figures of the dense map so far; from any thread."""
         with self._lock:
             return self._map.figures(self.worker.num_dropped)
 
@@ -181,20 +187,20 @@ class DenseMapping:
 
 
 def _is_keyframe(job: _Job) -> bool:
-    """Whether a job may be dropped: a keyframe may, but what was removed from another one must not be lost."""
+    """Whether a job may be dropped: a keyframe may be, the removal of observations must not be."""
     return isinstance(job, DenseKeyframe)
 
 
 def dense_mapping_of(
     camera: Camera, sensor: SensorModel, config: Config, key_detector: Detector | None, times: StageTimes
 ) -> DenseMapping:
-    """Make the dense map that the settings describe, empty, and its thread.
+    """Make an empty dense map according to the settings, and its thread.
 
     Args:
         camera: Camera that takes the frames.
         sensor: Camera with the limits of its depth.
         config: Settings in effect.
-        key_detector: Finds what the map has at full density; `None` for nothing.
+        key_detector: Detector of objects that the map keeps at full density; `None` for none.
         times: Record of the duration of every job.
     """
     nearest_m, farthest_m = float(sensor.min_depth_m), float(sensor.max_depth_m)

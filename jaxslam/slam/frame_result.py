@@ -1,4 +1,4 @@
-"""Result of a frame: with all arrays, rejected, or as one line of a log."""
+"""Results of frames: with all arrays, rejected, or as one line of a log."""
 
 from dataclasses import dataclass
 
@@ -14,39 +14,39 @@ class FrameResult:
     """Result of tracking one frame.
 
     Attributes:
-        timestamp_ns: Its time.
-        T_world_cam: `(7,)` float64 pose of the camera as `wxyz_xyz`; the last one where `status` is `LOST`.
-        covariance: `(6, 6)` of the pose in its submap, in the tangent space at the camera: translation (m), then
-            rotation (rad). It says how well the image fixes the pose among the points around; not how far the map has
-            drifted since it began, nor where the world of another submap is. At the first frame of a submap, which is
-            its origin by definition, 1e-12 on the diagonal; 100 where `status` is `LOST`.
+        timestamp_ns: Time of the frame, nanoseconds.
+        T_world_cam: `(7,)` float64 pose of the camera as `wxyz_xyz`; the last known pose where `status` is `LOST`.
+        covariance: `(6, 6)` covariance of the pose in its submap, in the tangent space at the camera: translation (m),
+            then rotation (rad). It tells how well the image determines the pose relative to the points around the
+            camera, but neither the drift of the map nor the place of another submap. It is 1e-12 on the diagonal at
+            the first frame of a submap, which is the origin by definition, and 100 where `status` is `LOST`.
         status: Quality of the pose.
-        reason: Why it is not worth more, and of `RELOCALIZED` why flow had lost it; empty if it is `OK`.
+        reason: Reason why the pose is worse than `OK`, or why a `RELOCALIZED` frame had been lost; empty for `OK`.
         twist: `(6,)` velocity of the camera in its own axes: m/s, then rad/s.
-        num_inliers: Followed points that agree with the pose.
-        inlier_ratio: Their share of the points that could be followed.
-        num_keyframe_matches: Points found again in keyframes, by their picture.
-        num_matched: Points of the map that were found by their descriptor and agree with the pose, sought where flow
-            is weak or lost.
-        residual_px: Robust standard deviation of the inliers' reprojection error, pixels.
-        uv: `(2, n)` float32 pixels of the points in the frame, those just found included.
-        weights: `(n,)` float32 weight of each, 0 to 1; 0 for a slot without a point.
-        followed: `(n,)` bool, true for points that came from the frame before, false for new ones.
-        keyframe: Why the frame was kept, `NONE` if it was not.
-        correction: `(7,)` how the map's frame changed since the frame before, from the old world to the new one, as
-            `wxyz_xyz`: the part of the change of pose that is no motion of the camera.
-        dynamic_mask: `(h, w)` bool, true where nothing was trusted because it moves or may.
+        num_inliers: Number of tracked points that agree with the pose.
+        inlier_ratio: Inliers as a share of the points that could be tracked.
+        num_keyframe_matches: Number of points matched with the images of keyframes.
+        num_matched: Number of map points that were matched by descriptor and agree with the pose; 0 unless the frame
+            was matched with the map, as weak and lost frames are.
+        residual_px: Robust standard deviation of the reprojection errors of the inliers, pixels.
+        uv: `(2, n)` float32 pixels of the points in the frame, new points included.
+        weights: `(n,)` float32 weight of each point, 0 to 1; 0 for a slot without a point.
+        followed: `(n,)` bool, true for points tracked from the frame before, false for new points.
+        keyframe: Reason why the frame became a keyframe; `NONE` if it did not.
+        correction: `(7,)` change of the map's frame since the frame before, from the old world to the new one, as
+            `wxyz_xyz`. It is the part of the change of pose that is not motion of the camera.
+        dynamic_mask: `(h, w)` bool, true for pixels that were ignored because they move or may move.
         mask_source: Origin of `dynamic_mask`.
-        mask_age: Frames since the one it was detected in; -1 if it was not.
+        mask_age: Number of frames since the frame in which the mask was detected; -1 if it was not detected.
         detector_error: Error of the detector, reported once; empty if there is none.
-        track_ms: Time it took, in milliseconds.
-        occluded_share: Share of the points of the keyframe it hangs on that something passed before and that were seen
-            again; `None` if the settings do not ask for it, it was lost, or the map had no keyframe yet.
-        warnings: Warnings about the input that were noticed at this frame, a sentence each; each is reported
-            once. `Slam.warnings` has all of them.
-        submap: Number of the submap that the pose is in. Poses of different submaps are in different worlds, which
-            have nothing to do with each other until a place of both is recognized and they become one.
-        in_map_frame: Whether that is the submap that the map began with, so that the pose is in the frame of the map.
+        track_ms: Time that tracking the frame took, milliseconds.
+        occluded_share: Share of the points of the reference keyframe that were blocked and then seen again; `None` if
+            `dynamics.occlusion` is off, the frame was lost, or the map had no keyframe yet.
+        warnings: Warnings about the input that were noticed at this frame, one sentence each; each is reported once.
+            `Slam.warnings` has all of them.
+        submap: Number of the submap that the pose is in. Poses of different submaps are in unrelated frames until a
+            place of both is recognized and the submaps are merged.
+        in_map_frame: Whether the submap is the one that the map began with, so that the pose is in the map's frame.
     """
 
     timestamp_ns: int
@@ -82,18 +82,19 @@ class FrameResult:
 
     @property
     def is_keyframe(self) -> bool:
-        """Whether the frame was kept."""
+        """Whether the frame became a keyframe."""
         return self.keyframe != KeyframeReason.NONE
 
 
 @dataclass(frozen=True)
 class Rejected:
-    """A frame of a recording that never reached the tracker; tracking goes on with the next one.
+    """A frame of a recording that the tracker did not get; tracking goes on with the next one.
 
     Attributes:
-        timestamp_ns: Its time.
-        error: Why.
-        status: `REJECTED` if it could not be read or does not fit, `DROPPED` if it came late.
+        timestamp_ns: Time of the frame, nanoseconds.
+        error: Error that tells why.
+        status: `REJECTED` if the frame could not be read or does not fit the camera, `DROPPED` if it came while
+            another one was tracked.
     """
 
     timestamp_ns: int
@@ -108,9 +109,9 @@ class Rejected:
 
 @dataclass(frozen=True)
 class FrameRecord:
-    """One line of a run's log: the result of a frame without its arrays.
+    """Result of a frame without its arrays: one line of the log of a run.
 
-    Attributes are those of `FrameResult`; a rejected frame has only a time, a status and a reason.
+    The attributes are those of `FrameResult`; a rejected frame has a time, a status and a reason only.
     """
 
     timestamp_ns: int
@@ -163,7 +164,16 @@ def frame_result(
     mask: FrameMask,
     occluded_share: float | None = None,
 ) -> FrameResult:
-    """The result of a frame, from what the compiled step said of it."""
+    """Make the result of a frame from the output of the tracker.
+
+    Args:
+        timestamp_ns: Time of the frame, nanoseconds.
+        output: Output of the tracker.
+        correction: `(7,)` change of the map's frame since the frame before.
+        num_matched: Number of map points that agree with the pose.
+        mask: Mask of the frame.
+        occluded_share: Share of occluded points of the reference keyframe; `None` if it is not known.
+    """
     return FrameResult(
         timestamp_ns=timestamp_ns,
         T_world_cam=np.asarray(output.T_world_cam.wxyz_xyz, np.float64),

@@ -1,4 +1,4 @@
-"""`Slam`: what a robot calls with every frame, and what runs a whole recording."""
+"""`Slam`: tracks a camera frame by frame, and maps what it sees."""
 
 import threading
 import time
@@ -40,28 +40,29 @@ from jaxslam.tracking.state import TrackReason, TrackStatus
 from jaxslam.trajectory.trajectory import PathLike, Trajectory
 
 _MASKED = 0.95
-"""Share of the picture under a mask beyond which that is why a frame is lost."""
+"""Share of the image under a mask beyond which the mask is the reason for a loss."""
 
 
 class Slam:
     """Tracks a camera through a scene, frame by frame, and maps it.
 
-    The world is the camera's place at the first frame, or that of the map it starts with. Methods called from several
-    threads wait for each other; in a process made by `fork` they are an error, use `spawn`. With `run.deterministic`
-    everything happens in the calling thread, on a fixed schedule; without it, mapping and loop closing have threads of
-    their own, and `close` (or `with`) ends them.
+    The world frame is the camera frame of the first image, or the frame of the map that it starts with. Calls from
+    several threads are serialized. A process made by `fork` cannot use it (`RuntimeError`); one made by `spawn` can.
+    With `run.deterministic`, everything runs in the calling thread on a fixed schedule; without it, mapping and loop
+    closing run in threads of their own, which `close` (or `with`) ends.
 
     Attributes:
         camera: Camera that takes the frames.
         config: Settings in effect.
-        without_network: Why no network looks at frames, as a part of a sentence; `None` if one or a `detector` does.
-        dense_mapping: Thread of the dense map; `None` without `dense.enabled`, or if the map is to stay as it is.
-        compile_s: Seconds that compiling took.
-        times: Durations of the stages of every frame: `take over` what mapping has done, `flow`, `wait for mask`,
-            `pose`, `match with map`, `hand over` to mapping and the detector; and of the jobs in other threads: `match
+        without_network: Reason why no network segments the frames, as part of a sentence; `None` if one, or a
+            `detector`, does.
+        dense_mapping: Thread of the dense map; `None` without `dense.enabled`, or with `localize_only`.
+        compile_s: Time spent compiling, seconds.
+        times: Durations of the stages of every frame: `take over` map corrections, `flow`, `wait for mask`, `pose`,
+            `match with map`, and `hand over` to mapping and the detector; and of the jobs of other threads: `match
             pair` of a stereo camera, `masks`, `detector`, `mapping`, `places`, `dense` and its parts. In a
-            deterministic run those are parts of stages: `match pair` in `flow`, `masks` there and in `hand over`, the
-            others in `hand over` or `take over`.
+            deterministic run, jobs count towards stages as well: `match pair` in `flow`, `masks` in `flow` and `hand
+            over`, the others in `hand over` or `take over`.
     """
 
     def __init__(
@@ -74,15 +75,16 @@ class Slam:
         detector: Detector | None = None,
         key_detector: Detector | None = None,
     ) -> None:
-        """Prepare for frames of a camera. Compiling happens at the first frame or in `warm_up`.
+        """Prepare to track a camera; compiling happens at the first frame, or in `warm_up`.
 
         Args:
             camera: Camera that takes the frames.
-            config: Settings; the default preset if not given.
-            slam_map: To start with: the first frame is `LOST` until its place is recognized.
-            localize_only: Leave the map as it is.
-            detector: Finds what may move, instead of the network of the settings.
-            key_detector: Finds what a dense map has at full density, instead of the network with `dense.key_classes`.
+            config: Settings; those of the default preset if not given.
+            slam_map: Map to start with; frames are `LOST` until the place of one is recognized in it.
+            localize_only: Track in the map without changing it.
+            detector: Detector of movable objects, instead of the network of the settings.
+            key_detector: Detector of the objects that the dense map keeps at full density, instead of the network with
+                `dense.key_classes`.
 
         Raises:
             TypeError: If an argument has the wrong type, such as the name of a camera or preset.
@@ -121,13 +123,13 @@ class Slam:
     def load(
         cls, path: PathLike, camera: Camera | None = None, config: Config | None = None, *, localize_only: bool = False
     ) -> "Slam":
-        """Start with the map in a file that `save` wrote.
+        """Start with a map that `save` wrote.
 
         Args:
-            path: The file.
-            camera: Camera that takes the frames; the one that made the map if not given.
-            config: Settings.
-            localize_only: Leave the map as it is.
+            path: Map file.
+            camera: Camera that takes the frames; the camera of the map if not given.
+            config: Settings; those of the default preset if not given.
+            localize_only: Track in the map without changing it.
 
         Raises:
             MapFileError: If the file is missing, damaged, of another kind, or of a camera of another size.
@@ -137,23 +139,26 @@ class Slam:
 
     @one_at_a_time
     def save(self, path: PathLike) -> None:
-        """Write the map, with all that was handed over to it, to a file that `load` reads.
+        """Wait until mapping has caught up, and write the map to a file that `load` reads.
 
         Raises:
-            MapFileError: If it cannot be written; a file that was there before is as it was.
+            MapFileError: If it cannot be written; an existing file is then left as it was.
         """
         self.finish()
         save_map(path, self.map)
 
     @one_at_a_time
     def reset(self) -> None:
-        """Forget everything since the beginning; the next frame starts anew."""
+        """Forget all frames and the map made of them; the next frame is the first one again."""
         self.close()
         self._begin()
 
     @one_at_a_time
     def warm_up(self) -> float:
-        """Compile all that is needed, or load it from the cache of an earlier run; gives the seconds it took, once."""
+        """Compile every program, or load it from the cache of an earlier run; return the seconds that took.
+
+        Later calls do nothing and return the same number.
+        """
         if not self._ready:
             began = time.perf_counter()
             shape = (self.camera.height, self.camera.width)
@@ -175,17 +180,17 @@ class Slam:
         """Track one frame.
 
         Args:
-            frame: Image and depth of the camera's size, later than the frame before.
+            frame: Image with depth, or a stereo pair, of the size of the camera and later than the frame before.
 
         Returns:
-            The pose and what it is worth. A frame without anything to track, such as a black one, is no error: its
-            status is `LOST`.
+            The pose with its status and covariance. A frame that cannot be tracked, such as a black one, is no error:
+            its status is `LOST`.
 
         Raises:
-            FrameError: If the frame does not fit the camera, or its time is not later than the last one's. Nothing
-                has happened then; go on with the next frame.
-            RuntimeError: After `close`.
-            Exception: Error of a job in a thread of the map.
+            FrameError: If the frame does not fit the camera, or is not later than the frame before. The state is
+                unchanged; go on with the next frame.
+            RuntimeError: After `close`, or in a process made by `fork`.
+            Exception: Error of a job of mapping or loop closing.
         """
         check_frame(frame, self.camera.width, self.camera.height, pair=self.camera.is_stereo)
         self._clock.check(frame.timestamp_ns, frame.depth_timestamp_ns)
@@ -239,28 +244,26 @@ class Slam:
         """Track a whole recording.
 
         A frame that cannot be read or does not fit is reported as `Rejected`, and the run goes on. With `run.realtime`,
-        so are frames that come late, with the status `DROPPED`.
+        frames that come while another one is tracked are reported so too, with the status `DROPPED`.
 
         Args:
-            dataset: The recording; its camera must be this one.
-            on_frame: Called after every frame, for progress and pictures; the frame is `None` if it was unreadable.
+            dataset: Recording of this camera.
+            on_frame: Function called after every frame, for progress and pictures; the frame is `None` if it could not
+                be read.
 
         Raises:
-            DatasetError: If it is no recording, or one of another camera.
+            DatasetError: If `dataset` is not a recording, or is one of another camera.
         """
         return run_recording(self, dataset, on_frame)
 
     @one_at_a_time
     def finish(self) -> None:
-        """Wait until mapping has caught up, so that `map` and `trajectory` hold all that was seen.
-
-        So has a detector that looks at keyframes alone, then.
-        """
+        """Wait for mapping, loop closing and a detector of keyframes, so that `map` and `trajectory` are complete."""
         self._tracker.recover()  # from a step that Ctrl-C ended
         self._tracker.state = self._back.finish(self._tracker.state)
 
     def close(self) -> None:
-        """End the threads, in two seconds at most; nothing can be tracked after that but from a `reset`."""
+        """End the threads, within two seconds; before another frame can be tracked, call `reset`."""
         self._back.close()
         self._masks.close()
 
@@ -272,54 +275,54 @@ class Slam:
 
     @property
     def map(self) -> Map:
-        """The map as it is now; it never changes, the next one is another."""
+        """The current map; it is immutable, and mapping replaces it by another one."""
         return self._back.map
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings about the input so far, a sentence each."""
+        """Warnings about the input so far, one sentence each."""
         return self._warnings.all
 
     @property
     def dense(self) -> DenseCloud | None:
-        """The dense map as it is now: points, colors and counts; `None` without `dense.enabled`."""
+        """The current dense map: points, colors and counts; `None` without `dense.enabled`."""
         return None if self.dense_mapping is None else self.dense_mapping.cloud()
 
     @property
     def loops_closed(self) -> int:
-        """Loops closed so far, submaps that became one included."""
+        """Number of loops closed so far, including those that merged two submaps."""
         return self._back.loops_closed
 
     @property
     def removed_by_semantics(self) -> int:
-        """Points removed from the map so far because a keyframe saw them where something may move.
+        """Number of map points removed so far because a detector found them on a movable object.
 
-        With `semantics.frames: keyframes`, as the next one.
+        0 unless `semantics.frames` is `keyframes`.
         """
         return self._back.removed_by_semantics
 
     @property
     def keyframes_passed_over(self) -> int:
-        """Keyframes so far that the detector had no time for: too many waited."""
+        """Number of keyframes so far that the detector skipped because too many waited for it."""
         return self._back.keyframes_passed_over
 
     @property
     def online_trajectory(self) -> Trajectory:
-        """Every pose that was in the map's frame when it was given out, as it was; frames that were lost have none."""
+        """Poses in the map's frame as `track` returned them; lost frames and other submaps are left out."""
         return self._history.online()
 
     @property
     def trajectory(self) -> Trajectory:
-        """Every pose in the map's frame as it is known now: from where its keyframe is, as it was tracked.
+        """Poses in the map's frame as known now: each moves with the keyframe that it was tracked from.
 
-        Poses in submaps that nothing links to it are left out; `trajectories` has them.
+        Poses in submaps that are not linked to the map's frame are left out; `trajectories` has them.
         """
         return self.trajectories.get(self.map.world_submap) or ordered_trajectory([])
 
     @property
     @one_at_a_time
     def trajectories(self) -> dict[int, Trajectory]:
-        """Every pose as it is known now, in the frame of the submap it is in, by the number of the submap."""
+        """All poses as known now, each in the frame of its submap, by the number of the submap."""
         return self._history.by_submap(self._back.pose, self._back.submap_of)
 
     def _begin(self) -> None:
@@ -373,7 +376,7 @@ class Slam:
         return tracked
 
     def _recorded(self, tracked: FrameResult, dt_s: float, depth_delay_s: float) -> FrameResult:
-        """The result as it is given out, and remembered."""
+        """Record the result, and return it as `track` does."""
         if tracked.status == TrackStatus.LOST:
             self._localization.frame_lost(dt_s, tracked.correction)
             self._masks.frame_lost(self._frame)
