@@ -41,6 +41,7 @@ from .tracking.cue_registry import with_cue_params as with_cue_params
 from .tracking.cue_registry import with_cues as with_cues
 from .tracking.from_config import track_params as track_params
 from .tracking.from_config import track_plan as track_plan
+from .tracking.initial_state import init_state as init_state
 from .tracking.points import KeyframeMatches as KeyframeMatches
 from .tracking.points import TrackedPoints as TrackedPoints
 from .tracking.pose_estimation import PoseStatus as PoseStatus
@@ -55,7 +56,6 @@ from .tracking.state import TrackState as TrackState
 from .tracking.state import TrackStatus as TrackStatus
 from .tracking.step import FlowResult as FlowResult
 from .tracking.step import follow_points as follow_points
-from .tracking.step import init_state as init_state
 from .tracking.step import track_followed as track_followed
 from .tracking.step import track_step as track_step
 from .trajectory.coverage import Coverage as Coverage

@@ -18,8 +18,9 @@ from jaxslam.runtime.machine import peak_rss_mb
 from jaxslam.sensors.frame_arrays import FrameArrays, stack_frames
 from jaxslam.tracking.batch import TrackedClips, track_clips
 from jaxslam.tracking.from_config import track_params, track_plan
+from jaxslam.tracking.initial_state import init_state
 from jaxslam.tracking.state import TrackParams, TrackPlan, TrackStatus
-from jaxslam.tracking.step import init_state, track_step
+from jaxslam.tracking.step import track_step
 from jaxslam.trajectory.evaluation import evaluate
 from jaxslam.trajectory.trajectory import Trajectory
 

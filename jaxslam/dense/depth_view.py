@@ -156,7 +156,7 @@ class DepthView:
         small = self.every(mask)
         x, y = X_cam[:2] / np.maximum(X_cam[2], 1e-3)
         column, row = self.intrinsics.fx * x + self.intrinsics.cx, self.intrinsics.fy * y + self.intrinsics.cy
-        if any(self.intrinsics.distortion.tolist()):
+        if self.intrinsics.distortion is not None and any(self.intrinsics.distortion.tolist()):
             column, row = _distorted(self.intrinsics, np.stack([x, y]))
         row = np.clip(np.rint(row), 0, self.shape[0] - 1).astype(np.intp)
         column = np.clip(np.rint(column), 0, self.shape[1] - 1).astype(np.intp)

@@ -32,8 +32,6 @@ class PreparedFrame(NamedTuple):
         depth: Its depth image, 0 where missing or not to be believed.
         elapsed_s: Seconds since the last good frame.
         right: Finest levels of the right image of a pair; `None` where depth is measured.
-        matched: `(n,)` depth of the points followed, by matching left and right, meters, 0 where that failed; `None`
-            where depth is measured.
     """
 
     frame: FrameArrays
@@ -41,7 +39,11 @@ class PreparedFrame(NamedTuple):
     depth: DepthImage
     elapsed_s: Scalar
     right: Pyramid | None = None
-    matched: Weights | None = None
+
+    @property
+    def height(self) -> int:
+        """Number of rows of the image."""
+        return self.depth.shape[0]
 
     def with_right(self) -> "PreparedFrame":
         """The same frame with the right image of its pair, if it is one."""
@@ -56,19 +58,110 @@ class PreparedFrame(NamedTuple):
 
 
 class Measurements(NamedTuple):
-    """Points as an ideal camera would have seen them at the time of the frame.
+    """Points as a global-shutter camera without distortion would have seen them at the time of the frame.
 
     Attributes:
         xy: `(2, n)` normalized coordinates.
-        depth: `(n,)` measured depth in meters, 0 where there is none to believe.
+        depth: `(n,)` measured depth, meters; 0 where there is none to believe.
+        sigma: `(n,)` standard deviation of the depth, meters.
     """
 
     xy: Pixels
     depth: Weights
+    sigma: Weights
 
     def in_camera(self) -> Points:
         """`(3, n)` where the points are in the axes of the camera; at its center without depth."""
         return jnp.concatenate([self.xy, jnp.ones_like(self.xy[:1])]) * self.depth[None, :]
+
+    def followed_by(self, others: "Measurements") -> "Measurements":
+        """Return these measurements and others after them."""
+        return Measurements(*(jnp.concatenate(pair, axis=-1) for pair in zip(self, others, strict=True)))
+
+
+class PixelRays(NamedTuple):
+    """Pixels of a frame with what is the same for every pose: the ray, the depth and its noise.
+
+    Attributes:
+        xy: `(2, n)` normalized coordinates as seen, without distortion.
+        row: `(n,)` rows of the pixels, which tell the times at which a rolling shutter took them.
+        depth: `(n,)` measured depth, meters; 0 where there is none to believe.
+        sigma: `(n,)` standard deviation of the depth, meters.
+    """
+
+    xy: Pixels
+    row: Weights
+    depth: Weights
+    sigma: Weights
+
+    def at_once(
+        self, expected_depth: Weights, twist: Float[Array, "6"], height: int, sensor: SensorModel
+    ) -> Measurements:
+        """Remove the rolling shutter.
+
+        Args:
+            expected_depth: `(n,)` approximate depths, meters, which scale the image motion that translation causes.
+            twist: `(6,)` velocity of the camera in its own axes, m/s, then rad/s.
+            height: Rows of the image, static.
+            sensor: Camera and its readout time.
+        """
+        velocity = image_velocity(self.xy, expected_depth, twist)
+        at_once = as_if_at_once(self.xy, velocity, self.row, height, sensor.readout_s)
+        return Measurements(at_once, self.depth, self.sigma)
+
+    def from_pose(
+        self, X_world: Points, pose: SE3, twist: Float[Array, "6"], height: int, sensor: SensorModel
+    ) -> Measurements:
+        """Remove the rolling shutter from map points `(3, n)`, in meters, that are seen from about `pose`."""
+        return self.at_once(_depth_from(X_world, pose, sensor), twist, height, sensor)
+
+
+def pixel_rays(
+    uv: Pixels,
+    expected_depth: Weights,
+    twist: Float[Array, "6"],
+    depth: DepthImage,
+    depth_delay_s: Scalar,
+    sensor: SensorModel,
+    *,
+    reach: int = 1,
+    matched: Weights | None = None,
+) -> PixelRays:
+    """Remove distortion, and read the depth where the pixels are by the time the depth image is taken.
+
+    Args:
+        uv: `(2, n)` pixels as seen.
+        expected_depth: `(n,)` approximate depths, meters, which scale the image motion that translation causes.
+        twist: `(6,)` velocity of the camera in its own axes, m/s, then rad/s.
+        depth: `(h, w)` depth image, meters; 0 where missing.
+        depth_delay_s: Seconds from the time of the image to that of the depth.
+        sensor: Camera with its depth noise.
+        reach: Reach of `sample_depth`, pixels, static.
+        matched: `(n,)` depths at the pixels from `match_depth`, which then are the measured ones.
+    """
+    xy = normalize(sensor.intrinsics, uv)
+    if matched is None:
+        focal = jnp.stack([sensor.intrinsics.fx, sensor.intrinsics.fy])[:, None]
+        later = uv + focal * image_velocity(xy, expected_depth, twist) * depth_delay_s
+        matched = sample_depth(depth, later, reach=reach)
+    return PixelRays(xy, uv[1], matched, depth_sigma(matched, sensor))
+
+
+def point_rays(
+    X_world: Points,
+    uv: Pixels,
+    pose: SE3,
+    twist: Float[Array, "6"],
+    view: PreparedFrame,
+    sensor: SensorModel,
+    matched: Weights | None = None,
+) -> PixelRays:
+    """Make the rays of map points `(3, n)`, in meters, that are seen at pixels `uv` from about `pose`.
+
+    `matched` is that of `pixel_rays`.
+    """
+    expected = _depth_from(X_world, pose, sensor)
+    return pixel_rays(uv, expected, twist, view.depth, view.frame.depth_delay_s, sensor, matched=matched)
 
 
 def measure(
@@ -82,40 +175,14 @@ def measure(
     reach: int = 1,
     matched: Weights | None = None,
 ) -> Measurements:
-    """Remove distortion, rolling shutter and the delay of the depth image from what was seen.
-
-    Args:
-        uv: `(2, n)` pixels as seen.
-        expected_depth: `(n,)` meters, about; it scales the part of the image motion that translation causes.
-        twist: Velocity of the camera in its own axes.
-        depth: Depth image, 0 where missing.
-        depth_delay_s: Seconds from the time of the image to that of the depth.
-        sensor: Camera and its readout time.
-        reach: Reach of `sample_depth` in pixels, static.
-        matched: `(n,)` depth at the pixels by `match_depth`, which then is what was measured.
-    """
-    xy = normalize(sensor.intrinsics, uv)
-    focal = jnp.stack([sensor.intrinsics.fx, sensor.intrinsics.fy])[:, None]
-    velocity = image_velocity(xy, expected_depth, twist)
-    at_once = as_if_at_once(xy, velocity, uv[1], depth.shape[0], sensor.readout_s)
-    if matched is not None:
-        return Measurements(at_once, matched)
-    later = uv + focal * velocity * depth_delay_s
-    return Measurements(at_once, sample_depth(depth, later, reach=reach))
+    """Remove distortion, rolling shutter and the delay of the depth image; the arguments are those of `pixel_rays`."""
+    rays = pixel_rays(uv, expected_depth, twist, depth, depth_delay_s, sensor, reach=reach, matched=matched)
+    return rays.at_once(expected_depth, twist, depth.shape[0], sensor)
 
 
-def measure_points(
-    X_world: Points,
-    uv: Pixels,
-    pose: SE3,
-    twist: Float[Array, "6"],
-    view: PreparedFrame,
-    sensor: SensorModel,
-    matched: Weights | None = None,
-) -> Measurements:
-    """Measure map points `(3, n)`, in meters, that are seen at pixels `uv` from about `pose`; `matched` as above."""
-    expected = jnp.maximum(to_camera(pose, X_world)[2], sensor.min_depth_m)
-    return measure(uv, expected, twist, view.depth, view.frame.depth_delay_s, sensor, matched=matched)
+def _depth_from(X_world: Points, pose: SE3, sensor: SensorModel) -> Weights:
+    """Return the depth of map points `(3, n)` as seen from a pose, meters, but at least the smallest valid one."""
+    return jnp.maximum(to_camera(pose, X_world)[2], sensor.min_depth_m)
 
 
 def match_depth(

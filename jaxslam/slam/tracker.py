@@ -13,12 +13,10 @@ from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame_arrays import FrameArrays
 from jaxslam.tracking.cue_registry import with_cue_params, with_cues
 from jaxslam.tracking.from_config import track_params, track_plan, with_dense_keyframes
-from jaxslam.tracking.state import TrackOutput, TrackParams, TrackPlan, TrackState
-from jaxslam.tracking.step import FlowResult, follow_points, init_state, track_followed
+from jaxslam.tracking.initial_state import init_state
+from jaxslam.tracking.state import TrackOutput, TrackParams, TrackPhase, TrackPlan, TrackState
+from jaxslam.tracking.step import FlowResult, follow_points, track_followed
 
-_RESTART_DISABLED = 1e6
-"""Value of `restart_after` with which the tracker never starts a new submap by itself. It must stay below the number
-of lost frames in a fresh state (2**20, `init_state`), which starts at once."""
 _PATIENT_S = 0.5
 """Seconds from one keyframe to the next for want of points, while mapping is behind. With the preset `ngd` at the rate
 of the camera there was one every tenth of a second, and the threads held each other up."""
@@ -66,9 +64,7 @@ class Tracker:
             camera: Camera that takes the frames.
             config: Settings in effect.
         """
-        params = track_params(camera, with_dense_keyframes(config))._replace(
-            restart_after=jnp.float32(_RESTART_DISABLED)
-        )
+        params = track_params(camera, with_dense_keyframes(config))._replace(restart_after=jnp.float32(jnp.inf))
         self.params = with_cue_params(params, config.dynamics)
         self.plan = with_cues(track_plan(config.track), config.dynamics, pairs=camera.is_stereo)
         # ORB-SLAM's local mapping does not accept keyframes either while it is busy.
@@ -99,8 +95,8 @@ class Tracker:
     def await_relocalization(self) -> None:
         """Stay lost until the place of a frame is recognized."""
         # Where the others are: with `jnp.zeros`, which is on no device for certain, the step was compiled anew.
-        lost_frames = jax.device_put(np.int32(0), *self.state.twist.devices())
-        self.state = self.state._replace(lost_frames=lost_frames)
+        phase = jax.device_put(np.int32(TrackPhase.LOST), *self.state.twist.devices())
+        self.state = self.state._replace(phase=phase)
 
     def recover(self) -> None:
         """Begin anew, awaiting relocalization, if an interrupted step took the state along."""

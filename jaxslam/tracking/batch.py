@@ -13,8 +13,9 @@ from jaxslam.errors import ConfigError, FrameError
 from jaxslam.runtime.compile_cache import FAST_COMPILE, SINGLE_THREAD
 from jaxslam.runtime.compiled import compiled
 from jaxslam.sensors.frame_arrays import FrameArrays, check_gray_range
+from jaxslam.tracking.initial_state import DEFAULT_PLAN, init_state
 from jaxslam.tracking.state import TrackParams, TrackPlan, TrackState
-from jaxslam.tracking.step import DEFAULT_PLAN, init_state, track_step
+from jaxslam.tracking.step import track_step
 
 
 class TrackedClips(NamedTuple):

@@ -21,9 +21,10 @@ from jaxslam.dynamics.regions import (
     of_points,
     region_weights,
 )
-from jaxslam.sensors.measurement import PreparedFrame, depth_sigma, measure_points
-from jaxslam.tracking.state import TrackParams, TrackPlan, TrackState
+from jaxslam.sensors.measurement import Measurements, PreparedFrame
+from jaxslam.tracking.state import TrackPlan
 from jaxslam.tracking.step_checks import check_cue_result
+from jaxslam.tracking.step_context import StepContext
 
 _MAX_MONITORED, _ENOUGH_MONITORED = 10, 5
 """Largest number of monitored points of a moving region or object, and the number from which it needs no new ones."""
@@ -40,6 +41,7 @@ class FramePoints(NamedTuple):
         trust: `(n,)` weights of the points before the cues.
         there: `(n,)` mask of the tracked points outside the mask of ignored pixels.
         object_id: `(n,)` number of the movable object that each point is on, from 1; 0 for none.
+        measured: Measurements of the points at the coarse pose.
     """
 
     uv: Pixels
@@ -49,6 +51,7 @@ class FramePoints(NamedTuple):
     trust: Weights
     there: Mask
     object_id: Int[Array, " n"]
+    measured: Measurements
 
 
 class DynamicRejection(NamedTuple):
@@ -167,59 +170,40 @@ class DynamicRejection(NamedTuple):
 
 
 def reject_dynamic_points(
-    state: TrackState,
-    view: PreparedFrame,
-    seen: FramePoints,
-    regions: Regions | None,
-    coarse: SE3,
-    twist: Float[Array, "6"],
-    params: TrackParams,
-    plan: TrackPlan,
+    step: StepContext, seen: FramePoints, regions: Regions | None, coarse: SE3
 ) -> DynamicRejection:
     """Apply the cues to the points, regions and movable objects of a frame, given its coarse pose.
 
     Args:
-        state: State before the frame.
-        view: The frame.
+        step: Context of the step.
         seen: Points of the state in the frame.
         regions: Regions of the frame; `None` without regions.
         coarse: Coarse pose of the frame, from RANSAC.
-        twist: `(6,)` velocity of the camera in its own axes, m/s, then rad/s.
-        params: Parameters of the tracker.
-        plan: Plan of the tracker.
     """
-    cue_results = _cue_results(state, view, seen, regions, coarse, twist, params, plan)
+    state, view, params, plan = step
+    cue_results = _cue_results(step, seen, regions, coarse)
     judged = _with_regions(cue_results, regions, state.regions.weight, view, seen.agreeing, plan)
     if cue_results:
         left = jnp.sum(seen.agreeing & (judged.weights(seen.trust) > 0), dtype=seen.trust.dtype)
         judged = judged._replace(applied=left >= params.min_inliers)
     if plan.motion is None:
         return judged
-    motion = _motion(state, view, seen, coarse, twist, params, as_published=plan.motion.as_published)
+    motion = _motion(step, seen, coarse, as_published=plan.motion.as_published)
     return judged.with_motion(motion, view)
 
 
-def _motion(
-    state: TrackState,
-    view: PreparedFrame,
-    seen: FramePoints,
-    coarse: SE3,
-    twist: Float[Array, "6"],
-    params: TrackParams,
-    *,
-    as_published: bool,
-) -> MotionState:
+def _motion(step: StepContext, seen: FramePoints, coarse: SE3, *, as_published: bool) -> MotionState:
     """Estimate the motion of the movable objects."""
+    state, params = step.state, step.params
     assert params.motion is not None
-    points = state.points
-    observed = measure_points(points.X_world, seen.uv, coarse, twist, view, params.sensor, view.matched)
+    points, observed = state.points, seen.measured
     there = seen.there & (observed.depth > 0) & (points.depth > 0)
     across = (
         params.pixel_sigma
         * observed.depth[None, :]
         / jnp.stack([params.sensor.intrinsics.fx, params.sensor.intrinsics.fy])[:, None]
     )
-    sigma = jnp.concatenate([across, depth_sigma(observed.depth, params.sensor)[None, :]])
+    sigma = jnp.concatenate([across, observed.sigma[None, :]])
     X_world = points.X_world
     if as_published:
         before = jnp.concatenate([points.xy, jnp.ones_like(points.xy[:1])]) * points.depth[None, :]
@@ -252,20 +236,13 @@ def _with_regions(
     return DynamicRejection(cue_results, regions, RegionMemory(regions.centers, weight), remembered, moving)
 
 
-def _cue_results(
-    state: TrackState,
-    view: PreparedFrame,
-    seen: FramePoints,
-    regions: Regions | None,
-    coarse: SE3,
-    twist: Float[Array, "6"],
-    params: TrackParams,
-    plan: TrackPlan,
-) -> tuple[CueResult, ...]:
+def _cue_results(step: StepContext, seen: FramePoints, regions: Regions | None, coarse: SE3) -> tuple[CueResult, ...]:
+    """Return the result of each cue for the points of a frame, given its coarse pose."""
+    state, view, params, plan = step
     if not plan.cues:
         return ()
     points, ideal = state.points, without_distortion(params.sensor.intrinsics)
-    observed = measure_points(points.X_world, seen.uv, coarse, twist, view, params.sensor, view.matched)
+    observed = seen.measured
     height, width = view.frame.image.shape
     scene = CueInput(
         uv_before=to_pixels(ideal, points.xy),

@@ -1,4 +1,4 @@
-"""The ring of keyframes: which to look into, looking their points up in a frame, and adding one."""
+"""The ring of keyframes: align their points with a frame, and add a frame to it."""
 
 import jax
 import jax.numpy as jnp
@@ -10,9 +10,10 @@ from jaxslam_kernels.se3 import to_camera
 from jaxslam_kernels.types import Mask, Pixels, Scalar, Weights
 from jaxtyping import Array, Bool, Float, Int, Num
 
-from jaxslam.sensors.measurement import PreparedFrame, predict_pixels
+from jaxslam.sensors.measurement import predict_pixels
 from jaxslam.tracking.points import KeyframeMatches, KeyframeRing, TrackedPoints
-from jaxslam.tracking.state import TrackParams, TrackPlan
+from jaxslam.tracking.state import TrackPlan
+from jaxslam.tracking.step_context import StepContext
 
 _MARGIN_PX = 8
 _MAX_TURN = 0.7
@@ -37,24 +38,16 @@ def empty_keyframes(height: int, width: int, plan: TrackPlan, image_dtype: jnp.d
     )
 
 
-def align_keyframe_points(
-    keyframes: KeyframeRing,
-    T_world_cam: SE3,
-    twist: Float[Array, "6"],
-    view: PreparedFrame,
-    params: TrackParams,
-    plan: TrackPlan,
-) -> KeyframeMatches:
-    """Look points of the best keyframes up in the current frame, around where the pose predicts them.
+def align_keyframe_points(step: StepContext, T_world_cam: SE3, twist: Float[Array, "6"]) -> KeyframeMatches:
+    """Align points of the keyframes that overlap the frame most with it, by their patches.
 
     Args:
-        keyframes: The ring.
-        T_world_cam: Pose of the current frame, good to a few pixels.
-        twist: Velocity of the camera, for the rolling shutter.
-        view: The current frame; its depth drops points that something covers.
-        params: Thresholds and camera.
-        plan: Static.
+        step: Context of the step; pixels that its frame ignores match nothing.
+        T_world_cam: Pose of the frame, good to a few pixels.
+        twist: `(6,)` velocity of the camera in its own axes, m/s, then rad/s, for the rolling shutter.
     """
+    state, view, params, plan = step
+    keyframes = state.keyframes
     height, width = view.pyramid.size()
     k, n = keyframes.weight.shape
     valid = keyframes.weight > 0

@@ -85,7 +85,7 @@ def detect_new_points(
     seen = Measurements(*chosen)
     matched = match_depth(view, uv, rough, new, params.sensor, known_point=False, plan=plan.pair_flow)
     if matched is not None:
-        seen, new = seen._replace(depth=matched), new & (matched > 0)
+        seen, new = Measurements(seen.xy, matched, depth_sigma(matched, params.sensor)), new & (matched > 0)
     X_world = to_world(T_world_cam, seen.in_camera())
     put = lambda old, fresh: jnp.where(new, fresh, old)
     num_corners = jnp.sum(corners.score > _MIN_SCORE, dtype=jnp.int32)
@@ -95,7 +95,7 @@ def detect_new_points(
         depth=put(points.depth, seen.depth),
         X_world=put(points.X_world, X_world),
         X_anchor=put(points.X_anchor, X_world),
-        information=put(points.information, 1 / jnp.square(depth_sigma(seen.depth, params.sensor))),
+        information=put(points.information, 1 / jnp.square(seen.sigma)),
         weight=jnp.where(new, 1, points.weight),
         age=jnp.where(new, 0, points.age),
         anchor_age=jnp.where(new, 0, points.anchor_age),

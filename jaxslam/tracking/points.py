@@ -2,6 +2,8 @@
 
 from typing import NamedTuple
 
+import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxslam_kernels.types import Code, Mask, Pixels, Points, Scalar, Weights
 from jaxtyping import Array, Float, Int, Num
 
@@ -35,6 +37,25 @@ class TrackedPoints(NamedTuple):
     anchor_age: Int[Array, " n"]
     id: Int[Array, " n"]
     valid: Mask
+
+
+def empty_points(num_points: int, dtype: DTypeLike) -> TrackedPoints:
+    """Make slots without points."""
+    numbers, plane, space = (jnp.zeros(shape, dtype) for shape in (num_points, (2, num_points), (3, num_points)))
+    counts = jnp.zeros(num_points, jnp.int32)
+    return TrackedPoints(
+        uv=plane,
+        xy=plane,
+        depth=numbers,
+        X_world=space,
+        X_anchor=space,
+        information=numbers,
+        weight=jnp.ones(num_points, dtype),
+        age=counts,
+        anchor_age=counts,
+        id=counts,
+        valid=jnp.zeros(num_points, bool),
+    )
 
 
 class KeyframeRing(NamedTuple):

@@ -10,9 +10,10 @@ from jaxslam_kernels.se3 import to_camera
 from jaxslam_kernels.types import Code, Mask, Pixels, Points, Weights
 from jaxtyping import Array, Float
 
-from jaxslam.sensors.measurement import PreparedFrame, depth_sigma, match_depth, measure_points
+from jaxslam.sensors.measurement import Measurements, PixelRays, match_depth, point_rays
 from jaxslam.tracking.points import KeyframeMatches
-from jaxslam.tracking.state import TrackParams, TrackPlan, TrackState
+from jaxslam.tracking.state import TrackParams
+from jaxslam.tracking.step_context import StepContext
 
 _DEPTH_GATE_M, _DEPTH_SIGMAS = 0.1, 3.0
 """Of depth that supports a pose hypothesis: meters, and deviations with even votes or of a pair.
@@ -25,17 +26,19 @@ instead of 16 in the room xyz.
 """
 
 
-def coarse_pose(
-    state: TrackState,
-    view: PreparedFrame,
-    uv: Pixels,
-    votes: Weights,
-    predicted: SE3,
-    params: TrackParams,
-    plan: TrackPlan,
-) -> tuple[SE3, Mask, Code]:
-    """The pose that gets most votes of points, which agree with it, and its `PoseStatus`."""
-    seen = measure_points(state.points.X_world, uv, predicted, state.twist, view, params.sensor, view.matched)
+def coarse_pose(step: StepContext, seen: Measurements, votes: Weights, predicted: SE3) -> tuple[SE3, Mask, Code]:
+    """Estimate the pose that most points agree with, by RANSAC.
+
+    Args:
+        step: Context of the step.
+        seen: Measurements of the points of the state at the predicted pose.
+        votes: `(n,)` weights of the points; 0 for a point that is not used.
+        predicted: Predicted pose, one of the hypotheses.
+
+    Returns:
+        The pose, the `(n,)` mask of the points that agree with it, and its `PoseStatus`.
+    """
+    state, view, params, plan = step
     by_noise = plan.balance_regions or view.right is not None
     result = ransac_pnp(
         jax.random.fold_in(state.random_key(), state.frame),
@@ -45,7 +48,7 @@ def coarse_pose(
         weights=votes,
         depth=seen.depth,
         threshold_px=params.ransac_px,
-        threshold_depth=_DEPTH_SIGMAS * depth_sigma(seen.depth, params.sensor) if by_noise else _DEPTH_GATE_M,
+        threshold_depth=_DEPTH_SIGMAS * seen.sigma if by_noise else _DEPTH_GATE_M,
         averaged=plan.balance_regions,
         num_hypotheses=plan.num_hypotheses,
         max_steps=plan.pose_steps,
@@ -59,27 +62,32 @@ def coarse_pose(
 
 
 def refined_pose(
-    state: TrackState,
-    view: PreparedFrame,
-    uv: Pixels,
+    step: StepContext,
+    seen: Measurements,
     trust: Weights,
-    keyframe_matches: KeyframeMatches,
+    matches: KeyframeMatches,
+    rays: PixelRays,
     coarse: SE3,
     twist: Float[Array, "6"],
-    params: TrackParams,
-    plan: TrackPlan,
 ) -> tuple[PoseRefinement, Mask]:
-    """The pose that fits followed points and points of keyframes together, and which followed points it fits."""
-    X_world = jnp.concatenate([state.points.X_world, keyframe_matches.X_world], axis=1)
-    expected = to_camera(coarse, keyframe_matches.X_world)[2]
-    matched = match_depth(
-        view, keyframe_matches.uv, expected, keyframe_matches.weight > 0, params.sensor, plan=plan.pair_flow
-    )
-    matched = None if view.matched is None or matched is None else jnp.concatenate([view.matched, matched])
-    seen = measure_points(
-        X_world, jnp.concatenate([uv, keyframe_matches.uv], axis=1), coarse, twist, view, params.sensor, matched
-    )
-    weights = jnp.concatenate([trust, keyframe_matches.weight])
+    """Refine the coarse pose from tracked points and keyframe matches together.
+
+    Args:
+        step: Context of the step.
+        seen: Measurements of the points of the state at the coarse pose.
+        trust: `(n,)` weights of the points; 0 for a point that is not used.
+        matches: Keyframe points matched with the frame.
+        rays: Rays of these matches in the frame.
+        coarse: Coarse pose.
+        twist: `(6,)` velocity of the camera at the coarse pose, m/s, then rad/s.
+
+    Returns:
+        The refinement, and the `(n,)` mask of the tracked points that agree with it.
+    """
+    params = step.params
+    X_world = jnp.concatenate([step.state.points.X_world, matches.X_world], axis=1)
+    seen = seen.followed_by(step.measured(rays, matches.X_world, coarse, twist))
+    weights = jnp.concatenate([trust, matches.weight])
     refined = refine_pose(
         coarse,
         X_world,
@@ -88,10 +96,10 @@ def refined_pose(
         weights=weights,
         depth=seen.depth,
         sigma_px=params.pixel_sigma,
-        sigma_depth=depth_sigma(seen.depth, params.sensor),
+        sigma_depth=seen.sigma,
         loss="cauchy",
         scale=params.loss_scale,
-        max_steps=plan.pose_steps,
+        max_steps=step.plan.pose_steps,
     )
     close = _close(refined.T_world_cam, X_world, seen.xy, params)
     return refined, (trust > 0) & close[: trust.shape[0]]
@@ -112,12 +120,23 @@ def _close(T_world_cam: SE3, X_world: Points, xy: Pixels, params: TrackParams) -
     return front & (jnp.sum(jnp.square(error), axis=0) < jnp.square(params.outlier_px))
 
 
-def fits(
-    state: TrackState, view: PreparedFrame, uv: Pixels, pose: SE3, twist: Float[Array, "6"], params: TrackParams
-) -> Mask:
-    """Tell which points are where a pose puts them, in the image and in depth where that is measured."""
-    X_world = state.points.X_world
-    seen = measure_points(X_world, uv, pose, twist, view, params.sensor, view.matched)
+def match_rays(step: StepContext, matches: KeyframeMatches, coarse: SE3, twist: Float[Array, "6"]) -> PixelRays:
+    """Make the rays of keyframe points matched with the frame, with their depths of a stereo pair if it is one."""
+    view, sensor = step.view, step.params.sensor
+    expected = to_camera(coarse, matches.X_world)[2]
+    depth = match_depth(view, matches.uv, expected, matches.weight > 0, sensor, plan=step.plan.pair_flow)
+    return point_rays(matches.X_world, matches.uv, coarse, twist, view, sensor, depth)
+
+
+def fits(step: StepContext, seen: Measurements, pose: SE3) -> Mask:
+    """Tell which points of the state a pose puts where they are seen, in the image and in depth where it is measured.
+
+    Args:
+        step: Context of the step.
+        seen: Measurements of the points at the pose.
+        pose: Pose of the camera.
+    """
+    X_world = step.state.points.X_world
     apart_m = jnp.abs(to_camera(pose, X_world)[2] - seen.depth)
-    near = (seen.depth <= 0) | (apart_m < _DEPTH_SIGMAS * depth_sigma(seen.depth, params.sensor))
-    return _close(pose, X_world, seen.xy, params) & near
+    near = (seen.depth <= 0) | (apart_m < _DEPTH_SIGMAS * seen.sigma)
+    return _close(pose, X_world, seen.xy, step.params) & near

@@ -56,6 +56,17 @@ class KeyframeReason(enum.IntEnum):
     """Few points are still tracked."""
 
 
+class TrackPhase(enum.IntEnum):
+    """What the tracker does with the next frame."""
+
+    START = 0
+    """It starts there, at the pose of the state."""
+    TRACK = 1
+    """It tracks the points of the last good frame."""
+    LOST = 2
+    """It tracks them too, and starts anew once more than `TrackParams.restart_after` frames are lost."""
+
+
 class TrackReason(enum.IntEnum):
     """Why a status is not `OK`."""
 
@@ -197,7 +208,7 @@ class TrackParams(NamedTuple):
         probation_frames: Number of frames after which a point has full weight. A point on a moving object becomes an
             outlier within a few frames, so it never has much weight.
         anchor_frames: Number of frames after which the anchor position of a point is renewed, for cues to slow motion.
-        restart_after: Number of lost frames after which tracking restarts at the held pose.
+        restart_after: Number of lost frames after which tracking restarts at the held pose; infinity for never.
         max_speed_m_per_s: Largest plausible speed of the camera.
         max_turn_rad_per_s: Largest plausible angular speed of the camera.
         cues: Parameters of each of `TrackPlan.cues`.
@@ -250,6 +261,7 @@ class TrackState(NamedTuple):
         elapsed_s: Time since the last good frame, seconds.
         since_keyframe_s: Time since the last keyframe, seconds.
         since_keyframe: Number of good frames since the last keyframe.
+        phase: A `TrackPhase`.
         lost_frames: Number of frames since tracking was lost; 0 while it is not lost.
         frame: Number of frames processed.
         next_id: Id of the next new point.
@@ -266,6 +278,7 @@ class TrackState(NamedTuple):
     elapsed_s: Scalar
     since_keyframe_s: Scalar
     since_keyframe: Code
+    phase: Code
     lost_frames: Code
     frame: Code
     next_id: Code

@@ -9,7 +9,7 @@ from jaxslam_kernels.se3 import compose, to_world
 from jaxslam_kernels.types import Code, Pixels, Points, Weights
 from jaxtyping import Array, Bool, Float, Int, Num
 
-from jaxslam.tracking.state import TrackState
+from jaxslam.tracking.state import TrackPhase, TrackState
 from jaxslam.tracking.step_checks import check_array
 
 
@@ -133,5 +133,5 @@ def reset_at_pose(state: TrackState, T_world_cam: Float[Array, "7"]) -> TrackSta
         twist=jnp.zeros_like(state.twist),
         points=state.points._replace(valid=jnp.zeros_like(state.points.valid)),
         keyframes=state.keyframes._replace(weight=jnp.zeros_like(state.keyframes.weight)),
-        lost_frames=jnp.full_like(state.lost_frames, 2**20),
+        phase=jnp.full_like(state.phase, TrackPhase.START),
     )

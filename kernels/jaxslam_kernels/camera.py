@@ -38,14 +38,15 @@ class Intrinsics(NamedTuple):
         fy: Focal length along v, pixels.
         cx: Principal point u, pixels.
         cy: Principal point v, pixels.
-        distortion: `k1 k2 p1 p2 k3`, OpenCV's order, zeros for a rectified camera.
+        distortion: `(5,)` coefficients `k1 k2 p1 p2 k3`, OpenCV's order; `None` for an ideal camera. With zeros, the
+            distortion is computed and inverted all the same.
     """
 
     fx: Scalar
     fy: Scalar
     cx: Scalar
     cy: Scalar
-    distortion: Float[Array, "5"]
+    distortion: Float[Array, "5"] | None
 
 
 @checked
@@ -65,8 +66,8 @@ def make_intrinsics(
 
 @checked
 def without_distortion(intrinsics: Intrinsics) -> Intrinsics:
-    """The ideal pinhole camera of the same focal lengths and principal point."""
-    return intrinsics._replace(distortion=jnp.zeros_like(intrinsics.distortion))
+    """Return the ideal pinhole camera of the same focal lengths and principal point."""
+    return intrinsics._replace(distortion=None)
 
 
 @checked
@@ -107,6 +108,8 @@ def to_pixels(intrinsics: Intrinsics, xy: Pixels) -> Pixels:
 @checked
 def distort(intrinsics: Intrinsics, xy: Pixels) -> Pixels:
     """Distorted normalized coordinates of undistorted ones."""
+    if intrinsics.distortion is None:
+        return xy
     return jnp.stack(_distort(tuple(intrinsics.distortion), xy[0], xy[1]))
 
 
@@ -124,7 +127,7 @@ def normalize(intrinsics: Intrinsics, uv: Pixels) -> Pixels:
         jnp.where(known, (u - intrinsics.cx) / intrinsics.fx, 0.0),
         jnp.where(known, (v - intrinsics.cy) / intrinsics.fy, 0.0),
     )
-    x, y = _undistort(tuple(intrinsics.distortion), target)
+    x, y = target if intrinsics.distortion is None else _undistort(tuple(intrinsics.distortion), target)
     return jnp.stack([jnp.where(known, x, 0.0), jnp.where(known, y, 0.0)])
 
 
@@ -164,7 +167,7 @@ def _distort(coefficients: _Coefficients, x: Array, y: Array) -> _Planes:
 @jax.custom_jvp
 def _undistort(coefficients: _Coefficients, target: _Planes) -> _Planes:
     """The inverse of `_distort`."""
-    return _last_step(coefficients, _nearly_undistorted(coefficients, target), coefficients, target)
+    return _newton(coefficients, target, _NEWTON_STEPS)
 
 
 @_undistort.defjvp
@@ -182,18 +185,24 @@ def _last_step(held: _Coefficients, at: _Planes, coefficients: _Coefficients, ta
 @jax.custom_jvp
 def _nearly_undistorted(coefficients: _Coefficients, target: _Planes) -> _Planes:
     """The solution but for the last step, with the derivative of the solution: for second derivatives."""
-
-    def step(_: Array, xy: _Planes) -> _Planes:
-        return _newton_step(coefficients, *xy, _distort(coefficients, *xy), target)
-
-    # A loop, not unrolled: XLA's CPU backend fuses unrolled steps into one kernel and evaluates an earlier step
-    # again for each of its uses, 4^steps times in all (200 ms for 500 points instead of 10 us).
-    return lax.fori_loop(0, _NEWTON_STEPS - 1, step, target)
+    return _newton(coefficients, target, _NEWTON_STEPS - 1)
 
 
 @_nearly_undistorted.defjvp
 def _nearly_undistorted_jvp(primals: tuple, tangents: tuple) -> tuple[_Planes, _Planes]:
     return _nearly_undistorted(*primals), jax.jvp(_undistort, primals, tangents)[1]
+
+
+def _newton(coefficients: _Coefficients, target: _Planes, num_steps: int) -> _Planes:
+    """Newton's method on `_distort` from the target."""
+
+    def step(_: Array, xy: _Planes) -> _Planes:
+        return _newton_step(coefficients, *xy, _distort(coefficients, *xy), target)
+
+    # A loop, not unrolled: XLA's CPU backend fuses unrolled steps into one kernel and evaluates an earlier step
+    # again for each of its uses, 4^steps times in all (200 ms for 500 points instead of 10 us). No step stands behind
+    # the loop either: it would be evaluated again in every kernel that uses the result.
+    return lax.fori_loop(0, num_steps, step, target)
 
 
 def _newton_step(coefficients: _Coefficients, x: Array, y: Array, value: _Planes, target: _Planes) -> _Planes:

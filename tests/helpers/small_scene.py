@@ -15,8 +15,8 @@ from jaxslam.sensors.frame import Frame
 from jaxslam.sensors.frame_arrays import FrameArrays, stack_frames
 from jaxslam.slam.slam import Slam
 from jaxslam.tracking.from_config import track_params, track_plan
+from jaxslam.tracking.initial_state import init_state
 from jaxslam.tracking.state import TrackParams, TrackState
-from jaxslam.tracking.step import init_state
 from jaxslam.trajectory.trajectory import Trajectory
 
 WIDTH, HEIGHT = 160, 120

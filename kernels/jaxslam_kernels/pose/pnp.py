@@ -22,6 +22,7 @@ from jaxslam_kernels.pose.pose_cost import PoseProblem, pose_problem
 from jaxslam_kernels.pose.pose_refine import PoseStatus, refine_problem, solve_pose, usable_pose
 from jaxslam_kernels.ransac_sampling import draw_samples
 from jaxslam_kernels.robust import Loss
+from jaxslam_kernels.se3 import rotation_matrix
 from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Points, Scalar, Weights
 
 SAMPLE_SIZE = 4
@@ -237,7 +238,7 @@ def _fallback(initial: SE3 | None, dtype: DTypeLike) -> tuple[SE3, Flag]:
 
 def _as_transform(T_world_cam: SE3) -> Float[Array, "3 4 1"]:
     T_world_cam = lax.stop_gradient(T_world_cam)
-    R_world_cam, position = T_world_cam.rotation().as_matrix(), T_world_cam.translation()
+    R_world_cam, position = rotation_matrix(T_world_cam), T_world_cam.translation()
     return jnp.concatenate([R_world_cam.T, -(R_world_cam.T @ position)[:, None]], axis=1)[:, :, None]
 
 

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from jaxslam_kernels.camera import MIN_DEPTH, Intrinsics, normalize
 from jaxslam_kernels.levenberg_marquardt import NormalEquations
 from jaxslam_kernels.robust import LARGEST_SQUARED, Loss, loss_value, loss_weight
-from jaxslam_kernels.se3 import to_camera
+from jaxslam_kernels.se3 import rotation_matrix, to_camera
 from jaxslam_kernels.types import Flag, Mask, Pixels, Points, Scalar, Weights
 
 UNKNOWN_CHI2 = 1e4
@@ -137,7 +137,7 @@ def with_idle(problem: PoseProblem, idle: PoseProblem, T_world_cam: SE3, loss: L
 
 def tangent_basis(T_world_cam: SE3) -> Float[Array, "7 6"]:
     """The derivative of the parameters `wxyz_xyz` of `T_world_cam @ exp(tangent)` at tangent zero."""
-    R, Q = T_world_cam.rotation().as_matrix(), _quaternion_basis(T_world_cam)
+    R, Q = rotation_matrix(T_world_cam), _quaternion_basis(T_world_cam)
     return jnp.block([[jnp.zeros_like(Q), 0.5 * Q], [R, jnp.zeros_like(R)]])
 
 
@@ -208,9 +208,9 @@ def _linearize(T_world_cam: SE3, problem: PoseProblem) -> tuple[list[Array], lis
 
 def _prior_error(T_world_cam: SE3, prior: PosePrior) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
     """The deviation from the prior and its derivative along the right tangent, both exact."""
-    R, Q, q = T_world_cam.rotation().as_matrix(), _quaternion_basis(T_world_cam), T_world_cam.wxyz_xyz[:4]
+    R, Q, q = rotation_matrix(T_world_cam), _quaternion_basis(T_world_cam), T_world_cam.wxyz_xyz[:4]
     predicted = prior.T_world_cam
-    R_prior, Q_prior, q_prior = predicted.rotation().as_matrix(), _quaternion_basis(predicted), predicted.wxyz_xyz[:4]
+    R_prior, Q_prior, q_prior = rotation_matrix(predicted), _quaternion_basis(predicted), predicted.wxyz_xyz[:4]
     sign = jnp.where(jnp.dot(q_prior, q) < 0, -1.0, 1.0)  # q and -q are the same rotation
     offset = R_prior.T @ (T_world_cam.translation() - predicted.translation())
     error = jnp.concatenate([offset, 2.0 * sign * (Q_prior.T @ q)])
@@ -231,7 +231,8 @@ def positive(values: Array) -> Array:
 
 def _usable(intrinsics: Intrinsics) -> Flag:
     pinhole = jnp.stack([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy])
-    return jnp.isfinite(pinhole).all() & jnp.isfinite(intrinsics.distortion).all() & (pinhole[:2] > 0).all()
+    usable = jnp.isfinite(pinhole).all() & (pinhole[:2] > 0).all()
+    return usable if intrinsics.distortion is None else usable & jnp.isfinite(intrinsics.distortion).all()
 
 
 def _usable_prior(prior: PosePrior | None) -> PosePrior | None:

@@ -24,7 +24,8 @@ from jaxslam.sensors.frame import Frame
 from jaxslam.sensors.frame_arrays import frame_arrays
 from jaxslam.tracking.cue_registry import with_cue_params, with_cues
 from jaxslam.tracking.from_config import track_params, track_plan
-from jaxslam.tracking.step import init_state, track_step
+from jaxslam.tracking.initial_state import init_state
+from jaxslam.tracking.step import track_step
 
 CAMERA = Camera("test", 320, 240, 260.0, 260.0, 159.5, 119.5, depth_scale_per_m=5000.0)
 CONFIG = load_config("usd")

@@ -21,8 +21,9 @@ from jaxslam.errors import ConfigError
 from jaxslam.slam.slam import Slam
 from jaxslam.tracking.cue_registry import with_cue_params, with_cues
 from jaxslam.tracking.dynamic_rejection import DynamicRejection
+from jaxslam.tracking.initial_state import init_state
 from jaxslam.tracking.state import TrackOutput, TrackParams, TrackPlan, TrackState, TrackStatus
-from jaxslam.tracking.step import init_state, track_step
+from jaxslam.tracking.step import track_step
 
 FRAMES = 6
 BY: dict[str, Callable[[TrackParams], Any]] = {

@@ -22,6 +22,7 @@ from jaxslam.sensors.frame_arrays import frame_arrays
 from jaxslam.sensors.sensor_model import sensor_model
 from jaxslam.slam.frame_result import FrameResult
 from jaxslam.slam.slam import Slam
+from jaxslam.slam.tracker import KeyframeDemand
 from jaxslam.tracking.state import TrackReason, TrackStatus
 
 CONFIG = Config(track=TRACK)
@@ -240,7 +241,7 @@ class TestWeakFrames:
         for frame in room().frames[:40]:
             slam.track(frame)
         weak = slam._tracker.params._replace(weak_inliers=np.float32(1e6))
-        monkeypatch.setattr(slam._tracker, "params", weak)
+        monkeypatch.setitem(slam._tracker._params_for, KeyframeDemand.NORMAL, weak)
         result = slam.track(room()[40])
         assert result.num_matched >= CONFIG.track.weak_inliers
         assert (result.status, result.reason) == (TrackStatus.OK, TrackReason.NONE.text)

@@ -34,9 +34,9 @@ from jaxslam.slam.frame_result import FrameResult
 from jaxslam.slam.keyframe_semantics import KeyframeSemantics
 from jaxslam.slam.mask_pipeline import MaskSource
 from jaxslam.slam.slam import Slam
+from jaxslam.tracking.initial_state import init_state
 from jaxslam.tracking.state import TrackPlan, TrackStatus
 from jaxslam.tracking.state_updates import drop_points
-from jaxslam.tracking.step import init_state
 
 WIDTH, HEIGHT, FRAMES = 320, 240, 60
 PLAN = replace(TRACK, num_points=256, points_per_source=96, cell_px=16)

@@ -13,8 +13,8 @@ from jaxslam.mapping.track_table import TrackId
 from jaxslam.slam.keyframe_reload import reload_keyframe
 from jaxslam.slam.reload_queue import ReloadQueue
 from jaxslam.slam.tracker_map_sync import TrackerMapSync
+from jaxslam.tracking.initial_state import init_state
 from jaxslam.tracking.state import TrackPlan
-from jaxslam.tracking.step import init_state
 
 PLAN = TrackPlan(num_points=8, num_levels=2, num_keyframes=3, num_reloaded=2, num_sources=1, points_per_source=4)
 RELOADED = slice(PLAN.num_keyframes, None)

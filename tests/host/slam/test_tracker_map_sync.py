@@ -19,9 +19,9 @@ from jaxslam.sensors.frame import Frame
 from jaxslam.sensors.frame_arrays import FrameArrays, frame_arrays
 from jaxslam.slam.keyframe_reload import reload_keyframe
 from jaxslam.slam.tracker_map_sync import AnchoredPose, TrackerMapSync
+from jaxslam.tracking.initial_state import init_state
 from jaxslam.tracking.points import KeyframeMatches
 from jaxslam.tracking.state import TrackOutput, TrackPlan, TrackState, TrackStatus
-from jaxslam.tracking.step import init_state
 
 PLAN = TrackPlan(num_points=8, num_levels=2, num_keyframes=3, num_reloaded=2, num_sources=1, points_per_source=4)
 SHAPE = (CAMERA.height, CAMERA.width)

@@ -10,9 +10,9 @@ from jaxlie import SE3
 from jaxslam import load_config
 from jaxslam.sensors.camera import Camera
 from jaxslam.tracking.from_config import track_params, track_plan
+from jaxslam.tracking.initial_state import init_state
 from jaxslam.tracking.keyframe_decision import KeyframeCandidate, keyframe_reason
 from jaxslam.tracking.state import KeyframeReason
-from jaxslam.tracking.step import init_state
 
 N = 64
 CAMERA = Camera("test", 64, 48, 50.0, 50.0, 31.5, 23.5, depth_scale_per_m=5000.0)

@@ -10,9 +10,9 @@ from jaxlie import SE3
 from small_map import pose
 
 from jaxslam.geometry.se3 import IDENTITY, between, compose, to_local, transform
-from jaxslam.tracking.state import TrackPlan, TrackState
+from jaxslam.tracking.initial_state import init_state
+from jaxslam.tracking.state import TrackPhase, TrackPlan, TrackState
 from jaxslam.tracking.state_updates import apply_map_correction, load_keyframe, reset_at_pose
-from jaxslam.tracking.step import init_state
 
 PLAN = TrackPlan(num_points=6, num_levels=2, num_keyframes=2, num_reloaded=2, num_sources=1, points_per_source=4)
 HEIGHT, WIDTH, SLOTS = 24, 32, 4
@@ -28,7 +28,9 @@ def state() -> Any:
     poses = np.stack([pose(rng) for _ in range(SLOTS)])
     kept = kept._replace(T_world_cam=jnp.asarray(poses, jnp.float32), weight=jnp.ones_like(kept.weight))
     points = jax.tree.map(fill, blank.points)._replace(valid=jnp.ones(PLAN.num_points, bool))
-    return blank._replace(keyframes=kept, points=points, twist=jnp.ones(6, jnp.float32), lost_frames=jnp.int32(3))
+    return blank._replace(
+        keyframes=kept, points=points, twist=jnp.ones(6, jnp.float32), phase=jnp.int32(TrackPhase.LOST)
+    )
 
 
 def parts(state: TrackState) -> dict[str, np.ndarray]:
@@ -113,9 +115,9 @@ class TestRelocated:
         """Points, keyframes and velocity; the numbers of points and the places in the ring go on."""
         there = pose(np.random.default_rng(7))
         after: Any = reset_at_pose(state, float32(there))
-        assert changed(state, after) == {".T_world_cam", ".twist", ".points.valid", ".keyframes.weight", ".lost_frames"}
+        assert changed(state, after) == {".T_world_cam", ".twist", ".points.valid", ".keyframes.weight", ".phase"}
         np.testing.assert_allclose(after.T_world_cam.wxyz_xyz, there, atol=1e-7)
         assert not np.asarray(after.points.valid).any()
         assert not np.asarray(after.keyframes.weight).any()
         assert not np.asarray(after.twist).any()
-        assert int(after.lost_frames) > 1e6  # more than any setting of `restart_after`: the next frame starts
+        assert int(after.phase) == TrackPhase.START

@@ -27,11 +27,12 @@ from jaxslam.config.schema import Config, SemanticsConfig
 from jaxslam.semantics import Detections, no_detections
 from jaxslam.sensors import measurement
 from jaxslam.sensors.frame_arrays import FrameArrays
-from jaxslam.sensors.measurement import PreparedFrame
+from jaxslam.sensors.measurement import PreparedFrame, point_rays
 from jaxslam.slam.frame_result import FrameResult
 from jaxslam.slam.slam import Slam
 from jaxslam.tracking import pose_estimation as frame_pose
-from jaxslam.tracking.pose_estimation import refined_pose, worse_status
+from jaxslam.tracking.initial_state import init_state
+from jaxslam.tracking.pose_estimation import match_rays, refined_pose, worse_status
 from jaxslam.tracking.state import (
     KeyframeMatches,
     KeyframeReason,
@@ -42,7 +43,8 @@ from jaxslam.tracking.state import (
     TrackState,
     TrackStatus,
 )
-from jaxslam.tracking.step import init_state, track_step
+from jaxslam.tracking.step import track_step
+from jaxslam.tracking.step_context import StepContext
 
 COUNT = 12
 SAME = {"twist": 1e-4 * 30, "covariance": 1e-7, "keyframe_matches.uv": 1e-2}
@@ -246,8 +248,12 @@ class TestPoseStatus:
                 jnp.zeros((3, 0)), jnp.zeros((2, 0)), jnp.zeros(0), jnp.zeros(0, jnp.int32), jnp.zeros(())
             )
             away, trust = retract(state.T_world_cam, jnp.full(6, 0.02)), state.points.valid.astype(jnp.float32)
-            refine = partial(refined_pose, state, view, state.points.uv, trust, none, away, state.twist, given)
-            return [refine(PLAN._replace(pose_steps=steps))[0].status for steps in (2, 25)]
+            X_world, twist = state.points.X_world, state.twist
+            rays = point_rays(X_world, state.points.uv, away, twist, view, given.sensor)
+            steps = [StepContext(state, view, given, PLAN._replace(pose_steps=steps)) for steps in (2, 25)]
+            rays_of_none = match_rays(steps[0], none, away, twist)
+            seen = steps[0].measured(rays, X_world, away, twist)
+            return [refined_pose(step, seen, trust, none, rays_of_none, away, twist)[0].status for step in steps]
 
         found = [int(code) for code in status(state, at(frames, 0), params())]
         assert found == [PoseStatus.NOT_CONVERGED, PoseStatus.OK]

@@ -1,0 +1,61 @@
+"""Whether a frame was tracked, and why not."""
+
+import enum
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxslam_kernels.pose.pose_refine import PoseRefinement
+from jaxslam_kernels.types import Code, Flag, Mask, Scalar
+
+from jaxslam.tracking.state import TrackReason
+from jaxslam.tracking.step_context import StepContext
+
+
+class Outcome(NamedTuple):
+    """Whether a frame was tracked, and why not.
+
+    Attributes:
+        lost: Whether no pose was found that can be believed.
+        weak: Whether few points agree with the pose.
+        reason: A `TrackReason`.
+        inlier_ratio: Share of the tracked points that agree with the pose.
+    """
+
+    lost: Flag
+    weak: Flag
+    reason: Code
+    inlier_ratio: Scalar
+
+
+def judge_frame(step: StepContext, refined: PoseRefinement, tracked: Mask, inliers: Mask) -> Outcome:
+    """Judge the refined pose of a frame.
+
+    Args:
+        step: Context of the step.
+        refined: Refinement of the pose.
+        tracked: `(n,)` mask of the tracked background points that no cue rejects.
+        inliers: `(n,)` mask of the points that agree with the pose.
+    """
+    params, dtype = step.params, step.state.twist.dtype
+    num_tracked, num_inliers = (jnp.sum(mask, dtype=dtype) for mask in (tracked, inliers))
+    ratio = num_inliers / jnp.maximum(num_tracked, 1)
+    twist = step.twist_to(refined.T_world_cam)
+    speed, turn = jnp.linalg.norm(twist[:3]), jnp.linalg.norm(twist[3:])
+    causes = (
+        (step.view.frame.dt_s <= 0, TrackReason.BAD_TIME),
+        (num_tracked < params.min_inliers, TrackReason.NO_POINTS),
+        (num_inliers < params.min_inliers, TrackReason.FEW_INLIERS),
+        (ratio < params.min_share, TrackReason.FEW_SHARE),
+        (~((speed < params.max_speed_m_per_s) & (turn < params.max_turn_rad_per_s)), TrackReason.IMPLAUSIBLE_MOTION),
+    )
+    conditions = [condition for condition, _ in causes]
+    lost = jnp.any(jnp.stack(conditions))
+    weak = num_inliers < params.weak_inliers
+    mild = jnp.where(weak, code(TrackReason.FEW_INLIERS), code(TrackReason.NONE))
+    codes = [code(reason) for _, reason in causes]
+    return Outcome(lost, weak & ~lost, jnp.select(conditions, codes, mild), ratio)
+
+
+def code(value: enum.IntEnum) -> Code:
+    """Return a member of an enumeration as an array."""
+    return jnp.full((), value, jnp.int32)
