@@ -70,6 +70,7 @@ for _row, _column, _factors in (
         _ROTATION[_row, _column][_pair] = _factor
 
 
+@checked
 def rotation_matrix(T_a_b: SE3) -> Float[Array, "3 3"]:
     """Return the rotation matrix `R_a_b` of a pose.
 

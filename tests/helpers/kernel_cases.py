@@ -247,6 +247,7 @@ def cases(n: int = 11) -> dict[str, Case]:
         transform.compose: {"T_a_b": transforms(n), "T_b_c": transforms(n)},
         transform.between: {"T_world_a": transforms(n), "T_world_b": transforms(n)},
         transform.displacement: {"T_world_a": transforms(), "T_world_b": transforms()},
+        transform.rotation_matrix: {"T_a_b": transforms()},
         transform.to_camera: {"T_world_cam": transforms(), "X_world": f(3, n)},
         transform.to_world: {"T_world_cam": transforms(), "X_cam": f(3, n)},
         transform.cross_matrix: {"v": f(3)},

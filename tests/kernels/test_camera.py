@@ -20,6 +20,7 @@ from jaxslam_kernels.camera import (
     project,
     to_pixels,
     undistort_pixels,
+    without_distortion,
 )
 
 WIDTH, HEIGHT, N = 640, 480, 400
@@ -57,6 +58,7 @@ def _points(seed: int) -> np.ndarray:
 
 def test_shapes():
     camera = make_intrinsics(500.0, 500.0, 320.0, 240.0, (0.1, 0.2))
+    assert camera.distortion is not None
     assert camera.distortion.shape == (5,)
     assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(camera))
     uv, depth = jnp.zeros((2, 7)), jnp.ones(7)
@@ -132,6 +134,27 @@ class TestGradient:
         with jax.enable_x64(True):
             X_cam = jnp.asarray(_points(6)).at[2].set(0.02) * jnp.asarray([[0.01], [0.01], [1.0]])
             self._check(project, _camera("tum_fr1"), X_cam)
+
+
+class TestIdeal:
+    """A camera without distortion is one whose coefficients are all zero, and computes less."""
+
+    def test_equals_zeros(self):
+        with jax.enable_x64(True):
+            ideal = without_distortion(_camera("tum_fr1"))
+            zeros = ideal._replace(distortion=jnp.zeros(5))
+            uv, X_cam = jnp.asarray(_pixels(8)), jnp.asarray(_points(8))
+            assert ideal.distortion is None
+            np.testing.assert_allclose(normalize(ideal, uv), normalize(zeros, uv), atol=1e-14)
+            np.testing.assert_allclose(project(ideal, X_cam), project(zeros, X_cam), atol=1e-11)
+            np.testing.assert_allclose(undistort_pixels(ideal, uv), uv, atol=1e-11)
+
+    def test_gradient(self):
+        with jax.enable_x64(True):
+            ideal = without_distortion(_camera("tum_fr1"))
+            TestGradient._check(project, ideal, jnp.asarray(_points(4)))
+            depth = jnp.asarray(np.random.default_rng(5).uniform(0.3, 8.0, N))
+            TestGradient._check(back_project, ideal, jnp.asarray(_pixels(5)), depth)
 
 
 def test_vmap_equals_loop():

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxlie import SE3
-from jaxslam_kernels.se3 import between, cross_matrix, displacement, retract, to_camera, to_world
+from jaxslam_kernels.se3 import between, cross_matrix, displacement, retract, rotation_matrix, to_camera, to_world
 from scipy.linalg import expm
 
 
@@ -42,6 +42,15 @@ class TestTransform:
         there = retract(A, jnp.asarray(tangent))
         np.testing.assert_allclose(there.as_matrix(), np.asarray(A.as_matrix()) @ expm(hat(tangent)), atol=1e-12)
         np.testing.assert_allclose(displacement(A, there), tangent, atol=1e-12)
+
+    def test_rotation_matrix(self):
+        """Equal to jaxlie's, also in its derivatives and for a quaternion that is not of unit length."""
+        for factor in (1.0, 0.5):
+            T = random_pose(6)
+            parameters = T.wxyz_xyz.at[:4].multiply(factor)
+            ours, theirs = (lambda p: rotation_matrix(SE3(p))), (lambda p: SE3(p).rotation().as_matrix())
+            np.testing.assert_allclose(ours(parameters), theirs(parameters), atol=1e-14)
+            np.testing.assert_allclose(jax.jacrev(ours)(parameters), jax.jacfwd(theirs)(parameters), atol=1e-13)
 
     def test_points_return(self):
         A, X = random_pose(4), jnp.asarray(np.random.default_rng(5).normal(size=(3, 20)))

@@ -251,8 +251,10 @@ def test_intrinsics() -> None:
     camera = Camera.load("tum_fr1")
     intrinsics = camera.intrinsics()
     assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(intrinsics))
+    assert intrinsics.distortion is not None
     assert intrinsics.distortion.shape == (5,)
     with jax.enable_x64(True):
         exact = camera.intrinsics(jnp.float64)
         assert [float(x) for x in exact[:4]] == [camera.fx, camera.fy, camera.cx, camera.cy]
+        assert exact.distortion is not None
         assert tuple(map(float, exact.distortion)) == camera.distortion
