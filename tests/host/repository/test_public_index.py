@@ -65,7 +65,8 @@ def test_words_for_every_code() -> None:
 def test_index_is_whole() -> None:
     """Each name is the one of its module, and no submodule hides it."""
     assert callable(enable_compile_cache)
-    for name in ("follow_points", "track_followed", "track_step", "init_state"):
+    assert jaxslam.init_state.__module__ == "jaxslam.tracking.initial_state"
+    for name in ("follow_points", "track_followed", "track_step"):
         assert getattr(jaxslam, name).__module__ == "jaxslam.tracking.step"
 
 
