@@ -441,7 +441,7 @@ class TestFailure:
         statuses = [result.status for result in results]
         second = keyframes(results)[1]
         print(statuses[second:])
-        # Without new points the second keyframe is made since 31 points are few; rounding decides if the map adds enough.
+        # Without new points, the second keyframe is made because 31 are few; rounding decides if the map adds enough.
         assert set(statuses[1:second]) == {TrackStatus.OK}
         assert statuses[second] in (TrackStatus.OK, TrackStatus.WEAK)
         assert (TrackStatus.RELOCALIZED in statuses) == (new_points == "keyframes")
