@@ -59,12 +59,14 @@ import math
 import os
 import struct
 import zipfile
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, ClassVar, TypeAlias
 
 import numpy as np
 
-from jaxslam.errors import CameraError, MapFileError, one_line
+from jaxslam.config.validation import Range, ValidatedConfig, from_mapping
+from jaxslam.errors import JaxSlamError, MapFileError, one_line
 from jaxslam.features.orb import Features
 from jaxslam.io.atomic_files import replacing
 from jaxslam.map.types import Culled, Keyframe, Loops, Map, MapPoints, Observations
@@ -105,12 +107,41 @@ _DAMAGE = (zipfile.BadZipFile, EOFError, ValueError, KeyError, RuntimeError, str
 """Exceptions besides `OSError` that reading an archive of arbitrary bytes may raise."""
 
 
-class _Header(NamedTuple):
+_Count: TypeAlias = Annotated[int, Range(at_least=0, at_most=4 * 10**18)]
+
+
+@dataclass(frozen=True)
+class _Counts(ValidatedConfig):
+    """Lengths of the arrays in a file."""
+
+    _error: ClassVar[type[JaxSlamError]] = MapFileError
+
+    keyframes: _Count
+    points: _Count
+    observations: _Count
+    loops: _Count
+    culled: _Count
+    features: _Count
+    image_bytes: _Count
+
+
+@dataclass(frozen=True)
+class _Header(ValidatedConfig):
+    """The first member of a file."""
+
+    _error: ClassVar[type[JaxSlamError]] = MapFileError
+
+    format: str
     version: int
     camera: Camera
-    lengths: dict[str, int]
-    next_keyframe: int
-    next_point: int
+    counts: _Counts
+    next_keyframe: _Count
+    next_point: _Count
+
+    @property
+    def lengths(self) -> dict[str, int]:
+        """Lengths of the dimensions of the arrays, by their letters."""
+        return {letter: getattr(self.counts, name) for letter, name in _COUNTS.items()}
 
 
 def save_map(path: str | os.PathLike[str], slam_map: Map) -> None:
@@ -240,21 +271,15 @@ def _read_header(archive: zipfile.ZipFile) -> _Header:
     if type(version) is not int or version not in READABLE:
         readable = ", ".join(str(number) for number in READABLE)
         raise MapFileError(f"expected a map file of version {readable}, got version {version!r}")
-    counts = _field(header, "counts", dict)
-    return _Header(
-        version=version,
-        camera=_camera(_field(header, "camera", dict)),
-        lengths={letter: _count(counts, _name_in_version(name, version)) for letter, name in _COUNTS.items()},
-        next_keyframe=_count(header, "next_keyframe"),
-        next_point=_count(header, "next_point"),
-    )
+    return from_mapping(_Header, _with_present_names(header, version), "header")
 
 
-def _field(record: dict[str, Any], name: str, kind: type) -> Any:
-    value = record.get(name)
-    if type(value) is not kind:
-        raise MapFileError(f"header: {name}: expected {kind.__name__}, got {value!r:.40}")
-    return value
+def _with_present_names(header: dict[str, Any], version: int) -> dict[str, Any]:
+    """Return a header with the names that the counts have in the latest version."""
+    if not isinstance(header.get("counts"), dict):
+        return header
+    present = {_name_in_version(name, version): name for name in _COUNTS.values()}
+    return header | {"counts": {present.get(name, name): count for name, count in header["counts"].items()}}
 
 
 def _name_in_version(name: str, version: int) -> str:
@@ -262,24 +287,6 @@ def _name_in_version(name: str, version: int) -> str:
     if version >= 3:
         return name
     return _BEFORE_VERSION_3.get(name, name.replace("observations", "sightings").replace("uv_raw", "seen_uv"))
-
-
-def _count(record: dict[str, Any], name: str) -> int:
-    count = _field(record, name, int)
-    if not 0 <= count < 2**62:
-        raise MapFileError(f"header: {name}: expected a count, got {count:.3g}")
-    return count
-
-
-def _camera(fields: dict[str, Any]) -> Camera:
-    expected = {field.name for field in dataclasses.fields(Camera)}
-    if fields.keys() != expected:
-        odd = ", ".join(sorted(fields.keys() ^ expected))
-        raise MapFileError(f"header: camera: unknown or missing: {odd}")
-    try:
-        return Camera(**fields)
-    except CameraError as error:
-        raise MapFileError(f"header: {error}") from None
 
 
 def _read_arrays(archive: zipfile.ZipFile, header: _Header, size: int) -> dict[str, np.ndarray]:

@@ -87,7 +87,7 @@ BAD: dict[str, tuple[Callable[[Path], Any], str | bytes, str]] = {
     "map_text": (load_map, b"keyframes: 3", "not a jaxslam map"),
     "map_empty": (load_map, b"", "is empty"),
     "map_member": (load_map, packed({"x\n" * 5000: b""}), "not a jaxslam map: an archive of x x x"),
-    "map_camera": (load_map, "camera", "unknown or missing: cx, xxx"),
+    "map_camera": (load_map, "camera", "header: camera: unknown key 'xxx"),
     "map_header": (load_map, "header", "points.ids: expected the header of a NumPy array"),
     "map_far": (load_map, "far", "points.X_world: expected coordinates of at most 1e+12 m, got 1e+200"),
     "map_behind": (load_map, "behind", "is damaged: holds bytes before or behind the archive"),
