@@ -14,6 +14,7 @@ from jaxslam_kernels.pose_graph.elimination_order import band_rank
 from jaxslam_kernels.pose_graph.pose_graph import PoseGraphStatus, optimize_pose_graph
 
 from jaxslam.geometry.se3 import IDENTITY, angle, between
+from jaxslam.geometry.types import Pose
 from jaxslam.map.types import NONE, Map, has, rows, visibility
 from jaxslam.runtime.compile_cache import FAST_COMPILE
 from jaxslam.runtime.compiled import compiled
@@ -39,12 +40,12 @@ _ONE_AT_A_TIME = {size: threading.Lock() for size in _SIZES}
 class _Graph(NamedTuple):
     source: np.ndarray
     target: np.ndarray
-    T_source_target: np.ndarray
+    T_source_target: Pose
     information: np.ndarray
 
 
 def poses_with_loop(
-    slam_map: Map, source: int, target: int, T_source_target: np.ndarray, information: np.ndarray
+    slam_map: Map, source: int, target: int, T_source_target: Pose, information: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Optimize the poses of a submap with a loop; `None` if the loop is not within the uncertainty of the graph.
 

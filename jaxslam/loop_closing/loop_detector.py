@@ -12,9 +12,11 @@ their relative poses (`essential_graph`).
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float64
 
 from jaxslam.features.orb import FeaturePlan
 from jaxslam.geometry.se3 import angle, between, compose, inverse
+from jaxslam.geometry.types import Ids, Pose, Poses
 from jaxslam.loop_closing.essential_graph import poses_with_loop
 from jaxslam.loop_closing.place_index import PlaceIndex
 from jaxslam.loop_closing.place_recognition import Recognition, recognize
@@ -52,16 +54,16 @@ class LoopClosure(NamedTuple):
 
     source: int
     target: int
-    T_source_target: np.ndarray
-    information: np.ndarray
-    keyframes: np.ndarray
-    T_world_cam: np.ndarray
+    T_source_target: Pose
+    information: Float64[np.ndarray, "6 6"]
+    keyframes: Ids
+    T_world_cam: Poses
 
 
 class _Candidate(NamedTuple):
     recognition: Recognition
     keyframe: int
-    T_new_old: np.ndarray
+    T_new_old: Pose
     """The correction of the world that it implies at the keyframe."""
 
 

@@ -14,6 +14,7 @@ from jaxslam.features.matching import hamming_pairs, match_by_projection, match_
 from jaxslam.features.orb import DEFAULT_PLAN, FeaturePlan, Features, no_features
 from jaxslam.features.pose_from_matches import Matches, fit_pose, matches_depth_sigma, matches_of, pinhole
 from jaxslam.geometry.se3 import IDENTITY, to_local
+from jaxslam.geometry.types import Pose
 from jaxslam.loop_closing.place_index import PlaceIndex
 from jaxslam.map.types import Keyframe, Map, has
 from jaxslam.runtime.compile_cache import FAST_COMPILE
@@ -115,7 +116,7 @@ def _by_descriptor(source: Features, features: Features) -> Int64[np.ndarray, "2
 
 
 def _where_expected(
-    source: Features, features: Features, T_keyframe_cam: np.ndarray, sensor: SensorModel, plan: FeaturePlan
+    source: Features, features: Features, T_keyframe_cam: Pose, sensor: SensorModel, plan: FeaturePlan
 ) -> Int64[np.ndarray, "2 k"]:
     """Match features near the pixels at which a pose predicts those of the keyframe."""
     known = np.flatnonzero(source.depth > 0)

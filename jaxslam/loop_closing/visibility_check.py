@@ -4,6 +4,7 @@ import numpy as np
 
 from jaxslam.features.orb import Features
 from jaxslam.geometry.se3 import to_local
+from jaxslam.geometry.types import Pose
 from jaxslam.sensors.camera import Camera
 
 _NEAR_PX = 8.0
@@ -12,7 +13,7 @@ _SAME_SHARE, _SAME_M = 0.1, 0.02
 _MIN_COMPARED = 50
 
 
-def see_through_ratio(camera: Camera, source: Features, target: Features, T_source_target: np.ndarray) -> float:
+def see_through_ratio(camera: Camera, source: Features, target: Features, T_source_target: Pose) -> float:
     """Return the share of one keyframe's surfaces that another would have to see through, of those it could see.
 
     A nearer depth there than expected may occlude a surface, or may have appeared since. A farther depth contradicts:

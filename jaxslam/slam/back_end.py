@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxslam.config.schema import Config
 from jaxslam.geometry.se3 import IDENTITY, compose, inverse
+from jaxslam.geometry.types import Pose
 from jaxslam.loop_closing.essential_graph import GraphCompiler
 from jaxslam.loop_closing.loop_detector import LoopClosing, LoopClosure
 from jaxslam.loop_closing.place_index import PlaceIndex
@@ -240,7 +241,7 @@ class BackEnd:
             return None
         return self._states.see(self.map, anchored.keyframe, anchored.T_keyframe_cam, np.asarray(output.twist), arrays)
 
-    def relocalize(self, arrays: FrameArrays, predicted: np.ndarray | None) -> tuple[LocalizedPose | None, bool]:
+    def relocalize(self, arrays: FrameArrays, predicted: Pose | None) -> tuple[LocalizedPose | None, bool]:
         """Localize a lost frame in the map; see `FrameLocalizer.relocalize`."""
         return self._localizer.relocalize(arrays, predicted)
 
@@ -252,22 +253,22 @@ class BackEnd:
         self._reloads.replace(self._searches.reload(Reload(self.map, pose, self._link.submap_now(), frozenset())))
         return self._reloads.load_all(state)
 
-    def start_submap(self, state: TrackState, T_world_cam: np.ndarray) -> TrackState:
+    def start_submap(self, state: TrackState, T_world_cam: Pose) -> TrackState:
         """Return the tracker's state reset to a pose `(7,)`, with which a new submap begins."""
         self._link.forget_slots()
         self._reloads.replace(())
         return _relocated(state, T_world_cam.astype(np.float32))
 
-    def frame_tracked(self, T_world_cam: np.ndarray, frame: int) -> None:
+    def frame_tracked(self, T_world_cam: Pose, frame: int) -> None:
         """Request keyframes of the surroundings at intervals, if no new keyframes are made that request them."""
         if self._localize_only and frame % _RECALL_EVERY == 0:
             self._request_reload(T_world_cam, frame)
 
-    def anchor(self, T_world_cam: np.ndarray) -> AnchoredPose:
+    def anchor(self, T_world_cam: Pose) -> AnchoredPose:
         """Express a pose `(7,)` of the tracker relative to the reference keyframe."""
         return self._link.anchor(T_world_cam)
 
-    def pose(self, anchored: AnchoredPose) -> np.ndarray:
+    def pose(self, anchored: AnchoredPose) -> Pose:
         """Return the current pose `(7,)` in the map of an anchored pose."""
         return self._link.pose(anchored)
 
@@ -332,12 +333,11 @@ class BackEnd:
         jax.block_until_ready(state)
 
     def _worker(self, work: Callable[[Any], Any], name: str, turn: int) -> Worker[Any, Any]:
-        latency_frames = turn * self._config.mapping.latency_frames
         return make_worker(
             self._times.timed(name, work),
             f"jaxslam-{name}",
             deterministic=self._config.run.in_turn,
-            latency_frames=latency_frames,
+            latency_frames=turn * self._config.mapping.latency_frames,
         )
 
     def _take_maps(self, updates: list[MapUpdate], frame: int) -> bool:
@@ -394,7 +394,7 @@ class BackEnd:
             elif result:
                 self._reloads.replace(result)
 
-    def _request_reload(self, T_world_cam: np.ndarray, frame: int) -> None:
+    def _request_reload(self, T_world_cam: Pose, frame: int) -> None:
         if self._track_plan.num_reloaded and self._link.reference != NONE:
             known = frozenset(self._link.latest())
             self._to_places.submit(Reload(self.map, T_world_cam, self._link.submap_now(), known), frame)

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from jaxslam.geometry.se3 import between, compose, rotate
+from jaxslam.geometry.types import Pose
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame_arrays import FrameArrays
 from jaxslam.sensors.sensor_model import SensorModel
@@ -101,7 +102,7 @@ class BackgroundConsistency:
         return replace(tracked, covariance=covariance, status=TrackStatus.WEAK, reason=TrackReason.UNCONFIRMED.text)
 
     def _compare(
-        self, gray: np.ndarray, depth_m: np.ndarray, ignore: np.ndarray, T_world_cam: np.ndarray, correction: np.ndarray
+        self, gray: np.ndarray, depth_m: np.ndarray, ignore: np.ndarray, T_world_cam: Pose, correction: Pose
     ) -> PoseDoubt:
         """Compare a frame that was tracked with those before.
 
@@ -143,7 +144,7 @@ class BackgroundConsistency:
         self._first = self._now = np.zeros((0, 2), np.float32)
         self._frames = 0
 
-    def _begin(self, gray: np.ndarray, without: np.ndarray, T_world_cam: np.ndarray) -> None:
+    def _begin(self, gray: np.ndarray, without: np.ndarray, T_world_cam: Pose) -> None:
         """Take corners of a frame to follow."""
         corners = cv2.goodFeaturesToTrack(gray, _NUM_CORNERS, 0.02, 12, mask=without)
         if corners is None or len(corners) < _FEWEST:
@@ -167,7 +168,7 @@ class BackgroundConsistency:
             self._first, self._now = self._first[there], now[there]
         self._previous = gray.copy()
 
-    def _confirms(self, T_first_cam: np.ndarray) -> bool:
+    def _confirms(self, T_first_cam: Pose) -> bool:
         """Whether most corners move as the pose says, and visibly so, and few do not."""
         focal = (self._K[0, 0] + self._K[1, 1]) / 2
         first, now = (

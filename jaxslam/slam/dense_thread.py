@@ -16,6 +16,7 @@ from jaxslam.dense.key_objects import Neighbors
 from jaxslam.dense.occupancy import Occupancy
 from jaxslam.dense.point_cloud import DenseCloud
 from jaxslam.geometry.se3 import IDENTITY, retract
+from jaxslam.geometry.types import Pose
 from jaxslam.map.dynamic_removal import DynamicObservations
 from jaxslam.map.types import NONE, Map
 from jaxslam.mapping.local_mapping import NewKeyframe
@@ -77,7 +78,7 @@ class DenseMapping:
         with self._lock:
             self._map.compile()
 
-    def insert_keyframe(self, new: NewKeyframe, image: np.ndarray, pose: np.ndarray, frame: int) -> None:
+    def insert_keyframe(self, new: NewKeyframe, image: np.ndarray, pose: Pose, frame: int) -> None:
         """Keep a keyframe, which is added to the dense map when local mapping has inserted it.
 
         Args:

@@ -8,6 +8,7 @@ from jaxlie import SE3
 from jaxslam.features.orb import FeaturePlan, Features, features_of
 from jaxslam.features.pose_from_matches import MIN_INLIERS
 from jaxslam.geometry.se3 import transform
+from jaxslam.geometry.types import Pose
 from jaxslam.loop_closing.place_index import PlaceIndex
 from jaxslam.loop_closing.place_recognition import recognize
 from jaxslam.mapping.local_map_tracking import match_local_map
@@ -36,7 +37,7 @@ class LocalizedPose(NamedTuple):
 
 
 def output_at_pose(
-    output: TrackOutput, T_world_cam: np.ndarray, change: np.ndarray, localized: LocalizedPose, weak_inliers: float
+    output: TrackOutput, T_world_cam: Pose, change: Pose, localized: LocalizedPose, weak_inliers: float
 ) -> TrackOutput:
     """Return the output of a frame at the pose from the local map; it is `OK` if enough points agree with that pose.
 
@@ -101,7 +102,7 @@ class FrameLocalizer:
         self.features = features_of(arrays, np.asarray(output.twist), self._sensor, self._plan)
         return self._in_local_map(self.features, pose_of(output))
 
-    def relocalize(self, arrays: FrameArrays, predicted: np.ndarray | None) -> tuple[LocalizedPose | None, bool]:
+    def relocalize(self, arrays: FrameArrays, predicted: Pose | None) -> tuple[LocalizedPose | None, bool]:
         """Localize a lost frame: against the local map at the predicted pose, else by place recognition.
 
         Args:
@@ -128,7 +129,7 @@ class FrameLocalizer:
         anchored = AnchoredPose(found.keyframe, found.T_keyframe_cam)
         return LocalizedPose(anchored, found.num_inliers, found.covariance), False
 
-    def _in_local_map(self, features: Features, T_world_cam: np.ndarray) -> LocalizedPose | None:
+    def _in_local_map(self, features: Features, T_world_cam: Pose) -> LocalizedPose | None:
         """Localize a frame against the local map from an approximate pose; `None` if too few points agree."""
         about = self._link.in_map(T_world_cam)
         if about is None:

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from jaxslam.config.schema import Config
 from jaxslam.dynamics.point_mask import mask_around, moving_points
 from jaxslam.geometry.se3 import IDENTITY, retract
+from jaxslam.geometry.types import Pose
 from jaxslam.masks.depth_instances import InstanceFinder
 from jaxslam.runtime.aligned_memory import aligned_array
 from jaxslam.runtime.stage_timer import StageTimes
@@ -182,9 +183,7 @@ class MaskStage:
         assert frame.right is not None
         np.copyto(depth, self._rough_depth.of(frame.image, frame.right))
 
-    def _find_mask(
-        self, number: int, frame: Frame, arrays: FrameArrays, depth: np.ndarray, correction: np.ndarray
-    ) -> None:
+    def _find_mask(self, number: int, frame: Frame, arrays: FrameArrays, depth: np.ndarray, correction: Pose) -> None:
         given = frame.dynamic_mask
         if self._pipeline is None:
             source = MaskSource.NONE if given is None else MaskSource.CALLER

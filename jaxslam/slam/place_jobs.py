@@ -2,8 +2,7 @@
 
 from typing import NamedTuple, TypeAlias
 
-import numpy as np
-
+from jaxslam.geometry.types import Pose
 from jaxslam.loop_closing.loop_detector import LoopClosing, LoopClosure
 from jaxslam.map.types import Map
 from jaxslam.mapping.local_map_tracking import keyframes_in_view
@@ -34,7 +33,7 @@ class Reload(NamedTuple):
     """
 
     map: Map
-    T_world_cam: np.ndarray
+    T_world_cam: Pose
     submap: int
     known: frozenset[int]
 

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam.geometry.se3 import IDENTITY, compose, retract
+from jaxslam.geometry.types import Pose
 from jaxslam.slam.tracker_map_sync import AnchoredPose
 from jaxslam.trajectory.trajectory import Trajectory
 
@@ -25,7 +26,7 @@ class _RecordedPose(NamedTuple):
     """
 
     timestamp_ns: int
-    T_world_cam: np.ndarray
+    T_world_cam: Pose
     anchored: AnchoredPose
     in_map_frame: bool
 
@@ -41,7 +42,7 @@ class PoseHistory:
         """Return the number of poses."""
         return len(self._poses)
 
-    def add(self, timestamp_ns: int, T_world_cam: np.ndarray, anchored: AnchoredPose, *, in_map_frame: bool) -> None:
+    def add(self, timestamp_ns: int, T_world_cam: Pose, anchored: AnchoredPose, *, in_map_frame: bool) -> None:
         """Record a pose.
 
         Args:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxslam.geometry.se3 import IDENTITY, angle, between, compose, inverse, to_local, transform
+from jaxslam.geometry.types import Pose
 from jaxslam.map.types import NONE, Map, has, surviving_keyframes
 from jaxslam.mapping.local_mapping import NewKeyframe, TrackedObservations
 from jaxslam.runtime.compiled import compiled
@@ -37,7 +38,7 @@ class AnchoredPose(NamedTuple):
     """
 
     keyframe: int
-    T_keyframe_cam: np.ndarray
+    T_keyframe_cam: Pose
 
 
 class TrackerMapSync:
@@ -67,15 +68,15 @@ class TrackerMapSync:
             state = _reloaded(state, np.int32(0), image, *places, nothing, nothing.astype(np.int32))
         return state
 
-    def anchor(self, T_world_cam: np.ndarray) -> AnchoredPose:
+    def anchor(self, T_world_cam: Pose) -> AnchoredPose:
         """A pose of the tracker, tied to the reference keyframe."""
         return AnchoredPose(self.reference, between(self._believed[self.reference], T_world_cam))
 
-    def pose(self, anchored: AnchoredPose) -> np.ndarray:
+    def pose(self, anchored: AnchoredPose) -> Pose:
         """`(7,)` where a pose is in the map as it is now."""
         return compose(self._in_map(anchored.keyframe), anchored.T_keyframe_cam)
 
-    def in_map(self, T_world_cam: np.ndarray) -> AnchoredPose | None:
+    def in_map(self, T_world_cam: Pose) -> AnchoredPose | None:
         """A pose of the tracker tied to a keyframe that is in the map; `None` if there is none yet."""
         if self.reference == NONE:
             return None
@@ -87,7 +88,7 @@ class TrackerMapSync:
         standing_id = int(surviving_keyframes(self.map, np.array([anchored.keyframe]))[0])
         return AnchoredPose(standing_id, between(self.map.pose(standing_id), self.pose(anchored)))
 
-    def tracker_pose(self, keyframe_id: int) -> np.ndarray:
+    def tracker_pose(self, keyframe_id: int) -> Pose:
         """`(7,)` where the tracker believes a keyframe to be."""
         return self._believed[keyframe_id]
 
@@ -167,7 +168,7 @@ class TrackerMapSync:
         self._believed = new
         return _carried(state, now.astype(np.float32), corrections.astype(np.float32)), now
 
-    def apply_correction(self, state: TrackState, T_new_old: np.ndarray, *, is_keyframe: bool) -> TrackState:
+    def apply_correction(self, state: TrackState, T_new_old: Pose, *, is_keyframe: bool) -> TrackState:
         """The tracker's state with the camera moved, and with it what it saw last; keyframes stay but this frame.
 
         Args:
@@ -207,7 +208,7 @@ class TrackerMapSync:
         places = (pose.astype(np.float32), keyframe.uv_raw, X_world)
         return _reloaded(state, np.int32(slot), keyframe.image, *places, keyframe.weight, keyframe.id)
 
-    def _in_map(self, keyframe_id: int) -> np.ndarray:
+    def _in_map(self, keyframe_id: int) -> Pose:
         """Return the pose of a keyframe in the map; one on its way there is placed relative to the one before."""
         anchored = self._on_the_way.get(keyframe_id)
         if anchored is None:
@@ -215,7 +216,7 @@ class TrackerMapSync:
         return anchored.T_keyframe_cam if anchored.keyframe == NONE else self.pose(anchored)
 
 
-def pose_of(output: TrackOutput) -> np.ndarray:
+def pose_of(output: TrackOutput) -> Pose:
     """`(7,)` the pose, its quaternion of unit length in float64."""
     return compose(np.asarray(output.T_world_cam.wxyz_xyz, np.float64), IDENTITY)
 
