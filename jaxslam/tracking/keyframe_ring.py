@@ -50,27 +50,25 @@ def align_keyframe_points(step: StepContext, T_world_cam: SE3, twist: Float[Arra
     keyframes = state.keyframes
     height, width = view.pyramid.size()
     k, n = keyframes.weight.shape
+    # 1. Points of all keyframes that are in view, seen from about the same direction and distance.
     valid = keyframes.weight > 0
     X_cam = to_camera(T_world_cam, jnp.moveaxis(keyframes.X_world, 1, 0).reshape(3, k * n))
     predicted = predict_pixels(X_cam, twist, height, params.sensor)
-    alike = _similar_views(keyframes, T_world_cam).reshape(-1)
-    visible = _visible(predicted, X_cam[2], height, width) & alike & valid.reshape(-1)
-    shown = jnp.sum(visible.reshape(k, n), axis=1)
+    inside = _visible(predicted, X_cam[2], height, width).reshape(k, n)
+    visible = inside & _similar_views(keyframes, T_world_cam) & valid
+    shown = jnp.sum(visible, axis=1)
     overlap = jnp.max((shown / jnp.maximum(jnp.sum(valid, axis=1), 1)).astype(predicted.dtype))
     if plan.num_sources == 0:
         return _no_matches(overlap, keyframes)
-    _, sources = jax.lax.top_k(shown, plan.num_sources)
-    chosen = jax.vmap(lambda s: jnp.nonzero(visible.reshape(k, n)[s], size=plan.points_per_source, fill_value=n)[0])(
-        sources
-    )
-    real = (chosen < n).reshape(-1)
-    index = (sources[:, None] * n + jnp.minimum(chosen, n - 1).astype(sources.dtype)).reshape(-1)
+    # 2. Some of the keyframes that share most of them with the frame, unless something covers them.
+    index, real = _chosen(visible, shown, plan)
     take = lambda array: jnp.take(array, index, axis=-1, mode="clip")
     guess, X_there = take(predicted), take(X_cam)
     seen_depth = sample_depth(view.depth, jax.lax.stop_gradient(guess), reach=0)
     column, row = jnp.round(jax.lax.stop_gradient(guess)).astype(jnp.int32)
     ignored = view.frame.ignore.at[row, column].get(mode="fill", fill_value=True)
     covered = (seen_depth > 0) & (jnp.abs(seen_depth - X_there[2]) > 0.1 * X_there[2] + 0.05)
+    # 3. Alignment of their patches.
     source = index // n
     X_world = take(jnp.moveaxis(keyframes.X_world, 1, 0).reshape(3, k * n))
     match = align_patches(
@@ -87,6 +85,16 @@ def align_keyframe_points(step: StepContext, T_world_cam: SE3, twist: Float[Arra
     found = match.converged & (match.correlation > params.min_correlation) & (shift < _MAX_SHIFT_PX**2)
     weight = jnp.where(found, take(keyframes.weight.reshape(-1)), 0)
     return KeyframeMatches(X_world, match.points, weight, take(keyframes.id.reshape(-1)), overlap)
+
+
+def _chosen(visible: Bool[Array, "k n"], shown: Int[Array, " k"], plan: TrackPlan) -> tuple[Int[Array, " m"], Mask]:
+    """Choose visible points of the keyframes that show most; return their indices, and which of them are points."""
+    n = visible.shape[1]
+    _, sources = jax.lax.top_k(shown, plan.num_sources)
+    of_source = lambda source: jnp.nonzero(visible[source], size=plan.points_per_source, fill_value=n)[0]
+    chosen = jax.vmap(of_source)(sources)
+    index = (sources[:, None] * n + jnp.minimum(chosen, n - 1).astype(sources.dtype)).reshape(-1)
+    return index, (chosen < n).reshape(-1)
 
 
 def _no_matches(overlap: Scalar, keyframes: KeyframeRing) -> KeyframeMatches:

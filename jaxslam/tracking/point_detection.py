@@ -1,16 +1,18 @@
 """New points for free slots: corners where no point is, with depth that can be believed."""
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
 from jaxlie import SE3
 from jaxslam_kernels.depth.sampling import sample_depth
 from jaxslam_kernels.image.corners import corner_score, grid_corners, occupied_cells
 from jaxslam_kernels.se3 import to_world
-from jaxslam_kernels.types import Code
+from jaxslam_kernels.types import Code, Mask, Pixels, Weights
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.sensors.measurement import Measurements, PreparedFrame, depth_sigma, match_depth, measure
+from jaxslam.sensors.measurement import Measurements, depth_sigma, match_depth, measure
 from jaxslam.tracking.points import TrackedPoints
-from jaxslam.tracking.state import TrackParams, TrackPlan
+from jaxslam.tracking.step_context import StepContext
 
 _MIN_SCORE = 2.0
 """Smallest eigenvalue of a corner worth tracking, in squared intensity a squared pixel, on the second level."""
@@ -19,14 +21,29 @@ _DEPTH_STEP = 0.3
 """Largest difference of depth in the window of a point that counts as one surface, as a share of its depth."""
 
 
+class _Candidates(NamedTuple):
+    """Corners of the cells of a grid over the image, one per cell.
+
+    Attributes:
+        uv: `(2, m)` positions, pixels.
+        score: `(m,)` scores of the corners.
+        rough: `(m,)` depths at the corners, meters, 0 where missing.
+        seen: Measurements of the corners.
+        good: `(m,)` mask of the corners that may become points.
+    """
+
+    uv: Pixels
+    score: Weights
+    rough: Weights
+    seen: Measurements
+    good: Mask
+
+
 def detect_new_points(
     points: TrackedPoints,
-    next_id: Int[Array, ""],
-    view: PreparedFrame,
+    step: StepContext,
     T_world_cam: SE3,
     twist: Float[Array, "6"],
-    params: TrackParams,
-    plan: TrackPlan,
     *,
     first: Bool[Array, "h w"] | None = None,
     cell_px: int | None = None,
@@ -44,51 +61,28 @@ def detect_new_points(
 
     Args:
         points: Current points.
-        next_id: Number of the first new one.
-        view: The frame.
-        T_world_cam: Its pose.
-        twist: Velocity of the camera.
-        params: Thresholds and camera.
-        plan: Static.
-        first: Pixels whose corners come before all others; some slots are kept free for them.
-        cell_px: Side of the cells instead of that of the plan, static.
+        step: Context of the step; pixels that its frame ignores give no points.
+        T_world_cam: Pose of the frame.
+        twist: `(6,)` velocity of the camera in its own axes, m/s, then rad/s.
+        first: `(h, w)` mask of pixels whose corners come before all others; some slots are kept free for them.
+        cell_px: Side of the cells instead of that of the plan, pixels, static.
 
     Returns:
-        The points, and how many cells of the grid hold a corner, with depth or without.
+        The points, and the number of grid cells that hold a corner, with depth or without.
     """
-    border, cell, depth = view.pyramid.border, (cell_px or plan.cell_px) // 2, view.depth
-    image = view.pyramid.levels[1][border:-border, border:-border]
-    v, u = jnp.mgrid[: image.shape[0], : image.shape[1]]
-    edge = _EDGE_PX // 2
-    inside = (u >= edge) & (v >= edge) & (u < image.shape[1] - edge) & (v < image.shape[0] - edge)
-    ignore = view.frame.ignore[::2, ::2][: image.shape[0], : image.shape[1]]
-    corners = grid_corners(corner_score(image), inside & ~ignore, cell=cell)
-    taken = occupied_cells(points.uv / 2, points.valid, (image.shape[0], image.shape[1]), cell=cell)
-    uv = corners.points * 2
-
-    rough = sample_depth(depth, uv, reach=2)
-    seen = measure(uv, rough, twist, depth, view.frame.depth_delay_s, params.sensor, reach=2)
-
-    good = (corners.score > _MIN_SCORE) & ~taken & (rough > 0) & (seen.depth > 0)
-    one_surface = sample_depth(depth, uv, reach=plan.flow.finest.window // 2, max_step=_DEPTH_STEP) > 0
+    state, view, params, plan = step
+    found = _candidates(points, step, twist, (cell_px or plan.cell_px) // 2)
     rank = jnp.cumsum(~points.valid, dtype=jnp.int32) - 1
-    keys, room = (-corners.score, ~one_surface, ~good), jnp.sum(good, dtype=jnp.int32)
-    if first is not None and plan.motion is not None:
-        column, row = jnp.round(uv).astype(jnp.int32)
-        ahead = good & first.at[row, column].get(mode="fill", fill_value=False)
-        keys, num_ahead = (*keys[:2], ~ahead, keys[2]), jnp.sum(ahead, dtype=jnp.int32)
-        room = jnp.minimum(room, jnp.maximum(num_ahead, rank[-1] + 1 - plan.motion.reserved))
-    order = jnp.lexsort(keys)
+    order, room = _order(found, step, rank, first)
     candidate = order[jnp.clip(rank, 0, order.shape[0] - 1)]
     new = ~points.valid & (rank < room)
-    uv, rough, *chosen = (jnp.take(array, candidate, axis=-1) for array in (uv, rough, *seen))
+    uv, rough, *chosen = (jnp.take(array, candidate, axis=-1) for array in (found.uv, found.rough, *found.seen))
     seen = Measurements(*chosen)
     matched = match_depth(view, uv, rough, new, params.sensor, known_point=False, plan=plan.pair_flow)
     if matched is not None:
         seen, new = Measurements(seen.xy, matched, depth_sigma(matched, params.sensor)), new & (matched > 0)
     X_world = to_world(T_world_cam, seen.in_camera())
     put = lambda old, fresh: jnp.where(new, fresh, old)
-    num_corners = jnp.sum(corners.score > _MIN_SCORE, dtype=jnp.int32)
     filled = TrackedPoints(
         uv=put(points.uv, uv),
         xy=put(points.xy, seen.xy),
@@ -99,7 +93,40 @@ def detect_new_points(
         weight=jnp.where(new, 1, points.weight),
         age=jnp.where(new, 0, points.age),
         anchor_age=jnp.where(new, 0, points.anchor_age),
-        id=jnp.where(new, next_id + rank, points.id),
+        id=jnp.where(new, state.next_id + rank, points.id),
         valid=points.valid | new,
     )
-    return filled, num_corners
+    return filled, jnp.sum(found.score > _MIN_SCORE, dtype=jnp.int32)
+
+
+def _candidates(points: TrackedPoints, step: StepContext, twist: Float[Array, "6"], cell: int) -> _Candidates:
+    """Find and measure the best corner of each cell; `cell` is the side of the cells on the second level, pixels."""
+    view, sensor = step.view, step.params.sensor
+    border, depth = view.pyramid.border, view.depth
+    image = view.pyramid.levels[1][border:-border, border:-border]
+    v, u = jnp.mgrid[: image.shape[0], : image.shape[1]]
+    edge = _EDGE_PX // 2
+    inside = (u >= edge) & (v >= edge) & (u < image.shape[1] - edge) & (v < image.shape[0] - edge)
+    ignore = view.frame.ignore[::2, ::2][: image.shape[0], : image.shape[1]]
+    corners = grid_corners(corner_score(image), inside & ~ignore, cell=cell)
+    taken = occupied_cells(points.uv / 2, points.valid, (image.shape[0], image.shape[1]), cell=cell)
+    uv = corners.points * 2
+    rough = sample_depth(depth, uv, reach=2)
+    seen = measure(uv, rough, twist, depth, view.frame.depth_delay_s, sensor, reach=2)
+    good = (corners.score > _MIN_SCORE) & ~taken & (rough > 0) & (seen.depth > 0)
+    return _Candidates(uv, corners.score, rough, seen, good)
+
+
+def _order(
+    found: _Candidates, step: StepContext, rank: Int[Array, " n"], first: Bool[Array, "h w"] | None
+) -> tuple[Int[Array, " m"], Code]:
+    """Order the candidates: those in `first`, then good ones on one surface, then by score; and count those used."""
+    plan = step.plan
+    one_surface = sample_depth(step.view.depth, found.uv, reach=plan.flow.finest.window // 2, max_step=_DEPTH_STEP) > 0
+    keys, room = (-found.score, ~one_surface, ~found.good), jnp.sum(found.good, dtype=jnp.int32)
+    if first is not None and plan.motion is not None:
+        column, row = jnp.round(found.uv).astype(jnp.int32)
+        ahead = found.good & first.at[row, column].get(mode="fill", fill_value=False)
+        keys, num_ahead = (*keys[:2], ~ahead, keys[2]), jnp.sum(ahead, dtype=jnp.int32)
+        room = jnp.minimum(room, jnp.maximum(num_ahead, rank[-1] + 1 - plan.motion.reserved))
+    return jnp.lexsort(keys), room

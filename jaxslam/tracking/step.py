@@ -6,8 +6,7 @@ points agree and which keyframes are matched are choices, constant for a derivat
 it, by the implicit function theorem.
 """
 
-from functools import partial
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,11 +16,10 @@ from jaxslam_kernels.camera import without_distortion
 from jaxslam_kernels.depth.sampling import valid_depth
 from jaxslam_kernels.flow.lk_flow import lk_flow
 from jaxslam_kernels.image.pyramid import Pyramid, build_pyramid
-from jaxslam_kernels.pose.pose_refine import PoseRefinement
 from jaxslam_kernels.robust import weighted_median
 from jaxslam_kernels.se3 import retract, to_camera
-from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Scalar, Weights
-from jaxtyping import Array, Float, Int
+from jaxslam_kernels.types import Mask, Pixels, Weights
+from jaxtyping import Array, Int
 
 from jaxslam.dynamics.object_motion import labels_at
 from jaxslam.dynamics.regions import Regions, balance_regions, find_regions
@@ -34,29 +32,19 @@ from jaxslam.sensors.measurement import (
     point_rays,
     predict_pixels,
 )
-from jaxslam.tracking.dynamic_rejection import DynamicRejection, FramePoints, reject_dynamic_points
+from jaxslam.tracking.conclusion import FrameEstimate, conclude
+from jaxslam.tracking.dynamic_rejection import FramePoints, reject_dynamic_points
 from jaxslam.tracking.initial_state import DEFAULT_PLAN, state_shapes
-from jaxslam.tracking.keyframe_decision import KeyframeCandidate, keyframe_reason
-from jaxslam.tracking.keyframe_ring import align_keyframe_points, with_keyframe
-from jaxslam.tracking.outcome import Outcome, code, judge_frame
-from jaxslam.tracking.point_detection import detect_new_points
-from jaxslam.tracking.point_update import KeptPoints, probation_weights, update_points
-from jaxslam.tracking.points import KeyframeMatches, TrackedPoints
+from jaxslam.tracking.keyframe_ring import align_keyframe_points
+from jaxslam.tracking.outcome import judge_frame
+from jaxslam.tracking.point_update import probation_weights, update_points
 from jaxslam.tracking.pose_estimation import coarse_pose, fits, match_rays, refined_pose, worse_status
-from jaxslam.tracking.state import TrackOutput, TrackParams, TrackPhase, TrackPlan, TrackReason, TrackState, TrackStatus
+from jaxslam.tracking.state import TrackOutput, TrackParams, TrackPlan, TrackState
 from jaxslam.tracking.step_checks import check_cues, check_followed, check_state, check_step
 from jaxslam.tracking.step_context import StepContext
 
 _MAX_PREDICTION_S = 0.1
 """A constant velocity says nothing about longer gaps."""
-_UNKNOWN_VARIANCE, _NO_VARIANCE = 1e2, 1e-12
-"""m^2 and rad^2. The pose at which a map or submap begins is its origin by definition; not 0, which some programs take
-for unknown and which has no inverse."""
-_MONITOR_EVERY = 3
-"""Number of frames from one search for points on movable objects that have too few to the next."""
-
-
-T = TypeVar("T")
 
 
 class FlowResult(NamedTuple):
@@ -73,60 +61,6 @@ class FlowResult(NamedTuple):
     predicted: SE3
     uv: Pixels
     ok: Mask
-
-
-class _Estimate(NamedTuple):
-    """What a step has found out about its frame.
-
-    Attributes:
-        refined: Refinement of the pose.
-        matches: Keyframe points aligned with the frame.
-        kept: Tracked points, updated.
-        outcome: Whether the frame was tracked.
-        rejection: Combined result of the dynamic cues.
-    """
-
-    refined: PoseRefinement
-    matches: KeyframeMatches
-    kept: KeptPoints
-    outcome: Outcome
-    rejection: DynamicRejection
-
-
-class _Motion(NamedTuple):
-    """Where the camera is after a frame.
-
-    Attributes:
-        T_world_cam: Pose of the frame; the last one while tracking is lost.
-        twist: `(6,)` velocity of the camera; 0 while tracking is lost.
-        start: Whether tracking is to start in the frame, at the pose.
-        lost_frames: Number of frames since tracking was lost, this one included.
-    """
-
-    T_world_cam: SE3
-    twist: Float[Array, "6"]
-    start: Flag
-    lost_frames: Code
-
-
-class _Ending(NamedTuple):
-    """The points after a frame, and what was decided about it.
-
-    Attributes:
-        points: Points of the new state.
-        at_rest: `(n,)` mask of the points outside moving regions and objects.
-        started: Whether tracking started in the frame.
-        reason: A `TrackReason`.
-        keyframe: A `KeyframeReason`.
-        since_keyframe_s: Time since the last keyframe before this frame, seconds.
-    """
-
-    points: TrackedPoints
-    at_rest: Mask
-    started: Flag
-    reason: Code
-    keyframe: Code
-    since_keyframe_s: Scalar
 
 
 def track_step(
@@ -214,9 +148,7 @@ def track_followed(
     _check_followed(state, frame, followed_points, params, plan)
     pyramid, predicted, uv, found = followed_points
     # 1. Prepare the frame: depth that can be believed, and the right image of a stereo pair.
-    depth = valid_depth(frame.depth, params.sensor.min_depth_m, params.sensor.max_depth_m)
-    view = PreparedFrame(frame, pyramid, depth, state.elapsed_s + frame.dt_s).with_right()
-    step, X_world = StepContext(state, view, params, plan), state.points.X_world
+    step, X_world = _prepared(state, frame, pyramid, params, plan), state.points.X_world
     # 2. Rays of the tracked points: distortion, depth and noise are the same for every pose below.
     rays = _tracked_rays(step, uv, found, predicted)
     # 3. Background points: those outside the mask and on no movable object.
@@ -240,7 +172,8 @@ def track_followed(
     trust = rejection.weights(trust)
     agreeing &= trust > 0
     # 6. Keyframe points, aligned with the frame by their patches around where the coarse pose predicts them.
-    matches = align_keyframe_points(step._replace(view=rejection.without_moving_pixels(view)), coarse, twist)
+    static_view = rejection.without_moving_pixels(step.view)
+    matches = align_keyframe_points(step._replace(view=static_view), coarse, twist)
     # 7. Refinement of the pose by tracked points and keyframe points together.
     counting, rays_of_matches = jnp.where(agreeing, trust, 0), match_rays(step, matches, coarse, twist)
     refined, inliers = refined_pose(step, seen, counting, matches, rays_of_matches, coarse, twist)
@@ -250,10 +183,7 @@ def track_followed(
     pose = refined.T_world_cam
     seen = step.measured(rays, X_world, pose, step.twist_to(pose))
     kept = update_points(step, uv, seen, inliers, monitored, pose)
-    estimate = _Estimate(refined, matches, kept, outcome, rejection)
-    motion = _motion(step, estimate)
-    ending = _ending(step, estimate, motion)
-    new_state, output = _new_state(step, estimate, motion, ending), _output(step, estimate, motion, ending)
+    new_state, output = conclude(step, FrameEstimate(refined, matches, kept, outcome, rejection))
     if plan.pose_steps > DEFAULT_PLAN.pose_steps:
         # Not always: one more use of the coarse pose's status has XLA round the pose itself in another way.
         output = output._replace(pose_status=worse_status(coarse_status, refined.status))
@@ -277,6 +207,15 @@ def _check_followed(
     check_cues(state, frame, params, plan)
     points = expected.points
     check_followed(followed_points, FlowResult(expected.pyramid, expected.T_world_cam, points.uv, points.valid))
+
+
+def _prepared(
+    state: TrackState, frame: FrameArrays, pyramid: Pyramid, params: TrackParams, plan: TrackPlan
+) -> StepContext:
+    """Prepare the frame: depth that can be believed, and the right image of a stereo pair."""
+    depth = valid_depth(frame.depth, params.sensor.min_depth_m, params.sensor.max_depth_m)
+    view = PreparedFrame(frame, pyramid, depth, state.elapsed_s + frame.dt_s)
+    return StepContext(state, view.with_right(), params, plan)
 
 
 def _tracked_rays(step: StepContext, uv: Pixels, found: Mask, predicted: SE3) -> PixelRays:
@@ -341,139 +280,3 @@ def _votes(step: StepContext, trust: Weights, background: Mask, regions: Regions
     """Return the `(n,)` weights of the points in RANSAC."""
     votes = jnp.where(background, trust, 0)
     return votes if regions is None or not step.plan.balance_regions else balance_regions(votes, regions)
-
-
-def _motion(step: StepContext, estimate: _Estimate) -> _Motion:
-    """Move the camera to the refined pose, or hold it where it was; decide whether a lost tracker starts anew there."""
-    state, lost = step.state, estimate.outcome.lost
-    lost_frames = jnp.where(lost, state.lost_frames + 1, 0)
-    waited = lost_frames.astype(state.twist.dtype) > step.params.restart_after
-    start = lost & ((state.phase == TrackPhase.START) | waited)
-    pose = _choose(lost, state.T_world_cam, estimate.refined.T_world_cam)
-    twist = jnp.where(lost, 0, step.twist_to(estimate.refined.T_world_cam))
-    return _Motion(pose, twist, start, lost_frames)
-
-
-def _ending(step: StepContext, estimate: _Estimate, motion: _Motion) -> _Ending:
-    """Detect new points if there are few, and decide whether tracking has started and whether to make a keyframe."""
-    state, _, params, plan = step
-    kept, outcome = estimate.kept, estimate.outcome
-    candidate = KeyframeCandidate(
-        T_world_cam=estimate.refined.T_world_cam,
-        points=kept.points,
-        tracked=kept.tracked,
-        overlap=estimate.matches.overlap,
-        lost=outcome.lost,
-        weak=outcome.weak,
-        started=motion.start,
-        since_keyframe_s=state.since_keyframe_s + jnp.maximum(step.view.frame.dt_s, 0),
-        movable=_movable_share(step),
-    )
-    points, num_corners = _with_new_points(step, estimate, motion, candidate)
-    failed = motion.start & (jnp.sum(points.valid, dtype=state.twist.dtype) < params.min_inliers)
-    started = motion.start & ~failed
-    few_corners = num_corners.astype(state.twist.dtype) < params.min_inliers
-    cannot_start = jnp.where(few_corners, code(TrackReason.NO_CORNERS), code(TrackReason.NO_DEPTH))
-    reason = jnp.select([failed, started], [cannot_start, code(TrackReason.NONE)], outcome.reason)
-    keyframe = keyframe_reason(state, candidate._replace(started=started), params, plan)
-    at_rest = estimate.rejection.at_rest(points.uv)
-    return _Ending(points, at_rest, started, reason, keyframe, candidate.since_keyframe_s)
-
-
-def _movable_share(step: StepContext) -> Scalar:
-    """Return the share of the image that movable objects cover."""
-    movable, dtype = step.view.frame.movable, step.state.twist.dtype
-    return jnp.zeros((), dtype) if movable is None else jnp.mean(movable > 0, dtype=dtype)
-
-
-def _with_new_points(
-    step: StepContext, estimate: _Estimate, motion: _Motion, candidate: KeyframeCandidate
-) -> tuple[TrackedPoints, Code]:
-    """Detect new points for free slots, if there are few points or tracking is to start.
-
-    Returns:
-        The points, and the number of grid cells that hold a corner; 0 if none were sought.
-    """
-    state, view, params, plan = step
-    lost, kept, rejection = estimate.outcome.lost, estimate.kept, estimate.rejection
-    held = state.points._replace(valid=state.points.valid & ~motion.start)
-    points = _choose(lost, held, kept.points)
-    wanted = jnp.sum(points.valid, dtype=state.twist.dtype) < params.detect_below * plan.num_points
-    if plan.new_points == "keyframes":
-        wanted &= keyframe_reason(state, candidate, params, plan) > 0
-    unmonitored = rejection.unmonitored(view, kept.monitored)
-    if unmonitored is not None:
-        wanted |= jnp.any(unmonitored) & (state.frame % _MONITOR_EVERY == 0)
-    free = rejection.without_monitored(view, kept.monitored, plan)
-    detect = partial(detect_new_points, first=unmonitored, next_id=state.next_id, view=free)
-    detect = partial(detect, T_world_cam=motion.T_world_cam, twist=motion.twist, params=params, plan=plan)
-    branch = (motion.start | (wanted & ~lost)).astype(jnp.int32)
-    branches = [lambda points: (points, jnp.zeros((), jnp.int32)), detect]
-    if plan.motion is not None:  # more features from the rest, as in USD-SLAM
-        branches.append(partial(detect, cell_px=plan.motion.dense_cell_px))
-        branch = branch * jnp.where(candidate.movable > 0.5, 2, 1)
-    return lax.switch(branch, branches, points)
-
-
-def _new_state(step: StepContext, estimate: _Estimate, motion: _Motion, ending: _Ending) -> TrackState:
-    """Make the state after the frame, with the frame in the ring of keyframes if it is one."""
-    state, view, params, plan = step
-    lost, points, moved = estimate.outcome.lost, ending.points, estimate.rejection.motion
-    held, make = lost & ~ending.started, ending.keyframe > 0
-    trust = jnp.where(ending.at_rest, probation_weights(points, params), 0)
-    image, pose = view.frame.image, motion.T_world_cam
-    still_to_start = held & (state.phase == TrackPhase.START)
-    return TrackState(
-        pyramid=_choose(held, state.pyramid, view.pyramid),
-        points=points,
-        keyframes=with_keyframe(state.keyframes, make, image, pose, points, trust, plan),
-        T_world_cam=pose,
-        twist=motion.twist,
-        elapsed_s=jnp.where(held, jnp.maximum(view.elapsed_s, 0), 0),
-        since_keyframe_s=jnp.where(make, 0, ending.since_keyframe_s),
-        since_keyframe=jnp.where(make, 0, state.since_keyframe + (~lost).astype(jnp.int32)),
-        phase=jnp.select([still_to_start, held], [state.phase, code(TrackPhase.LOST)], code(TrackPhase.TRACK)),
-        lost_frames=jnp.where(ending.started, 0, motion.lost_frames),
-        frame=state.frame + 1,
-        next_id=jnp.maximum(state.next_id, jnp.max(jnp.where(points.valid, points.id + 1, 0))),
-        key=state.key,
-        regions=estimate.rejection.memory or state.regions,
-        motion=state.motion if moved is None else _choose(lost, state.motion, moved.memory),
-    )
-
-
-def _output(step: StepContext, estimate: _Estimate, motion: _Motion, ending: _Ending) -> TrackOutput:
-    """Make the output for the frame."""
-    refined, matches, kept, outcome, rejection = estimate
-    lost, points, dtype = outcome.lost, ending.points, motion.twist.dtype
-    statuses = (TrackStatus.STARTED, TrackStatus.LOST, TrackStatus.WEAK)
-    matches = matches._replace(weight=jnp.where(lost, 0, matches.weight))
-    variance = jnp.where(ending.started, _NO_VARIANCE, _UNKNOWN_VARIANCE)
-    return TrackOutput(
-        T_world_cam=motion.T_world_cam,
-        covariance=jnp.where(lost, jnp.eye(6, dtype=dtype) * variance, refined.covariance),
-        status=jnp.select([ending.started, lost, outcome.weak], [*map(code, statuses)], code(TrackStatus.OK)),
-        reason=ending.reason,
-        num_inliers=jnp.where(lost, 0, jnp.sum(kept.tracked)),
-        inlier_ratio=jnp.where(lost, 0, outcome.inlier_ratio),
-        num_keyframe_matches=jnp.sum(matches.weight > 0),
-        residual_px=refined.residual_scale * step.params.pixel_sigma,
-        uv=points.uv,
-        weights=jnp.where(points.valid & ending.at_rest & (~lost | motion.start), points.weight, 0),
-        tracked=kept.tracked & ~lost,
-        X_world=points.X_world,
-        id=points.id,
-        keyframe_matches=matches,
-        twist=motion.twist,
-        keyframe=ending.keyframe,
-        pose_status=refined.status,
-        cue_results=rejection.cue_results,
-        regions=rejection.regions,
-        moving=rejection.moving,
-        motion=rejection.motion,
-    )
-
-
-def _choose(condition: Flag, if_true: T, if_false: T) -> T:
-    """Choose one of two pytrees."""
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), if_true, if_false)
