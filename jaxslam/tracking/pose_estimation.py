@@ -10,7 +10,7 @@ from jaxslam_kernels.se3 import to_camera
 from jaxslam_kernels.types import Code, Mask, Pixels, Points, Weights
 from jaxtyping import Array, Float
 
-from jaxslam.sensors.measurement import Measurements, PixelRays, match_depth, point_rays
+from jaxslam.sensors.measurement import Measurements, PixelRays, match_depth, pixel_rays
 from jaxslam.tracking.points import KeyframeMatches
 from jaxslam.tracking.state import TrackParams
 from jaxslam.tracking.step_context import StepContext
@@ -120,12 +120,12 @@ def _close(T_world_cam: SE3, X_world: Points, xy: Pixels, params: TrackParams) -
     return front & (jnp.sum(jnp.square(error), axis=0) < jnp.square(params.outlier_px))
 
 
-def match_rays(step: StepContext, matches: KeyframeMatches, coarse: SE3, twist: Float[Array, "6"]) -> PixelRays:
+def match_rays(step: StepContext, matches: KeyframeMatches, coarse: SE3) -> PixelRays:
     """Make the rays of keyframe points matched with the frame, with their depths of a stereo pair if it is one."""
     view, sensor = step.view, step.params.sensor
     expected = to_camera(coarse, matches.X_world)[2]
     depth = match_depth(view, matches.uv, expected, matches.weight > 0, sensor, plan=step.plan.pair_flow)
-    return point_rays(matches.X_world, matches.uv, coarse, twist, view, sensor, depth)
+    return pixel_rays(matches.uv, sensor, depth)
 
 
 def fits(step: StepContext, seen: Measurements, pose: SE3) -> Mask:

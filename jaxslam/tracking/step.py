@@ -29,7 +29,7 @@ from jaxslam.sensors.measurement import (
     PixelRays,
     PreparedFrame,
     match_depth,
-    point_rays,
+    pixel_rays,
     predict_pixels,
 )
 from jaxslam.tracking.conclusion import FrameEstimate, conclude
@@ -149,7 +149,7 @@ def track_followed(
     pyramid, predicted, uv, found = followed_points
     # 1. Prepare the frame: depth that can be believed, and the right image of a stereo pair.
     step, X_world = _prepared(state, frame, pyramid, params, plan), state.points.X_world
-    # 2. Rays of the tracked points: distortion, depth and noise are the same for every pose below.
+    # 2. Rays of the tracked points, without distortion: the same for every pose below.
     rays = _tracked_rays(step, uv, found, predicted)
     # 3. Background points: those outside the mask and on no movable object.
     masked, objects = _masked(frame, uv), _object_ids(step, uv)
@@ -175,7 +175,7 @@ def track_followed(
     static_view = rejection.without_moving_pixels(step.view)
     matches = align_keyframe_points(step._replace(view=static_view), coarse, twist)
     # 7. Refinement of the pose by tracked points and keyframe points together.
-    counting, rays_of_matches = jnp.where(agreeing, trust, 0), match_rays(step, matches, coarse, twist)
+    counting, rays_of_matches = jnp.where(agreeing, trust, 0), match_rays(step, matches, coarse)
     refined, inliers = refined_pose(step, seen, counting, matches, rays_of_matches, coarse, twist)
     outcome = judge_frame(step, refined, background & rejection.counts(), inliers)
     # 8. Points at the refined pose; new ones, and a keyframe, if they are needed.
@@ -223,7 +223,7 @@ def _tracked_rays(step: StepContext, uv: Pixels, found: Mask, predicted: SE3) ->
     state, view, sensor = step.state, step.view, step.params.sensor
     X_world = state.points.X_world
     matched = match_depth(view, uv, to_camera(predicted, X_world)[2], found, sensor, plan=step.plan.pair_flow)
-    return point_rays(X_world, uv, predicted, state.twist, view, sensor, matched)
+    return pixel_rays(uv, sensor, matched)
 
 
 def _masked(frame: FrameArrays, uv: Pixels) -> Mask:

@@ -45,4 +45,4 @@ class StepContext(NamedTuple):
             pose: Approximate pose of the camera.
             twist: `(6,)` velocity of the camera in its own axes, m/s, then rad/s.
         """
-        return rays.from_pose(X_world, pose, twist, self.view.height, self.params.sensor)
+        return rays.from_pose(X_world, pose, twist, self.view, self.params.sensor)

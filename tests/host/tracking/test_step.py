@@ -27,7 +27,7 @@ from jaxslam.config.schema import Config, SemanticsConfig
 from jaxslam.semantics import Detections, no_detections
 from jaxslam.sensors import measurement
 from jaxslam.sensors.frame_arrays import FrameArrays
-from jaxslam.sensors.measurement import PreparedFrame, point_rays
+from jaxslam.sensors.measurement import PreparedFrame, pixel_rays
 from jaxslam.slam.frame_result import FrameResult
 from jaxslam.slam.slam import Slam
 from jaxslam.tracking import pose_estimation as frame_pose
@@ -249,9 +249,9 @@ class TestPoseStatus:
             )
             away, trust = retract(state.T_world_cam, jnp.full(6, 0.02)), state.points.valid.astype(jnp.float32)
             X_world, twist = state.points.X_world, state.twist
-            rays = point_rays(X_world, state.points.uv, away, twist, view, given.sensor)
+            rays = pixel_rays(state.points.uv, given.sensor)
             steps = [StepContext(state, view, given, PLAN._replace(pose_steps=steps)) for steps in (2, 25)]
-            rays_of_none = match_rays(steps[0], none, away, twist)
+            rays_of_none = match_rays(steps[0], none, away)
             seen = steps[0].measured(rays, X_world, away, twist)
             return [refined_pose(step, seen, trust, none, rays_of_none, away, twist)[0].status for step in steps]
 
