@@ -133,7 +133,7 @@ class BackEnd:
 
     @property
     def keyframe_demand(self) -> KeyframeDemand:
-        """How much the maps want the next frame to be a keyframe."""
+        """Demand of the maps for the next frame as a keyframe."""
         # Keyframes wait that mapping has not begun with; never on the schedule of a deterministic run.
         if not self._config.run.in_turn and self._link.num_on_the_way > _MAX_ON_THE_WAY:
             return KeyframeDemand.FEWER

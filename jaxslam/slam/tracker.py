@@ -35,10 +35,10 @@ def _track_followed(
 
 
 class KeyframeDemand(Enum):
-    """How much the maps want a frame to be a keyframe."""
+    """Demand of the maps for a frame as a keyframe."""
 
     NORMAL = "normal"
-    """As the settings say."""
+    """A keyframe is made for the reasons in the settings."""
     FEWER = "fewer"
     """Less than that, since mapping is behind."""
     NOW = "now"

@@ -14,11 +14,11 @@ from jaxtyping import Array, Float
 from jaxslam.tracking.dynamic_rejection import DynamicRejection
 from jaxslam.tracking.keyframe_decision import KeyframeCandidate, keyframe_reason
 from jaxslam.tracking.keyframe_ring import with_keyframe
-from jaxslam.tracking.outcome import Outcome, code
+from jaxslam.tracking.outcome import Outcome
 from jaxslam.tracking.point_detection import detect_new_points
 from jaxslam.tracking.point_update import KeptPoints, probation_weights
 from jaxslam.tracking.points import KeyframeMatches, TrackedPoints
-from jaxslam.tracking.state import TrackOutput, TrackPhase, TrackReason, TrackState, TrackStatus
+from jaxslam.tracking.state import TrackOutput, TrackPhase, TrackReason, TrackState, TrackStatus, code
 from jaxslam.tracking.step_context import StepContext
 
 _UNKNOWN_VARIANCE, _NO_VARIANCE = 1e2, 1e-12

@@ -14,7 +14,7 @@ from jaxslam.dynamics.regions import no_regions
 from jaxslam.runtime.floating_dtype import floating_dtype
 from jaxslam.tracking.keyframe_ring import empty_keyframes
 from jaxslam.tracking.points import empty_points
-from jaxslam.tracking.state import TrackPhase, TrackPlan, TrackState
+from jaxslam.tracking.state import TrackPhase, TrackPlan, TrackState, code
 from jaxslam.tracking.step_checks import check_plan, check_pose
 
 DEFAULT_PLAN = TrackPlan()
@@ -62,7 +62,7 @@ def init_state(
         elapsed_s=jnp.zeros((), dtype),
         since_keyframe_s=jnp.zeros((), dtype),
         since_keyframe=none,
-        phase=jnp.full((), TrackPhase.START, jnp.int32),
+        phase=code(TrackPhase.START),
         lost_frames=none,
         frame=none,
         next_id=none,

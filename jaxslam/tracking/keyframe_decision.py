@@ -10,7 +10,7 @@ from jaxslam_kernels.se3 import to_camera
 from jaxslam_kernels.types import Code, Flag, Mask, Scalar
 
 from jaxslam.tracking.points import KeyframeRing, TrackedPoints
-from jaxslam.tracking.state import KeyframeReason, TrackParams, TrackPlan, TrackState
+from jaxslam.tracking.state import KeyframeReason, TrackParams, TrackPlan, TrackState, code
 
 _MIN_OVERLAP = 0.25
 """Smallest share of the minimum interval between keyframes that is waited when nothing overlaps the last keyframe."""
@@ -66,8 +66,8 @@ def keyframe_reason(state: TrackState, frame: KeyframeCandidate, params: TrackPa
     )
     urgent = (KeyframeReason.FEW_POINTS, KeyframeReason.WEAK)
     conditions = [condition if reason in urgent else condition & may for condition, reason in causes]
-    codes = [jnp.full((), reason, jnp.int32) for reason in (KeyframeReason.STARTED, *(reason for _, reason in causes))]
-    return jnp.select([frame.started, *conditions], codes, jnp.full((), KeyframeReason.NONE, jnp.int32))
+    codes = [code(reason) for reason in (KeyframeReason.STARTED, *(reason for _, reason in causes))]
+    return jnp.select([frame.started, *conditions], codes, code(KeyframeReason.NONE))
 
 
 def _adds_information(keyframes: KeyframeRing, frame: KeyframeCandidate, params: TrackParams, plan: TrackPlan) -> Flag:

@@ -1,13 +1,12 @@
 """Whether a frame was tracked, and why not."""
 
-import enum
 from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxslam_kernels.pose.pose_refine import PoseRefinement
 from jaxslam_kernels.types import Code, Flag, Mask, Scalar
 
-from jaxslam.tracking.state import TrackReason
+from jaxslam.tracking.state import TrackReason, code
 from jaxslam.tracking.step_context import StepContext
 
 
@@ -54,8 +53,3 @@ def judge_frame(step: StepContext, refined: PoseRefinement, tracked: Mask, inlie
     mild = jnp.where(weak, code(TrackReason.FEW_INLIERS), code(TrackReason.NONE))
     codes = [code(reason) for _, reason in causes]
     return Outcome(lost, weak & ~lost, jnp.select(conditions, codes, mild), ratio)
-
-
-def code(value: enum.IntEnum) -> Code:
-    """Return a member of an enumeration as an array."""
-    return jnp.full((), value, jnp.int32)

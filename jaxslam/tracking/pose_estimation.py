@@ -10,7 +10,7 @@ from jaxslam_kernels.se3 import to_camera
 from jaxslam_kernels.types import Code, Mask, Pixels, Points, Weights
 from jaxtyping import Array, Float
 
-from jaxslam.sensors.measurement import Measurements, PixelRays, match_depth, pixel_rays
+from jaxslam.sensors.measurement import Measurements, match_depth, pixel_rays
 from jaxslam.tracking.points import KeyframeMatches
 from jaxslam.tracking.state import TrackParams
 from jaxslam.tracking.step_context import StepContext
@@ -66,9 +66,8 @@ def refined_pose(
     seen: Measurements,
     trust: Weights,
     matches: KeyframeMatches,
-    rays: PixelRays,
+    matches_seen: Measurements,
     coarse: SE3,
-    twist: Float[Array, "6"],
 ) -> tuple[PoseRefinement, Mask]:
     """Refine the coarse pose from tracked points and keyframe matches together.
 
@@ -77,16 +76,15 @@ def refined_pose(
         seen: Measurements of the points of the state at the coarse pose.
         trust: `(n,)` weights of the points; 0 for a point that is not used.
         matches: Keyframe points matched with the frame.
-        rays: Rays of these matches in the frame.
+        matches_seen: Measurements of these matches at the coarse pose.
         coarse: Coarse pose.
-        twist: `(6,)` velocity of the camera at the coarse pose, m/s, then rad/s.
 
     Returns:
         The refinement, and the `(n,)` mask of the tracked points that agree with it.
     """
     params = step.params
     X_world = jnp.concatenate([step.state.points.X_world, matches.X_world], axis=1)
-    seen = seen.followed_by(step.measured(rays, matches.X_world, coarse, twist))
+    seen = seen.followed_by(matches_seen)
     weights = jnp.concatenate([trust, matches.weight])
     refined = refine_pose(
         coarse,
@@ -120,12 +118,19 @@ def _close(T_world_cam: SE3, X_world: Points, xy: Pixels, params: TrackParams) -
     return front & (jnp.sum(jnp.square(error), axis=0) < jnp.square(params.outlier_px))
 
 
-def match_rays(step: StepContext, matches: KeyframeMatches, coarse: SE3) -> PixelRays:
-    """Make the rays of keyframe points matched with the frame, with their depths of a stereo pair if it is one."""
+def measure_matches(step: StepContext, matches: KeyframeMatches, coarse: SE3, twist: Float[Array, "6"]) -> Measurements:
+    """Measure the keyframe points matched with the frame, with their depths of a stereo pair if it is one.
+
+    Args:
+        step: Context of the step.
+        matches: Keyframe points matched with the frame.
+        coarse: Coarse pose.
+        twist: `(6,)` velocity of the camera at the coarse pose, m/s, then rad/s.
+    """
     view, sensor = step.view, step.params.sensor
     expected = to_camera(coarse, matches.X_world)[2]
     depth = match_depth(view, matches.uv, expected, matches.weight > 0, sensor, plan=step.plan.pair_flow)
-    return pixel_rays(matches.uv, sensor, depth)
+    return step.measured(pixel_rays(matches.uv, sensor, depth), matches.X_world, coarse, twist)
 
 
 def fits(step: StepContext, seen: Measurements, pose: SE3) -> Mask:

@@ -4,6 +4,7 @@ import enum
 from typing import Any, Literal, NamedTuple
 
 import jax
+import jax.numpy as jnp
 from jaxlie import SE3
 from jaxslam_kernels.flow.disparity import ROW_PLAN
 from jaxslam_kernels.flow.lk_flow import FlowPlan, LevelPlan
@@ -102,6 +103,11 @@ _REASON_TEXT = {
     TrackReason.MASKED: "nearly all of the image is masked",
     TrackReason.UNCONFIRMED: "the background, which has no depth, does not move as the pose says",
 }
+
+
+def code(value: enum.IntEnum) -> Code:
+    """Return a member of an enumeration as an array."""
+    return jnp.full((), value, jnp.int32)
 
 
 _SETTINGS = TrackConfig()  # defaults are defined there only

@@ -38,7 +38,7 @@ from jaxslam.tracking.initial_state import DEFAULT_PLAN, state_shapes
 from jaxslam.tracking.keyframe_ring import align_keyframe_points
 from jaxslam.tracking.outcome import judge_frame
 from jaxslam.tracking.point_update import probation_weights, update_points
-from jaxslam.tracking.pose_estimation import coarse_pose, fits, match_rays, refined_pose, worse_status
+from jaxslam.tracking.pose_estimation import coarse_pose, fits, measure_matches, refined_pose, worse_status
 from jaxslam.tracking.state import TrackOutput, TrackParams, TrackPlan, TrackState
 from jaxslam.tracking.step_checks import check_cues, check_followed, check_state, check_step
 from jaxslam.tracking.step_context import StepContext
@@ -175,8 +175,8 @@ def track_followed(
     static_view = rejection.without_moving_pixels(step.view)
     matches = align_keyframe_points(step._replace(view=static_view), coarse, twist)
     # 7. Refinement of the pose by tracked points and keyframe points together.
-    counting, rays_of_matches = jnp.where(agreeing, trust, 0), match_rays(step, matches, coarse)
-    refined, inliers = refined_pose(step, seen, counting, matches, rays_of_matches, coarse, twist)
+    counting, matches_seen = jnp.where(agreeing, trust, 0), measure_matches(step, matches, coarse, twist)
+    refined, inliers = refined_pose(step, seen, counting, matches, matches_seen, coarse)
     outcome = judge_frame(step, refined, background & rejection.counts(), inliers)
     # 8. Points at the refined pose; new ones, and a keyframe, if they are needed.
     monitored = rejection.monitor_points(uv, state.points.anchor_age, background & ~inliers)

@@ -32,7 +32,7 @@ from jaxslam.slam.frame_result import FrameResult
 from jaxslam.slam.slam import Slam
 from jaxslam.tracking import pose_estimation as frame_pose
 from jaxslam.tracking.initial_state import init_state
-from jaxslam.tracking.pose_estimation import match_rays, refined_pose, worse_status
+from jaxslam.tracking.pose_estimation import measure_matches, refined_pose, worse_status
 from jaxslam.tracking.state import (
     KeyframeMatches,
     KeyframeReason,
@@ -251,9 +251,9 @@ class TestPoseStatus:
             X_world, twist = state.points.X_world, state.twist
             rays = pixel_rays(state.points.uv, given.sensor)
             steps = [StepContext(state, view, given, PLAN._replace(pose_steps=steps)) for steps in (2, 25)]
-            rays_of_none = match_rays(steps[0], none, away)
+            none_seen = measure_matches(steps[0], none, away, twist)
             seen = steps[0].measured(rays, X_world, away, twist)
-            return [refined_pose(step, seen, trust, none, rays_of_none, away, twist)[0].status for step in steps]
+            return [refined_pose(step, seen, trust, none, none_seen, away)[0].status for step in steps]
 
         found = [int(code) for code in status(state, at(frames, 0), params())]
         assert found == [PoseStatus.NOT_CONVERGED, PoseStatus.OK]
