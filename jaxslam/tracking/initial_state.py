@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 from jaxlie import SE3
+from jaxslam_kernels.counter_random import COUNTER_RANDOM
 from jaxslam_kernels.image.pyramid import build_pyramid
 from jaxtyping import Array, Int
 
@@ -66,7 +67,7 @@ def init_state(
         lost_frames=none,
         frame=none,
         next_id=none,
-        key=jax.random.key_data(jax.random.key(seed)),
+        key=jax.random.key_data(jax.random.key(seed, impl=COUNTER_RANDOM)),
         regions=no_regions(plan.regions, dtype),
         motion=no_motion(plan.motion, plan.num_points, dtype),
     )

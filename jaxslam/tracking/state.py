@@ -6,6 +6,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 from jaxlie import SE3
+from jaxslam_kernels.counter_random import COUNTER_RANDOM
 from jaxslam_kernels.flow.disparity import ROW_PLAN
 from jaxslam_kernels.flow.lk_flow import FlowPlan, LevelPlan
 from jaxslam_kernels.image.pyramid import Pyramid
@@ -294,7 +295,7 @@ class TrackState(NamedTuple):
 
     def random_key(self) -> Key[Array, ""]:
         """Return the typed random key with the data in `key`; JAX's typed keys cannot be saved as arrays."""
-        return jax.random.wrap_key_data(self.key)
+        return jax.random.wrap_key_data(self.key, impl=COUNTER_RANDOM)
 
 
 class TrackOutput(NamedTuple):
