@@ -31,7 +31,7 @@ INSIDE = {  # parts of kernels: called by kernels only, with what those have che
     *("bundle.lens", "bundle.schur", "bundle.zero_weight_points", "checks", "first_order", "flow.lk_row_search"),
     *("flow.lk_search", "image.patches", "implicit_positions", "levenberg_marquardt", "pose.pose_cost"),
     *("pose_graph.block_tridiagonal_cg", "pose_graph.cost", "pose_graph.sparse_solve", "two_view.fundamental_refine"),
-    *("positive_definite", "two_view.homography"),
+    *("positive_definite", "program_parts", "two_view.homography"),
 }
 NOT_CHECKED = {  # parts of kernels beside public ones, and functions of the host
     *("bundle_problem", "free_cameras", "clean_weights", "bundle_views", "bundle_cost", "normal_equations"),

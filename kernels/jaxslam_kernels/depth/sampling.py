@@ -1,15 +1,17 @@
 """Reading depth at points, without being fooled by edges and holes."""
 
-import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxslam_kernels.checks import checked
+from jaxslam_kernels.program_parts import apart
 from jaxslam_kernels.types import DepthImage, Pixels, Scalar, Weights
 
 _NOISE_M = 0.02
 """A difference that noise alone makes, at any depth."""
+_OUTSIDE_PX = 2**20
+"""Farther from the first pixel than the sides of any image."""
 
 
 @checked
@@ -33,15 +35,17 @@ def sample_depth(depth: DepthImage, uv: Pixels, *, reach: int = 1, max_step: flo
         reach: The surroundings are `2 * reach + 1` pixels a side, and all must have depth; static.
         max_step: Largest difference of depth in them, as a share of the depth in the middle; 2 cm are always allowed.
     """
-    height, width = depth.shape
     side = 2 * reach + 1
-    center = jnp.round(lax.stop_gradient(uv))
-    u, v = center
-    inside = (u >= reach) & (v >= reach) & (u < width - reach) & (v < height - reach)
-    column, row = jnp.where(inside[None, :], center, reach).astype(jnp.int32) - reach
-    cut = jax.vmap(lambda row, column: lax.dynamic_slice(depth, (row, column), (side, side)))(row, column)
-    around = cut.reshape(-1, side * side)
+    # Far outside where it is not a number, and never so far that the conversion to integers overflows.
+    center = lax.stop_gradient(jnp.where(jnp.abs(uv) < _OUTSIDE_PX, jnp.round(uv), -_OUTSIDE_PX)).astype(jnp.int32)
+    around = apart(lambda: _windows(depth, center[::-1].T - reach, side)).reshape(-1, side * side)
     low, high = jnp.min(around, axis=1), jnp.max(around, axis=1)
     middle = around[:, side * side // 2]
     smooth = (low > 0) & jnp.isfinite(high) & (high - low <= max_step * middle + _NOISE_M)
-    return jnp.where(inside & smooth, middle, 0)
+    return jnp.where(smooth, middle, 0)
+
+
+def _windows(depth: DepthImage, corner: Int[Array, "n 2"], side: int) -> Float[Array, "n s s"]:
+    """Square windows from their top-left corners, row and column; 0 where one leaves the image."""
+    numbers = lax.GatherDimensionNumbers(offset_dims=(1, 2), collapsed_slice_dims=(), start_index_map=(0, 1))
+    return lax.gather(depth, corner, numbers, (side, side), mode=lax.GatherScatterMode.FILL_OR_DROP, fill_value=0)

@@ -178,9 +178,7 @@ def _solve(inputs: _Inputs, *, plan: FlowPlan) -> ConvergedPositions:
 def _explain(position: Pixels, inputs: _Inputs, *, plan: FlowPlan) -> tuple[Pixels, _End]:
     """The slope of half the squared difference at the finest level, zero where the search ends, and the measures."""
     window, border = Window(plan.finest.window), inputs.previous.border
-    template = make_template(
-        inputs.previous.levels[0], inputs.points, border, window, lambda compute: compute(), plan.along_rows
-    )
+    template = make_template(inputs.previous.levels[0], inputs.points, border, window, plan.along_rows)
     error = difference(look(position, inputs.current.levels[0], border, window), template.patch, window)
     slope = jnp.einsum("nkl,nl->kn", template.gradient, error)
     if plan.along_rows:

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 from jaxslam_kernels.image import patches
 from jaxslam_kernels.image.patches import Window
 from jaxslam_kernels.image.pyramid import Pyramid
+from jaxslam_kernels.program_parts import apart
 from jaxslam_kernels.types import Mask, Pixels, Scalar
 
 
@@ -129,16 +130,15 @@ def make_template(
     position: Pixels,
     border: int,
     window: Window,
-    once: Callable[[Callable[[], Any]], Any],
     along_rows: bool = False,
 ) -> Template:
-    """The templates around `position`; `once` runs the parts that must not be fused, see `patches.at_once`."""
+    """The templates around `position`."""
     corner, fraction = patches.corner(position, border, window.half + 1)
     stride, length = window.stride, window.length
-    cut = patches.flattened(once(lambda: patches.cut(level, corner, window.side + 4, stride)))
-    smooth = once(lambda: patches.bilinear(cut, fraction, stride, length + 2 * stride + 2))
+    cut = patches.flattened(apart(lambda: patches.cut(level, corner, window.side + 4, stride)))
+    smooth = apart(lambda: patches.bilinear(cut, fraction, stride, length + 2 * stride + 2))
     counts = patches.in_image(position, level, border, window).astype(smooth.dtype)
-    gradient = once(lambda: patches.gradients(smooth, window) * counts[:, None, :])
+    gradient = apart(lambda: patches.gradients(smooth, window) * counts[:, None, :])
     patch = smooth[:, stride + 1 : stride + 1 + length]
     return _row_template(patch, gradient, counts, window) if along_rows else template_with(patch, gradient, window)
 
@@ -211,7 +211,7 @@ def iterate(search: Search, template: Template, level: Float[Array, "h w"], bord
         moves = search.active & jnp.isfinite(length)
         position = search.position + jnp.where(moves[None, :], step, 0)
         last_step = jnp.where(search.active, length, search.last_step)
-        # The next patch is part of the carry, not of the next iteration: see `patches.at_once`.
+        # The next patch is part of the carry, not of the next iteration: XLA would cut it again for each of its uses.
         sight = look(position, level, border, window)
         return Search(position, last_step, moves & (length > plan.tolerance**2)), sight, count + 1
 
@@ -250,7 +250,6 @@ def _search_chunk(
 ) -> Solution:
     """Search one chunk of finite points, from the coarsest level to the finest."""
     num_levels, border = len(previous.levels), previous.border
-    once = partial(patches.at_once, alive=jnp.all(jnp.isfinite(points)))
 
     def search_level(level: int, flow: Pixels) -> tuple[Search, Template, Pixels]:
         level_plan = plan.level(level, num_levels)
@@ -258,11 +257,11 @@ def _search_chunk(
         start = points / 2**level
         if level > 0:
             start = _move_inside(start, flow, previous.levels[level], border, window)
-        template = make_template(previous.levels[level], start, border, window, once, plan.along_rows)
+        template = make_template(previous.levels[level], start, border, window, plan.along_rows)
         active = usable & (template.texture > min_texture)
         search = Search(start + flow, jnp.zeros_like(points[0]), active)
         coarsest = level == num_levels - 1
-        search = settle(search, template, current.levels[level], border, level_plan, once=once, coarsest=coarsest)
+        search = settle(search, template, current.levels[level], border, level_plan, coarsest=coarsest)
         return search, template, search.position - start
 
     flow = (guess - points) / 2**num_levels
@@ -270,7 +269,7 @@ def _search_chunk(
         flow = search_level(level, 2 * flow)[2]
     search, template, _ = search_level(0, 2 * flow)
     window = Window(plan.finest.window)
-    sight = once(lambda: look(search.position, current.levels[0], border, window))
+    sight = apart(lambda: look(search.position, current.levels[0], border, window))
     residual = mean_absolute(difference(sight, template.patch, window), window)
     return Solution(search.position, search.last_step, residual, template.texture)
 
@@ -297,7 +296,9 @@ def in_chunks(function: Callable[..., Any], arrays: tuple[Array, ...], wanted: M
         return jnp.take(joined, place, axis=-1)
 
     def one(chunked: tuple[Array, ...]) -> Any:
-        return patches.at_once(partial(function, *chunked[:-1]), jnp.any(chunked[-1]))
+        compute = partial(function, *chunked[:-1])
+        nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(compute))
+        return lax.cond(jnp.any(chunked[-1]), compute, lambda: nothing)
 
     return jax.tree.map(join, lax.map(one, tuple(map(split, (*arrays, wanted)))))
 
@@ -322,7 +323,7 @@ def search(
     """Search all points; not differentiable, `lk_flow` is. `settle` finds them on one level, from where it begins.
 
     Under `vmap` the batch is worked off one after the other: chunks fill the vector units already, a batch would only
-    wait for its slowest member, and `patches.at_once` would no longer hold.
+    wait for its slowest member, and chunks without points would no longer be left out.
     """
 
     @jax.custom_batching.sequential_vmap

@@ -5,9 +5,8 @@ the picture the point was first seen in, warped by the affine map that the relat
 and SVO do), and aligned by Lucas-Kanade steps on one level, whatever the brightness.
 """
 
-from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,14 +19,12 @@ from jaxslam_kernels.image import patches
 from jaxslam_kernels.image.patches import Window
 from jaxslam_kernels.image.pyramid import Pyramid
 from jaxslam_kernels.implicit_positions import ConvergedPositions, implicit_positions
+from jaxslam_kernels.program_parts import apart
 from jaxslam_kernels.types import Mask, Pixels, Scalar, Weights
 
 DEFAULT_PLAN = LevelPlan(21, 8, 0.05)
 _GAIN_SQUARED = (0.25, 4.0)
 """Smallest and largest."""
-
-_Once: TypeAlias = Callable[[Callable[[], Any]], Any]
-"""Runs a part that XLA must not fuse with the rest, see `patches.at_once`."""
 
 
 class PatchMatch(NamedTuple):
@@ -110,15 +107,15 @@ class _Inputs(NamedTuple):
     min_texture: Scalar
 
 
-def _template(inputs: _Inputs, window: Window, border: int, once: _Once) -> tuple[Template, Float[Array, "n l"]]:
+def _template(inputs: _Inputs, window: Window, border: int) -> tuple[Template, Float[Array, "n l"]]:
     """The templates, and 1 for each of their pixels that counts, 0 for the others."""
     sample = lambda: warped_patches(
         inputs.pictures, inputs.picture, inputs.center, inputs.warp, side=window.side + 2, stride=window.stride
     )
-    smooth, inside = (jnp.pad(array, ((0, 0), (0, 2))) for array in once(sample))
+    smooth, inside = (jnp.pad(array, ((0, 0), (0, 2))) for array in apart(sample))
     counts = (inside[:, _middle(window)] & window.columns()[None, :]).astype(smooth.dtype)
-    there = lax.stop_gradient(_there(inputs.guess, inputs, window, border, once))
-    patch, gradient = once(lambda: _matched(smooth, there, counts, window))
+    there = lax.stop_gradient(_there(inputs.guess, inputs, window, border))
+    patch, gradient = apart(lambda: _matched(smooth, there, counts, window))
     return template_with(patch, gradient, window), counts
 
 
@@ -151,9 +148,9 @@ def _matched(
     return gain * centered + mean_there, gain[:, :, None] * free
 
 
-def _there(position: Pixels, inputs: _Inputs, window: Window, border: int, once: _Once) -> Float[Array, "n l"]:
+def _there(position: Pixels, inputs: _Inputs, window: Window, border: int) -> Float[Array, "n l"]:
     """Sample the current image around positions."""
-    sight = once(lambda: look(position, inputs.current, border, window))
+    sight = apart(lambda: look(position, inputs.current, border, window))
     flat = patches.flattened(sight.cut)
     return patches.bilinear(flat, sight.fraction, window.stride, window.length)
 
@@ -184,13 +181,12 @@ def _solve(inputs: _Inputs, *, plan: LevelPlan, border: int, chunk: int) -> Conv
     window = Window(plan.window)
 
     def search_chunk(inputs: _Inputs) -> ConvergedPositions:
-        once = partial(patches.at_once, alive=jnp.all(jnp.isfinite(inputs.center)))
-        template, counts = _template(inputs, window, border, once)
+        template, counts = _template(inputs, window, border)
         enough = 2 * jnp.sum(counts, axis=1) > window.side**2
         active = inputs.mask & enough & (template.texture > inputs.min_texture)
         begin = Search(inputs.guess, jnp.full_like(inputs.guess[0], jnp.inf), active)
         end = iterate(begin, template, inputs.current, border, plan)
-        correlation = _correlation(template.patch, _there(end.position, inputs, window, border, once), counts)
+        correlation = _correlation(template.patch, _there(end.position, inputs, window, border), counts)
         known = active & jnp.isfinite(correlation)
         settled = known & (correlation > 0) & (end.last_step < plan.accepted**2)
         low, high = patches.bounds(inputs.current, border)
@@ -213,9 +209,8 @@ def _solve(inputs: _Inputs, *, plan: LevelPlan, border: int, chunk: int) -> Conv
 def _explain(position: Pixels, inputs: _Inputs, *, plan: LevelPlan, border: int) -> tuple[Pixels, Weights]:
     """Slope of half the squared difference, zero where the search converged, and the correlation."""
     window = Window(plan.window)
-    directly = lambda compute: compute()
-    template, counts = _template(inputs, window, border, directly)
-    there = _there(position, inputs, window, border, directly)
+    template, counts = _template(inputs, window, border)
+    there = _there(position, inputs, window, border)
     slope = jnp.einsum("nkl,nl->kn", template.gradient, there - template.patch)
     return slope, _correlation(template.patch, there, counts)
 

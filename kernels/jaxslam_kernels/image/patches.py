@@ -5,7 +5,6 @@ contiguous row, which XLA vectorizes. Columns past the window hold neighboring p
 gradient there is zero, so that they drop out of every sum.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple, TypeVar
 
 import jax
@@ -13,7 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam_kernels.types import Flag, Pixels
+from jaxslam_kernels.types import Pixels
 
 T = TypeVar("T")
 
@@ -55,18 +54,6 @@ class Window(NamedTuple):
     def columns(self) -> Bool[Array, " l"]:
         """Tell which pixels of a flat patch belong to the window."""
         return self.offsets()[0] <= self.half
-
-
-def at_once(compute: Callable[[], T], alive: Flag) -> T:
-    """Run `compute` as a unit that XLA does not merge with what follows.
-
-    XLA's CPU fusion otherwise repeats a gather for every one of its uses: the flow of 1000 points takes 10.5 ms
-    instead of 9.0 ms. `lax.optimization_barrier` is dropped before fusion and does not help; a loop that runs once
-    does, but fills its buffers with zeros first, 1 ms in all. `alive` must not be known at compile time; where it is
-    false, nothing is computed and all is zero.
-    """
-    shapes = jax.eval_shape(compute)
-    return lax.cond(alive, compute, lambda: jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes))
 
 
 def bounds(level: Float[Array, "h w"], border: int) -> tuple[Float[Array, "2 1"], Float[Array, "2 1"]]:

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 
 from jaxslam_kernels.camera import MIN_DEPTH, Intrinsics, normalize
 from jaxslam_kernels.levenberg_marquardt import NormalEquations
+from jaxslam_kernels.program_parts import apart
 from jaxslam_kernels.robust import LARGEST_SQUARED, Loss, loss_value, loss_weight
 from jaxslam_kernels.se3 import rotation_matrix, to_camera
 from jaxslam_kernels.types import Flag, Mask, Pixels, Points, Scalar, Weights
@@ -93,11 +94,11 @@ def pose_problem(
     depth = jnp.zeros(n, dtype) if depth is None else depth
     sigma_px, sigma_depth = (jnp.broadcast_to(jnp.asarray(sigma, dtype), (n,)) for sigma in (sigma_px, sigma_depth))
     loss_scale = jnp.asarray(scale, dtype)
-    usable = _usable(intrinsics) & positive(loss_scale)
+    usable = apart(lambda: _usable(intrinsics) & positive(loss_scale))
     intrinsics, loss_scale = jax.tree.map(lambda x: jnp.where(usable, x, 1.0), (intrinsics, loss_scale))
-    has_depth = positive(depth) & positive(sigma_depth)
-    known = jnp.isfinite(X_world).all(axis=0) & jnp.isfinite(uv).all(axis=0)
-    known = known & positive(sigma_px)
+    has_depth = apart(lambda: positive(depth) & positive(sigma_depth))
+    finite = lambda array: jnp.isfinite(array).all(axis=0)
+    known = apart(lambda: finite(X_world) & finite(uv) & positive(sigma_px) & usable)
     focal = jnp.stack([intrinsics.fx, intrinsics.fy])
     inverse_depth_sigma = jnp.where(has_depth, 1.0 / jnp.where(has_depth, sigma_depth, 1.0), 0.0)
     xy, clean_prior = normalize(intrinsics, uv), _usable_prior(prior)
@@ -114,7 +115,7 @@ def pose_problem(
             prior=clean_prior,
         )
 
-    return problem_of(known & positive(weights) & usable), problem_of(known & (weights == 0) & usable)
+    return problem_of(known & positive(weights)), problem_of(known & (weights == 0))
 
 
 def with_idle(problem: PoseProblem, idle: PoseProblem, T_world_cam: SE3, loss: Loss) -> PoseProblem:
@@ -168,15 +169,13 @@ class PoseCost(NamedTuple):
 
 def pose_cost(T_world_cam: SE3, problem: PoseProblem, loss: Loss) -> PoseCost:
     """Evaluates the cost and its derivatives along `T_world_cam @ exp(tangent)`."""
-    residuals, rows, front = _linearize(T_world_cam, problem)
-    chi2 = jnp.where(front, sum(jnp.square(r) for r in residuals), UNKNOWN_CHI2)
+    rows, front = _linearize(T_world_cam, problem)
+    chi2 = jnp.where(front, jnp.sum(jnp.square(rows[6]), axis=0), UNKNOWN_CHI2)
     robust_weights = jnp.where(front, loss_weight(chi2, problem.scale, loss), 0.0)
-    weights = problem.weights * robust_weights
+    weights = apart(lambda: problem.weights * robust_weights)
     cost = 0.5 * jnp.sum(problem.weights * loss_value(chi2, problem.scale, loss))
-    gram = jnp.zeros((7, 7), chi2.dtype)
-    for row, residual in zip(rows, residuals, strict=True):
-        augmented = jnp.stack([*row, residual])  # [J r]: one product for both JᵀWJ and JᵀWr
-        gram = gram + (augmented * weights[None, :]) @ augmented.T
+    # With the residuals as a seventh column, one product gives both JᵀWJ and JᵀWr.
+    gram = (rows * weights[None, None, :]).reshape(7, -1) @ rows.reshape(7, -1).T
     gradient, hessian = gram[:6, 6], gram[:6, :6]
     if problem.prior is not None:
         error, jacobian = _prior_error(T_world_cam, problem.prior)
@@ -186,24 +185,31 @@ def pose_cost(T_world_cam: SE3, problem: PoseProblem, loss: Loss) -> PoseCost:
     return PoseCost(cost, NormalEquations(gradient, hessian), chi2, robust_weights)
 
 
-def _linearize(T_world_cam: SE3, problem: PoseProblem) -> tuple[list[Array], list[list[Array]], Mask]:
-    """Whitened residuals, their derivatives along the tangent, and which points are in front of the camera.
+def _linearize(T_world_cam: SE3, problem: PoseProblem) -> tuple[Float[Array, "7 3 n"], Mask]:
+    """Derivatives of the three whitened residuals along the tangent, then the residuals, and which points are in front.
 
     With X' = X - v - ω × X in the camera's frame, a residual of gradient a along X has the row (-a, a × X).
     """
     X, Y, Z = to_camera(T_world_cam, problem.X_world)
     front = Z > MIN_DEPTH
     inverse_z = 1.0 / jnp.where(front, Z, 1.0)
-    x, y = X * inverse_z, Y * inverse_z
-    fu, fv, fd = problem.precision
-    residuals = [(x - problem.xy[0]) * fu, (y - problem.xy[1]) * fv, (Z - problem.depth) * fd]
-    zero = jnp.zeros_like(x)
-    rows = [
-        [-fu * inverse_z, zero, fu * inverse_z * x, fu * x * y, -fu * (1.0 + x * x), fu * y],
-        [zero, -fv * inverse_z, fv * inverse_z * y, fv * (1.0 + y * y), -fv * x * y, -fv * x],
-        [zero, zero, -fd, -fd * Y, fd * X, zero],
-    ]
-    return residuals, rows, front
+    x, y = apart(lambda: (X * inverse_z, Y * inverse_z))
+
+    def rows() -> Float[Array, "7 3 n"]:
+        fu, fv, fd = problem.precision
+        zero = jnp.zeros_like(x)
+        each = (
+            *(-fu * inverse_z, zero, zero),
+            *(zero, -fv * inverse_z, zero),
+            *(fu * inverse_z * x, fv * inverse_z * y, -fd),
+            *(fu * x * y, fv * (1.0 + y * y), -fd * Y),
+            *(-fu * (1.0 + x * x), -fv * x * y, fd * X),
+            *(fu * y, -fv * x, zero),
+            *((x - problem.xy[0]) * fu, (y - problem.xy[1]) * fv, (Z - problem.depth) * fd),
+        )
+        return jnp.concatenate(each).reshape(7, 3, -1)
+
+    return apart(rows), front
 
 
 def _prior_error(T_world_cam: SE3, prior: PosePrior) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
