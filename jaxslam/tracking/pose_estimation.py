@@ -40,6 +40,7 @@ def coarse_pose(step: StepContext, seen: Measurements, votes: Weights, predicted
     """
     state, view, params, plan = step
     by_noise = plan.balance_regions or view.right is not None
+    expected_depth = jnp.where(seen.depth > 0, seen.depth, to_camera(predicted, state.points.X_world)[2])
     result = ransac_pnp(
         jax.random.fold_in(state.random_key(), state.frame),
         state.points.X_world,
@@ -53,6 +54,8 @@ def coarse_pose(step: StepContext, seen: Measurements, votes: Weights, predicted
         num_hypotheses=plan.num_hypotheses,
         max_steps=plan.pose_steps,
         initial=predicted,
+        expected_depth=expected_depth,
+        on_inliers=False,
     )
     if not plan.balance_regions or view.right is not None:
         return result.T_world_cam, result.inliers, result.status

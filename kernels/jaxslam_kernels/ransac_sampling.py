@@ -1,8 +1,11 @@
 """Random minimal samples of weighted points for RANSAC, all hypotheses at once."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int, Key
+from jax import lax
+from jaxtyping import Array, Float, Int, Key
 
 from jaxslam_kernels.checks import checked
 from jaxslam_kernels.types import Weights
@@ -36,23 +39,29 @@ def draw_samples(key: Key[Array, ""], weights: Weights, num_samples: int, size: 
     ends = jnp.cumsum(weights)
     starts, total = ends - weights, ends[-1]
     uniform = jax.random.uniform(key, (size, num_samples), weights.dtype)
-    drawn: list[Array] = []
-    taken: list[tuple[Array, Array]] = []  # where each one drawn starts on the line, in its order, and its weight
-    for position in range(size):
-        target = uniform[position] * (total - sum(weight for _, weight in taken))
-        for start, weight in taken:  # every cut ahead of the target moves it on
+    none = jnp.full((size, num_samples), jnp.inf, weights.dtype)
+
+    def draw(taken: _Taken, position_uniform: Array) -> tuple[_Taken, Array]:
+        target = position_uniform * (total - taken.weight.sum(axis=0))
+        for start, weight in zip(taken.start, taken.weight, strict=True):  # every cut ahead of the target moves it on
             target = target + jnp.where(target >= start, weight, 0.0)
         chosen = jnp.searchsorted(ends, target, side="right", method=search).astype(jnp.int32)
-        drawn.append(jnp.minimum(chosen, weights.size - 1))
-        taken = _inserted(taken, starts[drawn[-1]], weights[drawn[-1]])
-    return jnp.stack(drawn)
+        chosen = jnp.minimum(chosen, weights.size - 1)
+        return _inserted(taken, starts[chosen], weights[chosen]), chosen
+
+    return lax.scan(draw, _Taken(none, jnp.zeros_like(none)), uniform)[1]
 
 
-def _inserted(line: list[tuple[Array, Array]], start: Array, weight: Array) -> list[tuple[Array, Array]]:
-    """The pieces of a line in their order, with one more; elementwise, where a sort is a call of its own."""
-    longer: list[tuple[Array, Array]] = []
-    for other_start, other_weight in line:
-        first = start < other_start
-        longer.append((jnp.where(first, start, other_start), jnp.where(first, weight, other_weight)))
-        start, weight = jnp.where(first, other_start, start), jnp.where(first, other_weight, weight)
-    return [*longer, (start, weight)]
+class _Taken(NamedTuple):
+    """What is cut out of the line, in its order: where each piece starts, and its weight; infinity and 0 for none."""
+
+    start: Float[Array, "size h"]
+    weight: Float[Array, "size h"]
+
+
+def _inserted(taken: _Taken, start: Float[Array, " h"], weight: Float[Array, " h"]) -> _Taken:
+    """The pieces with one more in place of the last of none; elementwise, where a sort is a call of its own."""
+    here, before = taken.start < start[None], jnp.roll(taken.start, 1, axis=0) < start[None]
+    before = before.at[0].set(True)
+    put = lambda old, new: jnp.where(here, old, jnp.where(before, new[None], jnp.roll(old, 1, axis=0)))
+    return _Taken(put(taken.start, start), put(taken.weight, weight))

@@ -184,6 +184,7 @@ def cases(n: int = 11) -> dict[str, Case]:
         motion.upper_limit: {"intensity": f(n), "weights": f(n), "sigmas": f()},
         partial(motion.group_motion, num_groups=2): {"flow": f(3, n), "moves": f(n), "counts": b(n), "group": i(n)},
         p3p.p3p: {"bearings": f(3, 3, n), "X_world": f(3, 3, n)},
+        p3p.p3p_near: {"bearings": f(3, 3, n), "X_world": f(3, 3, n), "distances": f(3, n)},
         partial(patch_align.warped_patches, side=5, stride=8): {
             "pictures": f(2, 40, 48),
             "picture": i(n),

@@ -22,9 +22,9 @@ Triangles: TypeAlias = Float[Array, "3 3 *h"]
 _MIN_SINE = 1e-4
 """Of the angle at the first corner; below it the corners count as on a line."""
 
-_Vector: TypeAlias = list[Array]
-"""Three coordinates apart, each `(*h,)`."""
-_Axes: TypeAlias = tuple[_Vector, _Vector, _Vector]
+_Vectors: TypeAlias = Float[Array, " 3 *h"]
+_Axes: TypeAlias = Float[Array, "3 3 *h"]
+"""Axis and coordinate: two orthonormal axes in the plane of a triangle, and its normal."""
 
 
 @checked
@@ -52,66 +52,54 @@ def absolute_orientation(
         _in_plane(source, source_center, source_axes), _in_plane(target, target_center, target_axes)
     )
     first, second, normal = target_axes
-    turned = [
-        [cosine * a + sine * b for a, b in zip(first, second, strict=True)],
-        [cosine * b - sine * a for a, b in zip(first, second, strict=True)],
-        normal,
-    ]
-    R = [
-        [_dot([axis[row] for axis in turned], [axis[column] for axis in source_axes]) for column in range(3)]
-        for row in range(3)
-    ]
-    t = [target_center[row] - _dot(R[row], source_center) for row in range(3)]
-    return jnp.stack([jnp.stack(row) for row in R]), jnp.stack(t), valid
+    turned = jnp.stack([cosine * first + sine * second, cosine * second - sine * first, normal])
+    R = (turned[:, :, None] * source_axes[:, None, :]).sum(axis=0)
+    return R, target_center - (R * source_center[None]).sum(axis=1), valid
 
 
-def _turn_in_plane(source: list[tuple[Array, Array]], target: list[tuple[Array, Array]]) -> tuple[Array, Array]:
-    """Cosine and sine of the angle that maximizes `Σ qᵀ R(angle) p` over corners p and q in the plane.
+def _turn_in_plane(source: Float[Array, "2 3 *h"], target: Float[Array, "2 3 *h"]) -> tuple[Array, Array]:
+    """Cosine and sine `(1, *h)` of the angle that maximizes `Σ qᵀ R(angle) p` over corners p and q in the plane.
 
     The sum is never zero there, as both triangles go round the same way; `tiny` is for the rounded one.
     """
-    cosine, sine = jnp.zeros_like(source[0][0]), jnp.zeros_like(source[0][0])
-    for (px, py), (qx, qy) in zip(source, target, strict=True):
-        cosine = cosine + px * qx + py * qy
-        sine = sine + px * qy - py * qx
+    cosine = (source * target).sum(axis=(0, 1))
+    sine = (source[0] * target[1] - source[1] * target[0]).sum(axis=0)
     inverse = lax.rsqrt(cosine * cosine + sine * sine + jnp.finfo(cosine.dtype).tiny)
-    return cosine * inverse, sine * inverse
+    return (cosine * inverse)[None], (sine * inverse)[None]
 
 
-def _spans_plane(triangle: Array) -> Array:
+def _spans_plane(triangle: Triangles) -> Bool[Array, " *h"]:
     """Whether the corners are finite and not on a line; false for NaN, as no comparison with it is true."""
     edge, other = _edges(triangle)
     normal = _cross(edge, other)
     return _dot(normal, normal) > _MIN_SINE**2 * _dot(edge, edge) * _dot(other, other)
 
 
-def _plane_axes(triangle: Array) -> _Axes:
+def _plane_axes(triangle: Triangles) -> _Axes:
     """Two orthonormal axes in the plane of the triangle, and its normal, about which the corners turn left."""
     edge, other = _edges(triangle)
     first, normal = _unit(edge), _unit(_cross(edge, other))
-    return first, _cross(normal, first), normal
+    return jnp.stack([first, _cross(normal, first), normal])
 
 
-def _in_plane(triangle: Array, center: Array, axes: _Axes) -> list[tuple[Array, Array]]:
-    """Each corner relative to the center along the two axes in the plane."""
-    corners = [triangle[:, corner] - center for corner in range(3)]
-    return [(_dot(axes[0], corner), _dot(axes[1], corner)) for corner in corners]
+def _in_plane(triangle: Triangles, center: _Vectors, axes: _Axes) -> Float[Array, "2 3 *h"]:
+    """Each corner relative to the center along the two axes in the plane: `(axis, corner, ...)`."""
+    return (axes[:2, :, None] * (triangle - center[:, None])[None]).sum(axis=1)
 
 
-def _edges(triangle: Array) -> tuple[_Vector, _Vector]:
+def _edges(triangle: Triangles) -> tuple[_Vectors, _Vectors]:
     """From the first corner to the two others."""
-    edge, other = triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0]
-    return list(edge), list(other)
+    return triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0]
 
 
-def _unit(v: _Vector) -> _Vector:
-    inverse = lax.rsqrt(_dot(v, v))
-    return [x * inverse for x in v]
+def _unit(v: _Vectors) -> _Vectors:
+    return v * lax.rsqrt(_dot(v, v))[None]
 
 
-def _dot(u: Array | _Vector, v: Array | _Vector) -> Array:
-    return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
+def _dot(u: _Vectors, v: _Vectors) -> Float[Array, " *h"]:
+    # A sum over an axis, not three products: XLA does not compute it again in every kernel that uses it.
+    return (u * v).sum(axis=0)
 
 
-def _cross(u: _Vector, v: _Vector) -> _Vector:
-    return [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
+def _cross(u: _Vectors, v: _Vectors) -> _Vectors:
+    return jnp.stack([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])

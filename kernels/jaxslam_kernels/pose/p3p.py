@@ -27,6 +27,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxslam_kernels.checks import checked
+from jaxslam_kernels.program_parts import apart
 
 _Vector: TypeAlias = tuple[Array, Array, Array]
 """Three coordinates apart: of λ, or of a line in the plane of its directions."""
@@ -68,19 +69,58 @@ def p3p(
         solutions are real with all distances positive. The same solution may come twice. None for a triple that is
         not finite or in one place. All finite, whatever came in.
     """
+    bearings, X_world, known = apart(lambda: _known(bearings, X_world))
+    squared, versines, unit, spread = apart(lambda: _scaled(bearings, X_world))
+    candidates = _at_size(_intersect(*_split_pencil(squared, versines)), squared, versines)
+    return _in_meters(*_newton(candidates, squared, versines), unit, known & spread)
+
+
+@checked
+def p3p_near(
+    bearings: Float[Array, "3 3 h"], X_world: Float[Array, "3 3 h"], distances: Float[Array, "3 h"]
+) -> tuple[Float[Array, "3 1 h"], Bool[Array, "1 h"]]:
+    """Distances from the camera to three points, the solution near approximate ones.
+
+    Newton's method alone: a fifth of the program of `p3p` and a quarter of what follows it. Meant for points whose
+    depth has been measured or predicted.
+
+    Args:
+        bearings: `(3, 3, h)` as for `p3p`.
+        X_world: `(3, 3, h)` as for `p3p`.
+        distances: `(3, h)` (point, triple) approximate distances, meters; positive.
+
+    Returns:
+        As `p3p`, with one solution a triple.
+    """
+    bearings, X_world, known = apart(lambda: _known(bearings, X_world))
+    known = known & (jnp.isfinite(distances) & (distances > 0)).all(axis=0)
+    squared, versines, unit, spread = apart(lambda: _scaled(bearings, X_world))
+    near = jnp.where(known[None, :], distances, 1.0) * lax.rsqrt(unit)[None, :]
+    return _in_meters(*_newton((near[:1], near[1:2], near[2:]), squared, versines), unit, known & spread)
+
+
+def _known(bearings: Array, X_world: Array) -> tuple[Array, Array, Bool[Array, " h"]]:
+    """Bearings and points, 0 in the triples that are not finite, and which triples are."""
     known = jnp.isfinite(bearings).all(axis=(0, 1)) & jnp.isfinite(X_world).all(axis=(0, 1))
-    bearings, X_world = (jnp.where(known[None, None, :], a, 0.0) for a in (bearings, X_world))
+    return *(jnp.where(known[None, None, :], a, 0.0) for a in (bearings, X_world)), known
+
+
+def _scaled(bearings: Array, X_world: Array) -> tuple[_Pairs, _Pairs, Array, Bool[Array, " h"]]:
+    """Squared sides in units of their mean, versines, the unit in m², and which triangles are not in one place."""
     d12, d13, d23 = _squared_sides(X_world)
     size = (d12 + d13 + d23) / 3.0
     spread = size > 0
     unit = jnp.where(spread, size, 1.0)
-    squared = (d12 / unit, d13 / unit, d23 / unit)
     e12, e13, e23 = _squared_sides(bearings)
-    versines = (0.5 * e12, 0.5 * e13, 0.5 * e23)  # 1 - cos, without cancellation
-    lines, conic = _split_pencil(squared, versines)
-    candidates, valid = _polish(_intersect(lines, conic), squared, versines)
-    distances = jnp.stack(candidates) * jnp.sqrt(size)[None, None, :]
-    valid = valid & (known & spread)[None, :] & jnp.isfinite(distances).all(axis=0)
+    return (d12 / unit, d13 / unit, d23 / unit), (0.5 * e12, 0.5 * e13, 0.5 * e23), unit, spread
+
+
+def _in_meters(
+    candidates: _Vector, valid: Array, unit: Array, usable: Bool[Array, " h"]
+) -> tuple[Float[Array, "3 s h"], Bool[Array, "s h"]]:
+    """Distances in meters, 0 where there is no solution, and where there is one."""
+    distances = jnp.stack(candidates) * jnp.sqrt(unit)[None, None, :]
+    valid = valid & usable[None, :] & jnp.isfinite(distances).all(axis=0)
     return jnp.where(valid[None, :, :], distances, 0.0), valid
 
 
@@ -136,7 +176,7 @@ def _intersect(lines: _Vector, conic: _Conic) -> _Vector:
     """Intersect each of the two lines `(2, h)` with the conic: `(4, h)` points, up to scale.
 
     The coordinate with the largest factor in the line is eliminated, `c = α a + β b`, and with a = 1 (distances are
-    never 0) a quadratic in b remains. A negative discriminant counts as zero: `_polish` rejects what is not a root.
+    never 0) a quadratic in b remains. A negative discriminant counts as zero: `_newton` rejects what is not a root.
     """
     sizes = [jnp.abs(x) for x in lines]
     xx, xy, xz, yy, yz, zz = (x[None, :] for x in conic)
@@ -158,22 +198,33 @@ def _intersect(lines: _Vector, conic: _Conic) -> _Vector:
     return x, y, z
 
 
-def _polish(directions: _Vector, squared: _Pairs, versines: _Pairs) -> tuple[_Vector, Bool[Array, "4 h"]]:
-    """Newton's method on the laws of cosines from directions `(4, h)` of λ: where it ends, and whether at a root."""
+def _sides(xyz: _Vector, versines: _Pairs) -> _Pairs:
+    """Squared sides of the triangle so far away: `x² + y² - 2 c x y = (x - y)² + 2 (1 - c) x y`."""
+    x, y, z = xyz
+    e12, e13, e23 = (e[None, :] for e in versines)
+    return (
+        jnp.square(x - y) + 2.0 * e12 * x * y,
+        jnp.square(x - z) + 2.0 * e13 * x * z,
+        jnp.square(y - z) + 2.0 * e23 * y * z,
+    )
+
+
+def _at_size(directions: _Vector, squared: _Pairs, versines: _Pairs) -> _Vector:
+    """Scale directions `(4, h)` of λ to where the triangles have the right size."""
+    total = sum(_sides(directions, versines))
+    scale = jnp.sqrt(sum(squared)[None, :] / jnp.maximum(total, jnp.finfo(total.dtype).tiny))
+    x, y, z = directions
+    return scale * x, scale * y, scale * z
+
+
+def _newton(near: _Vector, squared: _Pairs, versines: _Pairs) -> tuple[_Vector, Bool[Array, "s h"]]:
+    """Newton's method on the laws of cosines from distances `(s, h)`: where it ends, and whether at a root."""
     d12, d13, d23 = (d[None, :] for d in squared)
     e12, e13, e23 = (e[None, :] for e in versines)
 
-    def sides(x: Array, y: Array, z: Array) -> _Pairs:
-        """Squared sides of the triangle so far away: `x² + y² - 2 c x y = (x - y)² + 2 (1 - c) x y`."""
-        return (
-            jnp.square(x - y) + 2.0 * e12 * x * y,
-            jnp.square(x - z) + 2.0 * e13 * x * z,
-            jnp.square(y - z) + 2.0 * e23 * y * z,
-        )
-
     def step(_: Array, xyz: _Vector) -> _Vector:
         x, y, z = xyz
-        s12, s13, s23 = sides(x, y, z)
+        s12, s13, s23 = _sides(xyz, versines)
         f12, f13, f23 = 0.5 * (s12 - d12), 0.5 * (s13 - d13), 0.5 * (s23 - d23)
         # The Jacobian has the rows [a b 0], [c 0 d], [0 e g]; its inverse is written out.
         a, b = x - y + e12 * y, y - x + e12 * x
@@ -186,12 +237,8 @@ def _polish(directions: _Vector, squared: _Pairs, versines: _Pairs) -> tuple[_Ve
             z + (a * e * f13 - c * e * f12 + b * c * f23) * inverse,
         )
 
-    x, y, z = directions
-    s12, s13, s23 = sides(x, y, z)
-    total = s12 + s13 + s23
-    scale = jnp.sqrt((d12 + d13 + d23) / jnp.maximum(total, jnp.finfo(total.dtype).tiny))
-    x, y, z = lax.fori_loop(0, _NEWTON_STEPS, step, (scale * x, scale * y, scale * z))
-    s12, s13, s23 = sides(x, y, z)
+    x, y, z = lax.fori_loop(0, _NEWTON_STEPS, step, near)
+    s12, s13, s23 = apart(lambda: _sides((x, y, z), versines))
     error = jnp.abs(s12 - d12) + jnp.abs(s13 - d13) + jnp.abs(s23 - d23)
     return (x, y, z), (error < _RESIDUAL) & (jnp.minimum(jnp.minimum(x, y), z) > 0)
 

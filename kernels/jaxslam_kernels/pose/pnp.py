@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from jaxslam_kernels.camera import MIN_DEPTH, Intrinsics
 from jaxslam_kernels.checks import checked
 from jaxslam_kernels.pose.absolute_orientation import absolute_orientation
-from jaxslam_kernels.pose.p3p import p3p
+from jaxslam_kernels.pose.p3p import p3p, p3p_near
 from jaxslam_kernels.pose.pose_cost import PoseProblem, pose_problem
 from jaxslam_kernels.pose.pose_refine import PoseStatus, refine_problem, solve_pose, usable_pose
 from jaxslam_kernels.ransac_sampling import draw_samples
@@ -66,6 +66,7 @@ def ransac_pnp(
     weights: Weights | None = None,
     depth: Weights | None = None,
     initial: SE3 | None = None,
+    expected_depth: Weights | None = None,
     threshold_px: Weights | Scalar | float = 3.0,
     threshold_depth: Weights | Scalar | float = 0.1,
     min_inliers: int = 8,
@@ -73,6 +74,7 @@ def ransac_pnp(
     loss: Loss = "huber",
     max_steps: int = 25,
     averaged: bool = False,
+    on_inliers: bool = True,
 ) -> PnpResult:
     """Finds the camera pose that most points agree on, among any number of wrong ones.
 
@@ -89,6 +91,9 @@ def ransac_pnp(
         depth: Measured depths in meters, 0 or NaN where missing; `None` for pixels alone. They take part in the
             choice of the root, in the score and in the refinement.
         initial: A predicted pose, tried as one more hypothesis.
+        expected_depth: Approximate depth of every point, meters, from which samples are solved by Newton's method
+            (`p3p_near`); `None` to solve them in closed form (`p3p`). One that is not positive takes its point out of
+            the samples' solutions, not out of the score.
         threshold_px: Largest error of an inlier in the image, pixels: about three standard deviations.
         threshold_depth: Largest error of an inlier along the optical axis, meters. The two combine:
             `e² = (pixels / threshold_px)² + (depth / threshold_depth)² < 1`.
@@ -97,6 +102,8 @@ def ransac_pnp(
         loss: The loss of the last refinement over the inliers, with a scale of half a threshold, static.
         max_steps: Bound on the steps of the last refinement, static.
         averaged: Whether the score is averaged over thresholds, see `score_poses`, static.
+        on_inliers: Whether the pose is refined on its inliers in the end, static. Without, it is the optimum of the
+            redescending loss over all points: enough for a pose from which another refinement begins.
 
     Returns:
         A `PnpResult`; everything in it is finite.
@@ -109,16 +116,16 @@ def ransac_pnp(
     problem, idle = pose_problem(X_world, uv, intrinsics, weights, depth, sigma_px, sigma_depth, _GATE_SIGMAS, None)
     fixed = lax.stop_gradient(problem)
     fallback, has_initial = _fallback(initial, X_world.dtype)
-    hypotheses, real = _hypotheses(fixed, draw_samples(key, fixed.weights, num_hypotheses, SAMPLE_SIZE))
+    samples = draw_samples(key, fixed.weights, num_hypotheses, SAMPLE_SIZE)
+    hypotheses, real = _hypotheses(fixed, samples, lax.stop_gradient(expected_depth))
     hypotheses = jnp.concatenate([hypotheses, _as_transform(fallback)], axis=2)
     scores = jnp.where(jnp.append(real, has_initial), score_poses(hypotheses, fixed, averaged), -1.0)
     best, _ = usable_pose(_as_pose(hypotheses[:, :, jnp.argmax(scores)]))
-    consensus = _improved(best, fixed, averaged)
-    inliers, _ = _consensus(consensus, fixed, averaged)
-    on_inliers = problem._replace(weights=jnp.where(inliers, problem.weights, 0.0), scale=0.5 * problem.scale)
-    idle = _agreeing_idle(consensus, idle)
-    refined = refine_problem(consensus, on_inliers, idle, loss, max_steps)
-    return _result(refined.T_world_cam, refined.status, fixed, fallback, scores.max() >= 0, min_inliers, averaged)
+    if on_inliers:
+        pose, status = _refined_on_inliers(best, problem, idle, loss, max_steps, averaged)
+    else:
+        pose, status = _refined_robustly(best, problem, idle, max_steps, averaged)
+    return _result(pose, status, fixed, fallback, scores.max() >= 0, min_inliers, averaged)
 
 
 @checked
@@ -154,16 +161,24 @@ def _squared_errors(T: Array, X_world: Array, xy: Array, depth: Array, precision
     return eu * eu + ev * ev + ed * ed + jnp.where(Z > MIN_DEPTH, 0.0, 1.0)
 
 
-def _hypotheses(problem: PoseProblem, samples: Int[Array, "4 h"]) -> tuple[_Transforms, Bool[Array, " h"]]:
+def _hypotheses(
+    problem: PoseProblem, samples: Int[Array, "4 h"], expected_depth: Weights | None
+) -> tuple[_Transforms, Bool[Array, " h"]]:
     """One pose a sample: of the up to four of P3P, the one that agrees best with what else was measured."""
     X_world, xy, depth, precision = (o[..., samples] for o in _observed(problem))
-    bearings = jnp.stack([xy[0], xy[1], jnp.ones_like(xy[0])])
-    bearings = bearings * lax.rsqrt(jnp.square(bearings).sum(axis=0))[None, :, :]
-    distances, real = p3p(bearings[:, :3], X_world[:, :3])
+    ray = jnp.concatenate([xy, jnp.ones_like(xy[:1])])
+    inverse = lax.rsqrt(jnp.square(ray).sum(axis=0))
+    bearings = ray * inverse[None, :, :]
+    if expected_depth is None:
+        distances, real = p3p(bearings[:, :3], X_world[:, :3])
+    else:
+        distances, real = p3p_near(bearings[:, :3], X_world[:, :3], expected_depth[samples[:3]] / inverse[:3])
     corners = distances[None, :, :, :] * bearings[:, :3, None, :]
     world_corners = jnp.broadcast_to(X_world[:, :3, None, :], corners.shape)
     R, t, spans = absolute_orientation(world_corners, corners)
     T = jnp.concatenate([R, t[:, None]], axis=1)  # (3, 4, solution, sample)
+    if expected_depth is not None:
+        return T[:, :, 0], (real & spans)[0]
     disagreement = _squared_errors(T[:, :, None], *(o[..., :, None, :] for o in (X_world, xy, depth, precision))).sum(
         axis=0
     )
@@ -173,11 +188,37 @@ def _hypotheses(problem: PoseProblem, samples: Int[Array, "4 h"]) -> tuple[_Tran
     return T, (real & spans).any(axis=0)
 
 
-def _improved(best: SE3, problem: PoseProblem, averaged: bool) -> SE3:
-    """A pose after a redescending refinement; averaged, as it was if that has led away to where fewer agree."""
+def _refined_on_inliers(
+    best: SE3, problem: PoseProblem, idle: PoseProblem, loss: Loss, max_steps: int, averaged: bool
+) -> tuple[SE3, Code]:
+    """Refine the best hypothesis on all points under a redescending loss, then on the points that agree with that."""
+    fixed = lax.stop_gradient(problem)
+    solved, _ = solve_pose(best, _narrowed(fixed, averaged), "geman_mcclure", _CONSENSUS_STEPS)
+    consensus = _better(solved, best, fixed, averaged)
+    inliers, _ = _consensus(consensus, fixed, averaged)
+    on_inliers = problem._replace(weights=jnp.where(inliers, problem.weights, 0.0), scale=0.5 * problem.scale)
+    refined = refine_problem(consensus, on_inliers, _agreeing_idle(consensus, idle), loss, max_steps)
+    return refined.T_world_cam, refined.status
+
+
+def _refined_robustly(
+    best: SE3, problem: PoseProblem, idle: PoseProblem, max_steps: int, averaged: bool
+) -> tuple[SE3, Code]:
+    """Refine the best hypothesis on all points under a redescending loss."""
+    narrowed, idle = (_narrowed(points, averaged) for points in (problem, idle))
+    refined = refine_problem(best, narrowed, idle, "geman_mcclure", max_steps)
+    return _better(refined.T_world_cam, best, lax.stop_gradient(problem), averaged), refined.status
+
+
+def _narrowed(problem: PoseProblem, averaged: bool) -> PoseProblem:
+    """The problem with the scale of the redescending loss."""
+    return problem._replace(scale=_NARROW * problem.scale) if averaged else problem
+
+
+def _better(solved: SE3, best: SE3, problem: PoseProblem, averaged: bool) -> SE3:
+    """The solved pose; averaged, the one before if the solution has led away to where fewer agree."""
     if not averaged:
-        return solve_pose(best, problem, "geman_mcclure", _CONSENSUS_STEPS)[0]
-    solved, _ = solve_pose(best, problem._replace(scale=_NARROW * problem.scale), "geman_mcclure", _CONSENSUS_STEPS)
+        return solved
     better = _consensus(solved, problem, averaged)[1] > _consensus(best, problem, averaged)[1]
     return SE3(jnp.where(better, solved.wxyz_xyz, best.wxyz_xyz))
 
