@@ -94,10 +94,15 @@ class GraphCompiler:
         """Start with nothing compiled."""
         self._size = 0
 
-    def compile_now(self) -> None:
-        """Compile the smallest graph and wait for it."""
-        compile_graph()
-        self._size = _SIZES[0]
+    def compile_now(self, num_keyframes: int) -> None:
+        """Compile the graphs that a map of this many keyframes needs now or soon, at least the smallest, and wait.
+
+        Submaps are graphs too, so that those smaller than the map's are among them.
+        """
+        largest = next((size for size in _SIZES if size >= _AHEAD * num_keyframes), _SIZES[-1])
+        for size in _SIZES[: _SIZES.index(largest) + 1]:
+            compile_graph(size)
+        self._size = largest
 
     def keep_ahead(self, num_keyframes: int) -> None:
         """Start compiling the next size that a map of this many keyframes will need soon; return at once."""

@@ -1,6 +1,8 @@
 """The one way in which jaxslam compiles a function: `jax.jit` with its options, the trace cache, and a register."""
 
-from collections.abc import Callable, Mapping, Sequence
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial, wraps
 from typing import Any, Literal, TypeAlias, TypeVar
@@ -36,6 +38,36 @@ programs: list[Program] = []
 leaves out would stop a robot for seconds in the middle of a run."""
 
 
+def committed(arrays: R) -> R:
+    """Return arrays in a pytree, at least one, as results of programs from the disk are: committed to their device.
+
+    A program that takes some of both kinds would be compiled for each.
+    """
+    return jax.device_put(arrays, *jax.tree.leaves(arrays)[0].devices())
+
+
+class _ThreadHook(threading.local):
+    """What a thread calls before each program that it compiles."""
+
+    before_each: Callable[[], None] = staticmethod(lambda: None)
+
+
+_this_thread = _ThreadHook()
+
+
+@contextmanager
+def before_each_program(call: Callable[[], None]) -> Iterator[None]:
+    """Call a function before each program that this thread compiles; its error ends that.
+
+    The compiler cannot be interrupted within a program, but a process that ends need not wait for more than one.
+    """
+    _this_thread.before_each = call
+    try:
+        yield
+    finally:
+        del _this_thread.before_each
+
+
 def compiled(
     *,
     when: When,
@@ -62,6 +94,7 @@ def compiled(
 
         @wraps(inner)
         def traced(*args: Any, **kwargs: Any) -> R:
+            _this_thread.before_each()
             program.num_compiled += 1  # `jax.jit` calls this once for each combination that it compiles
             return cached(*args, **kwargs)
 

@@ -1,6 +1,7 @@
 """Work that is done beside tracking: in a thread of its own, or in turn on a fixed schedule. One interface for both.
 
-The tracker offers jobs and takes results; it never waits for either, but when it asks to (`flush`).
+The tracker offers jobs and takes results; it never waits for either, but when it asks to (`flush`). A worker that is
+held keeps its jobs until `begin`: what they need may still have to be compiled.
 """
 
 import atexit
@@ -41,6 +42,14 @@ class Worker(Protocol[_Job_contra, _Result]):
         """Number of jobs that were dropped before they began, because more than `max_waiting` waited."""
         ...
 
+    def begin(self) -> None:
+        """Begin with the jobs that wait, if it was held; safe to call twice."""
+        ...
+
+    def is_due(self, frame: int) -> bool:
+        """Whether a result must be there by frame number `frame`; no thread owes one."""
+        ...
+
     def submit(self, job: _Job_contra, frame: int) -> None:
         """Give it a job, in frame number `frame`.
 
@@ -58,7 +67,7 @@ class Worker(Protocol[_Job_contra, _Result]):
         ...
 
     def flush(self) -> list[_Result]:
-        """Wait for all jobs unless it is closed, and take their results; raises as `collect` does."""
+        """Wait for all jobs unless it is held or closed, and take their results; raises as `collect` does."""
         ...
 
     def stop(self) -> None:
@@ -81,17 +90,28 @@ def close_all(workers: Iterable[Worker[Any, Any]], within_s: float = _CLOSE_S) -
 
 
 class InlineWorker(Generic[_Job, _Result]):
-    """Does each job at once, and hands its result over a fixed number of frames later: the same on every machine."""
+    """Does each job at once, and hands its result over a fixed number of frames later: the same on every machine.
 
-    def __init__(self, work: Callable[[_Job], _Result], name: str, latency_frames: int) -> None:
-        """Do jobs by calling `work`."""
+    One that is held does its jobs, in their order, when it begins; their results come at the same frames.
+    """
+
+    def __init__(self, work: Callable[[_Job], _Result], name: str, latency_frames: int, *, held: bool = False) -> None:
+        """Prepare to do jobs in the caller's thread.
+
+        Args:
+            work: Function that does a job and returns its result.
+            name: Name of the worker.
+            latency_frames: Number of frames after which a result is returned.
+            held: Whether jobs wait until `begin`.
+        """
         self._work, self._name, self._latency = work, name, latency_frames
         self._outcomes: deque[tuple[int, _Result | _Failed]] = deque()
-        self._stopped = False
+        self._waiting: deque[tuple[_Job, int]] = deque()
+        self._held, self._stopped = held, False
 
     @property
     def num_waiting(self) -> int:
-        """Always 0: each job runs when it is submitted."""
+        """Always 0, as decisions of a deterministic run may not depend on when it began."""
         return 0
 
     @property
@@ -99,10 +119,28 @@ class InlineWorker(Generic[_Job, _Result]):
         """Always 0: no job waits."""
         return 0
 
+    def begin(self) -> None:
+        """Do the jobs that wait."""
+        self._held = False
+        while self._waiting:
+            self._do(*self._waiting.popleft())
+
+    def is_due(self, frame: int) -> bool:
+        """Whether the first result is due, be it there or not."""
+        if self._outcomes:
+            return self._outcomes[0][0] <= frame
+        return bool(self._waiting) and self._waiting[0][1] + self._latency <= frame
+
     def submit(self, job: _Job, frame: int) -> None:
-        """Do it."""
+        """Do it, or keep it until `begin`."""
         if self._stopped:
             raise RuntimeError(f"{self._name} is closed")
+        if self._held:
+            self._waiting.append((job, frame))
+        else:
+            self._do(job, frame)
+
+    def _do(self, job: _Job, frame: int) -> None:
         outcome: _Result | _Failed
         try:
             outcome = self._work(job)
@@ -127,6 +165,7 @@ class InlineWorker(Generic[_Job, _Result]):
     def stop(self) -> None:
         """Nothing runs."""
         self._stopped = True
+        self._waiting.clear()
 
     def close(self, within_s: float = _CLOSE_S) -> None:
         """Nothing runs."""
@@ -149,6 +188,7 @@ class ThreadWorker(Generic[_Job, _Result]):
         urgent: bool = False,
         max_waiting: int | None = None,
         may_drop: Callable[[_Job], bool] | None = None,
+        held: bool = False,
     ) -> None:
         """Prepare a thread, which starts with the first job.
 
@@ -159,6 +199,7 @@ class ThreadWorker(Generic[_Job, _Result]):
             max_waiting: Number of droppable jobs that may wait. When one more is submitted, the oldest of them is
                 dropped. `None` for no limit.
             may_drop: Whether a job may be dropped; every job by default. Other jobs do not count towards `max_waiting`.
+            held: Whether jobs wait until `begin`.
         """
         if max_waiting is not None and max_waiting < 1:
             raise ValueError(f"max_waiting: expected at least 1, got {max_waiting}")
@@ -166,7 +207,9 @@ class ThreadWorker(Generic[_Job, _Result]):
         self._max_waiting, self._may_drop, self._num_dropped = max_waiting, may_drop, 0
         self._jobs: queue.Queue[tuple[Callable[[Any], Any], Any] | None] = queue.Queue()
         self._outcomes: deque[_Result | _Failed] = deque()
-        self._stopped = threading.Event()
+        self._begun, self._stopped = threading.Event(), threading.Event()
+        if not held:
+            self._begun.set()
         self._thread: threading.Thread | None = None
 
     @property
@@ -179,17 +222,26 @@ class ThreadWorker(Generic[_Job, _Result]):
         """Number of jobs that were dropped before they began."""
         return self._num_dropped
 
+    def begin(self) -> None:
+        """The thread goes on to the first job."""
+        self._begun.set()
+
+    def is_due(self, frame: int) -> bool:
+        """Never."""
+        del frame
+        return False
+
     def submit(self, job: _Job, frame: int) -> None:
         """Queue it; drop the oldest droppable job if too many wait."""
         del frame
         if self._stopped.is_set():
             raise RuntimeError(f"{self._name} is closed")
         if self._thread is None:
-            arguments = (self._jobs, self._outcomes, self._stopped, self._urgent)
+            arguments = (self._jobs, self._outcomes, self._begun, self._stopped, self._urgent)
             self._thread = threading.Thread(target=_serve, args=arguments, name=self._name, daemon=True)
             self._thread.start()
             _running.add(self)
-            weakref.finalize(self, _stop, self._jobs, self._stopped).atexit = False
+            weakref.finalize(self, _stop, self._jobs, self._begun, self._stopped).atexit = False
         if self._max_waiting is not None and self._is_droppable(job):
             self._drop_oldest(self._max_waiting)
         self._jobs.put((self._work, job))
@@ -201,13 +253,13 @@ class ThreadWorker(Generic[_Job, _Result]):
 
     def flush(self) -> list[_Result]:
         """Wait until nothing is left to do."""
-        if not self._stopped.is_set():
+        if self._begun.is_set() and not self._stopped.is_set():
             self._jobs.join()
         return self.collect(0)
 
     def stop(self) -> None:
         """The thread ends after the job at hand."""
-        _stop(self._jobs, self._stopped)
+        _stop(self._jobs, self._begun, self._stopped)
 
     def close(self, within_s: float = _CLOSE_S) -> None:
         """The thread is left to itself if its job takes longer; what comes of that can be taken."""
@@ -239,6 +291,7 @@ def make_worker(
     urgent: bool = False,
     max_waiting: int | None = None,
     may_drop: Callable[[_Job], bool] | None = None,
+    held: bool = False,
 ) -> Worker[_Job, _Result]:
     """Return an `InlineWorker` for a deterministic run, else a `ThreadWorker`.
 
@@ -250,10 +303,11 @@ def make_worker(
         urgent: Whether a thread runs at normal priority.
         max_waiting: Number of droppable jobs that may wait for a thread; `None` for no limit.
         may_drop: Whether a job may be dropped; every job by default.
+        held: Whether jobs wait until `begin`.
     """
     if deterministic:
-        return InlineWorker(work, name, latency_frames)
-    return ThreadWorker(work, name, urgent=urgent, max_waiting=max_waiting, may_drop=may_drop)
+        return InlineWorker(work, name, latency_frames, held=held)
+    return ThreadWorker(work, name, urgent=urgent, max_waiting=max_waiting, may_drop=may_drop, held=held)
 
 
 _running: "weakref.WeakSet[ThreadWorker[Any, Any]]" = weakref.WeakSet()
@@ -264,16 +318,24 @@ def _close_running() -> None:
     close_all(_running)
 
 
-def _stop(jobs: "queue.Queue[Any]", stopped: threading.Event) -> None:
+def _stop(jobs: "queue.Queue[Any]", begun: threading.Event, stopped: threading.Event) -> None:
     if not stopped.is_set():
-        stopped.set()
+        stopped.set()  # before a thread that was held goes on
         jobs.put(None)
+        begun.set()
 
 
-def _serve(jobs: "queue.Queue[Any]", outcomes: "deque[Any]", stopped: threading.Event, urgent: bool) -> None:
-    """Do jobs until there comes none; those that come after a stop are not done."""
+def _serve(
+    jobs: "queue.Queue[Any]",
+    outcomes: "deque[Any]",
+    begun: threading.Event,
+    stopped: threading.Event,
+    urgent: bool,
+) -> None:
+    """Do jobs until there comes none, from `begun` on; those that come after a stop are not done."""
     if not urgent:
         _step_back()
+    begun.wait()
     while (entry := jobs.get()) is not None:
         work, job = entry
         try:

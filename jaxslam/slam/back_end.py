@@ -1,18 +1,18 @@
 """The back end: mapping, loop closing, reloading of keyframes, and a detector that runs on keyframes only.
 
 It runs in threads, or on a fixed schedule. The tracker hands over keyframes and takes results that are ready; it never
-waits. Results are exchanged in the tracker's thread, in `update`: jobs and results are immutable, so that threads share
-nothing but their queues and the place index, which has a lock.
+waits. Until programs are compiled, jobs wait. Results are exchanged in the tracker's thread, in `update`: jobs and
+results are immutable, so that threads share nothing but their queues and the place index, which has a lock.
 """
 
 from collections.abc import Callable
-from typing import Any
+from functools import partial
+from typing import Any, TypeAlias
 
-import jax
 import numpy as np
 
 from jaxslam.config.schema import Config
-from jaxslam.geometry.se3 import IDENTITY, compose, inverse
+from jaxslam.geometry.se3 import IDENTITY, compose
 from jaxslam.geometry.types import Pose
 from jaxslam.loop_closing.essential_graph import GraphCompiler
 from jaxslam.loop_closing.loop_detector import LoopClosing, LoopClosure
@@ -22,7 +22,6 @@ from jaxslam.map.dynamic_removal import DynamicObservations
 from jaxslam.map.types import NONE, Map, empty_map
 from jaxslam.mapping.local_mapping import mapping_plan
 from jaxslam.mapping.occlusion_states import PointStates
-from jaxslam.runtime.compiled import compiled
 from jaxslam.runtime.preload import import_scipy
 from jaxslam.runtime.stage_timer import StageTimes
 from jaxslam.runtime.worker import Worker, close_all, make_worker
@@ -32,7 +31,7 @@ from jaxslam.sensors.frame import Frame
 from jaxslam.sensors.frame_arrays import FrameArrays, own_copy
 from jaxslam.sensors.sensor_model import SensorModel
 from jaxslam.slam.dense_thread import dense_mapping_of
-from jaxslam.slam.frame_localizer import FrameLocalizer, LocalizedPose, output_at_pose
+from jaxslam.slam.frame_localizer import FrameLocalizer, LocalizedPose
 from jaxslam.slam.keyframe_semantics import KeyframeSemantics
 from jaxslam.slam.map_jobs import MapJob, MapUpdate, MapWriter
 from jaxslam.slam.place_jobs import IndexUpdate, LoopSearch, PlaceJob, PlaceResult, PlaceSearch, Reload
@@ -40,12 +39,10 @@ from jaxslam.slam.reload_queue import ReloadQueue
 from jaxslam.slam.tracker import KeyframeDemand
 from jaxslam.slam.tracker_map_sync import AnchoredPose, TrackerMapSync, pose_of, tracks_of
 from jaxslam.tracking.state import TrackOutput, TrackPlan, TrackState, TrackStatus
-from jaxslam.tracking.state_updates import reset_at_pose
-
-_relocated = compiled(when="warm-up", donate="state")(reset_at_pose)
 
 _RECALL_EVERY = 10
 """Number of frames after which a tracker that only localizes requests keyframes of its surroundings."""
+_Step: TypeAlias = Callable[[], None]
 _MAX_ON_THE_WAY = 2
 """Number of keyframes: one that mapping works on, and one whose result waits for the next `update`."""
 
@@ -109,7 +106,7 @@ class BackEnd:
         self._detector_error = ""
         self._loops_closed = self._removed = 0
         self._states_in_map = 0  # number of the latest `StateChanges` in the newest map
-        self._closed = False
+        self._begun = self._closed = False
 
     @property
     def map(self) -> Map:
@@ -134,28 +131,43 @@ class BackEnd:
     @property
     def keyframe_demand(self) -> KeyframeDemand:
         """Demand of the maps for the next frame as a keyframe."""
-        # Keyframes wait that mapping has not begun with; never on the schedule of a deterministic run.
+        # Keyframes wait that mapping has not begun with, as at first; never on the schedule of a deterministic run.
         if not self._config.run.in_turn and self._link.num_on_the_way > _MAX_ON_THE_WAY:
             return KeyframeDemand.FEWER
         return KeyframeDemand.NOW if self.dense is not None and self.dense.wants_keyframe else KeyframeDemand.NORMAL
 
-    def compile(self, frame: FrameArrays, state: TrackState) -> None:
-        """Compile every program that tracking may call.
+    def programs(self, frame: FrameArrays, state: TrackState) -> tuple[list[_Step], list[_Step]]:
+        """Return what compiles every program of the back end, step by step.
 
         Args:
             frame: Any frame of the camera.
             state: Any state of the tracker; it is used up.
+
+        Returns:
+            The steps after which `begin` may be called, and those after which that of `dense` may be called too.
         """
-        import_scipy()
-        self._writer.compile(frame, self._num_tracks)
+        steps: list[_Step] = [
+            import_scipy,
+            partial(self._writer.compile, frame, self._num_tracks),
+            partial(self._link.compile, state, drops_points=self._semantics is not None),
+            partial(compile_recognition, self._sensor, self._plan.features),
+        ]
         if self._states is not None:
-            self._states.compile(frame)
-        compile_recognition(self._sensor, self._plan.features)
-        self._compile_edits(state)
+            steps.append(partial(self._states.compile, frame))
+        last: list[_Step] = [partial(self._graphs.compile_now, len(self.map.ids))]
         if self.dense is not None:
-            self.dense.compile()
-        if not self._config.run.in_turn:
-            self._graphs.compile_now()  # while frames come, it would take seconds from them
+            last.append(self.dense.compile)
+        return steps, last
+
+    def begin(self) -> None:
+        """Begin with the jobs that wait, now that programs are compiled; until then, `update` changes nothing."""
+        self._begun = True
+        self._to_mapping.begin()
+        self._to_places.begin()
+
+    def is_due(self, frame: int) -> bool:
+        """Whether a deterministic run must have results by frame number `frame`, for which it needs the programs."""
+        return self._to_mapping.is_due(frame) or (self._semantics is not None and self._semantics.worker.is_due(frame))
 
     def update(self, state: TrackState, frame: int) -> tuple[TrackState, np.ndarray]:
         """Take over the results that are ready: correct the tracker's state as the map, and reload a keyframe.
@@ -222,14 +234,7 @@ class BackEnd:
             State and output with the refined pose, and the number of map points that agree with it. Unchanged state
             and output, and 0, if too few points agree.
         """
-        localized = self._localizer.match_tracked(arrays, output)
-        if localized is None:
-            return state, output, 0
-        T_world_cam = self._link.pose(localized.anchored)
-        change = compose(T_world_cam, inverse(pose_of(output)))
-        state = self._link.apply_correction(state, change, is_keyframe=bool(output.keyframe))
-        output = output_at_pose(output, T_world_cam, change, localized, self._config.track.weak_inliers)
-        return state, output, localized.num_matched
+        return self._localizer.match_tracked(state, arrays, output, self._config.track.weak_inliers)
 
     def update_occlusion(self, arrays: FrameArrays, output: TrackOutput) -> float | None:
         """Update the occlusion states of the points of the reference keyframe from a tracked frame.
@@ -237,7 +242,7 @@ class BackEnd:
         Returns:
             Share of the points that are OCCLUDED; `None` if `dynamics.occlusion` is off or the map has no keyframe.
         """
-        if self._states is None or (anchored := self._link.in_map(pose_of(output))) is None:
+        if self._states is None or not self._begun or (anchored := self._link.in_map(pose_of(output))) is None:
             return None
         return self._states.see(self.map, anchored.keyframe, anchored.T_keyframe_cam, np.asarray(output.twist), arrays)
 
@@ -255,9 +260,8 @@ class BackEnd:
 
     def start_submap(self, state: TrackState, T_world_cam: Pose) -> TrackState:
         """Return the tracker's state reset to a pose `(7,)`, with which a new submap begins."""
-        self._link.forget_slots()
         self._reloads.replace(())
-        return _relocated(state, T_world_cam.astype(np.float32))
+        return self._link.reset_at_pose(state, T_world_cam)
 
     def frame_tracked(self, T_world_cam: Pose, frame: int) -> None:
         """Request keyframes of the surroundings at intervals, if no new keyframes are made that request them."""
@@ -325,19 +329,13 @@ class BackEnd:
         if self._semantics is not None:
             self._semantics.submit(keyframe, frame.image, np.asarray(arrays.depth), tracks_of(output), number)
 
-    def _compile_edits(self, state: TrackState) -> None:
-        """Compile the programs that change the tracker's state."""
-        state = self._link.compile(_relocated(state, np.asarray(IDENTITY, np.float32)))
-        if self._semantics is not None:
-            state = self._link.drop_points(state, np.zeros(1, np.int64))
-        jax.block_until_ready(state)
-
     def _worker(self, work: Callable[[Any], Any], name: str, turn: int) -> Worker[Any, Any]:
         return make_worker(
             self._times.timed(name, work),
             f"jaxslam-{name}",
             deterministic=self._config.run.in_turn,
             latency_frames=turn * self._config.mapping.latency_frames,
+            held=True,
         )
 
     def _take_maps(self, updates: list[MapUpdate], frame: int) -> bool:
@@ -359,6 +357,8 @@ class BackEnd:
         return bool(updates)
 
     def _carried(self, state: TrackState) -> TrackState:
+        if not self._begun:
+            return state
         if self._arrived is not None:
             state, change = self._link.apply_map(state, self._arrived)
             self._arrived = None

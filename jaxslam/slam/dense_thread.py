@@ -50,7 +50,9 @@ class DenseMapping:
         wants_keyframe: Whether a large share of the image shows surface that no keyframe shows.
     """
 
-    def __init__(self, slam_map: DenseMap, seen: SeenArea, config: DenseConfig, *, deterministic: bool) -> None:
+    def __init__(
+        self, slam_map: DenseMap, seen: SeenArea, config: DenseConfig, *, deterministic: bool, held: bool = False
+    ) -> None:
         """Start with an empty dense map.
 
         Args:
@@ -58,6 +60,7 @@ class DenseMapping:
             seen: Area seen by keyframes, empty, of which this object becomes the only user.
             config: Settings that the dense map was made with.
             deterministic: Run jobs in the caller's thread instead of a thread of its own.
+            held: Whether jobs wait until `begin`.
         """
         self._map, self._carves = slam_map, config.carve
         self._seen, self._least_seen, self.wants_keyframe = seen, config.keyframe_below, False
@@ -71,12 +74,17 @@ class DenseMapping:
             latency_frames=0,
             max_waiting=_MAX_WAITING,
             may_drop=_is_keyframe,
+            held=held,
         )
 
     def compile(self) -> None:
         """Compile the programs of the dense map."""
         with self._lock:
             self._map.compile()
+
+    def begin(self) -> None:
+        """Begin with the jobs that wait, now that the programs are compiled."""
+        self.worker.begin()
 
     def insert_keyframe(self, new: NewKeyframe, image: np.ndarray, pose: Pose, frame: int) -> None:
         """Keep a keyframe, which is added to the dense map when local mapping has inserted it.
@@ -195,7 +203,7 @@ def _is_keyframe(job: _Job) -> bool:
 def dense_mapping_of(
     camera: Camera, sensor: SensorModel, config: Config, key_detector: Detector | None, times: StageTimes
 ) -> DenseMapping:
-    """Make an empty dense map according to the settings, and its thread.
+    """Make an empty dense map according to the settings, and its thread, which is held.
 
     Args:
         camera: Camera that takes the frames.
@@ -209,4 +217,4 @@ def dense_mapping_of(
         camera, config.dense, nearest_m=nearest_m, farthest_m=farthest_m, key_detector=key_detector, times=times
     )
     seen = SeenArea(camera, nearest_m, farthest_m)
-    return DenseMapping(dense_map, seen, config.dense, deterministic=config.run.in_turn)
+    return DenseMapping(dense_map, seen, config.dense, deterministic=config.run.in_turn, held=True)

@@ -7,7 +7,7 @@ from jaxlie import SE3
 
 from jaxslam.features.orb import FeaturePlan, Features, features_of
 from jaxslam.features.pose_from_matches import MIN_INLIERS
-from jaxslam.geometry.se3 import transform
+from jaxslam.geometry.se3 import compose, inverse, transform
 from jaxslam.geometry.types import Pose
 from jaxslam.loop_closing.place_index import PlaceIndex
 from jaxslam.loop_closing.place_recognition import recognize
@@ -16,7 +16,7 @@ from jaxslam.mapping.occlusion_states import PointStates
 from jaxslam.sensors.frame_arrays import FrameArrays
 from jaxslam.sensors.sensor_model import SensorModel
 from jaxslam.slam.tracker_map_sync import AnchoredPose, TrackerMapSync, pose_of
-from jaxslam.tracking.state import TrackOutput, TrackReason, TrackStatus
+from jaxslam.tracking.state import TrackOutput, TrackReason, TrackState, TrackStatus
 
 _PATIENCE_S = 0.02
 """Longest wait for the lock of the place index while lost; the next frame tries again."""
@@ -36,7 +36,7 @@ class LocalizedPose(NamedTuple):
     covariance: np.ndarray
 
 
-def output_at_pose(
+def _output_at_pose(
     output: TrackOutput, T_world_cam: Pose, change: Pose, localized: LocalizedPose, weak_inliers: float
 ) -> TrackOutput:
     """Return the output of a frame at the pose from the local map; it is `OK` if enough points agree with that pose.
@@ -92,15 +92,25 @@ class FrameLocalizer:
         """Forget the features of the frame before."""
         self.features = None
 
-    def match_tracked(self, arrays: FrameArrays, output: TrackOutput) -> LocalizedPose | None:
-        """Localize a tracked frame against the local map; `None` if too few points agree.
+    def match_tracked(
+        self, state: TrackState, arrays: FrameArrays, output: TrackOutput, weak_inliers: float
+    ) -> tuple[TrackState, TrackOutput, int]:
+        """Refine the pose of a tracked frame against the local map; see `BackEnd.match_local_map`.
 
         Args:
+            state: State of the tracker after the frame.
             arrays: The frame.
             output: Output of the tracker for the frame.
+            weak_inliers: Number of matches from which the frame is no longer `WEAK`.
         """
         self.features = features_of(arrays, np.asarray(output.twist), self._sensor, self._plan)
-        return self._in_local_map(self.features, pose_of(output))
+        localized = self._in_local_map(self.features, pose_of(output))
+        if localized is None:
+            return state, output, 0
+        T_world_cam = self._link.pose(localized.anchored)
+        change = compose(T_world_cam, inverse(pose_of(output)))
+        state = self._link.apply_correction(state, change, is_keyframe=bool(output.keyframe))
+        return state, _output_at_pose(output, T_world_cam, change, localized, weak_inliers), localized.num_matched
 
     def relocalize(self, arrays: FrameArrays, predicted: Pose | None) -> tuple[LocalizedPose | None, bool]:
         """Localize a lost frame: against the local map at the predicted pose, else by place recognition.

@@ -10,6 +10,7 @@ from jaxslam.sensors.frame_arrays import FrameArrays
 from jaxslam.slam.back_end import BackEnd
 from jaxslam.slam.frame_localizer import LocalizedPose
 from jaxslam.slam.pose_history import ConstantVelocity
+from jaxslam.slam.program_compiler import ProgramCompiler
 from jaxslam.slam.tracker import Tracker
 from jaxslam.slam.tracker_map_sync import AnchoredPose
 from jaxslam.tracking.state import TrackOutput, TrackReason, TrackStatus
@@ -35,16 +36,19 @@ class LocalizationStage:
     The order of calls for a frame is `localize`, then `frame_tracked` or `frame_lost`.
     """
 
-    def __init__(self, tracker: Tracker, back_end: BackEnd, config: Config, *, localize_only: bool) -> None:
+    def __init__(
+        self, tracker: Tracker, back_end: BackEnd, programs: ProgramCompiler, config: Config, *, localize_only: bool
+    ) -> None:
         """Start before the first frame.
 
         Args:
             tracker: Tracker, whose state moves to the pose from the map.
             back_end: Owner of the map.
+            programs: Compiler of the programs; frames are as the tracker left them until it is done.
             config: Settings in effect.
             localize_only: Begin no submaps where a place is unknown.
         """
-        self._tracker, self._back = tracker, back_end
+        self._tracker, self._back, self._programs = tracker, back_end, programs
         self._match_map, self._restart_after = config.track.match_map, config.track.restart_after
         self._begins_submaps = config.run.on_loss == "submap" and not localize_only
         self._motion = ConstantVelocity()
@@ -62,7 +66,7 @@ class LocalizationStage:
         return self._motion.now()
 
     def localize(self, arrays: FrameArrays, output: TrackOutput, dt_s: float) -> LocalizedOutput:
-        """Relocalize a frame that is lost, or match one that is weak with the local map.
+        """Relocalize a frame that is lost, or match one that is weak with the local map, if that is compiled yet.
 
         Args:
             arrays: The frame.
@@ -70,8 +74,8 @@ class LocalizationStage:
             dt_s: Time since the frame before, in seconds.
         """
         if int(output.status) == TrackStatus.LOST:
-            return self._relocalize(arrays, output, dt_s)
-        if self._needs_map_match(output):
+            return self._relocalize(arrays, output, dt_s) if self._programs.can_map() else self._not_ready(output)
+        if self._needs_map_match(output) and self._programs.can_map():
             self._tracker.state, output, num_matched = self._back.match_local_map(self._tracker.state, arrays, output)
             return LocalizedOutput(output, num_matched)
         return LocalizedOutput(output)
@@ -96,6 +100,12 @@ class LocalizationStage:
         status = int(output.status)
         chosen = self._match_map == "always" or (self._match_map == "keyframes" and bool(output.keyframe))
         return status == TrackStatus.WEAK or (chosen and status != TrackStatus.STARTED)
+
+    def _not_ready(self, lost: TrackOutput) -> LocalizedOutput:
+        """Leave a frame lost, and say so where that it is not relocalized is why."""
+        if self._was_lost if self._any_tracked else len(self._back.map.ids):
+            lost = lost._replace(reason=np.int32(TrackReason.GETTING_READY))
+        return LocalizedOutput(lost)
 
     def _relocalize(self, arrays: FrameArrays, lost: TrackOutput, dt_s: float) -> LocalizedOutput:
         """Track a lost frame again from where the map recognizes its place, or from the last pose in a new submap."""

@@ -3,10 +3,7 @@
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-
-import numpy as np
 
 from jaxslam.config.schema import Config
 from jaxslam.datasets import Dataset
@@ -33,6 +30,7 @@ from jaxslam.slam.input_warnings import InputWarnings
 from jaxslam.slam.localization_stage import LocalizationStage
 from jaxslam.slam.mask_stage import MaskStage
 from jaxslam.slam.pose_history import PoseHistory, ordered_trajectory
+from jaxslam.slam.program_compiler import ProgramCompiler
 from jaxslam.slam.recording_run import run_recording
 from jaxslam.slam.status_log import StatusLog
 from jaxslam.slam.tracker import Tracker
@@ -57,7 +55,6 @@ class Slam:
         without_network: Reason why no network segments the frames, as part of a sentence; `None` if one, or a
             `detector`, does.
         dense_mapping: Thread of the dense map; `None` without `dense.enabled`, or with `localize_only`.
-        compile_s: Time spent compiling, seconds.
         times: Durations of the stages of every frame: `take over` map corrections, `flow`, `wait for mask`, `pose`,
             `match with map`, and `hand over` to mapping and the detector; and of the jobs of other threads: `match
             pair` of a stereo camera, `masks`, `detector`, `mapping`, `places`, `dense` and its parts. In a
@@ -75,7 +72,7 @@ class Slam:
         detector: Detector | None = None,
         key_detector: Detector | None = None,
     ) -> None:
-        """Prepare to track a camera; compiling happens at the first frame, or in `warm_up`.
+        """Prepare to track a camera; programs are compiled from the first frame on, or in `warm_up`.
 
         Args:
             camera: Camera that takes the frames.
@@ -102,7 +99,6 @@ class Slam:
         self.call_lock = threading.RLock()
         self.camera = camera
         self.config = config or Config()
-        self.compile_s = 0.0
         # An empty map knows no place: with it, no frame would ever be tracked.
         self._start_map, self._localize_only = (
             slam_map if slam_map is not None and len(slam_map.ids) else None,
@@ -116,7 +112,7 @@ class Slam:
         motion = self._tracker.plan.motion
         self._memory = FrameMemory(camera.height, camera.width, pairs=camera.is_stereo, movable=motion is not None)
         self._instances = None if motion is None else InstanceFinder(camera, motion.num_objects)
-        self._ready = False
+        self._programs = ProgramCompiler(self._tracker, camera, waits=self.config.run.in_turn)
         self._begin()
 
     @classmethod
@@ -155,29 +151,23 @@ class Slam:
 
     @one_at_a_time
     def warm_up(self) -> float:
-        """Compile every program, or load it from the cache of an earlier run; return the seconds that took.
+        """Compile every program, or load it from the cache of an earlier run; return `compile_s`.
 
-        Later calls do nothing and return the same number.
+        If compiling has begun with the first frame, this waits for the rest of it. Later calls do nothing and return
+        the same number.
+
+        Raises:
+            Exception: Error of compiling; the next call tries again.
         """
-        if not self._ready:
-            began = time.perf_counter()
-            shape = (self.camera.height, self.camera.width)
-            black = np.zeros(shape, np.uint8)
-            pair = black if self.camera.is_stereo else None
-            nothing = self._memory.hold(Frame(0, black, np.zeros(shape, np.float32), right=pair), 0.0)
-            # In two threads: traced anew it took 5.9 s instead of 7.4 from XLA's cache, 31 instead of 34 without.
-            with ThreadPoolExecutor(1, thread_name_prefix="jaxslam-compile") as beside:
-                back_end = beside.submit(self._back.compile, nothing, self._tracker.fresh_state())
-                self._tracker.compile(nothing)
-                self._masks.compile()
-                back_end.result()
-            self.compile_s = time.perf_counter() - began
-            self._ready = True
-        return self.compile_s
+        return self._programs.compile_all()
 
     @one_at_a_time
     def track(self, frame: Frame) -> FrameResult:
         """Track one frame.
+
+        The first call compiles what tracking itself needs. All else is compiled in a thread meanwhile: keyframes wait
+        for it, frames that are lost or weak stay so, and a map to start with is not looked into. With
+        `run.deterministic`, a frame waits for what it needs instead. After `warm_up`, nothing is left to compile.
 
         Args:
             frame: Image with depth, or a stereo pair, of the size of the camera and later than the frame before.
@@ -190,11 +180,11 @@ class Slam:
             FrameError: If the frame does not fit the camera, or is not later than the frame before. The state is
                 unchanged; go on with the next frame.
             RuntimeError: After `close`, or in a process made by `fork`.
-            Exception: Error of a job of mapping or loop closing.
+            Exception: Error of a job of mapping or loop closing, or of compiling in the thread.
         """
         check_frame(frame, self.camera.width, self.camera.height, pair=self.camera.is_stereo)
         self._clock.check(frame.timestamp_ns, frame.depth_timestamp_ns)
-        self.warm_up()
+        self._programs.prepare(self._frame)
         began, watch = time.perf_counter(), self.times.stopwatch()
         self._input_checks.look(frame)
 
@@ -259,11 +249,16 @@ class Slam:
     @one_at_a_time
     def finish(self) -> None:
         """Wait for mapping, loop closing and a detector of keyframes, so that `map` and `trajectory` are complete."""
+        self._programs.finish()
         self._tracker.recover()  # from a step that Ctrl-C ended
         self._tracker.state = self._back.finish(self._tracker.state)
 
     def close(self) -> None:
-        """End the threads, within two seconds; before another frame can be tracked, call `reset`."""
+        """End the threads, within two seconds; before another frame can be tracked, call `reset`.
+
+        A program that is being compiled cannot be interrupted: its thread, and a process that ends, end after it.
+        """
+        self._programs.stop()
         self._back.close()
         self._masks.close()
 
@@ -277,6 +272,15 @@ class Slam:
     def map(self) -> Map:
         """The current map; it is immutable, and mapping replaces it by another one."""
         return self._back.map
+
+    @property
+    def compile_s(self) -> float:
+        """Time from when compiling began until all programs, or those so far, were ready, seconds.
+
+        Before the first frame, it is that of all programs if `warm_up` was called. Else it is that of tracking at
+        first, and the time of the thread is added when all are ready.
+        """
+        return self._programs.seconds
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -356,9 +360,10 @@ class Slam:
             instances=self._instances,
             times=self.times,
         )
+        self._programs.use(self._masks, self._back)
         self._tracker.begin(await_relocalization=self._start_map is not None)
         self._localization = LocalizationStage(
-            self._tracker, self._back, self.config, localize_only=self._localize_only
+            self._tracker, self._back, self._programs, self.config, localize_only=self._localize_only
         )
         self._frame = 0
         self._clock = FrameClock(self.camera.fps, self._warnings)

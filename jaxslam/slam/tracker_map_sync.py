@@ -6,6 +6,7 @@ known poses, and frames and keyframes still on their way to the map hang on thos
 
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from jaxslam.geometry.se3 import IDENTITY, angle, between, compose, inverse, to_local, transform
@@ -17,11 +18,12 @@ from jaxslam.runtime.padding import padded
 from jaxslam.sensors.frame_arrays import FrameArrays
 from jaxslam.slam.keyframe_reload import MapKeyframe
 from jaxslam.tracking.state import TrackOutput, TrackPlan, TrackState, TrackStatus
-from jaxslam.tracking.state_updates import apply_map_correction, drop_points, load_keyframe
+from jaxslam.tracking.state_updates import apply_map_correction, drop_points, load_keyframe, reset_at_pose
 
 _MIN_MOVE_M, _MIN_TURN = 1e-6, 1e-6
 """A correction below both is none."""
 
+_relocated = compiled(when="warm-up", donate="state")(reset_at_pose)
 _carried = compiled(when="warm-up", donate="state")(apply_map_correction)
 _reloaded = compiled(when="warm-up", donate="state")(load_keyframe)
 _forgotten = compiled(when="warm-up", donate="state")(drop_points)
@@ -58,15 +60,22 @@ class TrackerMapSync:
         self._next = slam_map.next_keyframe
         self._submap = int(slam_map.submap.max(initial=-1)) + 1
 
-    def compile(self, state: TrackState) -> TrackState:
-        """Compile what changes a state, on one that is not needed any more."""
+    def compile(self, state: TrackState, *, drops_points: bool) -> None:
+        """Compile what changes a state.
+
+        Args:
+            state: Any state of the tracker; it is used up.
+            drops_points: Whether points may have to be dropped.
+        """
         identity, nothing = IDENTITY.astype(np.float32), np.zeros(self._plan.num_points, np.float32)
-        state = _carried(state, identity, np.tile(identity, (len(self._slots), 1)))
+        state = _carried(_relocated(state, identity), identity, np.tile(identity, (len(self._slots), 1)))
         if self._plan.num_reloaded:
             plane, image = np.tile(nothing, (3, 1)), np.zeros(state.keyframes.images.shape[1:], np.uint8)
             places = (identity, plane[:2], plane)
             state = _reloaded(state, np.int32(0), image, *places, nothing, nothing.astype(np.int32))
-        return state
+        if drops_points:
+            state = self.drop_points(state, np.zeros(1, np.int64))
+        jax.block_until_ready(state)
 
     def anchor(self, T_world_cam: Pose) -> AnchoredPose:
         """A pose of the tracker, tied to the reference keyframe."""
@@ -97,9 +106,10 @@ class TrackerMapSync:
         self.reference = keyframe_id
         self._believed.setdefault(keyframe_id, self.map.pose(keyframe_id))
 
-    def forget_slots(self) -> None:
-        """The tracker has forgotten its keyframes."""
+    def reset_at_pose(self, state: TrackState, T_world_cam: Pose) -> TrackState:
+        """The tracker's state reset to a pose `(7,)`, without its keyframes."""
         self._slots = [NONE] * len(self._slots)
+        return _relocated(state, T_world_cam.astype(np.float32))
 
     def submap_now(self) -> int:
         """Number of the submap that the frames are in."""

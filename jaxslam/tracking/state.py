@@ -83,6 +83,7 @@ class TrackReason(enum.IntEnum):
     PLACE_NOT_IN_MAP = 8
     MASKED = 9
     UNCONFIRMED = 10
+    GETTING_READY = 11
 
     @property
     def text(self) -> str:
@@ -103,6 +104,7 @@ _REASON_TEXT = {
     TrackReason.PLACE_NOT_IN_MAP: "the place was not recognized: it is not in the map",
     TrackReason.MASKED: "nearly all of the image is masked",
     TrackReason.UNCONFIRMED: "the background, which has no depth, does not move as the pose says",
+    TrackReason.GETTING_READY: "getting ready to relocalize: the programs for it are still being compiled",
 }
 
 

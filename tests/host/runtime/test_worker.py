@@ -176,6 +176,59 @@ class TestDropping:
             ThreadWorker(double, "test", max_waiting=0)
 
 
+class TestHeld:
+    """Until `begin`, jobs wait."""
+
+    def test_inline_results_come_at_the_same_frames(self) -> None:
+        done: list[int] = []
+        worker: AnyWorker = InlineWorker(lambda job: done.append(job) or double(job), "test", LATENCY, held=True)
+        for frame in range(3):
+            worker.submit(frame, frame)
+        assert (done, worker.num_waiting, worker.flush()) == ([], 0, [])
+        assert [worker.is_due(frame) for frame in (LATENCY - 1, LATENCY)] == [False, True]
+        worker.begin()
+        worker.begin()
+        assert done == [0, 1, 2]
+        assert [worker.is_due(frame) for frame in (LATENCY - 1, LATENCY)] == [False, True]
+        assert worker.collect(LATENCY) == [0]
+        assert worker.collect(LATENCY + 2) == [2, 4]
+        worker.submit(7, 7)
+        assert done == [0, 1, 2, 7]
+
+    def test_inline_errors_come_at_their_frames(self) -> None:
+        worker = InlineWorker(double, "test", LATENCY, held=True)
+        worker.submit(100, 0)
+        worker.begin()
+        assert worker.collect(LATENCY - 1) == []
+        with pytest.raises(WrongError, match="job 100"):
+            worker.collect(LATENCY)
+
+    def test_a_thread_waits(self) -> None:
+        done: list[int] = []
+        work: Callable[[int], int] = lambda job: done.append(job) or double(job)
+        worker = ThreadWorker(work, "test", max_waiting=2, held=True)
+        for job in range(4):
+            worker.submit(job, 0)
+        assert (worker.num_waiting, worker.num_dropped, worker.flush(), worker.is_due(100)) == (2, 2, [], False)
+        worker.begin()
+        assert worker.flush() == [4, 6]
+        assert done == [2, 3]
+        worker.close()
+
+    @pytest.mark.parametrize("inline", [True, False])
+    def test_closed_before_it_begins(self, *, inline: bool) -> None:
+        done: list[int] = []
+        work = lambda job: done.append(job) or job
+        worker = InlineWorker(work, "held", 0, held=True) if inline else ThreadWorker(work, "held", held=True)
+        worker.submit(1, 0)
+        began = time.monotonic()
+        worker.close()
+        worker.begin()
+        assert worker.flush() == done == []
+        assert time.monotonic() - began < 1
+        assert all(thread.name != "held" for thread in threading.enumerate())
+
+
 class TestClose:
     def test_twice(self, make: Make) -> None:
         worker = make(double)
