@@ -184,7 +184,7 @@ def all_centroids(grid: VoxelGrid, voxel_m: Float[Array, ""]) -> Voxels:
     return centroids(grid, jnp.zeros((), jnp.int32), voxel_m, size=len(grid.sums))
 
 
-@compiled(when="first use", static="capacity")
+@compiled(when="warm-up", static="capacity")
 def rebuilt(
     grid: VoxelGrid, old_m: Float[Array, ""], new_m: Float[Array, ""], capacity: int
 ) -> tuple[VoxelGrid, Int[Array, " c"], Points]:

@@ -26,7 +26,7 @@ from jaxslam.geometry.types import Ids, Pose
 from jaxslam.map.edit import with_states
 from jaxslam.map.types import NONE, Map, has, rows, visibility
 from jaxslam.runtime.compile_cache import SINGLE_THREAD
-from jaxslam.runtime.compiled import compiled
+from jaxslam.runtime.compiled import committed, compiled
 from jaxslam.runtime.padding import padded
 from jaxslam.sensors.frame_arrays import FrameArrays
 from jaxslam.sensors.measurement import depth_sigma, measure, predict_pixels
@@ -201,7 +201,7 @@ class PointStates:
     def _columns(self, *columns: np.ndarray) -> _Columns:
         """Pad one column per point with zeros to the compiled size."""
         filled: Any = (jnp.asarray(padded(column, self._room, axis=-1)) for column in columns)
-        return _Columns(*filled)
+        return committed(_Columns(*filled))  # as the states after a frame
 
     def _after(
         self, columns: _Columns, T_keyframe_cam: Pose, twist: Float[np.ndarray, "6"], arrays: FrameArrays

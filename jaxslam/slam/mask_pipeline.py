@@ -19,7 +19,7 @@ from jaxslam.masks.box_to_mask import dilated
 from jaxslam.masks.propagation import PYRAMID_LEVELS, follow, make_origin, predicted_mask
 from jaxslam.runtime.aligned_memory import aligned_array
 from jaxslam.runtime.compile_cache import SINGLE_THREAD
-from jaxslam.runtime.compiled import compiled
+from jaxslam.runtime.compiled import committed, compiled
 from jaxslam.runtime.stage_timer import StageTimes
 from jaxslam.semantics import Detector
 from jaxslam.sensors.camera import Camera
@@ -80,7 +80,7 @@ class _BufferedFrame:
     @property
     def pyramid(self) -> Pyramid:
         """Its pyramid; most frames need none, because nothing is in their mask."""
-        made = self._pyramid or _pyramid(self.gray)
+        made = self._pyramid or committed(_pyramid(self.gray))  # as those that `follow` makes
         self._pyramid = made
         return made
 
@@ -126,7 +126,7 @@ class MaskPipeline:
     def compile(self) -> None:
         """Compile all that masks need."""
         blank = np.zeros(self._mask.shape, np.uint8)
-        pyramid = _pyramid(blank)
+        pyramid = _BufferedFrame(blank).pyramid
         origin = make_origin(blank.view(bool), blank, 0)
         follow(origin, [pyramid] * 2, blank, blank.astype(np.float32))
         self._surfaces.compile()
