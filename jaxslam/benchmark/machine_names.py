@@ -1,8 +1,9 @@
-"""On what runs were made, in words: CPU, vector instructions, cores, and the versions of libraries that round."""
+"""On what runs were made, in words: CPU, vector instructions, cores, and versions of the libraries that decide."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+_COMPILED_WITH = ("jax", "jaxlib", "jaxlie", "equinox", "optimistix")
 _ROUNDING_LIBRARIES = ("jaxlib", "opencv-python-headless", "numpy")
 
 
@@ -25,3 +26,8 @@ def versions_of(results: Sequence[Mapping[str, Any]]) -> str:
     """Versions of the libraries that round, with which runs were made."""
     done = (result["versions"] for result in results if result["status"] == "done")
     return "; ".join(sorted({", ".join(f"{name} {of_run[name]}" for name in _ROUNDING_LIBRARIES) for of_run in done}))
+
+
+def compiled_with(machine: Mapping[str, Any]) -> str:
+    """Versions of the libraries that decide which programs are compiled, and how."""
+    return ", ".join(f"{name} {machine['versions'][name]}" for name in _COMPILED_WITH)

@@ -115,6 +115,14 @@ COMMANDS = (
         " `NPROC=1` before the command holds XLA to one thread.",
     ),
     Command(
+        ("bench", "compile"),
+        "bench_compile:Compile",
+        "Measure what compiling costs: instructions, kernels, seconds, memory.",
+        "Of the step, its gradient, mapping, loop closing and the dense map, each in a process of its own, without"
+        " caches; two minutes. With `--by-function`, also what each function of the source costs in a frame."
+        " The counts of the step are a budget that a test compares.",
+    ),
+    Command(
         ("bench", "gate"),
         "bench_gate:Gate",
         "Run the suite of a baseline, and fail if errors, coverage or times are worse.",
