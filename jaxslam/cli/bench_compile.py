@@ -52,15 +52,16 @@ class Compile(WithJson):
         from jaxslam.benchmark.compiling.part_process import PartJob, check_parts  # noqa: PLC0415
         from jaxslam.benchmark.compiling.report import how, markdown_report  # noqa: PLC0415
         from jaxslam.cli.measurement_files import write_measurements  # noqa: PLC0415
+        from jaxslam.runtime.compile_cache import prefer_one_thread  # noqa: PLC0415
         from jaxslam.runtime.machine import machine  # noqa: PLC0415
 
+        prefer_one_thread()  # for the processes of the parts, and so that it is said of them
         names = check_parts(self.only)
         make_folder(self.out, BenchmarkError)
         recording = None if self.recording is None else str(self.recording.expanduser().resolve())
         rows = _measured([PartJob(name, recording, size, self.by_function) for name in names])
         content = {
             **machine(),
-            "threads": 1,  # of the parts' processes, unless `NPROC` says otherwise; this one computes nothing
             "scene": "a rendered room through the lens of the camera bonn" if recording is None else recording,
             "gradient_size": size,
             "functions": self.functions,

@@ -155,9 +155,8 @@ def _row(part: str, program: CompiledProgram, spent: Mapping[str, Mapping[str, S
 def _functions(instructions: Mapping[str, Instruction], spent: Mapping[str, Spent] | None) -> list[dict[str, Any]]:
     """List the functions of a program: what they wrote and, if it was run, what they cost; the dearest first."""
     counts = count_by_function(instructions.values())
-    names = dict.fromkeys((*counts, *(spent or {})))
     found = []
-    for name in names:
+    for name in [*counts, *(name for name in spent or {} if name not in counts)]:
         cost = None if spent is None else spent.get(name, Spent(0, 0))
         measured = {"executed": None, "self_ms": None} if cost is None else vars(cost)
         found.append({"function": name, **counts.get(name, Count(0, 0))._asdict(), **measured})

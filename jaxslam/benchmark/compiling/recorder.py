@@ -6,7 +6,7 @@ itself, so that what is recorded is what jaxslam compiles, called in its own way
 
 import threading
 import time
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -19,6 +19,7 @@ from jaxslam.runtime.machine import peak_rss_mb
 
 _PREFIX = "/jax/core/compile/"
 _TRACE, _LOWER, _COMPILE = "jaxpr_trace_duration", "jaxpr_to_mlir_module_duration", "backend_compile_duration"
+_KINDS: tuple[str, ...] = (_TRACE, _LOWER, _COMPILE)
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ class _Interval:
     name: str
     began_s: float
     length_s: float
-    seconds: Counter[str]
+    seconds: dict[str, float]
 
 
 @dataclass
@@ -72,22 +73,28 @@ class _Thread:
     def add(self, kind: str, name: str, length_s: float) -> None:
         """Add an interval that ends now. A trace may hold intervals of all kinds, each reported before it."""
         began_s, own_s = time.perf_counter() - length_s, length_s
-        seconds: Counter[str] = Counter()
+        seconds = dict.fromkeys(_KINDS, 0.0)
         while self.outermost and self.outermost[-1].began_s >= began_s:
             inside = self.outermost.pop()
             own_s -= inside.length_s
-            seconds += inside.seconds
+            _add(seconds, inside.seconds)
         seconds[kind] += max(own_s, 0.0)
         self.outermost.append(_Interval(name, began_s, length_s, seconds))
 
     def take(self, name: str) -> dict[str, float]:
         """Return the seconds that went into the program of this name, and count them for no other one."""
-        seconds: Counter[str] = Counter()
+        seconds = dict.fromkeys(_KINDS, 0.0)
         for interval in self.outermost:
             if interval.name == name:
-                seconds += interval.seconds
-                interval.seconds = Counter()
+                _add(seconds, interval.seconds)
+                interval.seconds = {}
         return {"trace_s": seconds[_TRACE], "lower_s": seconds[_LOWER], "compile_s": seconds[_COMPILE]}
+
+
+def _add(seconds: dict[str, float], more: dict[str, float]) -> None:
+    """Add seconds of some kinds of work to those of all."""
+    for kind, value in more.items():
+        seconds[kind] += value
 
 
 @contextmanager
@@ -99,6 +106,9 @@ def recorded() -> Iterator[list[CompiledProgram]]:
 
     Returns:
         The programs in the order in which they were compiled; the list is filled when the context ends.
+
+    Raises:
+        RuntimeError: When the context ends, if JAX has reported a program that XLA's client does not hold.
     """
     known: list[Any] = get_backend().live_executables()
     threads: defaultdict[int, _Thread] = defaultdict(_Thread)
@@ -106,7 +116,7 @@ def recorded() -> Iterator[list[CompiledProgram]]:
 
     def on_event(event: str, duration_secs: float, **details: str | int) -> None:
         kind, thread = event.removeprefix(_PREFIX), threads[threading.get_ident()]
-        if kind not in (_TRACE, _LOWER, _COMPILE):
+        if kind not in _KINDS:
             return
         name = str(details.get("fun_name")).removeprefix("jit(").removesuffix(")")
         thread.add(kind, name, duration_secs)
@@ -115,7 +125,7 @@ def recorded() -> Iterator[list[CompiledProgram]]:
         figures = {"name": name.lstrip("_"), **thread.take(name), "peak_mb": peak_rss_mb()}
         new = [one for one in get_backend().live_executables() if not any(one is other for other in known)]
         known.extend(new)
-        kept.extend((one, figures) for one in new[:1])
+        kept.append((new[0] if new else None, figures))
 
     programs: list[CompiledProgram] = []
     jax.monitoring.register_event_duration_secs_listener(on_event)
@@ -123,5 +133,8 @@ def recorded() -> Iterator[list[CompiledProgram]]:
         yield programs
     finally:
         jax.monitoring.unregister_event_duration_listener(on_event)
+    lost = [figures["name"] for one, figures in kept if one is None]
+    if lost:
+        raise RuntimeError(f"expected XLA's client to hold what was compiled, it does not: {', '.join(lost)}")
     # Not before: texts are as long as a dozen megabytes, which would count as memory of the programs after them.
     programs.extend(CompiledProgram(**figures, text=one.hlo_modules()[0].to_string()) for one, figures in kept)

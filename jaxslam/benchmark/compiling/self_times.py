@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import cv2
 import jax
@@ -66,17 +67,25 @@ def room_through_lens(camera: Camera, count: int) -> list[Frame]:
         camera: Camera with or without distortion; the shutter opens for all rows at once.
         count: Number of frames.
     """
-    intrinsics = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
-    room = SyntheticDataset(SyntheticConfig(frames=count, width=camera.width, height=camera.height, **intrinsics))
+    of_lens = SyntheticConfig(
+        frames=count,
+        width=camera.width,
+        height=camera.height,
+        fx=camera.fx,
+        fy=camera.fy,
+        cx=camera.cx,
+        cy=camera.cy,
+    )
+    room = SyntheticDataset(of_lens)
     pinhole = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
     pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1).astype(np.float32)
     ideal = cv2.undistortPoints(pixels.reshape(-1, 1, 2), pinhole, np.array(camera.distortion), P=pinhole)
-    place = ideal.reshape(pixels.shape).astype(np.float32)
+    column, row = np.moveaxis(ideal.reshape(pixels.shape).astype(np.float32), -1, 0)
     frames = []
     for frame in map(room.__getitem__, range(count)):
         assert frame.depth_m is not None
-        image = cv2.remap(frame.image, place, None, cv2.INTER_LINEAR)
-        depth_m = cv2.remap(frame.depth_m, place, None, cv2.INTER_NEAREST)
+        image = cv2.remap(frame.image, column, row, cv2.INTER_LINEAR)
+        depth_m = cv2.remap(frame.depth_m, column, row, cv2.INTER_NEAREST)
         frames.append(replace(frame, image=image, depth_m=depth_m))
     return frames
 
@@ -118,7 +127,7 @@ def trace_tracker(
 
 
 def _sums(
-    profile: ProfileData, programs: Mapping[str, Mapping[str, Instruction]], num_frames: int
+    profile: Any, programs: Mapping[str, Mapping[str, Instruction]], num_frames: int
 ) -> dict[str, dict[str, Spent]]:
     """Sum the operations of a trace by program and function."""
     executed: defaultdict[tuple[str, str], int] = defaultdict(int)
@@ -137,7 +146,7 @@ def _sums(
     return found
 
 
-def _events(profile: ProfileData) -> Iterator[tuple[_Event, float]]:
+def _events(profile: Any) -> Iterator[tuple[_Event, float]]:
     """Give the operations of a trace, each with its time without those inside it, nanoseconds."""
     for plane in profile.planes:
         for line in plane.lines:

@@ -64,7 +64,9 @@ def text() -> str:
 
 
 def optimized(function: Callable[..., jax.Array], *arguments: np.ndarray) -> str:
-    return jax.jit(function).lower(*arguments).compile().as_text()
+    text = jax.jit(function).lower(*arguments).compile().as_text()
+    assert text is not None
+    return text
 
 
 class TestWritten:

@@ -2,11 +2,14 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 from command_line import failing, printed_json
 from tiny_recording import CAMERA, write_recording
 
+from jaxslam.benchmark.compiling import part_process
+from jaxslam.benchmark.compiling.part_process import PartJob
 from jaxslam.cli.entry_point import main
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.datasets.synthetic.write_tum import write_tum
@@ -55,6 +58,44 @@ class TestPart:
         assert 0 < sum(of["self_ms"] for of in row["functions"]) < 1000
         dearest = [of["self_ms"] for of in row["functions"]]
         assert dearest == sorted(dearest, reverse=True)
+
+
+class TestBudget:
+    """With made counts: those of the two programs are compiled in `test_compile_budget`."""
+
+    @pytest.fixture
+    def counts(self, monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
+        """Instructions by function of the program that each part has; changed by a test."""
+        sizes = {"pose.p3p": 700, "se3.retract": 300}
+
+        def measured(job: PartJob, *, plain: bool) -> list[dict[str, Any]]:
+            assert plain
+            program = {"flow": "follow_points", "step": "track_followed"}[job.part]
+            functions = [{"function": name, "instructions": size} for name, size in sizes.items()]
+            return [{"program": program, "instructions": sum(sizes.values()), "kernels": 50, "functions": functions}]
+
+        monkeypatch.setattr(part_process, "measure_part", measured)
+        return sizes
+
+    def test_written_and_kept_to(
+        self, capsys: pytest.CaptureFixture[str], tmp_path: Path, counts: dict[str, int]
+    ) -> None:
+        budget = str(tmp_path / "budget.json")
+        main(["bench", "compile", "--update-budget", "--budget", budget])
+        main(["bench", "compile", "--check-budget", "--budget", budget])
+        assert capsys.readouterr().out.rstrip().endswith(f"Within {budget}.")
+        counts["pose.p3p"] += 30
+        with pytest.raises(SystemExit) as stop:
+            main(["bench", "compile", "--check-budget", "--budget", budget])
+        assert stop.value.code == 1
+        out, err = capsys.readouterr()
+        for program in ("follow_points", "track_followed"):
+            assert f"{program}: 1,030 instructions, 3.0 % above the budget of 1,000; grown most: pose.p3p +30" in out
+        assert f"2 counts are off {budget}. If it must be" in err
+        main(["bench", "compile", "--update-budget", "--budget", budget, "--json"])
+        written, _ = printed_json(capsys)
+        assert written["track_followed"]["instructions"] == 1030
+        main(["bench", "compile", "--check-budget", "--budget", budget])
 
 
 class TestErrors:
