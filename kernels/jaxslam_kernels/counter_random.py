@@ -33,8 +33,8 @@ def _seeded(seed: Shaped[Array, ""]) -> UInt32[Array, "2"]:
     return jnp.stack([_hashed(low), _hashed(high ^ _hashed(low ^ jnp.uint32(_SECOND)))])
 
 
-def _folded(key: UInt32[Array, "2"], data: UInt32[Array, ""]) -> UInt32[Array, "2"]:
-    first = _hashed(key[0] + _hashed(data))
+def _folded(key: UInt32[Array, "2"], data: int | UInt32[Array, ""]) -> UInt32[Array, "2"]:
+    first = _hashed(key[0] + _hashed(jnp.asarray(data, jnp.uint32)))
     return jnp.stack([first, _hashed(key[1] ^ first)])
 
 

@@ -102,7 +102,8 @@ def p3p_near(
 def _known(bearings: Array, X_world: Array) -> tuple[Array, Array, Bool[Array, " h"]]:
     """Bearings and points, 0 in the triples that are not finite, and which triples are."""
     known = jnp.isfinite(bearings).all(axis=(0, 1)) & jnp.isfinite(X_world).all(axis=(0, 1))
-    return *(jnp.where(known[None, None, :], a, 0.0) for a in (bearings, X_world)), known
+    bearings, X_world = (jnp.where(known[None, None, :], a, 0.0) for a in (bearings, X_world))
+    return bearings, X_world, known
 
 
 def _scaled(bearings: Array, X_world: Array) -> tuple[_Pairs, _Pairs, Array, Bool[Array, " h"]]:
@@ -211,8 +212,9 @@ def _sides(xyz: _Vector, versines: _Pairs) -> _Pairs:
 
 def _at_size(directions: _Vector, squared: _Pairs, versines: _Pairs) -> _Vector:
     """Scale directions `(4, h)` of λ to where the triangles have the right size."""
-    total = sum(_sides(directions, versines))
-    scale = jnp.sqrt(sum(squared)[None, :] / jnp.maximum(total, jnp.finfo(total.dtype).tiny))
+    (s12, s13, s23), (d12, d13, d23) = _sides(directions, versines), squared
+    total = s12 + s13 + s23
+    scale = jnp.sqrt((d12 + d13 + d23)[None, :] / jnp.maximum(total, jnp.finfo(total.dtype).tiny))
     x, y, z = directions
     return scale * x, scale * y, scale * z
 

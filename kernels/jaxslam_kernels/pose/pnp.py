@@ -1,9 +1,9 @@
 """Robust absolute pose of an RGB-D camera: batched RANSAC with a fixed number of hypotheses.
 
 All hypotheses are drawn, solved and scored at once: P3P on three points, the root chosen by a fourth and by measured
-depths, then one pass over hypotheses x points. The best one is refined, first on all points under a redescending
-loss that is a smooth form of the score, then on its inliers. Which points are inliers is a constant for
-differentiation; the last refinement carries the gradient (see `pose_refine`).
+depths or near the depths that are expected, then one pass over hypotheses x points. The best one is refined, first on
+all points under a redescending loss that is a smooth form of the score, then on its inliers. Which points are inliers
+is a constant for differentiation; the last refinement carries the gradient (see `pose_refine`).
 """
 
 from typing import NamedTuple
@@ -26,7 +26,7 @@ from jaxslam_kernels.se3 import rotation_matrix
 from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Points, Scalar, Weights
 
 SAMPLE_SIZE = 4
-"""Three points for P3P and one to choose its root."""
+"""Three points for P3P and one to choose its root, of no use where depths are expected."""
 
 _GATE_SIGMAS = 3.0  # a threshold is taken as so many standard deviations in the refinement
 _NARROW = 0.5
@@ -164,7 +164,10 @@ def _squared_errors(T: Array, X_world: Array, xy: Array, depth: Array, precision
 def _hypotheses(
     problem: PoseProblem, samples: Int[Array, "4 h"], expected_depth: Weights | None
 ) -> tuple[_Transforms, Bool[Array, " h"]]:
-    """One pose a sample: of the up to four of P3P, the one that agrees best with what else was measured."""
+    """One pose a sample: of the up to four of P3P, the one that agrees best with what else was measured.
+
+    With expected depths, the one near them.
+    """
     X_world, xy, depth, precision = (o[..., samples] for o in _observed(problem))
     ray = jnp.concatenate([xy, jnp.ones_like(xy[:1])])
     inverse = lax.rsqrt(jnp.square(ray).sum(axis=0))

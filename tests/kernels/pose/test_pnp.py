@@ -370,8 +370,8 @@ class TestRansac:
 
     def test_expected_depth_replaces_the_closed_form(self):
         """Half of the points wrong, depth 10 % off at best: found every time, as accurately as by the closed form."""
-        solve = quick_compile(lambda key, near, *given: ransac_pnp(key, *given, camera(), expected_depth=near))
-        closed = quick_compile(lambda key, *given: ransac_pnp(key, *given, camera()))
+        solve = quick_compile(lambda key, near, X, uv: ransac_pnp(key, X, uv, camera(), expected_depth=near))
+        closed = quick_compile(lambda key, X, uv: ransac_pnp(key, X, uv, camera()))
         ours, theirs = [], []
         for seed in range(20):
             scene = make_scene(60 + seed, N, outliers=0.5)
