@@ -20,6 +20,15 @@ def room() -> Clip:
 
 
 @functools.cache
+def other_room() -> Clip:
+    """The beginning of the same path in a room that looks otherwise."""
+    source = SyntheticDataset(
+        SyntheticConfig(width=WIDTH, height=HEIGHT, frames=FRAMES, people=0, path="loop", fps=FPS, seed=1)
+    )
+    return Clip(source, [source[index] for index in range(23)])
+
+
+@functools.cache
 def _source() -> SyntheticDataset:
     return SyntheticDataset(SyntheticConfig(width=WIDTH, height=HEIGHT, frames=FRAMES, people=0, path="loop", fps=FPS))
 

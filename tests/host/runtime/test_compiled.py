@@ -12,8 +12,8 @@ from jaxslam.runtime.compile_cache import FAST_COMPILE, SINGLE_THREAD
 from jaxslam.runtime.compiled import compiled, programs
 
 ROOT = Path(__file__).resolve().parents[3]
-ELSEWHERE = {"runtime/compiled.py", "runtime/trace_cache.py", "benchmark/timing.py"}
-"""Modules that may call `jax.jit`: what the decorator is made of, and a benchmark that compiles any function anew."""
+ELSEWHERE = {"runtime/compiled.py", "runtime/trace_cache.py", "benchmark/timing.py", "benchmark/compiling/parts.py"}
+"""Modules that may call `jax.jit`: what the decorator is made of, and benchmarks that compile a function anew."""
 
 
 @compiled(when="first use", static="times")
