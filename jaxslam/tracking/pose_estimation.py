@@ -55,7 +55,9 @@ def coarse_pose(step: StepContext, seen: Measurements, votes: Weights, predicted
         max_steps=plan.pose_steps,
         initial=predicted,
         expected_depth=expected_depth,
-        on_inliers=False,
+        # With even votes the redescending loss is narrow, and its optimum as good as that of the inliers. With a wide
+        # one it is not: on the start of Bonn `crowd`, `ngd` would have 12.1 mm instead of 11.0, `rts` 9.4, not 8.5.
+        on_inliers=not plan.balance_regions,
     )
     if not plan.balance_regions or view.right is not None:
         return result.T_world_cam, result.inliers, result.status
