@@ -16,7 +16,7 @@ from jaxslam.config.schema import MappingConfig
 from jaxslam.runtime.compiled import compiled
 from jaxslam.runtime.padding import padded
 from jaxslam.sensors.frame_arrays import FrameArrays
-from jaxslam.sensors.measurement import RIGHT_LEVELS, PreparedFrame, match_depth, measure
+from jaxslam.sensors.measurement import RIGHT_LEVELS, PreparedFrame, match_depth, pixel_rays
 from jaxslam.sensors.sensor_model import SensorModel
 
 DESCRIPTOR_BYTES = 32
@@ -247,5 +247,5 @@ def _ideal(uv_raw: Pixels, twist: Float[Array, "6"], frame: FrameArrays, sensor:
         pyramid = build_pyramid(frame.image, num_levels=RIGHT_LEVELS, dtype=uv_raw.dtype)
         view = PreparedFrame(frame, pyramid, believed, frame.dt_s).with_right()
         matched = match_depth(view, uv_raw, rough, rough > 0, sensor, known_point=False)
-    seen = measure(uv_raw, rough, twist, believed, frame.depth_delay_s, sensor, matched=matched)
+    seen = pixel_rays(uv_raw, sensor, matched).measured(rough, twist, believed, frame.depth_delay_s, sensor)
     return to_pixels(sensor.intrinsics, seen.xy), seen.depth

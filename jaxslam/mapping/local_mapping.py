@@ -48,7 +48,7 @@ from jaxslam.mapping.track_table import TrackId, TrackTable
 from jaxslam.runtime.compiled import compiled
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame_arrays import FrameArrays
-from jaxslam.sensors.measurement import measure
+from jaxslam.sensors.measurement import pixel_rays
 from jaxslam.sensors.sensor_model import SensorModel, depth_noise
 
 _PART_KEYFRAMES = 30
@@ -329,7 +329,7 @@ def _ideal(
 ) -> tuple[Pixels, Weights]:
     """Convert pixels of the distorted image to pixels of the ideal camera, and measure their depth."""
     believed = valid_depth(frame.depth, sensor.min_depth_m, sensor.max_depth_m)
-    seen = measure(uv_raw, expected_depth, twist, believed, frame.depth_delay_s, sensor)
+    seen = pixel_rays(uv_raw, sensor).measured(expected_depth, twist, believed, frame.depth_delay_s, sensor)
     return to_pixels(sensor.intrinsics, seen.xy), seen.depth
 
 

@@ -29,7 +29,7 @@ from jaxslam.runtime.compile_cache import SINGLE_THREAD
 from jaxslam.runtime.compiled import committed, compiled
 from jaxslam.runtime.padding import padded
 from jaxslam.sensors.frame_arrays import FrameArrays
-from jaxslam.sensors.measurement import depth_sigma, measure, predict_pixels
+from jaxslam.sensors.measurement import depth_sigma, pixel_rays, predict_pixels
 from jaxslam.sensors.sensor_model import SensorModel
 
 _DEPTH_SIGMAS, _DEPTH_SHARE = 4.2, 0.02
@@ -280,7 +280,7 @@ def _displaced(
         depth_delay_s: Time from the image to its depth, in seconds.
         sensor: Camera and the error model of its depth.
     """
-    measured = measure(uv, expected, twist, depth, depth_delay_s, sensor, reach=_REACH_PX).depth
+    measured = pixel_rays(uv, sensor).measured(expected, twist, depth, depth_delay_s, sensor, reach=_REACH_PX).depth
     known = (measured > sensor.min_depth_m) & (measured < sensor.max_depth_m)
     tolerance = _DEPTH_SIGMAS * depth_sigma(expected, sensor) + _DEPTH_SHARE * expected
     return known & (jnp.abs(measured - expected) > tolerance)

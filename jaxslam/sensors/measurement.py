@@ -132,25 +132,6 @@ def pixel_rays(uv: Pixels, sensor: SensorModel, matched: Weights | None = None) 
     return PixelRays(uv, normalize(sensor.intrinsics, uv), matched)
 
 
-def measure(
-    uv: Pixels,
-    expected_depth: Weights,
-    twist: Float[Array, "6"],
-    depth: DepthImage,
-    depth_delay_s: Scalar,
-    sensor: SensorModel,
-    *,
-    reach: int = 1,
-    matched: Weights | None = None,
-) -> Measurements:
-    """Remove distortion, rolling shutter and the delay of the depth image.
-
-    The arguments are those of `pixel_rays` and `PixelRays.measured`.
-    """
-    rays = pixel_rays(uv, sensor, matched)
-    return rays.measured(expected_depth, twist, depth, depth_delay_s, sensor, reach=reach)
-
-
 def _depth_from(X_world: Points, pose: SE3, sensor: SensorModel) -> Weights:
     """Return the depth of map points `(3, n)` as seen from a pose, meters, but at least the smallest valid one."""
     return jnp.maximum(to_camera(pose, X_world)[2], sensor.min_depth_m)

@@ -10,7 +10,7 @@ from jaxslam_kernels.se3 import to_world
 from jaxslam_kernels.types import Code, Mask, Pixels, Weights
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.sensors.measurement import Measurements, depth_sigma, match_depth, measure
+from jaxslam.sensors.measurement import Measurements, depth_sigma, match_depth, pixel_rays
 from jaxslam.tracking.points import TrackedPoints
 from jaxslam.tracking.step_context import StepContext
 
@@ -112,7 +112,7 @@ def _candidates(points: TrackedPoints, step: StepContext, twist: Float[Array, "6
     taken = occupied_cells(points.uv / 2, points.valid, (image.shape[0], image.shape[1]), cell=cell)
     uv = corners.points * 2
     rough = sample_depth(depth, uv, reach=2)
-    seen = measure(uv, rough, twist, depth, view.frame.depth_delay_s, sensor, reach=2)
+    seen = pixel_rays(uv, sensor).measured(rough, twist, depth, view.frame.depth_delay_s, sensor, reach=2)
     good = (corners.score > _MIN_SCORE) & ~taken & (rough > 0) & (seen.depth > 0)
     return _Candidates(uv, corners.score, rough, seen, good)
 

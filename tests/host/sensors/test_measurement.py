@@ -9,7 +9,7 @@ from jaxslam_kernels.se3 import retract, to_camera
 
 from jaxslam import Camera
 from jaxslam.config.schema import TrackConfig
-from jaxslam.sensors.measurement import measure, predict_pixels
+from jaxslam.sensors.measurement import pixel_rays, predict_pixels
 from jaxslam.sensors.sensor_model import sensor_model
 
 TWIST = np.array([0.2, -0.1, 0.15, 0.3, -0.6, 0.4])
@@ -32,17 +32,12 @@ def points():
 def test_observing_undoes_predicting(sensor, points):
     twist = jnp.asarray(TWIST, jnp.float32)
     uv = predict_pixels(points, twist, 480, sensor)
-    seen = measure(uv, points[2], twist, jnp.ones((480, 640), jnp.float32), jnp.float32(0), sensor)
+    seen = pixel_rays(uv, sensor).measured(points[2], twist, jnp.ones((480, 640), jnp.float32), jnp.float32(0), sensor)
     error = np.abs(np.asarray(seen.xy) - np.asarray(points[:2] / points[2:3])) * 517
     # Second order in the readout time: the prediction looks up the row before the motion, the observation after it.
     assert error.max() < 0.3
-    still = measure(
-        predict_pixels(points, 0 * twist, 480, sensor),
-        points[2],
-        0 * twist,
-        jnp.ones((480, 640), jnp.float32),
-        jnp.float32(0),
-        sensor,
+    still = pixel_rays(predict_pixels(points, 0 * twist, 480, sensor), sensor).measured(
+        points[2], 0 * twist, jnp.ones((480, 640), jnp.float32), jnp.float32(0), sensor
     )
     assert (np.abs(np.asarray(still.xy) - np.asarray(points[:2] / points[2:3])) * 517).max() < 1e-2
 
@@ -64,7 +59,9 @@ def test_a_late_depth_image_is_read_where_the_point_is_then(sensor):
     depth[:, int(np.ceil(edge)) :] = 4.0
     uv = predict_pixels(X, 0 * turn, 480, global_shutter)
     read = lambda delay: float(
-        measure(uv, X[2], turn, jnp.asarray(depth), jnp.float32(delay), global_shutter, reach=0).depth[0]
+        pixel_rays(uv, global_shutter)
+        .measured(X[2], turn, jnp.asarray(depth), jnp.float32(delay), global_shutter, reach=0)
+        .depth[0]
     )
     assert edge > float(uv[0, 0]) + 10  # the scene moves right while the camera turns left
     assert read(0.02) == 2.0
