@@ -47,7 +47,7 @@ def committed(arrays: R) -> R:
 
 
 class _ThreadHook(threading.local):
-    """What a thread calls before each program that it compiles."""
+    """Function that a thread calls before each program that it compiles."""
 
     before_each: Callable[[], None] = staticmethod(lambda: None)
 

@@ -47,7 +47,7 @@ class Worker(Protocol[_Job_contra, _Result]):
         ...
 
     def is_due(self, frame: int) -> bool:
-        """Whether a result must be there by frame number `frame`; no thread owes one."""
+        """Tell whether a result must be there by frame number `frame`; no thread owes one."""
         ...
 
     def submit(self, job: _Job_contra, frame: int) -> None:
@@ -126,7 +126,7 @@ class InlineWorker(Generic[_Job, _Result]):
             self._do(*self._waiting.popleft())
 
     def is_due(self, frame: int) -> bool:
-        """Whether the first result is due, be it there or not."""
+        """Tell whether the first result is due, be it there or not."""
         if self._outcomes:
             return self._outcomes[0][0] <= frame
         return bool(self._waiting) and self._waiting[0][1] + self._latency <= frame

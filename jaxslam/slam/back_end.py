@@ -166,7 +166,7 @@ class BackEnd:
         self._to_places.begin()
 
     def is_due(self, frame: int) -> bool:
-        """Whether a deterministic run must have results by frame number `frame`, for which it needs the programs."""
+        """Tell whether a deterministic run must have results, and so the programs, by frame number `frame`."""
         return self._to_mapping.is_due(frame) or (self._semantics is not None and self._semantics.worker.is_due(frame))
 
     def update(self, state: TrackState, frame: int) -> tuple[TrackState, np.ndarray]:

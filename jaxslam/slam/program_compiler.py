@@ -83,7 +83,7 @@ class ProgramCompiler:
         self._take(wait=self._waits and not self._can_map and self._back.is_due(frame))
 
     def can_map(self) -> bool:
-        """Whether frames can be localized in the map; where a frame waits for what it needs, wait until they can.
+        """Tell whether frames can be localized in the map; where a frame waits for what it needs, wait until they can.
 
         Raises:
             Exception: Error of the thread.

@@ -41,7 +41,7 @@ class Instruction(NamedTuple):
 
     @property
     def counts(self) -> bool:
-        """Whether it computes anything; parameters, constants, tuples and bitcasts do not."""
+        """True if it computes anything; parameters, constants, tuples and bitcasts do not."""
         return self.operation not in _FREE
 
 

@@ -34,7 +34,7 @@ Compile: TypeAlias = Callable[[], object]
 
 @dataclass(frozen=True)
 class Scene:
-    """What programs are compiled for.
+    """Camera, settings and images for which programs are compiled.
 
     Attributes:
         camera: Camera of the frames.

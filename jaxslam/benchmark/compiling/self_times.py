@@ -31,7 +31,7 @@ _CLONE = re.compile(r"\.clone(\.\d+)?$")
 
 @dataclass(frozen=True)
 class Spent:
-    """What a function cost per frame.
+    """Cost of a function per frame.
 
     Attributes:
         executed: Number of operations executed per frame.
