@@ -1,6 +1,6 @@
 """Optimized HLO read: counts of a small program, and the functions that wrote it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import jax
 import jax.numpy as jnp
@@ -92,6 +92,15 @@ class TestWritten:
 
 
 class TestCompiled:
+    @pytest.fixture(autouse=True)
+    def _cached_with_its_origin(self) -> Iterator[None]:
+        """Without it the cache gives a program whose functions are those of another checkout that compiled the same."""
+        name = "jax_compilation_cache_include_metadata_in_key"
+        before = jax.config.values[name]
+        jax.config.update(name, True)
+        yield
+        jax.config.update(name, before)
+
     def test_one_addition(self) -> None:
         def plus_one(x: jax.Array) -> jax.Array:
             return x + jnp.float32(1)
