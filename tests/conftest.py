@@ -37,7 +37,8 @@ def pytest_sessionstart() -> None:
 
     These are strict too: a program that was traced with other rules has parts of other names, and is another one.
     """
-    from jaxslam.runtime.compile_cache import enable_compile_cache, prefer_one_thread  # noqa: PLC0415 - before it there are no type checks
+    from jaxslam.runtime.compile_cache import enable_compile_cache  # noqa: PLC0415 - before it there are no type checks
+    from jaxslam.runtime.threads import prefer_one_thread  # noqa: PLC0415 - before it there are no type checks
 
     prefer_one_thread()
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # a small one is loaded in a tenth of its time

@@ -12,9 +12,9 @@ import numpy as np
 
 from jaxslam.config.schema import TrackConfig
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
-from jaxslam.runtime.compile_cache import threads
 from jaxslam.runtime.compiled import compiled
 from jaxslam.runtime.machine import peak_rss_mb
+from jaxslam.runtime.threads import threads
 from jaxslam.sensors.frame_arrays import FrameArrays, stack_frames
 from jaxslam.tracking.batch import TrackedClips, track_clips
 from jaxslam.tracking.from_config import track_params, track_plan

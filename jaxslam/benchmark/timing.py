@@ -1,6 +1,6 @@
 """Times of two functions that do the same work: one process, one core, taken in turn.
 
-XLA should compute in one thread too: `jaxslam.runtime.compile_cache.prefer_one_thread()` before the first array.
+XLA should compute in one thread too: `jaxslam.runtime.threads.prefer_one_thread()` before the first array.
 """
 
 import functools

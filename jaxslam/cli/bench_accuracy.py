@@ -75,7 +75,7 @@ class AccuracyRuler(RunsOfSuite):
     def _measured(self) -> tuple[Sequence[Mapping[str, Any]], Path]:
         """Run the suite or read its results, and return them with the folder they are in."""
         from jaxslam.benchmark.suites.collected_results import read_results  # noqa: PLC0415
-        from jaxslam.runtime.compile_cache import usable_cores  # noqa: PLC0415
+        from jaxslam.runtime.threads import usable_cores  # noqa: PLC0415
 
         if self.results_from is not None:
             results = read_results(self.results_from)

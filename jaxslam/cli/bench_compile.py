@@ -52,8 +52,8 @@ class Compile(WithJson):
         from jaxslam.benchmark.compiling.part_process import PartJob, check_parts  # noqa: PLC0415
         from jaxslam.benchmark.compiling.report import how, markdown_report  # noqa: PLC0415
         from jaxslam.cli.measurement_files import write_measurements  # noqa: PLC0415
-        from jaxslam.runtime.compile_cache import prefer_one_thread  # noqa: PLC0415
         from jaxslam.runtime.machine import machine  # noqa: PLC0415
+        from jaxslam.runtime.threads import prefer_one_thread  # noqa: PLC0415
 
         prefer_one_thread()  # for the processes of the parts, and so that it is said of them
         names = check_parts(self.only)

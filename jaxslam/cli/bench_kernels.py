@@ -41,7 +41,7 @@ class Kernels(WithJson):
         from jaxslam.benchmark.kernels.registry import chosen  # noqa: PLC0415
         from jaxslam.benchmark.kernels.report import markdown_report, picture  # noqa: PLC0415
         from jaxslam.cli.measurement_files import write_measurements  # noqa: PLC0415
-        from jaxslam.runtime.compile_cache import prefer_one_thread  # noqa: PLC0415
+        from jaxslam.runtime.threads import prefer_one_thread  # noqa: PLC0415
 
         cases = chosen(self.only)
         make_folder(self.out, BenchmarkError)

@@ -22,7 +22,6 @@ class Compare(OfRecording):
         """Run the command."""
         from jaxslam.cli.compare_run import check_networks, compare_presets, print_tables, write_tables  # noqa: PLC0415
         from jaxslam.config.loading import presets  # noqa: PLC0415
-        from jaxslam.runtime.compile_cache import prefer_one_thread  # noqa: PLC0415
 
         if self.runs < 1:
             raise ConfigError(f"--runs: expected at least 1, got {self.runs}")
@@ -32,7 +31,6 @@ class Compare(OfRecording):
                 raise ConfigError(f"--presets: unknown preset '{preset}'{nearest(preset, presets())}")
         dataset, out = self.opened(), self.folder()
         check_networks(self, chosen)
-        prefer_one_thread()  # nothing else computes while a recording is tracked
         rows = compare_presets(self, chosen, dataset, out)
         if self.json:
             print_json(rows)

@@ -170,8 +170,8 @@ class SemanticsConfig(ValidatedConfig):
     examples: str | None = None
     """YAML file or folder that shows the movable objects: images with masks if `model` is an in-context segmenter
     (SegGPT), or boxes and points of every frame for a promptable segmenter. `labels` do not filter them."""
-    threads: Annotated[int, Range(at_least=1, at_most=64)] = 1
-    """Number of threads the network may use."""
+    threads: Annotated[int, Range(at_least=1, at_most=64)] | None = None
+    """Number of threads the network may use; as many as `run.threads` if not set."""
     frames: Literal["every", "keyframes"] = "keyframes"
     """Frames that the network processes. `every` is each frame it has time for, and makes masks for all frames. With
     `keyframes`, movable objects are removed from the keyframe and the map once they are detected, and other frames have
@@ -277,6 +277,9 @@ class RunConfig(ValidatedConfig):
     map when one of its places is recognized."""
     prefetch_frames: Annotated[int, Range(at_least=1, at_most=64)] = 4
     """Number of frames of a recording decoded ahead of the tracker."""
+    threads: Annotated[int, Range(at_least=1, at_most=64)] = 1
+    """Number of threads that XLA, OpenCV and the network may each use. XLA takes it at the first array of the process,
+    and `NPROC` in the environment outranks it there. One is fastest for the tracker."""
 
     @property
     def in_turn(self) -> bool:

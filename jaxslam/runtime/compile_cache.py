@@ -1,8 +1,7 @@
-"""Settings of XLA, JAX's compiler: the cache of compiled code, compiler options, and the number of threads."""
+"""Settings of XLA, JAX's compiler: the cache of compiled code, and compiler options."""
 
 import functools
 import logging
-import os
 import tempfile
 from pathlib import Path
 
@@ -105,28 +104,3 @@ FUSION_EMITTERS: dict[str, bool | str] = {"xla_cpu_use_fusion_emitters": True}
 """Options of `jax.jit` for a program that computes much for every pixel: XLA's newer generator of code, whatever
 `XLA_FLAGS` says. With the older one a frame of a room takes 111 ms instead of 63 (640x480, one thread, AMD EPYC).
 """
-
-
-def prefer_one_thread() -> None:
-    """Compute in the calling thread, unless `NPROC` in the environment says otherwise; before the first array.
-
-    XLA splits work that is too small for it and waits for the parts. On two cores, a frame takes 9.3 ms with one
-    thread and 10.0 with two, and 9.9 ms of processor time instead of 12.0. XLA's one thread would then be a queue for
-    all of Python's; without asynchronous dispatch each computes by itself: beside a thread that is always computing,
-    a call of 2 ms takes 2 ms instead of 30.
-    """
-    import jax  # noqa: PLC0415
-
-    os.environ.setdefault("NPROC", "1")
-    jax.config.update("jax_cpu_enable_async_dispatch", False)
-
-
-def threads() -> int:
-    """Return the number of threads XLA computes with, if `NPROC` is now what it was at the first array."""
-    chosen = os.environ.get("NPROC", "")
-    return int(chosen) if chosen.isdigit() and int(chosen) > 0 else usable_cores()
-
-
-def usable_cores() -> int:
-    """Cores this process may run on."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

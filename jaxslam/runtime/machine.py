@@ -7,7 +7,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from jaxslam.runtime.compile_cache import threads, usable_cores
+from jaxslam.runtime.threads import threads, usable_cores
 
 _PACKAGES = ("jaxslam", "jax", "jaxlib", "jaxlie", "equinox", "optimistix", "numpy", "opencv-python-headless")
 _WINDOWS_COUNTERS = (

@@ -31,8 +31,12 @@ _GO_ON = "To go on without it: --allow-missing-model, in Python semantics.missin
 _log = logging.getLogger(__name__)
 
 
-def detector_of(config: SemanticsConfig) -> Detector | None:
+def detector_of(config: SemanticsConfig, num_threads: int = 1) -> Detector | None:
     """Load the detector of the settings, with a promptable segmenter if the settings name one.
+
+    Args:
+        config: Settings of the networks.
+        num_threads: Number of threads of each network, if the settings leave it open.
 
     Returns:
         The detector; `None` if the settings name no network, or one that is missing and may be.
@@ -45,21 +49,25 @@ def detector_of(config: SemanticsConfig) -> Detector | None:
     """
     if config.model == SCENE:
         raise ConfigError(f"semantics.model: expected a network, got '{SCENE}', which knows rendered rooms only")
-    segmenter = _segmenter_of(config)
+    threads = config.threads or num_threads
+    segmenter = _segmenter_of(config, threads)
     path = None if config.model is None else _found(config, "model", _NO_NETWORK)
     examples = [] if config.examples is None else read_examples(Path(config.examples))
     shown = [each.image is not None for each in examples]
     if any(shown) and not all(shown):
         raise ConfigError(f"{config.examples}: expected all examples with an image, or all without, got both")
     if any(shown):
-        return _like_examples(config, path, segmenter, examples)
-    labels, threads = config.labels, config.threads
-    detector = path and load_detector(path, labels=labels, min_score=config.min_score, num_threads=threads)
+        return _like_examples(config, path, segmenter, examples, threads)
+    detector = path and load_detector(path, labels=config.labels, min_score=config.min_score, num_threads=threads)
     return _prompted(config, detector or None, segmenter, [each for one in examples for each in one.prompts])
 
 
 def _like_examples(
-    config: SemanticsConfig, path: Path | None, segmenter: PromptSegmenter | None, examples: Sequence[Example]
+    config: SemanticsConfig,
+    path: Path | None,
+    segmenter: PromptSegmenter | None,
+    examples: Sequence[Example],
+    threads: int,
 ) -> Detector | None:
     """Load an in-context segmenter; the promptable segmenter only makes the masks of examples without one."""
     if config.model is None:
@@ -67,7 +75,7 @@ def _like_examples(
     if path is None:
         return None
     shown = with_masks(examples, segmenter)
-    return load_in_context(path, shown, min_score=config.min_score, num_threads=config.threads)
+    return load_in_context(path, shown, min_score=config.min_score, num_threads=threads)
 
 
 def _prompted(
@@ -94,7 +102,7 @@ def _prompted(
     return PromptedDetector(segmenter, detector, prompts=prompts, min_iou=config.prompt_min_iou)
 
 
-def _segmenter_of(config: SemanticsConfig) -> PromptSegmenter | None:
+def _segmenter_of(config: SemanticsConfig, threads: int) -> PromptSegmenter | None:
     """Load the promptable segmenter of the settings; `None` if there is none or it is missing and may be."""
     named = {"prompt_encoder": config.prompt_encoder, "prompt_decoder": config.prompt_decoder}
     if None in named.values():
@@ -105,7 +113,7 @@ def _segmenter_of(config: SemanticsConfig) -> PromptSegmenter | None:
     encoder, decoder = (_found(config, key, _BY_DEPTH) for key in named)
     if encoder is None or decoder is None:
         return None
-    return load_segmenter(encoder, decoder, num_threads=config.threads)
+    return load_segmenter(encoder, decoder, num_threads=threads)
 
 
 def network_files(config: SemanticsConfig) -> dict[str, Path | None]:
@@ -174,4 +182,4 @@ def key_detector_of(config: Config) -> Detector | None:
     dense, semantics = config.dense, config.semantics
     if not dense.enabled or not dense.key_classes:
         return None
-    return detector_of(dataclasses.replace(semantics, labels=dense.key_classes))
+    return detector_of(dataclasses.replace(semantics, labels=dense.key_classes), config.run.threads)

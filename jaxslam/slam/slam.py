@@ -13,6 +13,7 @@ from jaxslam.map.types import Map
 from jaxslam.masks.depth_instances import InstanceFinder
 from jaxslam.runtime.compile_cache import enable_compile_cache
 from jaxslam.runtime.stage_timer import StageTimes
+from jaxslam.runtime.threads import bound_threads
 from jaxslam.semantics import Detector
 from jaxslam.semantics.checked_detector import CheckedDetector
 from jaxslam.semantics.from_config import detector_of, key_detector_of, why_no_network
@@ -104,9 +105,10 @@ class Slam:
             slam_map if slam_map is not None and len(slam_map.ids) else None,
             localize_only,
         )
+        bound_threads(self.config.run.threads)
         enable_compile_cache()
         self._tracker = Tracker(camera, self.config)
-        self._detector = _watched(detector or detector_of(self.config.semantics))
+        self._detector = _watched(detector or detector_of(self.config.semantics, self.config.run.threads))
         self.without_network = None if self._detector is not None else why_no_network(self.config.semantics)
         self._key_detector = _watched(key_detector or key_detector_of(self.config))
         motion = self._tracker.plan.motion

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from benchmarks.live import live_run, part_of, show
 
-from jaxslam.runtime.compile_cache import prefer_one_thread
+from jaxslam.runtime.threads import prefer_one_thread
 from jaxslam.semantics import Detections, no_detections
 
 pytestmark = [pytest.mark.benchmark, pytest.mark.usefixtures("opencv_in_one_thread")]

@@ -28,7 +28,7 @@ from jaxslam.benchmark.compiling.self_times import NUM_TRACED, NUM_WARM, Spent, 
 from jaxslam.config.loading import load_config
 from jaxslam.datasets import Dataset, open_dataset
 from jaxslam.errors import BenchmarkError, JaxSlamError, nearest
-from jaxslam.runtime.compile_cache import prefer_one_thread
+from jaxslam.runtime.threads import prefer_one_thread
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame
 

@@ -21,8 +21,8 @@ from jaxslam.benchmark.machine_names import machine_name, machine_of, versions_o
 from jaxslam.benchmark.suites.aggregate import by_sequence, row_name, rows_of
 from jaxslam.benchmark.suites.baseline import ATE, Baseline
 from jaxslam.errors import BenchmarkError
-from jaxslam.runtime.compile_cache import usable_cores
 from jaxslam.runtime.machine import machine
+from jaxslam.runtime.threads import usable_cores
 
 _WORSE_ATE, _WORSE_TIME = 0.02, 0.2
 """Shares by which the median error, and the time of the median frame, may be greater."""

@@ -35,7 +35,8 @@ from jaxslam.errors import BenchmarkError, JaxSlamError
 from jaxslam.io.atomic_files import write_atomically
 from jaxslam.io.yaml_files import parse_yaml
 from jaxslam.results.run_results import RunInfo, write_results
-from jaxslam.runtime.compile_cache import enable_compile_cache, prefer_one_thread
+from jaxslam.runtime.compile_cache import enable_compile_cache
+from jaxslam.runtime.threads import bound_threads
 from jaxslam.semantics.from_config import preset_needs_network
 from jaxslam.slam.slam import Slam
 from jaxslam.visualization.snapshots import RunPictures
@@ -223,9 +224,9 @@ def run_here(folder: Path, root: Path | None, rooms: Path | None) -> None:
     Raises:
         JaxSlamError: If its recording is not there or not fit to be tracked, or a file cannot be written.
     """
-    prefer_one_thread()
-    enable_compile_cache()
     job, sources = Job.of_json((folder / _JOB).read_text()), sources_sha256()
+    bound_threads(job.config.run.threads)
+    enable_compile_cache()
     whole, recording = opened(job.clip, root, rooms)
     dataset, truth = with_true_masks(whole, job.config.semantics)
     flow_ms = flow_time_ms(dataset)

@@ -15,8 +15,8 @@ from jaxslam.benchmark.suites.plan import fingerprint, plan
 from jaxslam.benchmark.suites.suite import load_suite
 from jaxslam.cli.bench_gate import Gate
 from jaxslam.errors import BenchmarkError
-from jaxslam.runtime.compile_cache import usable_cores
 from jaxslam.runtime.machine import machine
+from jaxslam.runtime.threads import usable_cores
 
 ROOT = Path(__file__).resolve().parents[3]
 LABELS = ("static", "default")

@@ -3,8 +3,8 @@
 import subprocess
 import sys
 
-from jaxslam.runtime.compile_cache import threads, usable_cores
 from jaxslam.runtime.machine import cpu_model, machine, peak_rss_mb
+from jaxslam.runtime.threads import threads, usable_cores
 
 
 def test_machine_is_told() -> None:

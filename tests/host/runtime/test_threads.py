@@ -1,0 +1,84 @@
+"""Threads of XLA, OpenCV and networks: one number for all, whatever a program did before its first `Slam`."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import tiny_models
+
+from jaxslam import load_config
+from jaxslam.config.schema import SemanticsConfig
+from jaxslam.errors import ConfigError
+from jaxslam.semantics import OnnxDetector
+from jaxslam.semantics.from_config import detector_of
+
+TRACKS = """
+import logging, sys
+logging.basicConfig(stream=sys.stdout, format="%(message)s")
+import cv2, jax, jax.numpy as jnp
+from jaxslam import Camera, Slam, load_config
+camera = Camera("small", width=64, height=64, fx=60.0, fy=60.0, cx=31.5, cy=31.5, baseline_m=0.1)
+def begin(threads):
+    Slam(camera, load_config(overrides=["semantics.model=null", f"run.threads={threads}"])).close()
+{body}
+from jaxslam.runtime.threads import threads
+print("threads", threads(), cv2.getNumThreads(), jax.config.values["jax_cpu_enable_async_dispatch"])
+"""
+
+
+def said(body: str, **environment: str) -> list[str]:
+    """Run a program in a process of its own; return the lines it wrote."""
+    others = {name: value for name, value in os.environ.items() if name != "NPROC"}
+    done = subprocess.run(
+        [sys.executable, "-c", TRACKS.replace("{body}", body)],
+        capture_output=True,
+        text=True,
+        env=others | environment,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_set_by_the_first_tracker(number: int) -> None:
+    assert said(f"begin({number})") == [f"threads {number} {number} False"]
+
+
+def test_environment_outranks_it() -> None:
+    """For XLA, and without a word: the user said so."""
+    assert said("begin(1)", NPROC="3") == ["threads 3 1 False"]
+
+
+def test_too_late_is_said_once() -> None:
+    warned, *rest = said("jnp.zeros(3).block_until_ready(); begin(1); begin(1)")
+    assert warned.startswith("XLA computes with ")
+    assert "one queue since the first array of this process, not with run.threads=1" in warned
+    assert len(rest) == 1
+
+
+def test_another_number_later_is_said() -> None:
+    """A second tracker of the same process cannot have other threads."""
+    warned, last = said("begin(1); begin(2)")
+    assert warned.startswith("XLA computes with 1 threads since")
+    assert last == "threads 1 2 False"
+
+
+def test_preferred_before_the_first_array() -> None:
+    assert said("import jaxslam; jaxslam.prefer_one_thread(); jnp.zeros(3); begin(1)") == ["threads 1 1 False"]
+
+
+def test_must_be_positive() -> None:
+    with pytest.raises(ConfigError, match=r"run\.threads: expected .*, got 0"):
+        load_config(overrides=["run.threads=0"])
+
+
+@pytest.mark.parametrize(("setting", "expected"), [(None, 2), (1, 1)])
+def test_network_has_as_many_unless_it_has_its_own(tmp_path: Path, setting: int | None, expected: int) -> None:
+    model = tiny_models.yolox(tmp_path / "yolox.onnx", [])
+    detector = detector_of(SemanticsConfig(model=str(model), threads=setting), num_threads=2)
+    assert isinstance(detector, OnnxDetector)
+    session = detector._network._session
+    assert session.get_session_options().intra_op_num_threads == expected
