@@ -46,6 +46,7 @@ from .tracking.initial_state import init_state as init_state
 from .tracking.points import KeyframeMatches as KeyframeMatches
 from .tracking.points import TrackedPoints as TrackedPoints
 from .tracking.pose_estimation import PoseStatus as PoseStatus
+from .tracking.rollout import rollout as rollout
 from .tracking.state import FlowPlan as FlowPlan
 from .tracking.state import KeyframeReason as KeyframeReason
 from .tracking.state import LevelPlan as LevelPlan

@@ -6,6 +6,7 @@ from .from_config import track_params as track_params
 from .from_config import track_plan as track_plan
 from .initial_state import init_state as init_state
 from .points import TrackedPoints as TrackedPoints
+from .rollout import rollout as rollout
 from .state import KeyframeReason as KeyframeReason
 from .state import TrackOutput as TrackOutput
 from .state import TrackParams as TrackParams

@@ -11,13 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax import lax
 from jaxtyping import Array
 from quick_compile import quick_compile
 from small_scene import PLAN, Clip, at, clip, new_state, params, stacked, truth_from_start
 
-from jaxslam.sensors.frame_arrays import FrameArrays
-from jaxslam.tracking.state import TrackState
+from jaxslam.tracking.rollout import rollout
 from jaxslam.tracking.step import track_step
 
 BEFORE, STEPS = 10, 10
@@ -90,14 +88,10 @@ def _problem(recording: Clip) -> Problem:
         )
         changed = given._replace(sensor=sensor, loss_scale=inputs.loss_scale, pixel_sigma=inputs.pixel_sigma)
 
-        def advance(state: TrackState, frame: FrameArrays) -> tuple[TrackState, Array]:
-            state, output = track_step(state, frame, changed, EXACT)
-            return state, output.T_world_cam.translation()
-
         points = state.points._replace(weight=inputs.weight, X_world=inputs.X_world)
         seen = window._replace(image=window.image + inputs.image * change)
-        _, positions = lax.scan(advance, state._replace(points=points), seen)
-        return jnp.sum(jnp.square(positions - truth))
+        _, outputs = rollout(state._replace(points=points), seen, changed, EXACT)
+        return jnp.sum(jnp.square(outputs.T_world_cam.translation() - truth))
 
     camera = given.sensor.intrinsics
     inputs = Inputs(
