@@ -33,6 +33,8 @@ _SIZES = (64, 256, 1024, 4096)
 _EDGES_A_NODE = 6
 _FEWEST, _AHEAD = 4, 2.0
 """Number of keyframes from which graphs are compiled ahead, and for which multiple of the current number."""
+COMPILE_THREAD = "jaxslam-compile"
+"""Name of the threads that compile graphs ahead."""
 _ONE_AT_A_TIME = {size: threading.Lock() for size in _SIZES}
 """One lock per size: two threads would compile the same program twice, while different sizes need not wait."""
 
@@ -110,7 +112,7 @@ class GraphCompiler:
         if num_keyframes >= _FEWEST and size > self._size:
             self._size = size
             # Not a daemon thread: on exit the interpreter then waits for the compiler instead of cutting it off.
-            threading.Thread(target=compile_graph, args=(size,), name="jaxslam-compile").start()
+            threading.Thread(target=compile_graph, args=(size,), name=COMPILE_THREAD).start()
 
 
 def _graph(slam_map: Map, inside: np.ndarray) -> _Graph:

@@ -1,6 +1,5 @@
 """Promptable segmenters: what is asked for comes back at its place in the image, by one embedding of it."""
 
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ import onnx
 import pytest
 import tiny_models
 import tiny_segmenters
+from real_networks import real_network
 from tiny_models import Thing
 from tiny_segmenters import RADIUS, SIDE, SURE, UNSURE
 
@@ -20,7 +20,6 @@ from jaxslam.semantics import Detections, load_detector, no_detections
 from jaxslam.semantics.onnx_session import Network
 from jaxslam.semantics.prompted import Prompt, PromptedDetector, PromptSegmenter, load_segmenter, prompt
 
-MODELS = os.environ.get("JAXSLAM_MODELS")  # before it is hidden from tests
 Pair = tuple[Path, Path]
 PAIRS: dict[str, tuple[Callable[[Path], Pair], str, str, int]] = {
     "sam": (tiny_segmenters.sam, "sam", "corner", 1),
@@ -419,9 +418,8 @@ def images(data_dir: Path) -> list[np.ndarray]:
 @pytest.mark.parametrize("name", ["yolox_nano", "nanodet_m_320", "FastestDet", "yolov8n-seg_int8"])
 def test_real_detectors_in_front(images: list[np.ndarray], tmp_path: Path, name: str) -> None:
     """Every person that they find has a mask, which fills the box: that is what the tiny decoder draws."""
-    if not MODELS or not (path := Path(MODELS).resolve() / f"{name}.onnx").is_file():
-        pytest.skip(f"JAXSLAM_MODELS holds no {name}.onnx")
-    segmenter, detector = load_segmenter(*tiny_segmenters.sam(tmp_path, blind=True)), load_detector(path)
+    detector = load_detector(real_network(name))
+    segmenter = load_segmenter(*tiny_segmenters.sam(tmp_path, blind=True))
     prompted = PromptedDetector(segmenter, detector, min_iou=0.3)
     total = 0
     for image in images:

@@ -1,27 +1,17 @@
 """Real networks on frames with people: what YOLOX finds, the others find too."""
 
-import os
 from pathlib import Path
 
 import numpy as np
 import pytest
+from real_networks import real_network
 
 from jaxslam.datasets import open_dataset
 from jaxslam.semantics import Detections, load_detector
 
-MODELS = os.environ.get("JAXSLAM_MODELS")  # before it is hidden from tests
 FRAMES = (400, 600, 800)
 BOXES = {"nanodet_m_320": "nanodet", "FastestDet": "fastestdet", "yolov8n-seg_int8": "yolov8_seg"}
 MAPS = ("deeplabv3_mobilenetv2_voc", "deeplabv3_mobilenetv2_dm05_voc")
-
-
-def model(name: str) -> Path:
-    if not MODELS:
-        pytest.skip("JAXSLAM_MODELS is not set: no networks here")
-    path = Path(MODELS).resolve() / f"{name}.onnx"
-    if not path.is_file():
-        pytest.skip(f"JAXSLAM_MODELS holds no {path.name}")
-    return path
 
 
 def iou(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
@@ -46,7 +36,7 @@ def images(data_dir: Path) -> list[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def people(images: list[np.ndarray]) -> list[Detections]:
-    detector = load_detector(model("yolox_nano"), min_score=0.45)
+    detector = load_detector(real_network("yolox_nano"), min_score=0.45)
     assert (detector.adapter, detector.input_size) == ("yolox", (416, 416))
     return [detector(image) for image in images]
 
@@ -59,7 +49,7 @@ def test_yolox(people: list[Detections]) -> None:
 
 @pytest.mark.parametrize("name", BOXES)
 def test_boxes(images: list[np.ndarray], people: list[Detections], name: str) -> None:
-    detector = load_detector(model(name))
+    detector = load_detector(real_network(name))
     assert detector.adapter == BOXES[name]
     overlaps = [iou(they.boxes, detector(image).boxes) for image, they in zip(images, people, strict=True)]
     best = np.concatenate([overlap.max(axis=1, initial=0) for overlap in overlaps])
@@ -70,7 +60,7 @@ def test_boxes(images: list[np.ndarray], people: list[Detections], name: str) ->
 @pytest.mark.parametrize("name", MAPS)
 def test_class_maps(images: list[np.ndarray], people: list[Detections], name: str) -> None:
     """Nearly all of the pixels are inside boxes, and every box has its share of them."""
-    detector = load_detector(model(name))
+    detector = load_detector(real_network(name))
     assert (detector.adapter, detector.input_size) == ("class_map", (513, 513))
     for image, they in zip(images, people, strict=True):
         mask = detector(image).class_mask
@@ -84,7 +74,7 @@ def test_class_maps(images: list[np.ndarray], people: list[Detections], name: st
 
 
 def test_instance_masks_match_the_class_map(images: list[np.ndarray]) -> None:
-    instances, pixels = load_detector(model("yolov8n-seg_int8")), load_detector(model(MAPS[0]))
+    instances, pixels = load_detector(real_network("yolov8n-seg_int8")), load_detector(real_network(MAPS[0]))
     for image in images:
         masks, mask = instances(image).masks, pixels(image).class_mask
         assert masks is not None
@@ -94,6 +84,6 @@ def test_instance_masks_match_the_class_map(images: list[np.ndarray]) -> None:
 
 
 def test_same_image_same_bytes(images: list[np.ndarray]) -> None:
-    first, second = (load_detector(model("yolox_nano"))(images[0]) for _ in range(2))
+    first, second = (load_detector(real_network("yolox_nano"))(images[0]) for _ in range(2))
     assert first.boxes.tobytes() == second.boxes.tobytes()
     assert first.scores.tobytes() == second.scores.tobytes()

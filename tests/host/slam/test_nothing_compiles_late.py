@@ -5,17 +5,21 @@ The optimization of loops is compiled for larger maps while they grow, ahead of 
 
 import dataclasses
 import functools
+import threading
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
+from real_networks import real_network
+from small_map import small_map
 from small_scene import HEIGHT, SETTINGS, TRACK, WIDTH, Clip
 
 from jaxslam.config.loading import load_config
 from jaxslam.config.schema import Config, DenseConfig
 from jaxslam.datasets import open_dataset
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
+from jaxslam.geometry.se3 import between
 from jaxslam.loop_closing import essential_graph
 from jaxslam.map.types import Map
 from jaxslam.semantics import Detections
@@ -55,7 +59,7 @@ def script(slam: Slam, frames: list[Frame], compiled: list[str]) -> list[TrackSt
     slam.warm_up()
     compiled.clear()
     statuses = [
-        slam.track(dataclasses.replace(frame, timestamp_ns=index * 66_666_666)).status
+        slam.track(dataclasses.replace(frame, timestamp_ns=index * 66_666_666, depth_timestamp_ns=None)).status
         for index, frame in enumerate(frames)
     ]
     slam.finish()
@@ -113,6 +117,46 @@ def test_loops_of_a_loaded_map(monkeypatch: pytest.MonkeyPatch) -> None:
     graphs.compile_now(60)
     graphs.keep_ahead(128)
     assert sizes == [64, 256]
+
+
+@pytest.mark.parametrize(
+    "num_keyframes", [65, pytest.param(257, marks=pytest.mark.slow), pytest.param(1025, marks=pytest.mark.slow)]
+)
+def test_loops_of_a_map_that_grows(compiled: list[str], num_keyframes: int) -> None:
+    """The graph that a map outgrows its last one with is there when it does: it was begun at half of that."""
+    slam_map = small_map(num_keyframes)
+    loop = between(slam_map.pose(0), slam_map.pose(num_keyframes - 1))
+    essential_graph.GraphCompiler().keep_ahead(num_keyframes // 2 + 1)
+    for thread in threading.enumerate():
+        if thread.name == essential_graph.COMPILE_THREAD:
+            thread.join()
+    compiled.clear()
+    assert essential_graph.poses_with_loop(slam_map, 0, num_keyframes - 1, loop, np.eye(6)) is not None
+    assert compiled == []
+
+
+def test_another_image_size(compiled: list[str]) -> None:
+    """Its tracker compiles when it warms up, and no later; neither does the first one after that."""
+    other = Clip(source := SyntheticDataset(SyntheticConfig(width=200, height=152, frames=8)), list(source))
+    jax.clear_caches()
+    with Slam(room().camera, CONFIG) as slam, Slam(other.camera, CONFIG) as wider:
+        script(slam, room().frames[:8], compiled)
+        script(wider, other.frames, compiled)
+        slam.reset()
+        script(slam, room().frames[:8], compiled)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", ["ngd", "default"])
+def test_a_real_network(compiled: list[str], data_dir: Path, preset: str) -> None:
+    """Its boxes become masks, and those are propagated: people leave and come, and the place is lost and found."""
+    recording = open_dataset(data_dir / "bonn" / "rgbd_bonn_crowd")
+    settings = load_config(preset=preset, overrides=[f"semantics.model={real_network('yolox_nano')}"])
+    frames = [recording[index] for index in range(400, 460)]
+    dark = dataclasses.replace(frames[0], image=np.zeros_like(frames[0].image))
+    jax.clear_caches()
+    with Slam(recording.camera, settings) as slam:
+        script(slam, [*frames, dark, dark, *frames[30:40]], compiled)
 
 
 @pytest.mark.slow
