@@ -19,6 +19,7 @@ from jaxslam.map.types import NONE, Map, has, rows, visibility
 from jaxslam.runtime.compile_cache import FAST_COMPILE
 from jaxslam.runtime.compiled import compiled
 from jaxslam.runtime.padding import padded
+from jaxslam.runtime.worker import step_back
 
 _STRONG = 100
 """Common points from which two covisible keyframes get an edge (ORB-SLAM's essential graph)."""
@@ -33,7 +34,7 @@ _SIZES = (64, 256, 1024, 4096)
 _EDGES_A_NODE = 6
 _FEWEST, _AHEAD = 4, 2.0
 """Number of keyframes from which graphs are compiled ahead, and for which multiple of the current number."""
-COMPILE_THREAD = "jaxslam-compile"
+COMPILE_THREAD = "jaxslam-compile-graph"
 """Name of the threads that compile graphs ahead."""
 _ONE_AT_A_TIME = {size: threading.Lock() for size in _SIZES}
 """One lock per size: two threads would compile the same program twice, while different sizes need not wait."""
@@ -112,7 +113,12 @@ class GraphCompiler:
         if num_keyframes >= _FEWEST and size > self._size:
             self._size = size
             # Not a daemon thread: on exit the interpreter then waits for the compiler instead of cutting it off.
-            threading.Thread(target=compile_graph, args=(size,), name=COMPILE_THREAD).start()
+            threading.Thread(target=_compile_beside, args=(size,), name=COMPILE_THREAD).start()
+
+
+def _compile_beside(num_keyframes: int) -> None:
+    step_back()
+    compile_graph(num_keyframes)
 
 
 def _graph(slam_map: Map, inside: np.ndarray) -> _Graph:

@@ -334,7 +334,7 @@ def _serve(
 ) -> None:
     """Do jobs until there comes none, from `begun` on; those that come after a stop are not done."""
     if not urgent:
-        _step_back()
+        step_back()
     begun.wait()
     while (entry := jobs.get()) is not None:
         work, job = entry
@@ -348,10 +348,11 @@ def _serve(
         del entry, work, job  # so that nothing is held while waiting for the next one
 
 
-def _step_back() -> None:
-    """Let the tracker go first: with 2 cores, p95 of a frame is 1.7 times OpenCV's optical flow then, not 2.4.
+def step_back() -> None:
+    """Lower the priority of the calling thread, so that the tracker goes first.
 
-    Of threads, only Linux knows priorities.
+    With two cores, p95 of a frame is 1.7 times OpenCV's optical flow then, not 2.4. Only Linux has priorities of
+    threads; elsewhere this does nothing.
     """
     if sys.platform == "linux":
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)
