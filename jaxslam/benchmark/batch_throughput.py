@@ -175,7 +175,6 @@ def _batch(clips: Sequence[FrameArrays], task: Task, way: Way) -> TrackedClips:
     return track_clips(clips, task.params, task.plan, at_once=way.at_once, threads=way.threads)
 
 
-_new_state = compiled(when="first use", static=("height", "width", "plan"))(init_state)
 _step_alone = compiled(when="first use", static="plan", donate="state")(track_step)
 
 
@@ -184,7 +183,7 @@ def loop(clips: Iterable[FrameArrays], task: Task) -> TrackedClips:
     poses, statuses = [], []
     for clip in clips:
         num_frames, height, width = clip.image.shape
-        state, found = _new_state(height, width, task.plan), []
+        state, found = init_state(height, width, task.plan), []
         for index in range(num_frames):
             frame = jax.tree.map(lambda array, index=index: array[index], clip)
             state, output = _step_alone(state, frame, task.params, plan=task.plan)

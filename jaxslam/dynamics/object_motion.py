@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 from jaxslam.config.cue_sections import MotionConfig
 from jaxslam.dynamics.cue import threshold_evidence
 from jaxslam.dynamics.regions import RegionCueResult
+from jaxslam.runtime.filled_arrays import filled
 
 Labels = UInt8[Array, "h w"]
 """Number of the movable object at each pixel, from 1; 0 where there is none."""
@@ -138,7 +139,7 @@ class MeasuredPoints(NamedTuple):
 def no_motion(plan: MotionPlan | None, num_points: int, dtype: jnp.dtype) -> MotionMemory:
     """Return the memory before the first frame."""
     num = 0 if plan is None else plan.num_objects
-    return MotionMemory(jnp.zeros(num_points, jnp.int32), jnp.zeros(num, dtype), jnp.zeros(num, bool))
+    return MotionMemory(filled(num_points, jnp.int32), filled(num, dtype), filled(num, bool))
 
 
 def labels_at(labels: Labels, uv: Pixels) -> Int[Array, " n"]:

@@ -16,6 +16,7 @@ from jaxslam_kernels.types import DepthImage, Mask, Points, Weights
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxslam.config.cue_sections import ClusterCueConfig
+from jaxslam.runtime.filled_arrays import filled
 
 _PER_LIMIT = 0.25
 """Loss of weight for evidence that exceeds the threshold by one threshold."""
@@ -89,7 +90,7 @@ class RegionMemory(NamedTuple):
 def no_regions(plan: RegionPlan | None, dtype: jnp.dtype) -> RegionMemory:
     """Return the memory before the first frame."""
     num = 0 if plan is None else plan.num_regions
-    return RegionMemory(jnp.full((3, num), jnp.inf, dtype), jnp.ones(num, dtype))
+    return RegionMemory(filled((3, num), dtype, jnp.inf), filled(num, dtype, 1))
 
 
 def find_regions(

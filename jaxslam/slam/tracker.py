@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxslam.config.schema import Config
 from jaxslam.runtime.compile_cache import FAST_COMPILE, SINGLE_THREAD
-from jaxslam.runtime.compiled import compiled
+from jaxslam.runtime.compiled import committed, compiled
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame_arrays import FrameArrays
 from jaxslam.tracking.cue_registry import with_cue_params, with_cues
@@ -24,8 +24,6 @@ of the camera there was one every tenth of a second, and the threads held each o
 _ALL_IS_NEW = 2.0
 """More than the whole of a keyframe's points: a frame that shows them all is kept too."""
 
-# One program instead of fifty.
-_new_state = compiled(when="warm-up", static=("height", "width", "plan"), options=FAST_COMPILE)(init_state)
 _follow_points = compiled(when="warm-up", static="plan", options=FAST_COMPILE | SINGLE_THREAD)(follow_points)
 
 
@@ -80,9 +78,8 @@ class Tracker:
 
     def fresh_state(self) -> TrackState:
         """Return a state before the first frame."""
-        state = _new_state(self._height, self._width, self.plan, seed=self._seed)
         # Committed from the beginning, as after any `cached_trace`: else all is compiled again when the first one is.
-        return jax.device_put(state, *state.twist.devices())
+        return committed(init_state(self._height, self._width, self.plan, seed=self._seed))
 
     def begin(self, *, await_relocalization: bool) -> None:
         """Forget all frames.

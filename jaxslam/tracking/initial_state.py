@@ -6,16 +6,18 @@ import jax
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 from jaxlie import SE3
-from jaxslam_kernels.counter_random import COUNTER_RANDOM
+from jaxslam_kernels.counter_random import COUNTER_RANDOM, seed_words
 from jaxslam_kernels.image.pyramid import build_pyramid
-from jaxtyping import Array, Int
+from jaxtyping import Array, Int, UInt32
 
 from jaxslam.dynamics.object_motion import no_motion
 from jaxslam.dynamics.regions import no_regions
+from jaxslam.geometry.se3 import IDENTITY
+from jaxslam.runtime.filled_arrays import filled
 from jaxslam.runtime.floating_dtype import floating_dtype
 from jaxslam.tracking.keyframe_ring import empty_keyframes
 from jaxslam.tracking.points import empty_points
-from jaxslam.tracking.state import TrackPhase, TrackPlan, TrackState, code
+from jaxslam.tracking.state import TrackPhase, TrackPlan, TrackState
 from jaxslam.tracking.step_checks import check_plan, check_pose
 
 DEFAULT_PLAN = TrackPlan()
@@ -51,26 +53,33 @@ def init_state(
     """
     check_plan(plan)
     dtype = floating_dtype(dtype)
-    pose = SE3.identity() if T_world_cam is None else T_world_cam
+    pose = SE3(jax.device_put(IDENTITY.astype(dtype))) if T_world_cam is None else T_world_cam
     check_pose("T_world_cam", pose)
-    none = jnp.zeros((), jnp.int32)
+    black = jax.ShapeDtypeStruct((height, width), dtype)
+    pyramid = jax.eval_shape(partial(build_pyramid, num_levels=plan.num_levels), black)
     return TrackState(
-        pyramid=build_pyramid(jnp.zeros((height, width), dtype), num_levels=plan.num_levels),
+        pyramid=jax.tree.map(lambda level: filled(level.shape, level.dtype), pyramid),  # black on all levels
         points=empty_points(plan.num_points, dtype),
         keyframes=empty_keyframes(height, width, plan, jnp.dtype(image_dtype), dtype),
         T_world_cam=SE3(pose.wxyz_xyz.astype(dtype)),
-        twist=jnp.zeros(6, dtype),
-        elapsed_s=jnp.zeros((), dtype),
-        since_keyframe_s=jnp.zeros((), dtype),
-        since_keyframe=none,
-        phase=code(TrackPhase.START),
-        lost_frames=none,
-        frame=none,
-        next_id=none,
-        key=jax.random.key_data(jax.random.key(seed, impl=COUNTER_RANDOM)),
+        twist=filled(6, dtype),
+        elapsed_s=filled((), dtype),
+        since_keyframe_s=filled((), dtype),
+        since_keyframe=filled((), jnp.int32),
+        phase=filled((), jnp.int32, TrackPhase.START),
+        lost_frames=filled((), jnp.int32),
+        frame=filled((), jnp.int32),
+        next_id=filled((), jnp.int32),
+        key=_key_data(seed),
         regions=no_regions(plan.regions, dtype),
         motion=no_motion(plan.motion, plan.num_points, dtype),
     )
+
+
+def _key_data(seed: int | Int[Array, ""]) -> UInt32[Array, "2"]:
+    if isinstance(seed, int):
+        return jax.device_put(seed_words(seed))
+    return jax.random.key_data(jax.random.key(seed, impl=COUNTER_RANDOM))
 
 
 @lru_cache(maxsize=32)

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxlie import SE3
 from jaxslam_kernels.camera import Intrinsics
 from jaxslam_kernels.depth.sampling import sample_depth
@@ -10,6 +11,8 @@ from jaxslam_kernels.se3 import rotation_matrix, to_camera
 from jaxslam_kernels.types import Mask, Pixels, Points, Scalar, Weights
 from jaxtyping import Array, Bool, Float, Int, Num
 
+from jaxslam.geometry.se3 import IDENTITY
+from jaxslam.runtime.filled_arrays import filled
 from jaxslam.sensors.measurement import predict_pixels
 from jaxslam.tracking.points import KeyframeMatches, KeyframeRing, TrackedPoints
 from jaxslam.tracking.state import TrackPlan
@@ -28,13 +31,13 @@ def empty_keyframes(height: int, width: int, plan: TrackPlan, image_dtype: jnp.d
     """A ring without keyframes."""
     k, n = plan.num_keyframes + plan.num_reloaded, plan.num_points
     return KeyframeRing(
-        images=jnp.zeros((k, height, width), image_dtype),
-        T_world_cam=jnp.tile(SE3.identity().wxyz_xyz.astype(dtype), (k, 1)),
-        uv=jnp.zeros((k, 2, n), dtype),
-        X_world=jnp.zeros((k, 3, n), dtype),
-        weight=jnp.zeros((k, n), dtype),
-        id=jnp.zeros((k, n), jnp.int32),
-        made=jnp.zeros((), jnp.int32),
+        images=filled((k, height, width), image_dtype),
+        T_world_cam=jax.device_put(np.tile(IDENTITY, (k, 1)).astype(dtype)),
+        uv=filled((k, 2, n), dtype),
+        X_world=filled((k, 3, n), dtype),
+        weight=filled((k, n), dtype),
+        id=filled((k, n), jnp.int32),
+        made=filled((), jnp.int32),
     )
 
 

@@ -7,6 +7,8 @@ from jax.typing import DTypeLike
 from jaxslam_kernels.types import Code, Mask, Pixels, Points, Scalar, Weights
 from jaxtyping import Array, Float, Int, Num
 
+from jaxslam.runtime.filled_arrays import filled
+
 
 class TrackedPoints(NamedTuple):
     """Points tracked from frame to frame; slots that are not `valid` are free.
@@ -40,21 +42,20 @@ class TrackedPoints(NamedTuple):
 
 
 def empty_points(num_points: int, dtype: DTypeLike) -> TrackedPoints:
-    """Make slots without points."""
-    numbers, plane, space = (jnp.zeros(shape, dtype) for shape in (num_points, (2, num_points), (3, num_points)))
-    counts = jnp.zeros(num_points, jnp.int32)
+    """Make slots without points; no two arrays share memory, so that a program may take all of them over."""
+    n = num_points
     return TrackedPoints(
-        uv=plane,
-        xy=plane,
-        depth=numbers,
-        X_world=space,
-        X_anchor=space,
-        information=numbers,
-        weight=jnp.ones(num_points, dtype),
-        age=counts,
-        anchor_age=counts,
-        id=counts,
-        valid=jnp.zeros(num_points, bool),
+        uv=filled((2, n), dtype),
+        xy=filled((2, n), dtype),
+        depth=filled(n, dtype),
+        X_world=filled((3, n), dtype),
+        X_anchor=filled((3, n), dtype),
+        information=filled(n, dtype),
+        weight=filled(n, dtype, 1),
+        age=filled(n, jnp.int32),
+        anchor_age=filled(n, jnp.int32),
+        id=filled(n, jnp.int32),
+        valid=filled(n, bool),
     )
 
 

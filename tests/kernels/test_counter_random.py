@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxslam_kernels.counter_random import COUNTER_RANDOM
+from jaxslam_kernels.counter_random import COUNTER_RANDOM, seed_words
 from scipy import stats
 
 
@@ -57,3 +57,11 @@ def test_types(dtype: str, width: int) -> None:
     assert not np.array_equal(wide_seed, narrow_seed)
     assert jax.random.normal(_key(1), (3,)).shape == (3,)
     assert sorted(np.asarray(jax.random.permutation(_key(1), 10))) == list(range(10))
+
+
+@pytest.mark.parametrize("wide", [False, True])
+@pytest.mark.parametrize("seed", [0, 1, 2**31 - 1, 2**31, 2**32 - 1])
+def test_words_of_a_seed_are_those_of_its_key(seed: int, *, wide: bool) -> None:
+    with jax.enable_x64(wide):
+        key = jax.random.key_data(jax.random.key(seed, impl=COUNTER_RANDOM))
+        np.testing.assert_array_equal(seed_words(seed), key)

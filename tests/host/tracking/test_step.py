@@ -110,6 +110,18 @@ class TestShapes:
             assert output.uv.shape == (2, PLAN.num_points)
 
 
+class TestInitialState:
+    def test_takes_no_program(self, compiled: list[str]) -> None:
+        jax.clear_caches()
+        init_state(HEIGHT, WIDTH, PLAN, seed=3)
+        assert compiled == []
+
+    def test_a_program_may_take_all_its_memory(self) -> None:
+        """No two arrays are one."""
+        state = init_state(HEIGHT, WIDTH, PLAN)
+        jax.block_until_ready(jax.jit(lambda state: state, donate_argnums=0)(state))
+
+
 class TestCompiled:
     def test_tracks(self, counted: Counted, frames: FrameArrays) -> None:
         state, outputs = track(counted.step, frames)
