@@ -36,8 +36,7 @@ def prefer_one_thread() -> None:
 
     `Slam` does it when it begins (`run.threads`). Call it where your program makes arrays before.
 
-    XLA splits work that is too small for it and waits for the parts. On two cores, a frame takes 9.3 ms with one
-    thread and 10.0 with two, and 9.9 ms of processor time instead of 12.0.
+    With more threads XLA splits work that is too small for it, and waits for the parts; `bound_threads` has figures.
     """
     _bound_xla(1)
 
