@@ -135,6 +135,7 @@ def test_loops_of_a_map_that_grows(compiled: list[str], num_keyframes: int) -> N
     assert compiled == []
 
 
+@pytest.mark.slow
 def test_another_image_size(compiled: list[str]) -> None:
     """Its tracker compiles when it warms up, and no later; neither does the first one after that."""
     source = SyntheticDataset(SyntheticConfig(width=200, height=152, frames=8))

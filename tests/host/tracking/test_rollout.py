@@ -54,6 +54,7 @@ def test_equals_its_steps(frames: FrameArrays) -> None:
     np.testing.assert_array_equal(end.points.valid, state.points.valid)
 
 
+@pytest.mark.slow
 def test_gradients_of_a_batch_are_those_of_each(alone: Any, frames: FrameArrays) -> None:
     """Over cameras and initial states, one of which has another seed."""
     cameras, states = [with_focal(scale) for scale in (1.0, 1.03)], [new_state(seed=seed) for seed in (0, 7)]
@@ -65,6 +66,7 @@ def test_gradients_of_a_batch_are_those_of_each(alone: Any, frames: FrameArrays)
     np.testing.assert_allclose(found, jnp.stack(each), rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_memory_of_a_frame_is_a_state(alone: Any) -> None:
     """What is inside the steps is not kept: it would be some fifteen states a frame."""
     more = stacked(clip().frames[: 2 * FRAMES])
