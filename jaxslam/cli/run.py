@@ -157,7 +157,6 @@ class Run(OfRecording):
         """Run the command."""
         from jaxslam.cli.tracking_run import make_viewer, track  # noqa: PLC0415
         from jaxslam.map.npz_file import load_map  # noqa: PLC0415
-        from jaxslam.runtime.threads import bound_threads  # noqa: PLC0415
         from jaxslam.slam.slam import Slam  # noqa: PLC0415
 
         if self.localize_only and self.map is None:
@@ -165,7 +164,6 @@ class Run(OfRecording):
         if self.localize_only and self.dense:
             raise ConfigError("--dense: a map that stays as it is, by --localize-only, gets no dense one")
         config, dataset = self.settings(self.preset, *_dense(self.dense)), self.opened()
-        bound_threads(config.run.threads)  # before the map makes arrays
         start = None if self.map is None else load_map(self.map)
         slam = Slam(dataset.camera, config, slam_map=start, localize_only=self.localize_only)
         viewer = make_viewer(slam, dataset, live=self.viz, path=self.rrd)

@@ -68,7 +68,7 @@ def test_gradients_of_a_batch_are_those_of_each(alone: Any, frames: FrameArrays)
 
 @pytest.mark.slow
 def test_memory_of_a_frame_is_a_state(alone: Any) -> None:
-    """What is inside the steps is not kept: it would be some fifteen states a frame."""
+    """Values inside the steps are not kept; they would be some fifteen states a frame."""
     more = stacked(clip().frames[: 2 * FRAMES])
     longer: Any = quick_compile(gradient).lower(new_state(), more, params()).compile()
     of_six, of_twelve = (program.memory_analysis().temp_size_in_bytes for program in (alone, longer))
