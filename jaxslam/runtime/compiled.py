@@ -9,6 +9,7 @@ from typing import Any, Literal, TypeAlias, TypeVar
 
 import jax
 
+from jaxslam.runtime.garbage import collector_paused
 from jaxslam.runtime.trace_cache import cached_trace
 
 R = TypeVar("R")
@@ -96,7 +97,8 @@ def compiled(
         def traced(*args: Any, **kwargs: Any) -> R:
             _this_thread.before_each()
             program.num_compiled += 1  # `jax.jit` calls this once for each combination that it compiles
-            return cached(*args, **kwargs)
+            with collector_paused():
+                return cached(*args, **kwargs)
 
         jitted: Any = jax.jit(
             traced,

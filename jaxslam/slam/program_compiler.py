@@ -34,7 +34,7 @@ _ONE_AT_A_TIME = threading.Lock()
 class ProgramCompiler:
     """Compiles all programs of a `Slam`, and lets the workers of the back end begin when theirs are ready.
 
-    From an empty cache the first pose comes 8 s after the call, not 16 s as with all programs compiled before it (TUM
+    From an empty cache the first pose comes 7 s after the call, not 16 s as with all programs compiled before it (TUM
     `fr1_rpy`, two cores of an AMD EPYC). The tracker's thread calls the methods, but for `stop`; workers begin in it
     too, so that what is ready does not change in the middle of a frame.
     """

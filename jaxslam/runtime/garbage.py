@@ -1,0 +1,33 @@
+"""Pauses of Python's garbage collector, for work that makes many objects and no cycles."""
+
+import gc
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+_lock = threading.Lock()
+_num_pauses = 0
+_was_enabled = False
+
+
+@contextmanager
+def collector_paused() -> Iterator[None]:
+    """Keep Python's cyclic garbage collector from running, in all threads; pauses may overlap.
+
+    Tracing a program makes so many objects that the collector walks through everything that has been imported again and
+    again: 0.7 of the 8.4 s to the first pose. Reference counting frees what it frees as ever. A collector that was
+    disabled before stays so.
+    """
+    global _num_pauses, _was_enabled  # noqa: PLW0603 - one collector for the process
+    with _lock:
+        if _num_pauses == 0:
+            _was_enabled = gc.isenabled()
+            gc.disable()
+        _num_pauses += 1
+    try:
+        yield
+    finally:
+        with _lock:
+            _num_pauses -= 1
+            if _num_pauses == 0 and _was_enabled:
+                gc.enable()
