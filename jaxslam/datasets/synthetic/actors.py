@@ -4,8 +4,10 @@ Each actor has a frame of its own: origin on the floor under it (a person) or in
 Motions are closed forms of time in float64, so that ground truth is exact and any frame can be asked for.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from functools import partial
+from typing import NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
@@ -31,6 +33,24 @@ class Actor(Protocol):
     def parts(self, time_s: np.ndarray) -> np.ndarray:
         """Placements `T_actor_solid` of its solids: `(t, len(solids), 4, 4)`."""
         ...
+
+
+class GroundMotion(NamedTuple):
+    """Where something that moves on the floor is at `t` times.
+
+    Attributes:
+        position: `(t, 2)` meters.
+        heading: `(t,)` radians from the x axis of the world towards its y axis.
+        speed_m_per_s: `(t,)`.
+    """
+
+    position: np.ndarray
+    heading: np.ndarray
+    speed_m_per_s: np.ndarray
+
+
+Walk: TypeAlias = Callable[[np.ndarray], GroundMotion]
+"""Motion on the floor at `(t,)` seconds since the start."""
 
 
 @dataclass(frozen=True)
@@ -78,14 +98,15 @@ def cast(path: str, people: int, boxes: int, seated: int, parked: int, seed: int
         sharing = people + boxes - lane if lane == len(lanes) - 1 else 1
         start = np.random.default_rng([seed, 300, lane]).uniform(0.0, 2.0 * np.pi)
         start += 2.0 * np.pi * (index - lane) / sharing
-        kind = Person if index < people else CarriedBox
-        actors.append(kind(lanes[lane], start, np.random.default_rng([seed, 200, index])))
+        rng = np.random.default_rng([seed, 200, index])
+        walk = partial(_walk, lanes[lane], start)
+        actors.append(Person(walk, start, rng) if index < people else CarriedBox(walk, start, rng))
     actors += [SeatedPerson(place, seed) for place in range(seated)]
     return actors + [ParkedBox(place, seed) for place in range(parked)]
 
 
-def _walk(lane: Lane, start: float, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Position `(t, 2)`, heading `(t,)` and speed `(t,)` on a lane, with a pace that varies a little."""
+def _walk(lane: Lane, start: float, time_s: np.ndarray) -> GroundMotion:
+    """Motion on a lane, with a pace that varies a little."""
     angle = start + lane.rate * time_s + 0.15 * np.sin(0.9 * time_s + start)
     rate = lane.rate + 0.135 * np.cos(0.9 * time_s + start)
     a, b = lane.semi_axes
@@ -95,7 +116,7 @@ def _walk(lane: Lane, start: float, time_s: np.ndarray) -> tuple[np.ndarray, np.
     rounder = max(a, 0.4 * b)
     sign = np.sign(lane.rate)
     heading = np.arctan2(sign * b * np.cos(angle), -sign * rounder * np.sin(angle))
-    return position, heading, speed
+    return GroundMotion(position, heading, speed)
 
 
 _STRIDES_PER_S = 0.85
@@ -107,22 +128,28 @@ class Person:
 
     label = "person"
 
-    def __init__(self, lane: Lane, start: float, rng: np.random.Generator) -> None:
-        self._lane = lane
-        self._start = start
+    def __init__(self, walk: Walk, phase: float, rng: np.random.Generator) -> None:
+        """Choose size and clothes.
+
+        Args:
+            walk: Where the person is at any time.
+            phase: Phase of the strides at time 0, in radians.
+            rng: Chooses size and clothes.
+        """
+        self._walk, self._phase = walk, phase
         self._scale = rng.uniform(0.94, 1.05)
         self.solids = body(self._scale, rng)
 
     def root(self, time_s: np.ndarray) -> np.ndarray:
         """Poses of the point on the floor under the hips, x forward: `(t, 7)`, wxyz_xyz."""
-        position, heading, _ = _walk(self._lane, self._start, time_s)
+        position, heading, _ = self._walk(time_s)
         floor = np.zeros((len(position), 1))
         return np.concatenate([axis_rotation(2, heading), position, floor], axis=1)
 
     def parts(self, time_s: np.ndarray) -> np.ndarray:
         """Placements of the body's solids in its frame: `(t, 15, 4, 4)`."""
-        _, _, speed = _walk(self._lane, self._start, time_s)
-        phase = 2.0 * np.pi * _STRIDES_PER_S * time_s + self._start
+        speed = self._walk(time_s).speed_m_per_s
+        phase = 2.0 * np.pi * _STRIDES_PER_S * time_s + self._phase
         swing = np.arcsin(np.minimum(speed / (4.0 * _STRIDES_PER_S * _LEG_M), 0.6))
         trunk = [_still(time_s, place) for place in TRUNK]
         limbs = [_limbs(side, phase, swing) for side in (-1.0, 1.0)]
@@ -161,15 +188,15 @@ def _still(time_s: np.ndarray, place: tuple[float, float, float]) -> np.ndarray:
 class CarriedBox(Crate):
     """A textured box carried about at the height of a chest, turning as it goes: a mover no detector knows."""
 
-    def __init__(self, lane: Lane, start: float, rng: np.random.Generator) -> None:
-        self._lane = lane
-        self._start = start
+    def __init__(self, walk: Walk, phase: float, rng: np.random.Generator) -> None:
+        """Choose size and pattern; whoever carries it walks as `walk` says, and `phase` is that of its turns."""
+        self._walk, self._start = walk, phase
         half_m = rng.uniform((0.16, 0.20, 0.18), (0.22, 0.32, 0.34))
         super().__init__(half_m, ((0.50, 0.40, 0.26), (0.72, 0.58, 0.40)), rng)
 
     def root(self, time_s: np.ndarray) -> np.ndarray:
         """Poses of the center of the box: `(t, 7)`, wxyz_xyz."""
-        position, _, _ = _walk(self._lane, self._start, time_s)
+        position, _, _ = self._walk(time_s)
         height = 1.1 + 0.18 * np.sin(0.7 * time_s + 2.0 * self._start)
         turn = 0.5 * np.sin(0.45 * time_s + self._start)
         return np.concatenate([axis_rotation(2, turn), position, height[:, None]], axis=1)

@@ -3,20 +3,18 @@
 from dataclasses import dataclass, field
 from typing import Annotated
 
-import cv2
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.config.validation import Range, ValidatedConfig
-from jaxslam.datasets.synthetic import homogeneous as rigid
 from jaxslam.datasets.synthetic.actors import cast
 from jaxslam.datasets.synthetic.camera_path import CameraPathKind, camera_path
 from jaxslam.datasets.synthetic.parked_boxes import MAX_PARKED
-from jaxslam.datasets.synthetic.render import CameraView, Rendering, pack_scene, render
 from jaxslam.datasets.synthetic.room import furnish
 from jaxslam.datasets.synthetic.seated_people import MAX_SEATED, chairs
-from jaxslam.datasets.synthetic.sensor_noise import SensorConfig, measure, sensor_params
+from jaxslam.datasets.synthetic.sensor_noise import SensorConfig
+from jaxslam.datasets.synthetic.shading import ROOM_LIGHT
+from jaxslam.datasets.synthetic.virtual_camera import Stage, VirtualCamera
 from jaxslam.errors import ConfigError
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame
@@ -151,10 +149,8 @@ class SyntheticDataset:
         )
         self.actors = cast(config.path, config.people, config.boxes, config.seated, config.parked, config.seed)
         static = furnish(config.seed) + chairs(config.seated, config.seed)
-        owned = [(solid, number) for number, actor in enumerate(self.actors, 1) for solid in actor.solids]
-        solids = [(placed.solid, 0) for placed in static] + owned
-        self._scene, self._slots = pack_scene([solid for solid, _ in solids], [number for _, number in solids])
-        self._static_from_world = rigid.inverse(np.stack([placed.T_world_solid for placed in static]))
+        self.stage = Stage(static, self.actors, ROOM_LIGHT)
+        self._filming = VirtualCamera(self.stage, self.camera, config.sensor, self._pose, self._gain)
         self._key = jax.random.key(config.seed)
 
     def __len__(self) -> int:
@@ -173,63 +169,27 @@ class SyntheticDataset:
         index = range(len(self))[index]
         time_s = float(self._time_s[index])
         key = jax.random.fold_in(self._key, index)
-        own, rgb, depth_m = self._taken(time_s, key)
-        right = None
+        taken, right = self._filming.take(time_s, key), None
         if self.config.baseline_m is not None:
-            _, right, _ = self._taken(time_s, jax.random.fold_in(key, 1), self.config.baseline_m)
+            right = self._filming.take(time_s, jax.random.fold_in(key, 1), self.config.baseline_m).rgb
         return SyntheticFrame(
             timestamp_ns=int(self.timestamps_ns[index]),
-            rgb=rgb,
-            depth_m=depth_m,
-            exact_depth_m=np.asarray(own.depth_m),
-            instance_mask=np.asarray(own.owner),
+            rgb=taken.rgb,
+            depth_m=taken.depth_m,
+            exact_depth_m=np.asarray(taken.exact.depth_m),
+            instance_mask=np.asarray(taken.exact.owner),
             T_world_cam=self.T_world_cam[index].copy(),
             T_world_actor=self.T_world_actor(np.array([time_s]))[0],
             right=right,
         )
-
-    def _taken(
-        self, time_s: float, key: jax.Array, to_the_right_m: float = 0.0
-    ) -> tuple[Rendering, np.ndarray, np.ndarray]:
-        """The moment of the frame itself, and color and depth as measured, by the camera or one to its right."""
-        moments = self._expose(time_s, to_the_right_m)
-        own = moments[len(moments) // 2]
-        colors, sensor = tuple(moment.color for moment in moments), sensor_params(self.config.sensor)
-        channels, depth_m = measure(colors, own.depth_m, own.incidence, self.fx, self._gain(time_s), sensor, key)
-        # XLA needs as long to interleave the channels as to render a moment.
-        return own, cv2.merge(list(np.asarray(channels))), np.asarray(depth_m)
 
     def T_world_actor(self, time_s: np.ndarray) -> np.ndarray:
         """Poses of the actors at `(t,)` seconds since the start: `(t, actors, 7)` float64, wxyz_xyz."""
         poses = [actor.root(time_s) for actor in self.actors]
         return np.stack(poses, axis=1) if poses else np.zeros((len(time_s), 0, 7))
 
-    def _expose(self, time_s: float, to_the_right_m: float) -> list[Rendering]:
-        """The moments of one exposure, evenly in time, each on its own row and column within the pixel."""
-        n = self.config.sensor.exposure_samples
-        rank = np.arange(n)
-        centered = (rank + 0.5) / n - 0.5
-        offsets = np.stack([centered, centered[(2 * rank + (n + 1) // 2) % n]], axis=1)
-        views = self._views(time_s + self.config.sensor.exposure_s * centered, offsets, to_the_right_m)
-        return [render(self._scene, view, height=self.height, width=self.width) for view in views]
-
-    def _views(self, time_s: np.ndarray, offsets: np.ndarray, to_the_right_m: float) -> list[CameraView]:
-        world_from_cam = rigid.matrix_from_pose(camera_path(self.config.path, time_s, self.config.seed))
-        world_from_cam[:, :3, 3] += to_the_right_m * world_from_cam[:, :3, 0]
-        from_world = [np.broadcast_to(self._static_from_world, (len(time_s), *self._static_from_world.shape))]
-        for actor in self.actors:
-            root = rigid.matrix_from_pose(actor.root(time_s))
-            from_world.append(rigid.inverse(root[:, None] @ actor.parts(time_s)))
-        solid_from_cam = np.zeros((len(time_s), len(self._scene.owner), 3, 4), np.float32)
-        solid_from_cam[:] = np.eye(4)[:3]
-        solid_from_cam[:, self._slots] = (np.concatenate(from_world, axis=1) @ world_from_cam[:, None])[:, :, :3]
-        intrinsics = np.array([self.fx, self.fy, self.cx, self.cy], np.float32)
-        return [
-            CameraView(
-                *map(jnp.asarray, (solids, camera[:3].astype(np.float32), intrinsics, offset.astype(np.float32)))
-            )
-            for solids, camera, offset in zip(solid_from_cam, world_from_cam, offsets, strict=True)
-        ]
+    def _pose(self, time_s: np.ndarray) -> np.ndarray:
+        return camera_path(self.config.path, time_s, self.config.seed)
 
     def _gain(self, time_s: float) -> float:
         phases = np.random.default_rng([self.config.seed, 400]).uniform(0.0, 2.0 * np.pi, 2)

@@ -22,7 +22,7 @@ from jaxslam.datasets.synthetic.raycast import (
     solids_in_tiles,
     unpack,
 )
-from jaxslam.datasets.synthetic.shading import SUN, Hits, shade
+from jaxslam.datasets.synthetic.shading import Hits, Light, shade
 from jaxslam.datasets.synthetic.texture import N_WORDS
 from jaxslam.runtime.compile_cache import FUSION_EMITTERS
 from jaxslam.runtime.compiled import compiled
@@ -40,6 +40,7 @@ class RenderScene(NamedTuple):
         surface: Texture parameters, six surfaces a solid.
         owner: 0 for static solids, otherwise the number of the actor.
         used: Whether the entry holds a solid.
+        light: Light of the scene.
     """
 
     box_size: Float[Array, "b 3"]
@@ -48,6 +49,7 @@ class RenderScene(NamedTuple):
     surface: UInt[Array, "s 12"]
     owner: Int[Array, " n"]
     used: Bool[Array, " n"]
+    light: Light
 
 
 class CameraView(NamedTuple):
@@ -82,12 +84,13 @@ class Rendering(NamedTuple):
     owner: Int[Array, "h w"]
 
 
-def pack_scene(solids: list[Solid], owner: list[int]) -> tuple[RenderScene, np.ndarray]:
+def pack_scene(solids: list[Solid], owner: list[int], light: Light) -> tuple[RenderScene, np.ndarray]:
     """Arrange solids for rendering.
 
     Args:
         solids: The room first, then any boxes and capsules.
         owner: The number of the actor of each solid, 0 for none.
+        light: Light of the scene.
 
     Returns:
         The scene, and the slot of each solid in it, `(len(solids),)`: the row of its transform in a `View`.
@@ -111,6 +114,7 @@ def pack_scene(solids: list[Solid], owner: list[int]) -> tuple[RenderScene, np.n
         jnp.asarray(surface.reshape(-1, N_WORDS)),
         jnp.asarray(owners),
         jnp.asarray(used),
+        Light(*map(jnp.asarray, light)),
     )
     return scene, slots
 
@@ -136,7 +140,7 @@ def render(scene: RenderScene, view: CameraView, *, height: int, width: int) -> 
     shapes = Shapes(view.solid_from_cam / size[:, :, None], stem)
     reaches = solids_in_tiles(_corners(view, size, stem), view.intrinsics, rows, columns) & scene.used[None]
     boxes, capsules = compact(reaches[:, 1:n_boxes], 1), compact(reaches[:, n_boxes:], n_boxes)
-    sun = jnp.einsum("nij,kj,k->ni", view.solid_from_cam[:, :, :3], view.world_from_cam[:, :3], SUN)
+    sun = jnp.einsum("nij,kj,k->ni", view.solid_from_cam[:, :, :3], view.world_from_cam[:, :3], scene.light.towards_sun)
     table = jnp.concatenate([shapes.unit_from_cam.reshape(-1, 12), size, stem[:, None], sun], axis=1)
 
     def render_tile(tile: tuple[Array, InTile, InTile]) -> tuple[Array, ...]:
@@ -144,7 +148,10 @@ def render(scene: RenderScene, view: CameraView, *, height: int, width: int) -> 
         x, y = _rays(view, (index // columns) * TILE_HEIGHT, (index % columns) * TILE_WIDTH)
         depth, which = unpack(shapes, nearest_solid(shapes, x, y, boxes, capsules))
         hits = Hits(x, y, depth, which, which < n_boxes)
-        return (*shade(table, scene.surface, hits, view.world_from_cam, view.intrinsics[0]), scene.owner[which])
+        return (
+            *shade(table, scene.surface, hits, view.world_from_cam, view.intrinsics[0], scene.light),
+            scene.owner[which],
+        )
 
     planes = jax.lax.map(render_tile, (jnp.arange(rows * columns, dtype=jnp.int32), boxes, capsules))
     return Rendering(*(_untile(plane, rows, columns)[:height, :width] for plane in planes))

@@ -16,13 +16,38 @@ from jaxtyping import Array, Bool, Float, Int, Shaped, UInt
 from jaxslam.datasets.synthetic.raycast import Plane, Vectors
 from jaxslam.datasets.synthetic.texture import as_surface, texture_color
 
-SUN = np.array([-0.45, 0.30, 0.84], np.float32)
-"""Unit vector towards the directional light, in the world."""
-_LAMP_M = np.array([-0.6, 0.4, 2.6], np.float32)
-_LAMP_REACH_M = 4.2
-_BRIGHTNESS = 1.45
-_AMBIENT = 0.42
 _LEVELS = 800.0
+
+
+class Light(NamedTuple):
+    """Light of a scene: from one direction, and a lamp around which it fades.
+
+    Attributes:
+        towards_sun: Unit vector towards the directional light, in the world.
+        lamp_m: Place of the lamp in the world, in meters.
+        fading_per_m2: Inverse of the squared distance from the lamp at which half of the light is left; 0 outdoors.
+        brightness: Factor of all light.
+        ambient: Light that comes from everywhere.
+        directed: Light of the sun at its brightest.
+    """
+
+    towards_sun: Float[Array, "3"] | np.ndarray
+    lamp_m: Float[Array, "3"] | np.ndarray
+    fading_per_m2: Float[Array, ""] | np.float32
+    brightness: Float[Array, ""] | np.float32
+    ambient: Float[Array, ""] | np.float32
+    directed: Float[Array, ""] | np.float32
+
+
+ROOM_LIGHT = Light(
+    towards_sun=np.array([-0.45, 0.30, 0.84], np.float32),
+    lamp_m=np.array([-0.6, 0.4, 2.6], np.float32),
+    fading_per_m2=np.float32(1.0) / np.float32(4.2**2),
+    brightness=np.float32(1.45),
+    ambient=np.float32(0.42),
+    directed=np.float32(0.58),
+)
+"""Light of the furnished room."""
 
 
 class Hits(NamedTuple):
@@ -49,6 +74,7 @@ def shade(
     hits: Hits,
     world_from_cam: Float[Array, "3 4"],
     focal: Float[Array, ""],
+    light: Light,
 ) -> tuple[UInt[Array, " p"], Plane, Plane]:
     """Color and exact place of hits.
 
@@ -59,6 +85,7 @@ def shade(
         hits: Hits to shade.
         world_from_cam: Rigid transform from camera to world coordinates.
         focal: Focal length in pixels.
+        light: Light of the scene.
 
     Returns:
         Packed color, depth, and the cosine between ray and surface normal.
@@ -77,9 +104,9 @@ def shade(
     u, v = jnp.where(axis == 0, place[1], place[0]), jnp.where(axis == 2, place[1], place[2])
     side = 6 * hits.which + 2 * axis + (_component(point, axis) > 0.0).astype(jnp.int32)
     pixels_per_m = focal * jnp.maximum(incidence, 0.05) / depth
-    light = _light(world_from_cam, hits, depth, _dot(normal, sun))
+    bright = _brightness(light, world_from_cam, hits, depth, _dot(normal, sun))
     red, green, blue = texture_color(u, v, pixels_per_m, as_surface(_gather(surfaces, side)))
-    return _pack_color(light * red, light * green, light * blue), depth, incidence
+    return _pack_color(bright * red, bright * green, bright * blue), depth, incidence
 
 
 def _pack_color(red: Plane, green: Plane, blue: Plane) -> UInt[Array, " p"]:
@@ -119,13 +146,15 @@ def _normal(point: Vectors, size: Vectors, stem: Plane, is_box: Bool[Array, " p"
     return axis, _each(lambda k: jnp.where(is_box, flat[k], bent[k]))
 
 
-def _light(world_from_cam: Float[Array, "3 4"], hits: Hits, depth: Plane, towards_sun: Plane) -> Plane:
+def _brightness(
+    light: Light, world_from_cam: Float[Array, "3 4"], hits: Hits, depth: Plane, towards_sun: Plane
+) -> Plane:
     """Ambient light, light from one direction that wraps round, both fading with the distance from a lamp."""
-    start = world_from_cam[:, 3] - _LAMP_M
+    start = world_from_cam[:, 3] - light.lamp_m
     turned = _each(lambda k: world_from_cam[k, 0] * hits.x + world_from_cam[k, 1] * hits.y + world_from_cam[k, 2])
     from_lamp = _each(lambda k: start[k] + depth * turned[k])
-    wrapped = _AMBIENT + (1.0 - _AMBIENT) * (0.5 + 0.5 * towards_sun)
-    return _BRIGHTNESS * wrapped / (1.0 + _dot(from_lamp, from_lamp) / _LAMP_REACH_M**2)
+    wrapped = light.ambient + light.directed * (0.5 + 0.5 * towards_sun)
+    return light.brightness * wrapped / (1.0 + _dot(from_lamp, from_lamp) * light.fading_per_m2)
 
 
 def _each(component: Callable[[int], Plane]) -> Vectors:

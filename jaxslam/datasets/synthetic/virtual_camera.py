@@ -1,0 +1,129 @@
+"""A camera in a rendered scene: what it measures at any time, and the exact picture behind it."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam.datasets.synthetic import homogeneous as rigid
+from jaxslam.datasets.synthetic.actors import Actor
+from jaxslam.datasets.synthetic.primitives import PlacedSolid
+from jaxslam.datasets.synthetic.render import CameraView, Rendering, pack_scene, render
+from jaxslam.datasets.synthetic.sensor_noise import SensorConfig, measure, sensor_params
+from jaxslam.datasets.synthetic.shading import Light
+from jaxslam.sensors.camera import Camera
+
+
+class Stage:
+    """Everything that can be seen, packed for rendering.
+
+    Attributes:
+        scene: The solids and the light.
+    """
+
+    def __init__(
+        self, static: Sequence[PlacedSolid], actors: Sequence[Actor], light: Light, owners: Sequence[int] = ()
+    ) -> None:
+        """Pack solids; actor `k` of `actors` has the number `k`, from 1 on.
+
+        Args:
+            static: What stands still; first a box around everything, seen from inside.
+            actors: What moves.
+            light: Light of the scene.
+            owners: Number of each of `static`, 0 for none; by default all of them have none.
+        """
+        self._actors = tuple(actors)
+        owned = [(solid, number) for number, actor in enumerate(actors, 1) for solid in actor.solids]
+        solids = [placed.solid for placed in static] + [solid for solid, _ in owned]
+        numbers = [*(owners or [0] * len(static)), *(number for _, number in owned)]
+        self.scene, self._slots = pack_scene(solids, numbers, light)
+        self._static_from_world = rigid.inverse(np.stack([placed.T_world_solid for placed in static]))
+
+    def solid_from_cam(self, time_s: np.ndarray, world_from_cam: np.ndarray) -> np.ndarray:
+        """Where the solids are for a camera at `(t,)` times and `(t, 4, 4)` places: `(t, slots, 3, 4)` float32."""
+        from_world = [np.broadcast_to(self._static_from_world, (len(time_s), *self._static_from_world.shape))]
+        for actor in self._actors:
+            root = rigid.matrix_from_pose(actor.root(time_s))
+            from_world.append(rigid.inverse(root[:, None] @ actor.parts(time_s)))
+        transforms = np.zeros((len(time_s), len(self.scene.owner), 3, 4), np.float32)
+        transforms[:] = np.eye(4)[:3]
+        transforms[:, self._slots] = (np.concatenate(from_world, axis=1) @ world_from_cam[:, None])[:, :, :3]
+        return transforms
+
+
+class TakenPicture(NamedTuple):
+    """A picture as measured, and the exact one of its moment.
+
+    Attributes:
+        exact: Depth, owners and color of the middle of the exposure.
+        rgb: `(height, width, 3)` uint8.
+        depth_m: `(height, width)` float32, 0 where missing.
+    """
+
+    exact: Rendering
+    rgb: np.ndarray
+    depth_m: np.ndarray
+
+
+class VirtualCamera:
+    """Takes pictures of a stage, with the faults of a real camera."""
+
+    def __init__(
+        self,
+        stage: Stage,
+        camera: Camera,
+        sensor: SensorConfig,
+        pose_at: Callable[[np.ndarray], np.ndarray],
+        gain_at: Callable[[float], float],
+    ) -> None:
+        """Set up a camera.
+
+        Args:
+            stage: What is to be seen.
+            camera: Size and intrinsics, without distortion.
+            sensor: The faults.
+            pose_at: `(t, 7)` poses `T_world_cam`, wxyz_xyz, at `(t,)` seconds since the start.
+            gain_at: Factor of brightness at a time.
+        """
+        self._stage, self._camera, self._sensor = stage, camera, sensor
+        self._pose_at, self._gain_at = pose_at, gain_at
+
+    def take(self, time_s: float, key: jax.Array, to_the_right_m: float = 0.0) -> TakenPicture:
+        """Take a picture.
+
+        Args:
+            time_s: Middle of the exposure, seconds since the start.
+            key: Random key of the noise.
+            to_the_right_m: How far to the right of the camera's place the picture is taken.
+        """
+        moments = self._expose(time_s, to_the_right_m)
+        own = moments[len(moments) // 2]
+        colors, sensor = tuple(moment.color for moment in moments), sensor_params(self._sensor)
+        gain = self._gain_at(time_s)
+        channels, depth_m = measure(colors, own.depth_m, own.incidence, self._camera.fx, gain, sensor, key)
+        # XLA needs as long to interleave the channels as to render a moment.
+        return TakenPicture(own, cv2.merge(list(np.asarray(channels))), np.asarray(depth_m))
+
+    def _expose(self, time_s: float, to_the_right_m: float) -> list[Rendering]:
+        """The moments of one exposure, evenly in time, each on its own row and column within the pixel."""
+        n = self._sensor.exposure_samples
+        rank = np.arange(n)
+        centered = (rank + 0.5) / n - 0.5
+        offsets = np.stack([centered, centered[(2 * rank + (n + 1) // 2) % n]], axis=1)
+        views = self._views(time_s + self._sensor.exposure_s * centered, offsets, to_the_right_m)
+        height, width = self._camera.height, self._camera.width
+        return [render(self._stage.scene, view, height=height, width=width) for view in views]
+
+    def _views(self, time_s: np.ndarray, offsets: np.ndarray, to_the_right_m: float) -> list[CameraView]:
+        world_from_cam = rigid.matrix_from_pose(self._pose_at(time_s))
+        world_from_cam[:, :3, 3] += to_the_right_m * world_from_cam[:, :3, 0]
+        solid_from_cam = self._stage.solid_from_cam(time_s, world_from_cam)
+        camera = self._camera
+        intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
+        return [
+            CameraView(*map(jnp.asarray, (solids, place[:3].astype(np.float32), intrinsics, offset.astype(np.float32))))
+            for solids, place, offset in zip(solid_from_cam, world_from_cam, offsets, strict=True)
+        ]
