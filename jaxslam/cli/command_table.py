@@ -165,6 +165,19 @@ COMMANDS = (
     Command(("data",), None, "Public recordings to track: list them, get one."),
     Command(("data", "get"), "data:GetRecording", "Download a recording and unpack it, or go on with a cut download."),
     Command(("data", "list"), "data:ListRecordings", "Print the known recordings: size, license, where they are."),
+    Command(("world",), None, "Rendered worlds: list them, look at one, make one into a recording."),
+    Command(("world", "list"), "world:ListWorlds", "Print the worlds that come with jaxslam."),
+    Command(
+        ("world", "render"),
+        "world:RenderWorld",
+        "Render a world into a recording with exact ground truth.",
+        "In the layout of TUM RGB-D, with masks, numbers and labels of all things, and the calibration.",
+    ),
+    Command(
+        ("world", "show"),
+        "world:ShowWorld",
+        "Write pictures of a world: a contact sheet, a plan, a clip.",
+    ),
 )
 
 

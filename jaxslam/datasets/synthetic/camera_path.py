@@ -44,8 +44,22 @@ def camera_path(kind: str, time_s: np.ndarray, seed: int) -> np.ndarray:
     time_s = np.asarray(time_s, np.float64)
     phases = np.random.default_rng([seed, CAMERA_PATHS.index(kind)]).uniform(0.0, 2.0 * np.pi, (4, 3))
     position, angles = _PATHS[kind](time_s, phases)
-    shake = _waves(time_s, (0.9, 0.63, 0.77), phases[2]) + 0.5 * _waves(time_s, (0.37, 0.31, 0.41), phases[3])
-    return _poses(position + 0.002 * shake, angles + np.deg2rad(0.15) * np.roll(shake, 1, axis=1))
+    moved, turned = hand_tremor(time_s, phases[2:])
+    return poses_of(position + moved, angles + turned)
+
+
+def hand_tremor(time_s: np.ndarray, phases: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How the hand that holds the camera trembles.
+
+    Args:
+        time_s: `(n,)` seconds since the start.
+        phases: `(2, 3)` phases in radians.
+
+    Returns:
+        Offsets of the position, `(n, 3)` meters, and of yaw, pitch and roll, `(n, 3)` radians.
+    """
+    shake = _waves(time_s, (0.9, 0.63, 0.77), phases[0]) + 0.5 * _waves(time_s, (0.37, 0.31, 0.41), phases[1])
+    return 0.002 * shake, np.deg2rad(0.15) * np.roll(shake, 1, axis=1)
 
 
 def _waves(time_s: np.ndarray, periods: tuple[float, float, float], phases: np.ndarray) -> np.ndarray:
@@ -72,7 +86,7 @@ def _halfsphere(time_s: np.ndarray, phases: np.ndarray) -> _Motion:
         [-np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=1
     )
     position = HOME + np.array([0.35, 0.0, -0.1]) + 0.5 * outward
-    return position, _looking_at(position, DESK) + np.deg2rad(3.0) * sweep[:, [2, 2, 2]]
+    return position, looking_at(position, DESK) + np.deg2rad(3.0) * sweep[:, [2, 2, 2]]
 
 
 def _static(time_s: np.ndarray, phases: np.ndarray) -> _Motion:
@@ -88,7 +102,7 @@ def _loop(time_s: np.ndarray, phases: np.ndarray) -> _Motion:
     ring = np.stack([-np.cos(turn), -np.sin(turn), np.zeros_like(turn)], axis=1)
     position = np.array([0.2, 0.0, 1.35]) + np.array([1.75, 1.9, 0.0]) * ring + 0.06 * bob
     target = DESK + 0.25 * np.sin(turn[:, None] * np.array([2.0, 3.0, 2.0]) + phases[1])
-    return position, _looking_at(position, target)
+    return position, looking_at(position, target)
 
 
 _PATHS: dict[str, Callable[[np.ndarray, np.ndarray], _Motion]] = {
@@ -100,13 +114,14 @@ _PATHS: dict[str, Callable[[np.ndarray, np.ndarray], _Motion]] = {
 }
 
 
-def _looking_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
+def looking_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Yaw, pitch and zero roll `(n, 3)` that point the optical axis from `position` to `target`."""
     x, y, z = np.moveaxis(target - position, -1, 0)
     return np.stack([np.arctan2(y, x), np.arctan2(-z, np.hypot(x, y)), np.zeros_like(x)], axis=1)
 
 
-def _poses(position: np.ndarray, angles: np.ndarray) -> np.ndarray:
+def poses_of(position: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    """Camera poses `(n, 7)` at positions `(n, 3)`, with yaw, pitch (positive looks down) and roll `(n, 3)`."""
     yaw, pitch, roll = angles.T
     body = multiply(axis_rotation(2, yaw), axis_rotation(1, pitch))
     rotation = multiply(multiply(body, axis_rotation(0, roll)), _BODY_FROM_CAMERA)

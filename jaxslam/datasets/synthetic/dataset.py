@@ -22,7 +22,7 @@ from jaxslam.trajectory.trajectory import Trajectory
 
 DEPTH_COUNTS_PER_M = 5000.0
 """Of depth images in files, as in TUM RGB-D."""
-_START_NS = 1_600_000_000_000_000_000
+START_NS = 1_600_000_000_000_000_000
 
 
 @dataclass(frozen=True)
@@ -103,6 +103,11 @@ class SyntheticFrame:
     right: np.ndarray | None = None
 
     @property
+    def mask_images(self) -> dict[str, np.ndarray]:
+        """Numbers of the actors for a file, `(height, width)` uint8."""
+        return {"mask": self.instance_mask.astype(np.uint8)}
+
+    @property
     def measured(self) -> Frame:
         """Return what a camera would deliver: no mask of moving objects, and no depth for a stereo pair."""
         return Frame(self.timestamp_ns, self.rgb, self.depth_m if self.right is None else None, right=self.right)
@@ -131,7 +136,7 @@ class SyntheticDataset:
         self.cy = 0.5 * (config.height - 1) if config.cy is None else config.cy
         # Whole microseconds: six decimals of a second hold them exactly.
         elapsed_us = np.round(np.arange(config.frames) * (1e6 / config.fps)).astype(np.int64)
-        self.timestamps_ns = _START_NS + 1000 * elapsed_us
+        self.timestamps_ns = START_NS + 1000 * elapsed_us
         self._time_s = 1e-6 * elapsed_us
         self.ground_truth = Trajectory(self.timestamps_ns, camera_path(config.path, self._time_s, config.seed))
         self.T_world_cam = self.ground_truth.T_world_cam
@@ -149,8 +154,8 @@ class SyntheticDataset:
         )
         self.actors = cast(config.path, config.people, config.boxes, config.seated, config.parked, config.seed)
         static = furnish(config.seed) + chairs(config.seated, config.seed)
-        self.stage = Stage(static, self.actors, ROOM_LIGHT)
-        self._filming = VirtualCamera(self.stage, self.camera, config.sensor, self._pose, self._gain)
+        self._stage = Stage(static, self.actors, ROOM_LIGHT)
+        self._filming = VirtualCamera(self._stage, self.camera, config.sensor, self._pose, self._gain)
         self._key = jax.random.key(config.seed)
 
     def __len__(self) -> int:

@@ -25,20 +25,28 @@ class Stage:
     """
 
     def __init__(
-        self, static: Sequence[PlacedSolid], actors: Sequence[Actor], light: Light, owners: Sequence[int] = ()
+        self,
+        static: Sequence[PlacedSolid],
+        actors: Sequence[Actor],
+        light: Light,
+        *,
+        static_numbers: Sequence[int] | None = None,
+        actor_numbers: Sequence[int] | None = None,
     ) -> None:
-        """Pack solids; actor `k` of `actors` has the number `k`, from 1 on.
+        """Pack solids.
 
         Args:
             static: What stands still; first a box around everything, seen from inside.
             actors: What moves.
             light: Light of the scene.
-            owners: Number of each of `static`, 0 for none; by default all of them have none.
+            static_numbers: Number of each of `static` in masks; by default 0.
+            actor_numbers: Number of each actor in masks; by default 1, 2 and so on.
         """
         self._actors = tuple(actors)
-        owned = [(solid, number) for number, actor in enumerate(actors, 1) for solid in actor.solids]
-        solids = [placed.solid for placed in static] + [solid for solid, _ in owned]
-        numbers = [*(owners or [0] * len(static)), *(number for _, number in owned)]
+        numbers = [0] * len(static) if static_numbers is None else list(static_numbers)
+        for number, actor in zip(actor_numbers or range(1, len(actors) + 1), actors, strict=True):
+            numbers += [number] * len(actor.solids)
+        solids = [placed.solid for placed in static] + [solid for actor in actors for solid in actor.solids]
         self.scene, self._slots = pack_scene(solids, numbers, light)
         self._static_from_world = rigid.inverse(np.stack([placed.T_world_solid for placed in static]))
 

@@ -15,13 +15,14 @@ from jaxslam import Camera, TrackParams, TrackPlan, TrackReason, TrackStatus
 from jaxslam.cli.command_table import ExitCode, find_command
 from jaxslam.config.loading import presets
 from jaxslam.config.schema import Config
+from jaxslam.datasets import open_dataset
 from jaxslam.results.dense_results import DENSE_FILES
 from jaxslam.semantics.prompted import read_examples
 
 CONTRIBUTING = ROOT / ".github" / "CONTRIBUTING.md"
 _GETTING_STARTED = DOCS / "getting-started.md"
 _RECORDING = "recordings/room"
-_QUICK = {"cameras-and-recordings", "command-line", "determinism-and-caches"}
+_QUICK = {"cameras-and-recordings", "command-line", "determinism-and-caches", "worlds"}
 """Pages whose blocks take less than 20 s; all others are `slow`."""
 _BRITISH = re.compile(
     r"\b\w*(?:colour|centre|neighbour|behaviour|favour|grey|licence|catalogue|labelled|modelled|travell|cancell"
@@ -87,6 +88,11 @@ def _check_benchmarks(folder: Path, printed: str) -> None:
     assert names >= {"report.html", "report.md", "results.json"}
 
 
+def _check_worlds(folder: Path, printed: str) -> None:
+    assert {path.name for path in (folder / "results" / "worlds" / "corridor").iterdir()} >= {"sheet.png", "clip.gif"}
+    assert len(open_dataset(folder / "recordings" / "corridor")) == 15
+
+
 _LEFT_BEHIND = {
     "getting-started": _check_started,
     "cameras-and-recordings": _check_cameras,
@@ -94,6 +100,7 @@ _LEFT_BEHIND = {
     "dense-map": _check_dense,
     "gradients-and-batches": _check_gradients,
     "benchmarks": _check_benchmarks,
+    "worlds": _check_worlds,
 }
 
 

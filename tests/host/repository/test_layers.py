@@ -18,6 +18,7 @@ LAYERS = [
     "dynamics",
     "semantics",
     "datasets",
+    "worlds",
     "tracking",
     "features",
     "masks",

@@ -1,0 +1,356 @@
+"""What a world is built of: solids that stand still, and actors that do not."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxslam.datasets.synthetic.actors import GroundMotion, Person, Walk
+from jaxslam.datasets.synthetic.homogeneous import transform
+from jaxslam.datasets.synthetic.primitives import PlacedSolid, Solid, box, pill, upright
+from jaxslam.datasets.synthetic.shading import Light
+from jaxslam.datasets.synthetic.texture import Material
+from jaxslam.geometry.so3 import axis_rotation, matrices, multiply
+from jaxslam.worlds import description
+from jaxslam.worlds.description import Kind, Lighting, Look, Opening, Part, Room, Side, Thing, World
+from jaxslam.worlds.motion import RouteWalk
+
+BACKDROP_NUMBER = -1
+"""Number of the backdrop in masks of instances."""
+_BACKDROP_M = 30.0
+"""Distance of the backdrop from everything that the description places."""
+_OUT_OF_SIGHT_M = 1e4
+_CARRIED_M = (0.36, 0.0, 0.95)
+"""Where a carried thing is, in the axes of the person."""
+_PICTURE_M, _HUNG_M, _TRIES = ((0.35, 0.35), (0.9, 0.8)), (1.25, 1.75), 20
+_MOVING_M_PER_S = 1e-3
+
+
+class Instance(NamedTuple):
+    """Something that has a number: a thing or a person.
+
+    Attributes:
+        label: Class label.
+        movable: Whether it can move, be it at rest or not.
+        walk: Its motion on the floor; `None` if it stands still.
+        height_m: Height of its origin above the floor.
+        turn: Its direction against that of the motion, in radians.
+        from_s: Time at which it appears.
+        until_s: Time at which it is gone.
+    """
+
+    label: str
+    movable: bool
+    walk: Walk
+    height_m: float
+    turn: float
+    from_s: float
+    until_s: float
+
+    def is_there(self, time_s: np.ndarray) -> np.ndarray:
+        """Tell at which of `(t,)` times it is there."""
+        return (time_s >= self.from_s) & (time_s < self.until_s)
+
+    def is_moving(self, time_s: np.ndarray) -> np.ndarray:
+        """Tell at which of `(t,)` times it is there and moves."""
+        return self.is_there(time_s) & (self.walk(time_s).speed_m_per_s > _MOVING_M_PER_S)
+
+    def poses(self, time_s: np.ndarray) -> np.ndarray:
+        """Poses of its origin, x ahead, at `(t,)` times: `(t, 7)`, wxyz_xyz."""
+        position, heading, _ = self.walk(time_s)
+        height = np.full((len(position), 1), self.height_m)
+        return np.concatenate([axis_rotation(2, heading + self.turn), position, height], axis=1)
+
+
+class Built(NamedTuple):
+    """A world as the renderer takes it.
+
+    Attributes:
+        static: What stands still all the time; first the backdrop.
+        static_numbers: Number of each of them, 0 for what has none.
+        actors: What moves, or is there for some time only.
+        actor_numbers: Number of each of them.
+        instances: Things and people; number `k` is `instances[k - 1]`.
+        light: The light.
+    """
+
+    static: list[PlacedSolid]
+    static_numbers: list[int]
+    actors: "list[InstanceActor]"
+    actor_numbers: list[int]
+    instances: list[Instance]
+    light: Light
+
+
+class InstanceActor:
+    """An actor of solids, which is out of sight while it is not there."""
+
+    def __init__(self, instance: Instance, solids: list[Solid], placed: "_Placed | _WalkingParts") -> None:
+        """Take solids, and where they are in the axes of the instance."""
+        self.label, self.solids = instance.label, solids
+        self._instance, self._placed = instance, placed
+
+    def root(self, time_s: np.ndarray) -> np.ndarray:
+        """Poses `T_world_actor` at `(t,)` seconds: `(t, 7)`, wxyz_xyz."""
+        return self._instance.poses(time_s)
+
+    def parts(self, time_s: np.ndarray) -> np.ndarray:
+        """Placements of its solids in its axes: `(t, len(solids), 4, 4)`."""
+        parts = np.array(self._placed.parts(time_s))
+        parts[~self._instance.is_there(time_s), :, 2, 3] -= _OUT_OF_SIGHT_M
+        return parts
+
+
+class _Placed(NamedTuple):
+    """Solids that do not move against each other: `(k, 4, 4)` placements."""
+
+    T_thing_solid: np.ndarray
+
+    def parts(self, time_s: np.ndarray) -> np.ndarray:
+        return np.broadcast_to(self.T_thing_solid, (len(time_s), *self.T_thing_solid.shape))
+
+
+class _WalkingParts(NamedTuple):
+    """The solids of a person, and then those of the thing that the person carries."""
+
+    person: Person
+    carried: np.ndarray
+
+    def parts(self, time_s: np.ndarray) -> np.ndarray:
+        held = np.broadcast_to(self.carried, (len(time_s), *self.carried.shape))
+        return np.concatenate([self.person.parts(time_s), held], axis=1)
+
+
+class _Standing:
+    """A `Walk` of something that stands still."""
+
+    def __init__(self, at_m: Sequence[float], turn_deg: float) -> None:
+        self._at, self._heading = np.array(at_m[:2], np.float64), float(np.deg2rad(turn_deg))
+
+    def __call__(self, time_s: np.ndarray) -> GroundMotion:
+        n = len(time_s)
+        return GroundMotion(np.broadcast_to(self._at, (n, 2)), np.full(n, self._heading), np.zeros(n))
+
+
+def build(world: World) -> Built:
+    """Build a world, with the catalog's looks and kinds in it.
+
+    Args:
+        world: The world; every name in it is known.
+    """
+    looks = {name: _Finish(look) for name, look in world.looks.items()}
+    built = Built([_backdrop(world, looks)], [BACKDROP_NUMBER], [], [], [], _light(world.lighting))
+    for index, room in enumerate(world.rooms):
+        solids = _room(room, looks, np.random.default_rng([world.seed, 701, index]))
+        built.static.extend(solids)
+        built.static_numbers.extend([0] * len(solids))
+    for index, thing in enumerate(world.things):
+        _add_thing(built, thing, world.kinds[thing.kind], looks, np.random.default_rng([world.seed, 702, index]))
+    for index, person in enumerate(world.people):
+        carried = None if person.carries is None else world.kinds[person.carries]
+        _add_person(built, person, carried, looks, np.random.default_rng([world.seed, 703, index]))
+    return built
+
+
+class _Finish:
+    """A look, which gives each thing colors of its own if it is printed."""
+
+    def __init__(self, look: Look) -> None:
+        fields = asdict(look)
+        self._printed = fields.pop("printed")
+        self._material = Material(**fields)
+
+    def material(self, rng: np.random.Generator) -> Material:
+        if not self._printed:
+            return self._material
+        dark, bright = rng.uniform(0.02, 0.55, 3), rng.uniform(0.35, 1.0, 3)
+        return self._material._replace(dark=tuple(dark), bright=tuple(bright))
+
+
+_Finishes = Mapping[str, _Finish]
+
+
+def _add_thing(built: Built, thing: Thing, kind: Kind, looks: _Finishes, rng: np.random.Generator) -> None:
+    solids, places = _parts(kind, looks, rng, thing.scale)
+    height_m = float(thing.at_m[2]) if len(thing.at_m) > 2 else 0.0
+    route = thing.route
+    instance = Instance(
+        label=kind.label,
+        movable=kind.movable or route is not None,
+        walk=_Standing(thing.at_m, thing.turn_deg) if route is None else RouteWalk(route),
+        height_m=height_m,
+        turn=0.0 if route is None else float(np.deg2rad(thing.turn_deg)),
+        from_s=thing.from_s,
+        until_s=np.inf if thing.until_s is None else thing.until_s,
+    )
+    built.instances.append(instance)
+    number = len(built.instances)
+    if route is None and thing.from_s == 0.0 and thing.until_s is None:
+        at = upright(thing.at_m[0], thing.at_m[1], height_m, thing.turn_deg)
+        built.static.extend(PlacedSolid(at @ place, solid) for place, solid in zip(places, solids, strict=True))
+        built.static_numbers.extend([number] * len(solids))
+    else:
+        built.actors.append(InstanceActor(instance, solids, _Placed(places)))
+        built.actor_numbers.append(number)
+
+
+def _add_person(
+    built: Built, person: description.Person, carried: Kind | None, looks: _Finishes, rng: np.random.Generator
+) -> None:
+    walk: Walk = _Standing(person.at_m, person.turn_deg) if person.route is None else RouteWalk(person.route)
+    body = Person(walk, float(rng.uniform(0.0, 2.0 * np.pi)), rng)
+    until_s = np.inf if person.until_s is None else person.until_s
+    instance = Instance("person", True, walk, 0.0, 0.0, person.from_s, until_s)
+    solids, held = list(body.solids), np.zeros((0, 4, 4))
+    if carried is not None:
+        more, held = _parts(carried, looks, rng, 1.0)
+        solids, held = solids + more, transform(np.eye(3), np.array(_CARRIED_M)) @ held
+    built.instances.append(instance)
+    built.actors.append(InstanceActor(instance, solids, _WalkingParts(body, held)))
+    built.actor_numbers.append(len(built.instances))
+
+
+def _parts(kind: Kind, looks: _Finishes, rng: np.random.Generator, scale: float) -> tuple[list[Solid], np.ndarray]:
+    """The solids of a thing, and their places in its axes, `(k, 4, 4)`."""
+    finish = {name: looks[name].material(rng) for name in dict.fromkeys(part.look for part in kind.parts)}
+    solids = [_solid(part, finish[part.look], rng, scale) for part in kind.parts]
+    places = [
+        transform(matrices(_turned(part.turn_deg)), scale * np.array(part.at_m, np.float64)) for part in kind.parts
+    ]
+    return solids, np.stack(places)
+
+
+def _solid(part: Part, material: Material, rng: np.random.Generator, scale: float) -> Solid:
+    x, y, z = (0.5 * scale * extent for extent in part.size_m)
+    if part.shape == "box":
+        return box((x, y, z), material, rng)
+    if part.shape == "ellipsoid":
+        return pill((x, y, z), 0.0, material, rng)
+    cap = min(x, y)
+    return pill((x, y, cap), 2.0 * (z - cap), material, rng)
+
+
+def _turned(turn_deg: Sequence[float]) -> np.ndarray:
+    x, y, z = (axis_rotation(axis, np.deg2rad(angle)) for axis, angle in enumerate(turn_deg))
+    return multiply(z, multiply(y, x))
+
+
+def _backdrop(world: World, looks: _Finishes) -> PlacedSolid:
+    """A box around everything, seen from inside."""
+    points = [np.array([*point[:2], 0.0]) for route in _routes(world) for point in route]
+    points += [np.array(point) for point in world.way.points_m]
+    for room in world.rooms:
+        half = 0.5 * np.array(room.size_m)
+        points += [np.array([*room.at_m, 0.0]) - half, np.array([*room.at_m, 0.0]) + 2.0 * half]
+    low, high = np.min(points, axis=0) - _BACKDROP_M, np.max(points, axis=0) + _BACKDROP_M
+    rng = np.random.default_rng([world.seed, 700])
+    half_x, half_y, half_z = 0.5 * (high - low)
+    shell = box((float(half_x), float(half_y), float(half_z)), looks[world.backdrop].material(rng), rng)
+    return PlacedSolid(upright(*(0.5 * (low + high))), shell)
+
+
+def _routes(world: World) -> list[Sequence[Sequence[float]]]:
+    """Where things and people are: their ways, or their one place."""
+    placed = [*world.things, *world.people]
+    return [(item.at_m,) if item.route is None else item.route.points_m for item in placed]
+
+
+def _light(lighting: Lighting) -> Light:
+    towards = np.array(lighting.from_m, np.float64)
+    lamp = lighting.lamp_m
+    return Light(
+        towards_sun=(towards / np.linalg.norm(towards)).astype(np.float32),
+        lamp_m=np.array((0.0, 0.0, 0.0) if lamp is None else lamp, np.float32),
+        fading_per_m2=np.float32(0.0 if lamp is None else 1.0 / lighting.reach_m**2),
+        brightness=np.float32(lighting.brightness),
+        ambient=np.float32(lighting.ambient),
+        directed=np.float32(1.0 - lighting.ambient),
+    )
+
+
+class _Wall(NamedTuple):
+    """A wall of a room: middle of its inner side on the floor, directions along it and out of the room, length."""
+
+    middle: np.ndarray
+    along: np.ndarray
+    outward: np.ndarray
+    length_m: float
+
+
+def _wall(room: Room, side: Side) -> _Wall:
+    length, width, _ = room.size_m
+    x, y = room.at_m
+    if side in {"north", "south"}:
+        sign = 1.0 if side == "north" else -1.0
+        middle, along, outward = (x, y + sign * 0.5 * width), (1.0, 0.0), (0.0, sign)
+        return _Wall(np.array(middle), np.array(along), np.array(outward), length)
+    sign = 1.0 if side == "east" else -1.0
+    middle, along, outward = (x + sign * 0.5 * length, y), (0.0, 1.0), (sign, 0.0)
+    return _Wall(np.array(middle), np.array(along), np.array(outward), width)
+
+
+def _room(room: Room, looks: _Finishes, rng: np.random.Generator) -> list[PlacedSolid]:
+    length, width, height = room.size_m
+    (x, y), thick = room.at_m, room.wall_m
+    slab = (0.5 * length + thick, 0.5 * width + thick, 0.05)
+    solids = [
+        PlacedSolid(upright(x, y, -0.05), box(slab, looks[room.floor].material(rng), rng)),
+        PlacedSolid(upright(x, y, height + 0.05), box(slab, looks[room.ceiling].material(rng), rng)),
+    ]
+    material = looks[room.walls].material(rng)
+    sides: tuple[Side, ...] = ("north", "south", "east", "west")
+    for side in sides:
+        wall, openings = _wall(room, side), [opening for opening in room.openings if opening.wall == side]
+        for low_m, high_m, bottom_m, top_m in _wall_pieces(wall.length_m + 2.0 * thick, height, openings):
+            piece = _on_wall(wall, 0.5 * (low_m + high_m), 0.5 * (bottom_m + top_m), 0.5 * thick)
+            half = _wall_box(wall, 0.5 * (high_m - low_m), 0.5 * thick, 0.5 * (top_m - bottom_m))
+            solids.append(PlacedSolid(piece, box(half, material, rng)))
+    return solids + _pictures(room, looks, rng)
+
+
+def _wall_pieces(length_m: float, height_m: float, openings: list[Opening]) -> list[tuple[float, float, float, float]]:
+    """The parts of a wall around its openings: from, to along it, from, to above the floor."""
+    pieces, reached = [], -0.5 * length_m
+    for opening in sorted(openings, key=lambda opening: opening.along_m):
+        low, high = opening.along_m - 0.5 * opening.width_m, opening.along_m + 0.5 * opening.width_m
+        pieces += [
+            (reached, low, 0.0, height_m),
+            (low, high, 0.0, opening.bottom_m),
+            (low, high, opening.top_m, height_m),
+        ]
+        reached = high
+    pieces.append((reached, 0.5 * length_m, 0.0, height_m))
+    return [piece for piece in pieces if piece[1] > piece[0] and piece[3] > piece[2]]
+
+
+def _on_wall(wall: _Wall, along_m: float, height_m: float, outward_m: float) -> np.ndarray:
+    x, y = wall.middle + along_m * wall.along + outward_m * wall.outward
+    return upright(float(x), float(y), height_m)
+
+
+def _wall_box(wall: _Wall, half_along: float, half_out: float, half_up: float) -> tuple[float, float, float]:
+    along, out = np.abs(wall.along), np.abs(wall.outward)
+    x, y = half_along * along + half_out * out
+    return float(x), float(y), half_up
+
+
+def _pictures(room: Room, looks: _Finishes, rng: np.random.Generator) -> list[PlacedSolid]:
+    """Pictures on the walls, beside the openings and each other where there is space."""
+    hung: dict[Side, list[tuple[float, float]]] = {"north": [], "south": [], "east": [], "west": []}
+    for opening in room.openings:
+        hung[opening.wall].append((opening.along_m, opening.width_m))
+    solids = []
+    for _ in range(room.pictures):
+        for _ in range(_TRIES):
+            side = rng.choice(sorted(hung))
+            wall = _wall(room, side)
+            (width, height), up = rng.uniform(*_PICTURE_M), rng.uniform(*_HUNG_M)
+            along = rng.uniform(-0.5, 0.5) * (wall.length_m - width)
+            if all(abs(along - other) > 0.5 * (width + taken) + 0.05 for other, taken in hung[side]):
+                hung[side].append((along, width))
+                half = _wall_box(wall, 0.5 * width, 0.01, 0.5 * height)
+                picture = box(half, looks["poster"].material(rng), rng)
+                solids.append(PlacedSolid(_on_wall(wall, along, up, -0.01), picture))
+                break
+    return solids

@@ -1,0 +1,187 @@
+"""A recording of a world: any frame of it, with exact ground truth."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from jaxslam.datasets.synthetic.dataset import DEPTH_COUNTS_PER_M, START_NS
+from jaxslam.datasets.synthetic.primitives import PlacedSolid
+from jaxslam.datasets.synthetic.virtual_camera import Stage, VirtualCamera
+from jaxslam.sensors.camera import Camera
+from jaxslam.sensors.frame import Frame
+from jaxslam.trajectory.trajectory import Trajectory
+from jaxslam.worlds.building import BACKDROP_NUMBER, build
+from jaxslam.worlds.camera_way import CameraWay
+from jaxslam.worlds.description import World
+from jaxslam.worlds.library import load_world, with_catalog
+
+_FLAT_M = 0.051
+"""Half the thickness of floors and ceilings, and a little."""
+
+
+@dataclass(frozen=True)
+class WorldFrame:
+    """One frame with all that is known about it.
+
+    Attributes:
+        timestamp_ns: Time of the middle of the exposure.
+        rgb: `(height, width, 3)` uint8, as measured.
+        depth_m: `(height, width)` float32 depth as measured by a camera that does; 0 where missing.
+        exact_depth_m: `(height, width)` float32 depth at the centers of the pixels; 0 on the backdrop.
+        instance_mask: `(height, width)` int32 numbers of things and people; 0 on rooms and the backdrop.
+        moving_mask: `(height, width)` bool, true on what moves in this frame.
+        T_world_cam: `(7,)` float64 pose of the camera, wxyz_xyz.
+        T_world_instance: `(n, 7)` float64 poses of things and people, wxyz_xyz; number `k` is in row `k - 1`.
+        right: `(height, width, 3)` uint8, what the right camera of a pair measured; `None` without one.
+    """
+
+    timestamp_ns: int
+    rgb: np.ndarray
+    depth_m: np.ndarray
+    exact_depth_m: np.ndarray
+    instance_mask: np.ndarray
+    moving_mask: np.ndarray
+    T_world_cam: np.ndarray
+    T_world_instance: np.ndarray
+    right: np.ndarray | None = None
+
+    @property
+    def mask_images(self) -> dict[str, np.ndarray]:
+        """Numbers of what moves, and of all things and people, for files, `(height, width)` uint16."""
+        numbers = self.instance_mask.astype(np.uint16)
+        return {"mask": np.where(self.moving_mask, numbers, np.uint16(0)), "instance": numbers}
+
+    @property
+    def measured(self) -> Frame:
+        """Return what a camera would deliver: no mask of moving objects, and no depth for a stereo pair."""
+        return Frame(self.timestamp_ns, self.rgb, self.depth_m if self.right is None else None, right=self.right)
+
+
+class WorldRecording:
+    """A recording of a world, rendered when a frame is asked for: a dataset as `open_dataset` returns.
+
+    Two recordings of the same world give the same bytes on the same machine, in any order of frames.
+
+    Attributes:
+        world: The world.
+        name: Name of the recording.
+        camera: The camera that takes it.
+        timestamps_ns: `(n,)` int64 times of the frames.
+        ground_truth: Trajectory of the camera.
+        labels: Class label of each thing and person; that of number `k` is `labels[k - 1]`.
+        movable: Whether each can move.
+    """
+
+    def __init__(self, world: World | str | Path) -> None:
+        """Build a world.
+
+        Args:
+            world: A world, the name of one that comes with jaxslam, or a YAML file.
+
+        Raises:
+            ConfigError: If there is no such world, or something in its description is wrong.
+        """
+        self.name = "world" if isinstance(world, World) else Path(world).stem
+        self.world = world = world if isinstance(world, World) else load_world(world)
+        filmed = world.camera
+        fx = 525.0 * filmed.width / 640.0 if filmed.fx is None else filmed.fx
+        self.camera = Camera(
+            self.name,
+            filmed.width,
+            filmed.height,
+            fx,
+            fx,
+            0.5 * (filmed.width - 1),
+            0.5 * (filmed.height - 1),
+            depth_scale_per_m=None if filmed.baseline_m else DEPTH_COUNTS_PER_M,
+            fps=filmed.fps,
+            baseline_m=filmed.baseline_m,
+        )
+        num_frames = max(round(world.seconds * filmed.fps), 1)
+        # Whole microseconds: six decimals of a second hold them exactly.
+        elapsed_us = np.round(np.arange(num_frames) * (1e6 / filmed.fps)).astype(np.int64)
+        self._time_s, self.timestamps_ns = 1e-6 * elapsed_us, START_NS + 1000 * elapsed_us
+        self._way = CameraWay(world.way, world.seed)
+        self.ground_truth = Trajectory(self.timestamps_ns, self._way.poses(self._time_s))
+        self._built = built = build(with_catalog(world))
+        self.instances = tuple(built.instances)
+        self.labels = tuple(instance.label for instance in built.instances)
+        self.movable = tuple(instance.movable for instance in built.instances)
+        numbers = {"static_numbers": built.static_numbers, "actor_numbers": built.actor_numbers}
+        self._stage = Stage(built.static, built.actors, built.light, **numbers)
+        self._filming = VirtualCamera(self._stage, self.camera, filmed.sensor, self._way.poses, self._gain)
+        self._key = jax.random.key(world.seed)
+        self._gain_phases = np.random.default_rng([world.seed, 601]).uniform(0.0, 2.0 * np.pi, 2)
+
+    def __len__(self) -> int:
+        return len(self._time_s)
+
+    def __getitem__(self, index: int) -> Frame:
+        """Frame `index` as a camera would deliver it: without a mask of what moves."""
+        return self.render(index).measured
+
+    def render(self, index: int) -> WorldFrame:
+        """Frame `index` with its ground truth.
+
+        Raises:
+            IndexError: If there is no such frame.
+        """
+        index = range(len(self))[index]
+        time_s = float(self._time_s[index])
+        key = jax.random.fold_in(self._key, index)
+        taken, right = self._filming.take(time_s, key), None
+        if self.camera.baseline_m is not None:
+            right = self._filming.take(time_s, jax.random.fold_in(key, 1), self.camera.baseline_m).rgb
+        owner = np.asarray(taken.exact.owner)
+        is_backdrop, instance = owner == BACKDROP_NUMBER, np.maximum(owner, 0)
+        now = np.array([time_s])
+        moves = np.array([False, *(each.is_moving(now)[0] for each in self.instances)])
+        poses = [each.poses(now)[0] for each in self.instances]
+        return WorldFrame(
+            timestamp_ns=int(self.timestamps_ns[index]),
+            rgb=taken.rgb,
+            depth_m=np.where(is_backdrop, np.float32(0), taken.depth_m),
+            exact_depth_m=np.where(is_backdrop, np.float32(0), np.asarray(taken.exact.depth_m)),
+            instance_mask=instance,
+            moving_mask=moves[instance],
+            T_world_cam=self.ground_truth.T_world_cam[index].copy(),
+            T_world_instance=np.stack(poses) if poses else np.zeros((0, 7)),
+            right=right,
+        )
+
+    def footprints(self) -> list[tuple[np.ndarray, bool]]:
+        """Outlines of what stands still, from above: corners `(4, 2)` in meters, and whether it belongs to a thing.
+
+        Floors, ceilings and the backdrop are left out.
+        """
+        return [
+            (_outline(placed), number > 0)
+            for placed, number in zip(self._built.static, self._built.static_numbers, strict=True)
+            if number > 0 or (number == 0 and placed.solid.size[2] > _FLAT_M)
+        ]
+
+    def labels_text(self) -> str:
+        """Number, class label, and whether it can move, of each thing and person: lines of a file."""
+        rows = zip(self.labels, self.movable, strict=True)
+        lines = [f"{number} {int(movable)} {label}" for number, (label, movable) in enumerate(rows, 1)]
+        return "\n".join(["# number movable label", *lines]) + "\n"
+
+    def _gain(self, time_s: float) -> float:
+        """Factor of brightness: what the exposure says, and an automatic one that wanders."""
+        waves = np.sin(2.0 * np.pi * time_s / np.array([9.0, 5.3]) + self._gain_phases)
+        wander = 1.0 + self.world.camera.sensor.gain_swing * (0.7 * waves[0] + 0.3 * waves[1])
+        times, factors = [0.0], [1.0]
+        for change in self.world.exposure:
+            times += [change.at_s, change.at_s + change.over_s]
+            factors += [factors[-1], change.factor]
+        steps = np.searchsorted(times, time_s, side="right") - 1
+        after = min(steps + 1, len(times) - 1)
+        share = 0.0 if times[after] == times[steps] else (time_s - times[steps]) / (times[after] - times[steps])
+        return float(wander * (factors[steps] + share * (factors[after] - factors[steps])))
+
+
+def _outline(placed: PlacedSolid) -> np.ndarray:
+    corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) * placed.solid.size[:2]
+    return corners @ placed.T_world_solid[:2, :2].T + placed.T_world_solid[:2, 3]

@@ -1,0 +1,55 @@
+"""`jaxslam world` as a user types it."""
+
+import json
+from pathlib import Path
+
+import cv2
+import pytest
+from PIL import Image
+
+from jaxslam.cli import main
+from jaxslam.datasets import open_dataset
+
+TINY = """
+about: An empty room.
+seconds: 0.2
+rooms: [{size_m: [4, 3, 2.5]}]
+things: [{kind: chair, at_m: [0.5, 0.5]}]
+camera: {width: 64, height: 48}
+way: {points_m: [[-1, 0, 1.4], [1, 0, 1.4]]}
+"""
+
+
+def tiny(folder: Path) -> str:
+    path = folder / "tiny.yaml"
+    path.write_text(TINY)
+    return str(path)
+
+
+def test_list_names_every_world(capsys):
+    main(["world", "list", "--json"])
+    assert {"flat", "kitchen"} <= {entry["name"] for entry in json.loads(capsys.readouterr().out)}
+
+
+def test_show_writes_a_sheet_a_plan_and_a_clip(tmp_path, capsys):
+    main(["world", "show", tiny(tmp_path), "--out", str(tmp_path / "out"), "--json"])
+    told = json.loads(capsys.readouterr().out)
+    assert (told["frames"], told["things and people"]) == (6, "1 chair")
+    sheet, plan, clip = (Path(file) for file in told["files"])
+    assert cv2.imread(str(sheet)).shape == (2 * 240, 4 * 320, 3)
+    assert cv2.imread(str(plan)).std() > 1
+    with Image.open(clip) as animation:
+        assert animation.n_frames == 6
+
+
+def test_render_writes_a_recording_that_opens(tmp_path, capsys):
+    main(["world", "render", tiny(tmp_path), str(tmp_path / "tiny")])
+    assert "6 frames" in capsys.readouterr().out
+    assert len(open_dataset(tmp_path / "tiny")) == 6
+
+
+def test_an_unknown_world_is_an_error_in_one_line(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["world", "show", "kitchn"])
+    assert ended.value.code == 1
+    assert "expected the name of a world or a YAML file, got 'kitchn'" in capsys.readouterr().err

@@ -1,0 +1,184 @@
+"""Recordings of worlds against their own truth."""
+
+import dataclasses
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from jaxslam.datasets import open_dataset
+from jaxslam.datasets.synthetic import PERFECT_SENSOR
+from jaxslam.datasets.synthetic.homogeneous import inverse, matrix_from_pose
+from jaxslam.datasets.synthetic.write_tum import write_tum
+from jaxslam.worlds import World, WorldRecording, load_world, worlds
+from jaxslam.worlds.description import Exposure, Person, Room, Route, Thing, Way, WorldCamera
+
+CAMERA = WorldCamera(width=160, height=120)
+PERFECT = dataclasses.replace(CAMERA, sensor=PERFECT_SENSOR)
+ROOM = World(
+    about="A room.",
+    seconds=6.0,
+    way=Way(((-1.5, 0.0, 1.4), (-1.2, 0.5, 1.4)), speed_m_per_s=0.3, look=(1.0, 0.0, 0.8)),
+    rooms=(Room((5.0, 4.0, 2.5)),),
+    things=(
+        Thing("dining table", (1.0, 0.5), turn_deg=90),
+        Thing("chair", (0.6, -0.6), until_s=2.0),
+        Thing("carton", (0.2, 0.2), route=Route(((0.2, 1.0), (0.2, -1.0)), 0.5)),
+    ),
+    people=(Person(route=Route(((1.8, -1.0), (1.8, 1.0)), 0.8), carries="carton"), Person((1.9, 1.6), 180.0)),
+    camera=PERFECT,
+)
+TABLE, CHAIR, CARTON, WALKER, STANDER = range(1, 6)
+
+
+@pytest.fixture(scope="module")
+def room() -> WorldRecording:
+    return WorldRecording(ROOM)
+
+
+def points(recording: WorldRecording, frame) -> np.ndarray:
+    """Points of all pixels in the camera, `(h, w, 3)`."""
+    camera = recording.camera
+    v, u = np.mgrid[: camera.height, : camera.width]
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
+    return rays * frame.exact_depth_m[..., None].astype(np.float64)
+
+
+def moved(matrix: np.ndarray, xyz: np.ndarray) -> np.ndarray:
+    return xyz @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def test_labels_and_numbers(room):
+    assert room.labels == ("dining table", "chair", "box", "person", "person")
+    assert room.movable == (False, True, True, True, True)
+    frame = room.render(0)
+    assert set(np.unique(frame.instance_mask)) == {0, TABLE, CHAIR, CARTON, WALKER, STANDER}
+
+
+def test_what_moves_is_in_the_mask_and_nothing_else(room):
+    for index in (20, 45, 100):  # not while they turn, at rest for a moment
+        frame = room.render(index)
+        np.testing.assert_array_equal(frame.moving_mask, np.isin(frame.instance_mask, [CARTON, WALKER]))
+
+
+def test_a_thing_is_gone_after_its_time(room):
+    assert (room.render(59).instance_mask == CHAIR).any()
+    assert not (room.render(60).instance_mask == CHAIR).any()
+
+
+@pytest.mark.parametrize("number", [0, TABLE, CARTON])
+def test_points_of_a_frame_are_found_in_the_next_by_truth(room, number):
+    """Depth, poses of the camera and of rigid movers, and numbers agree with each other."""
+    first, second = room.render(10), room.render(13)
+    here = first.instance_mask == number
+    world = moved(matrix_from_pose(first.T_world_cam), points(room, first)[here])
+    if number:
+        then, now = (matrix_from_pose(frame.T_world_instance[number - 1]) for frame in (first, second))
+        world = moved(now @ inverse(then), world)
+    x, y, z = moved(inverse(matrix_from_pose(second.T_world_cam)), world).T
+    camera = room.camera
+    u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    inside = (u > 1) & (u < camera.width - 2) & (v > 1) & (v < camera.height - 2)
+    u, v, z = (values[inside] for values in (u, v, z))
+    # Inverse depth is linear in the pixels of a plane.
+    seen = (
+        1.0
+        / cv2.remap(
+            (1.0 / second.exact_depth_m).astype(np.float32),
+            u.astype(np.float32),
+            v.astype(np.float32),
+            cv2.INTER_LINEAR,
+        ).ravel()
+    )
+    error = np.abs(seen - z)
+    assert inside.sum() > 100
+    assert np.median(error) < 1e-3
+    # The others are at edges, or hidden.
+    assert np.mean(error < 5e-3) > 0.75
+
+
+def test_floor_and_walls_are_where_they_are(room):
+    frame = room.render(0)
+    world = moved(matrix_from_pose(frame.T_world_cam), points(room, frame)[frame.instance_mask == 0])
+    for distance in (world[:, 2], 2.5 - world[:, 0]):
+        assert distance.min() > -1e-4
+        assert np.count_nonzero(distance < 1e-4) > 500
+
+
+def test_nothing_is_behind_the_backdrop():
+    open_place = dataclasses.replace(ROOM, rooms=(), people=())
+    frame = WorldRecording(open_place).render(0)
+    assert (frame.exact_depth_m[frame.instance_mask == 0] == 0).all()
+    assert (frame.depth_m[frame.instance_mask == 0] == 0).all()
+
+
+def test_exposure_changes_the_brightness():
+    dark = dataclasses.replace(ROOM, exposure=(Exposure(1.0, 0.3, over_s=0.1), Exposure(2.0, 2.0)))
+    usual, changed = WorldRecording(ROOM), WorldRecording(dark)
+    for index, factor in ((29, 1.0), (31, 1.0 - 0.7 / 3), (40, 0.3), (59, 0.3)):
+        before, after = (recording.render(index).rgb.astype(np.float64) for recording in (usual, changed))
+        assert np.median(after[before > 60] / before[before > 60]) == pytest.approx(factor, abs=0.02)
+    assert changed.render(70).rgb.mean() > usual.render(70).rgb.mean() + 20
+
+
+def test_a_pair_sees_the_same_from_two_places():
+    recording = WorldRecording(dataclasses.replace(ROOM, camera=dataclasses.replace(PERFECT, baseline_m=0.1)))
+    frame, camera = recording.render(0), recording.camera
+    v, u = np.mgrid[: camera.height, : camera.width].astype(np.float32)
+    from_right = cv2.remap(frame.right, u - np.float32(camera.fx * 0.1) / frame.exact_depth_m, v, cv2.INTER_LINEAR)
+    difference = np.abs(from_right.astype(int) - frame.rgb.astype(int)).max(axis=2)[:, 30:]
+    assert np.median(difference) < 8
+    assert recording[0].depth_m is None
+
+
+def test_frames_do_not_depend_on_their_order(room):
+    again = WorldRecording(ROOM)
+    later = again.render(50)
+    for recording in (room, again):
+        frame = recording.render(50)
+        for field in ("rgb", "depth_m", "exact_depth_m", "instance_mask", "T_world_instance"):
+            np.testing.assert_array_equal(getattr(frame, field), getattr(later, field))
+
+
+def test_another_process_renders_the_same_bytes():
+    code = (
+        "import hashlib\nfrom jaxslam.worlds import WorldRecording\nframe = WorldRecording('kitchen').render(33)\n"
+        "print(hashlib.sha256(frame.rgb.tobytes() + frame.depth_m.tobytes()).hexdigest())"
+    )
+    digests = {
+        subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout
+        for _ in range(2)
+    }
+    assert len(digests) == 1
+
+
+def test_other_seeds_look_otherwise(room):
+    other = WorldRecording(dataclasses.replace(ROOM, seed=1)).render(0)
+    assert np.abs(other.rgb.astype(int) - room.render(0).rgb.astype(int)).mean() > 5
+
+
+def test_is_written_as_tum_with_numbers_and_labels(tmp_path):
+    short = WorldRecording(dataclasses.replace(ROOM, seconds=0.1, camera=CAMERA))
+    write_tum(short, tmp_path / "room", texts={"labels.txt": short.labels_text()})
+    read = open_dataset(tmp_path / "room")
+    assert len(read) == len(short) == 3
+    np.testing.assert_array_equal(read[1].image, short[1].image)
+    np.testing.assert_allclose(read[1].depth_m, short[1].depth_m, atol=1.1e-4)
+    np.testing.assert_allclose(read.ground_truth.T_world_cam, short.ground_truth.T_world_cam, atol=1e-6)
+    number = cv2.imread(str(min((tmp_path / "room" / "instance").glob("*.png"))), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(number, short.render(0).instance_mask)
+    moving = cv2.imread(str(min((tmp_path / "room" / "mask").glob("*.png"))), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(moving > 0, short.render(0).moving_mask)
+    assert "4 1 person" in (tmp_path / "room" / "labels.txt").read_text()
+
+
+@pytest.mark.parametrize("name", worlds())
+def test_the_camera_of_every_world_keeps_clear_of_everything(name):
+    world = load_world(name)
+    small = dataclasses.replace(world.camera, width=160, height=120)
+    recording = WorldRecording(dataclasses.replace(world, camera=small))
+    for index in np.linspace(0, len(recording) - 1, 60).astype(int):
+        frame = recording.render(int(index))
+        assert frame.exact_depth_m[frame.exact_depth_m > 0].min() > 0.25, f"frame {index}"
