@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial, wraps
-from typing import Any, Literal, TypeAlias, TypeVar
+from typing import Any, Literal, TypeAlias, TypeVar, cast
 
 import jax
 
@@ -45,6 +45,16 @@ def committed(arrays: R) -> R:
     A program that takes some of both kinds would be compiled for each.
     """
     return jax.device_put(arrays, *jax.tree.leaves(arrays)[0].devices())
+
+
+def lower(program: Callable[..., Any], *args: Any) -> None:
+    """Trace and lower a program for arguments, so that calling it with such ones only has to compile it.
+
+    Args:
+        program: What `compiled` has returned.
+        args: Its arguments; none of them is donated.
+    """
+    cast(Any, program).lower(*args)
 
 
 class _ThreadHook(threading.local):

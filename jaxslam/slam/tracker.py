@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxslam.config.schema import Config
 from jaxslam.runtime.compile_cache import FAST_COMPILE, SINGLE_THREAD
-from jaxslam.runtime.compiled import committed, compiled
+from jaxslam.runtime.compiled import committed, compiled, lower
 from jaxslam.runtime.garbage import collector_paused
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame_arrays import FrameArrays
@@ -110,7 +110,7 @@ class Tracker:
         # In two threads: XLA compiles one while Python traces the other, 1.2 s less from an empty cache. The step
         # takes longer: it is lowered before, as Python traces one program at a time.
         with collector_paused(), ThreadPoolExecutor(1, thread_name_prefix="jaxslam-compile-flow") as beside:
-            _track_followed.lower(state, frame, followed, self.params, self.plan)
+            lower(_track_followed, state, frame, followed, self.params, self.plan)
             flow = beside.submit(_follow_points, other, frame, self.params, self.plan)
             jax.block_until_ready(_track_followed(state, frame, followed, self.params, self.plan))
             jax.block_until_ready(flow.result())

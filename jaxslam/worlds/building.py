@@ -2,13 +2,14 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from jaxslam.datasets.synthetic.actors import GroundMotion, Person, Walk
 from jaxslam.datasets.synthetic.homogeneous import transform
-from jaxslam.datasets.synthetic.primitives import PlacedSolid, Solid, box, pill, upright
+from jaxslam.datasets.synthetic.primitives import PlacedSolid, Solid, box, pill, scaled_solid, upright
 from jaxslam.datasets.synthetic.shading import Light
 from jaxslam.datasets.synthetic.texture import Material
 from jaxslam.geometry.so3 import axis_rotation, matrices, multiply
@@ -86,10 +87,12 @@ class Built(NamedTuple):
 class InstanceActor:
     """An actor of solids, which is out of sight while it is not there."""
 
-    def __init__(self, instance: Instance, solids: list[Solid], placed: "_Placed | _WalkingParts") -> None:
-        """Take solids, and where they are in the axes of the instance."""
+    def __init__(
+        self, instance: Instance, solids: list[Solid], placed: "_Placed | _WalkingParts", scale: float = 1.0
+    ) -> None:
+        """Take solids, where they are in the axes of the instance, and a factor of all lengths in `placed`."""
         self.label, self.solids = instance.label, solids
-        self._instance, self._placed = instance, placed
+        self._instance, self._placed, self._scale = instance, placed, scale
 
     def root(self, time_s: np.ndarray) -> np.ndarray:
         """Poses `T_world_actor` at `(t,)` seconds: `(t, 7)`, wxyz_xyz."""
@@ -98,8 +101,13 @@ class InstanceActor:
     def parts(self, time_s: np.ndarray) -> np.ndarray:
         """Placements of its solids in its axes: `(t, len(solids), 4, 4)`."""
         parts = np.array(self._placed.parts(time_s))
+        parts[..., :3, 3] *= self._scale
         parts[~self._instance.is_there(time_s), :, 2, 3] -= _OUT_OF_SIGHT_M
         return parts
+
+    def scaled(self, instance: Instance, factor: float) -> "InstanceActor":
+        """The same actor with all its lengths times a factor, as an instance that is scaled already."""
+        return InstanceActor(instance, [scaled_solid(solid, factor) for solid in self.solids], self._placed, factor)
 
 
 class _Placed(NamedTuple):
@@ -150,7 +158,33 @@ def build(world: World) -> Built:
     for index, person in enumerate(world.people):
         carried = None if person.carries is None else world.kinds[person.carries]
         _add_person(built, person, carried, looks, np.random.default_rng([world.seed, 703, index]))
-    return built
+    return built if world.scale == 1.0 else _scaled(built, world.scale)
+
+
+def _scaled(built: Built, factor: float) -> Built:
+    """The same world with all its lengths times a factor."""
+    instances = [
+        each._replace(walk=partial(_scaled_walk, each.walk, factor), height_m=factor * each.height_m)
+        for each in built.instances
+    ]
+    actors = [
+        actor.scaled(instances[number - 1], factor)
+        for number, actor in zip(built.actor_numbers, built.actors, strict=True)
+    ]
+    light = built.light._replace(
+        lamp_m=np.float32(factor) * built.light.lamp_m, fading_per_m2=built.light.fading_per_m2 / np.float32(factor**2)
+    )
+    static = [PlacedSolid(_scaled_place(place, factor), scaled_solid(solid, factor)) for place, solid in built.static]
+    return built._replace(static=static, actors=actors, instances=instances, light=light)
+
+
+def _scaled_place(T_world_solid: np.ndarray, factor: float) -> np.ndarray:
+    return transform(T_world_solid[:3, :3], factor * T_world_solid[:3, 3])
+
+
+def _scaled_walk(walk: Walk, factor: float, time_s: np.ndarray) -> GroundMotion:
+    position, heading, speed = walk(time_s)
+    return GroundMotion(factor * position, heading, factor * speed)
 
 
 class _Finish:
@@ -239,7 +273,7 @@ def _turned(turn_deg: Sequence[float]) -> np.ndarray:
 def _backdrop(world: World, looks: _Finishes) -> PlacedSolid:
     """A box around everything, seen from inside."""
     points = [np.array([*point[:2], 0.0]) for route in _routes(world) for point in route]
-    points += [np.array(point) for point in world.way.points_m]
+    points += [np.array(point) for point in world.way.points_m or (world.way.at_m,)]
     for room in world.rooms:
         half = 0.5 * np.array(room.size_m)
         points += [np.array([*room.at_m, 0.0]) - half, np.array([*room.at_m, 0.0]) + 2.0 * half]

@@ -1,28 +1,56 @@
 """The way of the camera of a world: poses at any time."""
 
+from typing import Protocol
+
 import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
 
 from jaxslam.datasets.synthetic.camera_path import hand_tremor, looking_at, poses_of
-from jaxslam.worlds.description import Way
+from jaxslam.errors import ConfigError
+from jaxslam.geometry.so3 import axis_rotation, matrices, multiply
+from jaxslam.trajectory import trajectory
+from jaxslam.worlds.description import Way, World
 from jaxslam.worlds.motion import SmoothWay
 
 _SWING_PERIOD_S = 8.0
+_MIN_POSES = 4
+"""A spline through poses needs as many."""
 
 
-class CameraWay:
+class CameraWay(Protocol):
     """Poses of the camera on its way."""
 
-    def __init__(self, way: Way, seed: int) -> None:
+    def poses(self, time_s: np.ndarray) -> np.ndarray:
+        """Poses `T_world_cam` at `(t,)` seconds since the start: `(t, 7)` float64, wxyz_xyz."""
+        ...
+
+
+def camera_way(world: World) -> CameraWay:
+    """Return the way of the camera of a world.
+
+    Raises:
+        ConfigError: The trajectory in a file is shorter than the recording.
+        TrajectoryError: The file cannot be read.
+    """
+    if world.way.file is None:
+        return PointWay(world.way, world.seed, world.scale)
+    return FileWay(world.way, world.way.file, world.seconds, world.scale, world.seed)
+
+
+class PointWay:
+    """The way through points."""
+
+    def __init__(self, way: Way, seed: int, scale: float) -> None:
         """Prepare a way.
 
         Args:
             way: Its description.
             seed: Chooses the phases of the tremor.
+            scale: Factor of all lengths.
         """
-        self._way = way
+        self._way, self._scale, self._phases = way, scale, _phases(seed)
         self._smooth = SmoothWay(way.points_m, way.speed_m_per_s, way.ends, way.pause_s, 0.5 * way.turn_s)
-        self._phases = np.random.default_rng([seed, 600]).uniform(0.0, 2.0 * np.pi, (2, 3))
-        self.seconds = self._smooth.seconds
 
     def poses(self, time_s: np.ndarray) -> np.ndarray:
         """Poses `T_world_cam` at `(t,)` seconds since the start: `(t, 7)` float64, wxyz_xyz."""
@@ -34,4 +62,49 @@ class CameraWay:
         else:
             angles = looking_at(position, np.array(self._way.look))
         moved, turned = hand_tremor(time_s, self._phases)
-        return poses_of(position + self._way.tremor * moved, angles + self._way.tremor * turned)
+        position = self._scale * (position + self._way.tremor * moved)
+        return poses_of(position, angles + self._way.tremor * turned)
+
+
+class FileWay:
+    """The way of a trajectory in a file: splines through its poses, smooth up to the acceleration."""
+
+    def __init__(self, way: Way, file: str, seconds: float, scale: float, seed: int) -> None:
+        """Read the trajectory.
+
+        Args:
+            way: Its description.
+            file: Its file.
+            seconds: Length of the recording.
+            scale: Factor of all lengths.
+            seed: Chooses the phases of the tremor.
+
+        Raises:
+            ConfigError: It is shorter than the recording, or has fewer than four poses.
+            TrajectoryError: The file cannot be read.
+        """
+        self._way, self._scale, self._phases = way, scale, _phases(seed)
+        given = trajectory.read(file)
+        stamps, first = np.unique(given.timestamps_ns, return_index=True)
+        if len(stamps) < _MIN_POSES:
+            raise ConfigError(f"{file}: expected at least {_MIN_POSES} poses, got {len(stamps)}")
+        poses, times_s = given.T_world_cam[first], 1e-9 * (stamps - stamps[0])
+        if times_s[-1] < way.from_s + seconds:
+            needed = f"from_s + seconds, {way.from_s + seconds:g} s"
+            raise ConfigError(f"{file}: expected a trajectory of {needed}, got {times_s[-1]:.3f} s")
+        turn = axis_rotation(2, np.deg2rad(way.turn_deg))
+        places = poses[:, 4:] @ matrices(turn).T + np.array(way.at_m)
+        self._position = CubicSpline(times_s, places)
+        self._rotation = RotationSpline(times_s, Rotation.from_quat(multiply(turn, poses[:, :4])[:, [1, 2, 3, 0]]))
+
+    def poses(self, time_s: np.ndarray) -> np.ndarray:
+        """Poses `T_world_cam` at `(t,)` seconds since the start: `(t, 7)` float64, wxyz_xyz."""
+        within_s = np.asarray(time_s, np.float64) + self._way.from_s
+        moved, turned = (self._way.tremor * each for each in hand_tremor(time_s, self._phases))
+        rotation = self._rotation(within_s) * Rotation.from_euler("ZYX", turned)
+        position = self._scale * (self._position(within_s) + moved)
+        return np.concatenate([rotation.as_quat()[:, [3, 0, 1, 2]], position], axis=1)
+
+
+def _phases(seed: int) -> np.ndarray:
+    return np.random.default_rng([seed, 600]).uniform(0.0, 2.0 * np.pi, (2, 3))

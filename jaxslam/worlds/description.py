@@ -267,11 +267,37 @@ class Exposure(ValidatedConfig):
 
 
 @dataclass(frozen=True)
-class Way(ValidatedConfig):
-    """The way of the camera: through points, held by a hand.
+class Fault(ValidatedConfig):
+    """Time in which the camera does not deliver pictures as it should.
 
     Attributes:
-        points_m: Points `(x, y, z)` it passes; at least two.
+        from_s: Its beginning.
+        until_s: Its end.
+        pictures: `missing`: there are no frames; `black`: frames are black and without depth; `frozen`: all are the
+            last one before.
+    """
+
+    from_s: Annotated[float, Range(at_least=0)]
+    until_s: Annotated[float, Positive]
+    pictures: Literal["missing", "black", "frozen"] = "missing"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.until_s <= self.from_s:
+            raise ConfigError(f"Fault.until_s: expected more than from_s, {self.from_s}, got {self.until_s}")
+
+
+@dataclass(frozen=True)
+class Way(ValidatedConfig):
+    """The way of the camera: through points, held by a hand, or that of a trajectory in a file.
+
+    Attributes:
+        points_m: Points `(x, y, z)` it passes; at least two, or none with a `file`.
+        file: File of a trajectory of the camera in the layout of TUM RGB-D, KITTI or EuRoC, z up; splines go through
+            its poses. Of the other fields only `at_m`, `turn_deg`, `from_s` and `tremor` count then.
+        at_m: Place of the trajectory's origin in the world.
+        turn_deg: Turn of the trajectory about the vertical.
+        from_s: Time in the trajectory at which the recording begins.
         speed_m_per_s: Speed along the way.
         ends: At the last point: `back` to the first one and on, round in a `loop`, or `stop`.
         pause_s: Time of rest at the first and the last point.
@@ -282,7 +308,11 @@ class Way(ValidatedConfig):
         tremor: Factor of the tremor of the hand: 1 for 2 mm and 0.15 degrees; 0 for none.
     """
 
-    points_m: tuple[Point, ...]
+    points_m: tuple[Point, ...] = ()
+    file: str | None = None
+    at_m: Point = (0.0, 0.0, 0.0)
+    turn_deg: float = 0.0
+    from_s: Annotated[float, Range(at_least=0)] = 0.0
     speed_m_per_s: Annotated[float, Range(above=0, at_most=100)] = 0.5
     ends: Literal["back", "loop", "stop"] = "back"
     pause_s: Annotated[float, Range(at_least=0)] = 0.0
@@ -294,7 +324,10 @@ class Way(ValidatedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_points("Way.points_m", self.points_m)
+        if self.file is None:
+            check_points("Way.points_m", self.points_m)
+        elif self.points_m:
+            raise ConfigError("Way: expected points_m or a file, got both")
 
 
 @dataclass(frozen=True)
@@ -335,7 +368,10 @@ class World(ValidatedConfig):
         backdrop: Name of the look of what lies behind everything: the sky, or the dark behind an open door.
         lighting: The light.
         exposure: Changes of the brightness of the pictures, in the order of time.
+        faults: Times in which the camera does not deliver.
         camera: The camera.
+        scale: Factor of all lengths and speeds of the world, and of the ranges and noise of the sensor: pictures stay
+            the same, and depth and poses grow.
     """
 
     about: str
@@ -350,7 +386,9 @@ class World(ValidatedConfig):
     backdrop: str = "dusk"
     lighting: Lighting = field(default_factory=Lighting)
     exposure: tuple[Exposure, ...] = ()
+    faults: tuple[Fault, ...] = ()
     camera: WorldCamera = field(default_factory=WorldCamera)
+    scale: Annotated[float, Range(at_least=0.01, at_most=100)] = 1.0
 
     def __post_init__(self) -> None:
         super().__post_init__()

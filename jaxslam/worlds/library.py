@@ -34,7 +34,9 @@ def load_world(name: str | Path) -> World:
             )
     world = from_mapping(World, read_mapping(path, ConfigError), str(path))
     _check_names(world, str(path))
-    return world
+    way = world.way
+    # A file beside the description, wherever that is read from.
+    return world if way.file is None else replace(world, way=replace(way, file=str(path.parent / way.file)))
 
 
 def with_catalog(world: World) -> World:

@@ -8,12 +8,14 @@ import numpy as np
 
 from jaxslam.datasets.synthetic.dataset import DEPTH_COUNTS_PER_M, START_NS
 from jaxslam.datasets.synthetic.primitives import PlacedSolid
-from jaxslam.datasets.synthetic.virtual_camera import Stage, VirtualCamera
+from jaxslam.datasets.synthetic.sensor_noise import scaled_sensor
+from jaxslam.datasets.synthetic.virtual_camera import Stage, TakenPicture, VirtualCamera
+from jaxslam.errors import ConfigError
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame
 from jaxslam.trajectory.trajectory import Trajectory
 from jaxslam.worlds.building import BACKDROP_NUMBER, build
-from jaxslam.worlds.camera_way import CameraWay
+from jaxslam.worlds.camera_way import camera_way
 from jaxslam.worlds.description import World
 from jaxslam.worlds.library import load_world, with_catalog
 
@@ -27,7 +29,7 @@ class WorldFrame:
 
     Attributes:
         timestamp_ns: Time of the middle of the exposure.
-        rgb: `(height, width, 3)` uint8, as measured.
+        rgb: `(height, width, 3)` uint8, as measured; where the camera has a fault, what it delivers.
         depth_m: `(height, width)` float32 depth as measured by a camera that does; 0 where missing.
         exact_depth_m: `(height, width)` float32 depth at the centers of the pixels; 0 on the backdrop.
         instance_mask: `(height, width)` int32 numbers of things and people; 0 on rooms and the backdrop.
@@ -82,6 +84,7 @@ class WorldRecording:
 
         Raises:
             ConfigError: If there is no such world, or something in its description is wrong.
+            TrajectoryError: If the file of its way cannot be read.
         """
         self.name = "world" if isinstance(world, World) else Path(world).stem
         self.world = world = world if isinstance(world, World) else load_world(world)
@@ -97,21 +100,26 @@ class WorldRecording:
             0.5 * (filmed.height - 1),
             depth_scale_per_m=None if filmed.baseline_m else DEPTH_COUNTS_PER_M,
             fps=filmed.fps,
-            baseline_m=filmed.baseline_m,
+            baseline_m=filmed.baseline_m and world.scale * filmed.baseline_m,
         )
         num_frames = max(round(world.seconds * filmed.fps), 1)
         # Whole microseconds: six decimals of a second hold them exactly.
         elapsed_us = np.round(np.arange(num_frames) * (1e6 / filmed.fps)).astype(np.int64)
+        self._numbers = np.flatnonzero(~self._has_fault("missing", 1e-6 * elapsed_us))
+        elapsed_us = elapsed_us[self._numbers]
+        if not len(elapsed_us):
+            raise ConfigError("World.faults: expected some frames that are not missing, got none")
         self._time_s, self.timestamps_ns = 1e-6 * elapsed_us, START_NS + 1000 * elapsed_us
-        self._way = CameraWay(world.way, world.seed)
+        self._way = camera_way(world)
         self.ground_truth = Trajectory(self.timestamps_ns, self._way.poses(self._time_s))
         self._built = built = build(with_catalog(world))
         self.instances = tuple(built.instances)
         self.labels = tuple(instance.label for instance in built.instances)
         self.movable = tuple(instance.movable for instance in built.instances)
         numbers = {"static_numbers": built.static_numbers, "actor_numbers": built.actor_numbers}
+        sensor = scaled_sensor(filmed.sensor, world.scale)
         self._stage = Stage(built.static, built.actors, built.light, **numbers)
-        self._filming = VirtualCamera(self._stage, self.camera, filmed.sensor, self._way.poses, self._gain)
+        self._filming = VirtualCamera(self._stage, self.camera, sensor, self._way.poses, self._gain)
         self._key = jax.random.key(world.seed)
         self._gain_phases = np.random.default_rng([world.seed, 601]).uniform(0.0, 2.0 * np.pi, 2)
 
@@ -129,27 +137,48 @@ class WorldRecording:
             IndexError: If there is no such frame.
         """
         index = range(len(self))[index]
-        time_s = float(self._time_s[index])
-        key = jax.random.fold_in(self._key, index)
-        taken, right = self._filming.take(time_s, key), None
+        now, source = self._time_s[index : index + 1], self._source(index)
+        taken = self._take(index)
+        delivered = taken if source == index else self._take(source)
+        rgb, depth_m, right = delivered.rgb, np.where(_backdrop(delivered), np.float32(0), delivered.depth_m), None
         if self.camera.baseline_m is not None:
-            right = self._filming.take(time_s, jax.random.fold_in(key, 1), self.camera.baseline_m).rgb
-        owner = np.asarray(taken.exact.owner)
-        is_backdrop, instance = owner == BACKDROP_NUMBER, np.maximum(owner, 0)
-        now = np.array([time_s])
+            right = self._take(source, self.camera.baseline_m).rgb
+        if self._has_fault("black", now)[0]:
+            rgb, depth_m = np.zeros_like(rgb), np.zeros_like(depth_m)
+            right = None if right is None else np.zeros_like(right)
+        instance_mask = np.maximum(np.asarray(taken.exact.owner), 0)
         moves = np.array([False, *(each.is_moving(now)[0] for each in self.instances)])
         poses = [each.poses(now)[0] for each in self.instances]
         return WorldFrame(
             timestamp_ns=int(self.timestamps_ns[index]),
-            rgb=taken.rgb,
-            depth_m=np.where(is_backdrop, np.float32(0), taken.depth_m),
-            exact_depth_m=np.where(is_backdrop, np.float32(0), np.asarray(taken.exact.depth_m)),
-            instance_mask=instance,
-            moving_mask=moves[instance],
+            rgb=rgb,
+            depth_m=depth_m,
+            exact_depth_m=np.where(_backdrop(taken), np.float32(0), np.asarray(taken.exact.depth_m)),
+            instance_mask=instance_mask,
+            moving_mask=moves[instance_mask],
             T_world_cam=self.ground_truth.T_world_cam[index].copy(),
             T_world_instance=np.stack(poses) if poses else np.zeros((0, 7)),
             right=right,
         )
+
+    def _take(self, index: int, to_the_right_m: float = 0.0) -> TakenPicture:
+        key = jax.random.fold_in(self._key, int(self._numbers[index]))
+        key = jax.random.fold_in(key, 1) if to_the_right_m else key
+        return self._filming.take(float(self._time_s[index]), key, to_the_right_m)
+
+    def _source(self, index: int) -> int:
+        """Return the frame whose picture is delivered: an earlier one where the camera is frozen."""
+        while index > 0 and self._has_fault("frozen", self._time_s[index : index + 1])[0]:
+            index -= 1
+        return index
+
+    def _has_fault(self, pictures: str, time_s: np.ndarray) -> np.ndarray:
+        """Tell at which of `(t,)` times the camera has a fault of this kind."""
+        has_fault = np.zeros(len(time_s), bool)
+        for fault in self.world.faults:
+            if fault.pictures == pictures:
+                has_fault |= (time_s >= fault.from_s) & (time_s < fault.until_s)
+        return has_fault
 
     def footprints(self) -> list[tuple[np.ndarray, bool]]:
         """Outlines of what stands still, from above: corners `(4, 2)` in meters, and whether it belongs to a thing.
@@ -185,3 +214,8 @@ class WorldRecording:
 def _outline(placed: PlacedSolid) -> np.ndarray:
     corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) * placed.solid.size[:2]
     return corners @ placed.T_world_solid[:2, :2].T + placed.T_world_solid[:2, 3]
+
+
+def _backdrop(taken: TakenPicture) -> np.ndarray:
+    """Where a picture shows nothing but the backdrop, `(height, width)` bool."""
+    return np.asarray(taken.exact.owner) == BACKDROP_NUMBER

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxslam.datasets.synthetic.homogeneous import transform
-from jaxslam.datasets.synthetic.texture import Material, surface_row
+from jaxslam.datasets.synthetic.texture import Material, scaled_surface, surface_row
 from jaxslam.geometry.so3 import axis_rotation, matrices
 
 
@@ -28,6 +28,11 @@ class PlacedSolid(NamedTuple):
 
     T_world_solid: np.ndarray
     solid: Solid
+
+
+def scaled_solid(solid: Solid, factor: float) -> Solid:
+    """The same solid with all its lengths, those of its textures too, times a factor."""
+    return Solid(factor * solid.size, solid.stem, scaled_surface(solid.surface, factor))
 
 
 def box(half_m: tuple[float, float, float], look: Material | list[Material], rng: np.random.Generator) -> Solid:

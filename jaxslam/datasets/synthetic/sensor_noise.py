@@ -1,7 +1,7 @@
 """Sensor model of a Kinect-like camera: noise, holes and quantization, each with its own switch."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, NamedTuple
 
 import jax
@@ -49,6 +49,19 @@ class SensorConfig(ValidatedConfig):
     exposure_samples: Annotated[int, Range(at_least=1, at_most=31)] = 3
     gain_swing: Annotated[float, Range(at_least=0, below=1)] = 0.12
     image_noise: Annotated[float, Range(at_least=0, at_most=100)] = 2.0
+
+
+def scaled_sensor(config: SensorConfig, factor: float) -> SensorConfig:
+    """The same camera for a scene whose lengths are times a factor: it measures the same, times that factor."""
+    return replace(
+        config,
+        depth_noise_per_m=config.depth_noise_per_m / factor,
+        depth_step_per_m=config.depth_step_per_m / factor,
+        depth_unit_m=config.depth_unit_m * factor,
+        shadow_baseline_m=config.shadow_baseline_m * factor,
+        min_depth_m=config.min_depth_m * factor,
+        max_depth_m=config.max_depth_m * factor,
+    )
 
 
 PERFECT_SENSOR = SensorConfig(

@@ -109,6 +109,21 @@ def surface_row(material: Material, seed: int) -> np.ndarray:
     return np.concatenate([packed_colors, halves[::2] << 16 | halves[1::2], [seed]]).astype(np.uint32)
 
 
+_POWERS_OF_LENGTH = np.array([0, -1, -1, -1, -1, 1, 1, 1, 0, -1, 1, 0, 0, 0], np.float32)
+"""How the numbers of a packed surface, in order, grow with its lengths."""
+
+
+def scaled_surface(rows: np.ndarray, factor: float) -> np.ndarray:
+    """The same pattern with all its lengths times a factor; `rows` are `surface_row`s, `(..., N_WORDS)` uint32."""
+    scaled = rows.copy()
+    pairs = rows[..., 4:11]
+    halves = np.stack([pairs & np.uint32(0xFFFF0000), pairs << np.uint32(16)], axis=-1).view(np.float32)
+    numbers = halves.reshape(*rows.shape[:-1], 14) * np.float32(factor) ** _POWERS_OF_LENGTH
+    rounded = (numbers.astype(np.float32).view(np.uint32) + np.uint32(0x8000)) >> np.uint32(16)
+    scaled[..., 4:11] = rounded[..., ::2] << np.uint32(16) | rounded[..., 1::2]
+    return scaled
+
+
 def as_surface(words: UInt[Array, "12 p"]) -> Surface:
     """Unpack the `surface_row` of each pixel."""
 

@@ -12,8 +12,9 @@ from jaxslam.datasets import open_dataset
 from jaxslam.datasets.synthetic import PERFECT_SENSOR
 from jaxslam.datasets.synthetic.homogeneous import inverse, matrix_from_pose
 from jaxslam.datasets.synthetic.write_tum import write_tum
+from jaxslam.errors import ConfigError
 from jaxslam.worlds import World, WorldRecording, load_world, worlds
-from jaxslam.worlds.description import Exposure, Person, Room, Route, Thing, Way, WorldCamera
+from jaxslam.worlds.description import Exposure, Fault, Person, Room, Route, Thing, Way, WorldCamera
 
 CAMERA = WorldCamera(width=160, height=120)
 PERFECT = dataclasses.replace(CAMERA, sensor=PERFECT_SENSOR)
@@ -123,9 +124,57 @@ def test_exposure_changes_the_brightness():
     assert changed.render(70).rgb.mean() > usual.render(70).rgb.mean() + 20
 
 
+def test_missing_frames_leave_the_others_as_they_are(room):
+    gap = WorldRecording(dataclasses.replace(ROOM, faults=(Fault(1.0, 1.5),)))
+    assert len(gap) == len(room) - 15
+    assert np.diff(gap.timestamps_ns).max() == pytest.approx(16e9 / 30, rel=1e-5)
+    np.testing.assert_array_equal(gap.render(40).rgb, room.render(55).rgb)
+    np.testing.assert_array_equal(gap.ground_truth.T_world_cam[40], room.ground_truth.T_world_cam[55])
+
+
+def test_black_and_frozen_frames_keep_their_truth(room):
+    faults = Fault(0.5, 0.6, "black"), Fault(1.0, 1.2, "frozen")
+    faulty = WorldRecording(dataclasses.replace(ROOM, faults=faults))
+    black, frozen = faulty.render(16), faulty.render(33)
+    assert not black.rgb.any()
+    assert not black.depth_m.any()
+    np.testing.assert_array_equal(frozen.rgb, room.render(29).rgb)
+    for frame, index in ((black, 16), (frozen, 33)):
+        np.testing.assert_array_equal(frame.exact_depth_m, room.render(index).exact_depth_m)
+        np.testing.assert_array_equal(frame.T_world_cam, room.render(index).T_world_cam)
+    np.testing.assert_array_equal(faulty.render(36).rgb, room.render(36).rgb)
+
+
+def test_no_frames_at_all_is_an_error():
+    with pytest.raises(ConfigError, match="expected some frames that are not missing"):
+        WorldRecording(dataclasses.replace(ROOM, faults=(Fault(0.0, 10.0),)))
+
+
+@pytest.mark.parametrize("scale", [4.0, 0.3])
+def test_a_scaled_world_looks_the_same_and_measures_in_proportion(room, scale):
+    scaled = WorldRecording(dataclasses.replace(ROOM, scale=scale))
+    frame, big = room.render(40), scaled.render(40)
+    assert np.mean(frame.instance_mask == big.instance_mask) > 0.999
+    # Textures hold eight digits of their lengths: only powers of two change nothing.
+    assert np.mean(np.abs(frame.rgb.astype(int) - big.rgb) > 2) < (0.001 if scale == 4.0 else 0.12)
+    assert np.median(np.abs(big.exact_depth_m / frame.exact_depth_m / scale - 1)) < 1e-6
+    np.testing.assert_allclose(big.T_world_cam[4:], scale * frame.T_world_cam[4:], rtol=1e-12)
+    np.testing.assert_allclose(big.T_world_instance[:, 4:], scale * frame.T_world_instance[:, 4:], rtol=1e-12)
+
+
+def test_the_sensor_of_a_scaled_world_is_scaled_too():
+    usual, big = (WorldRecording(dataclasses.replace(ROOM, camera=CAMERA, scale=scale)) for scale in (1.0, 4.0))
+    frame, scaled = usual.render(0), big.render(0)
+    both = (frame.depth_m > 0) & (scaled.depth_m > 0)
+    assert both.mean() > 0.6
+    assert np.mean((frame.depth_m > 0) == (scaled.depth_m > 0)) > 0.99
+    np.testing.assert_allclose(scaled.depth_m[both], 4 * frame.depth_m[both], rtol=1e-3)
+
+
 def test_a_pair_sees_the_same_from_two_places():
     recording = WorldRecording(dataclasses.replace(ROOM, camera=dataclasses.replace(PERFECT, baseline_m=0.1)))
     frame, camera = recording.render(0), recording.camera
+    assert frame.right is not None
     v, u = np.mgrid[: camera.height, : camera.width].astype(np.float32)
     from_right = cv2.remap(frame.right, u - np.float32(camera.fx * 0.1) / frame.exact_depth_m, v, cv2.INTER_LINEAR)
     difference = np.abs(from_right.astype(int) - frame.rgb.astype(int)).max(axis=2)[:, 30:]
@@ -165,11 +214,16 @@ def test_is_written_as_tum_with_numbers_and_labels(tmp_path):
     read = open_dataset(tmp_path / "room")
     assert len(read) == len(short) == 3
     np.testing.assert_array_equal(read[1].image, short[1].image)
-    np.testing.assert_allclose(read[1].depth_m, short[1].depth_m, atol=1.1e-4)
+    depth_m, expected_m = read[1].depth_m, short[1].depth_m
+    assert depth_m is not None
+    assert expected_m is not None
+    np.testing.assert_allclose(depth_m, expected_m, atol=1.1e-4)
+    assert read.ground_truth is not None
     np.testing.assert_allclose(read.ground_truth.T_world_cam, short.ground_truth.T_world_cam, atol=1e-6)
     number = cv2.imread(str(min((tmp_path / "room" / "instance").glob("*.png"))), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(number, short.render(0).instance_mask)
     moving = cv2.imread(str(min((tmp_path / "room" / "mask").glob("*.png"))), cv2.IMREAD_UNCHANGED)
+    assert moving is not None
     np.testing.assert_array_equal(moving > 0, short.render(0).moving_mask)
     assert "4 1 person" in (tmp_path / "room" / "labels.txt").read_text()
 
