@@ -1,6 +1,7 @@
 """The worlds that come with jaxslam, and those in files of the user."""
 
 import functools
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,7 +9,7 @@ from jaxslam.config.loading import configs_dir
 from jaxslam.config.validation import from_mapping
 from jaxslam.errors import ConfigError, nearest
 from jaxslam.io.yaml_files import read_mapping
-from jaxslam.worlds.description import Catalog, Kind, Look, World
+from jaxslam.worlds.description import Catalog, World
 
 
 def worlds() -> list[str]:
@@ -33,16 +34,26 @@ def load_world(name: str | Path) -> World:
                 f"world: expected the name of a world or a YAML file, got '{name}'{nearest(str(name), worlds())}"
             )
     world = from_mapping(World, read_mapping(path, ConfigError), str(path))
-    _check_names(world, str(path))
+    with_catalog(world, str(path))
     way = world.way
     # A file beside the description, wherever that is read from.
     return world if way.file is None else replace(world, way=replace(way, file=str(path.parent / way.file)))
 
 
-def with_catalog(world: World) -> World:
-    """The world with all looks and kinds of the catalog; its own ones come first."""
+def with_catalog(world: World, place: str = "world") -> World:
+    """The world with all looks and kinds of the catalog; its own ones come first.
+
+    Args:
+        world: The world.
+        place: Name of the world or its file, for messages.
+
+    Raises:
+        ConfigError: The world names a look or kind that is neither its own nor in the catalog.
+    """
     shared = catalog()
-    return replace(world, looks={**shared.looks, **world.looks}, kinds={**shared.kinds, **world.kinds})
+    full = replace(world, looks={**shared.looks, **world.looks}, kinds={**shared.kinds, **world.kinds})
+    _check_names(full, place)
+    return full
 
 
 @functools.cache
@@ -56,24 +67,22 @@ def _folder() -> Path:
     return configs_dir() / "worlds"
 
 
-def _check_names(world: World, place: str) -> None:
+def _check_names(full: World, place: str) -> None:
     """Refuse names of looks and kinds that are not known."""
-    full = with_catalog(world)
-    for name, kind in world.kinds.items():
+    for name, kind in full.kinds.items():
         for index, part in enumerate(kind.parts):
             _check_name(part.look, full.looks, f"{place}: kinds: {name}: parts[{index}]: look")
-    for index, room in enumerate(world.rooms):
+    for index, room in enumerate(full.rooms):
         for field in ("floor", "walls", "ceiling"):
             _check_name(getattr(room, field), full.looks, f"{place}: rooms[{index}]: {field}")
-    _check_name(world.backdrop, full.looks, f"{place}: backdrop")
-    for index, thing in enumerate(world.things):
+    _check_name(full.backdrop, full.looks, f"{place}: backdrop")
+    for index, thing in enumerate(full.things):
         _check_name(thing.kind, full.kinds, f"{place}: things[{index}]: kind")
-    for index, person in enumerate(world.people):
+    for index, person in enumerate(full.people):
         if person.carries is not None:
             _check_name(person.carries, full.kinds, f"{place}: people[{index}]: carries")
 
 
-def _check_name(name: str, known: "dict[str, Look] | dict[str, Kind] | object", key: str) -> None:
-    names = list(known)  # type: ignore[call-overload]
-    if name not in names:
-        raise ConfigError(f"{key}: expected a known name, got '{name}'{nearest(name, names)}")
+def _check_name(name: str, known: Collection[str], key: str) -> None:
+    if name not in known:
+        raise ConfigError(f"{key}: expected a known name, got '{name}'{nearest(name, list(known))}")

@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 
 from jaxslam.errors import ConfigError
-from jaxslam.worlds import World, load_world, worlds
+from jaxslam.worlds import World, WorldRecording, load_world, worlds
+from jaxslam.worlds.description import Thing, Way
 
 MINIMAL = """
 about: An empty room.
@@ -70,3 +71,9 @@ def test_an_unknown_name_is_refused_with_the_nearest():
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(ConfigError, match=r"nowhere\.yaml"):
         load_world(tmp_path / "nowhere.yaml")
+
+
+def test_a_world_made_in_python_is_checked_too():
+    way = Way(((0.0, 0.0, 1.0), (1.0, 0.0, 1.0)))
+    with pytest.raises(ConfigError, match=r"world: things\[0\]: kind: expected a known name, got 'elephant'"):
+        WorldRecording(World("An elephant.", 1.0, way, things=(Thing("elephant"),)))
