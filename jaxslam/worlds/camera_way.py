@@ -54,11 +54,12 @@ class PointWay:
 
     def poses(self, time_s: np.ndarray) -> np.ndarray:
         """Poses `T_world_cam` at `(t,)` seconds since the start: `(t, 7)` float64, wxyz_xyz."""
-        position = self._smooth.position(time_s)
+        within_s = time_s + self._way.from_s
+        position = self._smooth.position(within_s)
         if self._way.look == "ahead":
-            swing = np.deg2rad(self._way.swing_deg) * np.sin(2.0 * np.pi * time_s / _SWING_PERIOD_S)
+            swing = np.deg2rad(self._way.swing_deg) * np.sin(2.0 * np.pi * within_s / _SWING_PERIOD_S)
             down = np.full(len(time_s), np.deg2rad(self._way.down_deg))
-            angles = np.stack([self._smooth.heading(time_s) + swing, down, np.zeros(len(time_s))], axis=1)
+            angles = np.stack([self._smooth.heading(within_s) + swing, down, np.zeros(len(time_s))], axis=1)
         else:
             angles = looking_at(position, np.array(self._way.look))
         moved, turned = hand_tremor(time_s, self._phases)

@@ -297,7 +297,7 @@ class Way(ValidatedConfig):
             its poses. Of the other fields only `at_m`, `turn_deg`, `from_s` and `tremor` count then.
         at_m: Place of the trajectory's origin in the world.
         turn_deg: Turn of the trajectory about the vertical.
-        from_s: Time in the trajectory at which the recording begins.
+        from_s: Time on the way, or in the trajectory, at which the recording begins.
         speed_m_per_s: Speed along the way.
         ends: At the last point: `back` to the first one and on, round in a `loop`, or `stop`.
         pause_s: Time of rest at the first and the last point.
