@@ -1,5 +1,6 @@
 """The compiled tracker of one camera: its settings, its state, and the programs that advance it by a frame."""
 
+import gc
 from concurrent.futures import ThreadPoolExecutor
 from enum import Enum
 
@@ -112,6 +113,7 @@ class Tracker:
         with collector_paused(), ThreadPoolExecutor(1, thread_name_prefix="jaxslam-compile-flow") as beside:
             lower(_track_followed, state, frame, followed, self.params, self.plan)
             flow = beside.submit(_follow_points, other, frame, self.params, self.plan)
+            beside.submit(gc.collect)  # while XLA compiles the step; the second frame would wait for it, 0.2 s
             jax.block_until_ready(_track_followed(state, frame, followed, self.params, self.plan))
             jax.block_until_ready(flow.result())
 
