@@ -99,7 +99,7 @@ def _opened(name: str) -> "WorldRecording":
 
 
 def _figures(recording: "WorldRecording") -> dict[str, Any]:
-    """What a world holds, for a reader."""
+    """Return the figures of a world that are printed."""
     camera, world = recording.camera, recording.world
     counts = Counter(recording.labels)
     return {

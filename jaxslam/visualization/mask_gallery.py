@@ -1,6 +1,5 @@
 """Pictures of the masks of a run: an animation and a contact sheet."""
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from jaxslam.sensors.frame import Frame
 from jaxslam.slam.frame_result import FrameResult, Rejected
 from jaxslam.slam.mask_pipeline import MaskSource
 from jaxslam.visualization.overlay import GREEN, ORANGE, PURPLE, SKY_BLUE, VERMILION, Rgb, tint
-from jaxslam.visualization.plots import PNG_LEVEL
+from jaxslam.visualization.picture_files import contact_sheet, small_animation, spread
 
 MASK_RGB: dict[MaskSource, Rgb] = {
     MaskSource.NONE: (120, 120, 120),
@@ -27,8 +26,7 @@ MASK_RGB: dict[MaskSource, Rgb] = {
 
 _MAX_PICTURES = 60
 _WIDTH_PX, _BAR_PX, _FONT_PX = 320, 20, 14
-_FRAME_MS, _GIF_COLORS, _MAX_GIF_BYTES = 150, 128, 3_000_000
-_SHEET_PICTURES, _SHEET_COLUMNS = 12, 4
+_FRAME_MS, _SHEET_PICTURES = 150, 12
 
 
 class MaskPictures:
@@ -60,7 +58,7 @@ class MaskPictures:
 
     def _keep(self, picture: np.ndarray) -> None:
         if len(self.kept) == self._most:
-            self.kept = _spread(self.kept, self._most // 2, self._random)
+            self.kept = spread(self.kept, self._most // 2, self._random)
             self._one_of *= 2
         self.kept.append(picture)
 
@@ -97,17 +95,8 @@ def write_mask_pictures(folder: Path, pictures: Sequence[np.ndarray]) -> None:
     Raises:
         JaxSlamError: If a file cannot be written.
     """
-    write_atomically(folder / "masks.png", _sheet(_spread(pictures, _SHEET_PICTURES)))
-    write_atomically(folder / "masks.gif", _small_animation(pictures))
-
-
-def _spread(pictures: Sequence[np.ndarray], most: int, random: np.random.Generator | None = None) -> list[np.ndarray]:
-    """So many of them, or all: one by chance from each of as many parts of equal length."""
-    if len(pictures) <= most:
-        return list(pictures)
-    random = random or np.random.default_rng(0)
-    ends = np.linspace(0, len(pictures), most + 1).astype(int)
-    return [pictures[index] for index in random.integers(ends[:-1], ends[1:])]
+    write_atomically(folder / "masks.png", contact_sheet(spread(pictures, _SHEET_PICTURES)))
+    write_atomically(folder / "masks.gif", small_animation(pictures, _FRAME_MS))
 
 
 def _bar(text: str, color: tuple[int, int, int]) -> np.ndarray:
@@ -116,33 +105,3 @@ def _bar(text: str, color: tuple[int, int, int]) -> np.ndarray:
     font = ImageFont.load_default(_FONT_PX)
     ImageDraw.Draw(bar).text((4, _BAR_PX // 2), text, fill=(0, 0, 0), font=font, anchor="lm")
     return np.asarray(bar)
-
-
-def _sheet(pictures: Sequence[np.ndarray]) -> bytes:
-    """Encode pictures in rows of four as a PNG."""
-    from skimage.util import montage  # noqa: PLC0415 - used once, at the end of a run
-
-    columns = min(len(pictures), _SHEET_COLUMNS)
-    shape = -(-len(pictures) // columns), columns
-    file = io.BytesIO()
-    sheet = montage(np.stack(pictures), fill=(255, 255, 255), grid_shape=shape, channel_axis=-1)
-    Image.fromarray(sheet).save(file, "PNG", compress_level=PNG_LEVEL)
-    return file.getvalue()
-
-
-def _small_animation(pictures: Sequence[np.ndarray]) -> bytes:
-    """Encode a GIF of all pictures, or of every 2nd, 4th, ... if it would be too large."""
-    data = _animation(pictures)
-    while len(data) > _MAX_GIF_BYTES and len(pictures) > 1:
-        pictures = pictures[::2]
-        data = _animation(pictures)
-    return data
-
-
-def _animation(pictures: Sequence[np.ndarray]) -> bytes:
-    """Encode a GIF with one palette, so that a mask has the same color in all frames."""
-    palette = Image.fromarray(np.concatenate(_spread(pictures, 8))).quantize(_GIF_COLORS)
-    frames = [Image.fromarray(each).quantize(palette=palette, dither=Image.Dither.NONE) for each in pictures]
-    file = io.BytesIO()
-    frames[0].save(file, "GIF", save_all=True, append_images=frames[1:], duration=_FRAME_MS, loop=0)
-    return file.getvalue()

@@ -1,6 +1,5 @@
 """Pictures of a world: a contact sheet, a plan with the way of the camera, a clip."""
 
-import io
 from collections.abc import Callable
 from pathlib import Path
 
@@ -8,14 +7,15 @@ import cv2
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from PIL import Image
 
 from jaxslam.io.atomic_files import write_atomically
 from jaxslam.visualization.overlay import VERMILION, tint
+from jaxslam.visualization.picture_files import contact_sheet, small_animation
+from jaxslam.visualization.plots import png
 from jaxslam.worlds.recording import WorldFrame, WorldRecording
 
-_COLUMNS, _ROWS, _WIDTH_PX = 4, 4, 320
-_CLIP_S, _CLIP_PICTURES, _GIF_COLORS = 6.0, 60, 128
+_SHEET_PICTURES, _WIDTH_PX = 16, 320
+_CLIP_S, _CLIP_PICTURES = 6.0, 60
 _PLAN_STEPS = 400
 
 Progress = Callable[[int, int], None]
@@ -41,7 +41,7 @@ def write_world_pictures(recording: WorldRecording, folder: Path, progress: Prog
         The files.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    spread = np.unique(np.linspace(0, len(recording) - 1, _COLUMNS * _ROWS).round().astype(int))
+    spread = np.unique(np.linspace(0, len(recording) - 1, _SHEET_PICTURES).round().astype(int))
     end = min(len(recording), max(round(_CLIP_S * recording.camera.fps), 1))
     clip = np.unique(np.linspace(0, end - 1, min(_CLIP_PICTURES, end)).round().astype(int))
     pictures: dict[int, np.ndarray] = {}
@@ -51,21 +51,11 @@ def write_world_pictures(recording: WorldRecording, folder: Path, progress: Prog
         if progress is not None:
             progress(done, len(wanted))
     files = [folder / name for name in ("sheet.png", "plan.png", "clip.gif")]
-    write_atomically(files[0], _png(_sheet([pictures[int(index)] for index in spread])))
+    write_atomically(files[0], contact_sheet([pictures[int(index)] for index in spread]))
     write_atomically(files[1], _plan(recording))
-    seconds = end / recording.camera.fps
-    write_atomically(files[2], _gif([pictures[int(index)] for index in clip], round(1000 * seconds / len(clip))))
+    frame_ms = round(1000 * end / recording.camera.fps / len(clip))
+    write_atomically(files[2], small_animation([pictures[int(index)] for index in clip], frame_ms))
     return files
-
-
-def _sheet(pictures: list[np.ndarray]) -> np.ndarray:
-    height, width = pictures[0].shape[:2]
-    columns = min(_COLUMNS, len(pictures))
-    sheet = np.full((height * -(-len(pictures) // columns), width * columns, 3), 255, np.uint8)
-    for index, picture in enumerate(pictures):
-        row, column = divmod(index, columns)
-        sheet[row * height : (row + 1) * height, column * width : (column + 1) * width] = picture
-    return sheet
 
 
 def _plan(recording: WorldRecording) -> bytes:
@@ -88,17 +78,4 @@ def _plan(recording: WorldRecording) -> bytes:
     axes.set(xlabel="x, m", ylabel="y, m", title=recording.world.about, aspect="equal")
     axes.title.set_wrap(True)
     axes.legend(loc="upper right", fontsize=8)
-    file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=100)
-    return file.getvalue()
-
-
-def _png(image: np.ndarray) -> bytes:
-    return cv2.imencode(".png", image[..., ::-1])[1].tobytes()
-
-
-def _gif(pictures: list[np.ndarray], frame_ms: int) -> bytes:
-    file = io.BytesIO()
-    first, *others = [Image.fromarray(picture).quantize(_GIF_COLORS) for picture in pictures]
-    first.save(file, format="GIF", save_all=True, append_images=others, duration=frame_ms, loop=0)
-    return file.getvalue()
+    return png(figure)

@@ -10,6 +10,7 @@ import numpy as np
 from jaxslam.datasets.synthetic.actors import GroundMotion, Person, Walk
 from jaxslam.datasets.synthetic.homogeneous import transform
 from jaxslam.datasets.synthetic.primitives import PlacedSolid, Solid, box, pill, scaled_solid, upright
+from jaxslam.datasets.synthetic.room import printed
 from jaxslam.datasets.synthetic.shading import Light
 from jaxslam.datasets.synthetic.texture import Material
 from jaxslam.geometry.so3 import axis_rotation, matrices, multiply
@@ -34,7 +35,7 @@ class Instance(NamedTuple):
     Attributes:
         label: Class label.
         movable: Whether it can move, be it at rest or not.
-        walk: Its motion on the floor; `None` if it stands still.
+        walk: Its motion on the floor.
         height_m: Height of its origin above the floor.
         turn: Its direction against that of the motion, in radians.
         from_s: Time at which it appears.
@@ -196,10 +197,7 @@ class _Finish:
         self._material = Material(**fields)
 
     def material(self, rng: np.random.Generator) -> Material:
-        if not self._printed:
-            return self._material
-        dark, bright = rng.uniform(0.02, 0.55, 3), rng.uniform(0.35, 1.0, 3)
-        return self._material._replace(dark=tuple(dark), bright=tuple(bright))
+        return printed(self._material, rng) if self._printed else self._material
 
 
 _Finishes = Mapping[str, _Finish]
@@ -285,7 +283,7 @@ def _backdrop(world: World, looks: _Finishes) -> PlacedSolid:
 
 
 def _routes(world: World) -> list[Sequence[Sequence[float]]]:
-    """Where things and people are: their ways, or their one place."""
+    """Return the ways of things and people, or their one place."""
     placed = [*world.things, *world.people]
     return [(item.at_m,) if item.route is None else item.route.points_m for item in placed]
 

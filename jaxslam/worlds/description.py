@@ -24,7 +24,7 @@ Side: TypeAlias = Literal["north", "south", "east", "west"]
 
 @dataclass(frozen=True)
 class Look(ValidatedConfig):
-    """How a surface looks: noise between two colors, bricks or planks, and scattered patches.
+    """Appearance of a surface: noise between two colors, bricks or planks, and scattered patches.
 
     Attributes:
         color: RGB from 0 to 1 where the noise is low.
@@ -125,7 +125,7 @@ class Route(ValidatedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_points("Route.points_m", self.points_m)
+        _check_points("Route.points_m", self.points_m)
 
 
 @dataclass(frozen=True)
@@ -152,8 +152,7 @@ class Thing(ValidatedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.until_s is not None and self.until_s <= self.from_s:
-            raise ConfigError(f"Thing.until_s: expected more than from_s, {self.from_s}, got {self.until_s}")
+        _check_span("Thing", self.from_s, self.until_s)
 
 
 @dataclass(frozen=True)
@@ -178,8 +177,7 @@ class Person(ValidatedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.until_s is not None and self.until_s <= self.from_s:
-            raise ConfigError(f"Person.until_s: expected more than from_s, {self.from_s}, got {self.until_s}")
+        _check_span("Person", self.from_s, self.until_s)
 
 
 @dataclass(frozen=True)
@@ -283,8 +281,7 @@ class Fault(ValidatedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.until_s <= self.from_s:
-            raise ConfigError(f"Fault.until_s: expected more than from_s, {self.from_s}, got {self.until_s}")
+        _check_span("Fault", self.from_s, self.until_s)
 
 
 @dataclass(frozen=True)
@@ -325,7 +322,7 @@ class Way(ValidatedConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.file is None:
-            check_points("Way.points_m", self.points_m)
+            _check_points("Way.points_m", self.points_m)
         elif self.points_m:
             raise ConfigError("Way: expected points_m or a file, got both")
 
@@ -395,9 +392,6 @@ class World(ValidatedConfig):
         times = [change.at_s for change in self.exposure]
         if times != sorted(times):
             raise ConfigError(f"World.exposure: expected times in order, got {times}")
-        if self.camera.sensor.exposure_samples % 2 == 0:
-            samples = self.camera.sensor.exposure_samples
-            raise ConfigError(f"World.camera: sensor.exposure_samples: expected an odd integer, got {samples}")
 
 
 @dataclass(frozen=True)
@@ -413,7 +407,12 @@ class Catalog(ValidatedConfig):
     kinds: Mapping[str, Kind]
 
 
-def check_points(name: str, points: tuple[tuple[float, ...], ...]) -> None:
+def _check_span(of: str, from_s: float, until_s: float | None) -> None:
+    if until_s is not None and until_s <= from_s:
+        raise ConfigError(f"{of}.until_s: expected more than from_s, {from_s}, got {until_s}")
+
+
+def _check_points(name: str, points: tuple[tuple[float, ...], ...]) -> None:
     """Refuse a way of fewer than two points, or with a point twice in a row.
 
     Raises:

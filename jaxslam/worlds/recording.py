@@ -6,10 +6,17 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jaxslam.datasets.synthetic.dataset import DEPTH_COUNTS_PER_M, START_NS
+from jaxslam.datasets.synthetic.dataset import DEPTH_COUNTS_PER_M
 from jaxslam.datasets.synthetic.primitives import PlacedSolid
 from jaxslam.datasets.synthetic.sensor_noise import scaled_sensor
-from jaxslam.datasets.synthetic.virtual_camera import Stage, TakenPicture, VirtualCamera
+from jaxslam.datasets.synthetic.virtual_camera import (
+    START_NS,
+    Stage,
+    TakenPicture,
+    VirtualCamera,
+    automatic_gain,
+    frame_times_us,
+)
 from jaxslam.errors import ConfigError
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame
@@ -103,8 +110,7 @@ class WorldRecording:
             baseline_m=filmed.baseline_m and world.scale * filmed.baseline_m,
         )
         num_frames = max(round(world.seconds * filmed.fps), 1)
-        # Whole microseconds: six decimals of a second hold them exactly.
-        elapsed_us = np.round(np.arange(num_frames) * (1e6 / filmed.fps)).astype(np.int64)
+        elapsed_us = frame_times_us(num_frames, filmed.fps)
         self._numbers = np.flatnonzero(~self._has_fault("missing", 1e-6 * elapsed_us))
         elapsed_us = elapsed_us[self._numbers]
         if not len(elapsed_us):
@@ -140,9 +146,8 @@ class WorldRecording:
         now, source = self._time_s[index : index + 1], self._source(index)
         taken = self._take(index)
         delivered = taken if source == index else self._take(source)
-        rgb, depth_m, right = delivered.rgb, np.where(_backdrop(delivered), np.float32(0), delivered.depth_m), None
-        if self.camera.baseline_m is not None:
-            right = self._take(source, self.camera.baseline_m).rgb
+        rgb, right = delivered.rgb, delivered.right
+        depth_m = np.where(_shows_backdrop(delivered), np.float32(0), delivered.depth_m)
         if self._has_fault("black", now)[0]:
             rgb, depth_m = np.zeros_like(rgb), np.zeros_like(depth_m)
             right = None if right is None else np.zeros_like(right)
@@ -153,7 +158,7 @@ class WorldRecording:
             timestamp_ns=int(self.timestamps_ns[index]),
             rgb=rgb,
             depth_m=depth_m,
-            exact_depth_m=np.where(_backdrop(taken), np.float32(0), np.asarray(taken.exact.depth_m)),
+            exact_depth_m=np.where(_shows_backdrop(taken), np.float32(0), np.asarray(taken.exact.depth_m)),
             instance_mask=instance_mask,
             moving_mask=moves[instance_mask],
             T_world_cam=self.ground_truth.T_world_cam[index].copy(),
@@ -161,10 +166,8 @@ class WorldRecording:
             right=right,
         )
 
-    def _take(self, index: int, to_the_right_m: float = 0.0) -> TakenPicture:
-        key = jax.random.fold_in(self._key, int(self._numbers[index]))
-        key = jax.random.fold_in(key, 1) if to_the_right_m else key
-        return self._filming.take(float(self._time_s[index]), key, to_the_right_m)
+    def _take(self, index: int) -> TakenPicture:
+        return self._filming.take(float(self._time_s[index]), jax.random.fold_in(self._key, int(self._numbers[index])))
 
     def _source(self, index: int) -> int:
         """Return the frame whose picture is delivered: an earlier one where the camera is frozen."""
@@ -199,8 +202,7 @@ class WorldRecording:
 
     def _gain(self, time_s: float) -> float:
         """Factor of brightness: what the exposure says, and an automatic one that wanders."""
-        waves = np.sin(2.0 * np.pi * time_s / np.array([9.0, 5.3]) + self._gain_phases)
-        wander = 1.0 + self.world.camera.sensor.gain_swing * (0.7 * waves[0] + 0.3 * waves[1])
+        wander = automatic_gain(time_s, self.world.camera.sensor.gain_swing, self._gain_phases)
         times, factors = [0.0], [1.0]
         for change in self.world.exposure:
             times += [change.at_s, change.at_s + change.over_s]
@@ -216,6 +218,6 @@ def _outline(placed: PlacedSolid) -> np.ndarray:
     return corners @ placed.T_world_solid[:2, :2].T + placed.T_world_solid[:2, 3]
 
 
-def _backdrop(taken: TakenPicture) -> np.ndarray:
-    """Where a picture shows nothing but the backdrop, `(height, width)` bool."""
+def _shows_backdrop(taken: TakenPicture) -> np.ndarray:
+    """Tell which pixels show nothing but the backdrop, `(height, width)` bool."""
     return np.asarray(taken.exact.owner) == BACKDROP_NUMBER

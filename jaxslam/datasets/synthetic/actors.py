@@ -36,7 +36,7 @@ class Actor(Protocol):
 
 
 class GroundMotion(NamedTuple):
-    """Where something that moves on the floor is at `t` times.
+    """Motion of something on the floor, at `t` times.
 
     Attributes:
         position: `(t, 2)` meters.

@@ -49,7 +49,7 @@ def camera_path(kind: str, time_s: np.ndarray, seed: int) -> np.ndarray:
 
 
 def hand_tremor(time_s: np.ndarray, phases: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How the hand that holds the camera trembles.
+    """Tremor of the hand that holds the camera.
 
     Args:
         time_s: `(n,)` seconds since the start.

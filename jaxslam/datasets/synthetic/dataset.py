@@ -14,15 +14,13 @@ from jaxslam.datasets.synthetic.room import furnish
 from jaxslam.datasets.synthetic.seated_people import MAX_SEATED, chairs
 from jaxslam.datasets.synthetic.sensor_noise import SensorConfig
 from jaxslam.datasets.synthetic.shading import ROOM_LIGHT
-from jaxslam.datasets.synthetic.virtual_camera import Stage, VirtualCamera
-from jaxslam.errors import ConfigError
+from jaxslam.datasets.synthetic.virtual_camera import START_NS, Stage, VirtualCamera, automatic_gain, frame_times_us
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame
 from jaxslam.trajectory.trajectory import Trajectory
 
 DEPTH_COUNTS_PER_M = 5000.0
 """Of depth images in files, as in TUM RGB-D."""
-START_NS = 1_600_000_000_000_000_000
 
 
 @dataclass(frozen=True)
@@ -49,7 +47,7 @@ class SyntheticConfig(ValidatedConfig):
         sensor: The faults of the camera, of both if there are two.
 
     Raises:
-        ConfigError: A field has the wrong type or is out of range, or `sensor.exposure_samples` is even.
+        ConfigError: A field has the wrong type or is out of range.
     """
 
     seed: Annotated[int, Range(at_least=0, below=2**31)] = 0
@@ -68,14 +66,6 @@ class SyntheticConfig(ValidatedConfig):
     cy: float | None = None
     baseline_m: Annotated[float, Range(above=0, at_most=1)] | None = None
     sensor: SensorConfig = field(default_factory=SensorConfig)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.sensor.exposure_samples % 2 == 0:
-            raise ConfigError(
-                "SensorConfig.exposure_samples: expected an odd integer, so that one moment is the frame's own,"
-                f" got {self.sensor.exposure_samples}"
-            )
 
 
 @dataclass(frozen=True)
@@ -134,8 +124,7 @@ class SyntheticDataset:
         self.fy = self.fx if config.fy is None else config.fy
         self.cx = 0.5 * (config.width - 1) if config.cx is None else config.cx
         self.cy = 0.5 * (config.height - 1) if config.cy is None else config.cy
-        # Whole microseconds: six decimals of a second hold them exactly.
-        elapsed_us = np.round(np.arange(config.frames) * (1e6 / config.fps)).astype(np.int64)
+        elapsed_us = frame_times_us(config.frames, config.fps)
         self.timestamps_ns = START_NS + 1000 * elapsed_us
         self._time_s = 1e-6 * elapsed_us
         self.ground_truth = Trajectory(self.timestamps_ns, camera_path(config.path, self._time_s, config.seed))
@@ -173,10 +162,7 @@ class SyntheticDataset:
         """
         index = range(len(self))[index]
         time_s = float(self._time_s[index])
-        key = jax.random.fold_in(self._key, index)
-        taken, right = self._filming.take(time_s, key), None
-        if self.config.baseline_m is not None:
-            right = self._filming.take(time_s, jax.random.fold_in(key, 1), self.config.baseline_m).rgb
+        taken = self._filming.take(time_s, jax.random.fold_in(self._key, index))
         return SyntheticFrame(
             timestamp_ns=int(self.timestamps_ns[index]),
             rgb=taken.rgb,
@@ -185,7 +171,7 @@ class SyntheticDataset:
             instance_mask=np.asarray(taken.exact.owner),
             T_world_cam=self.T_world_cam[index].copy(),
             T_world_actor=self.T_world_actor(np.array([time_s]))[0],
-            right=right,
+            right=taken.right,
         )
 
     def T_world_actor(self, time_s: np.ndarray) -> np.ndarray:
@@ -198,5 +184,4 @@ class SyntheticDataset:
 
     def _gain(self, time_s: float) -> float:
         phases = np.random.default_rng([self.config.seed, 400]).uniform(0.0, 2.0 * np.pi, 2)
-        waves = np.sin(2.0 * np.pi * time_s / np.array([9.0, 5.3]) + phases)
-        return float(1.0 + self.config.sensor.gain_swing * (0.7 * waves[0] + 0.3 * waves[1]))
+        return automatic_gain(time_s, self.config.sensor.gain_swing, phases)

@@ -104,7 +104,7 @@ def furnish(seed: int) -> list[PlacedSolid]:
     return [room, *tables, *_things_on_tables(rng), *_storage(rng), *_posters(rng)]
 
 
-def _printed(look: Material, rng: np.random.Generator) -> Material:
+def printed(look: Material, rng: np.random.Generator) -> Material:
     """The same material printed in colors of its own."""
     dark, bright = rng.uniform(0.02, 0.55, 3), rng.uniform(0.35, 1.0, 3)
     return look._replace(dark=tuple(dark), bright=tuple(bright))
@@ -123,15 +123,15 @@ def _table(y: float, rng: np.random.Generator) -> list[PlacedSolid]:
         PlacedSolid(upright(0.50, y, 1.02, turn), box((0.02, 0.26, 0.17), SCREEN, rng)),
         PlacedSolid(upright(0.52, y, 0.80, turn), box((0.05, 0.07, 0.055), METAL, rng)),
         PlacedSolid(upright(0.22, y + 0.05, 0.757, turn), box((0.07, 0.20, 0.012), KEYS, rng)),
-        PlacedSolid(upright(0.14, y - 0.28, 0.795), pill((0.04, 0.04, 0.01), 0.08, _printed(POSTER, rng), rng)),
+        PlacedSolid(upright(0.14, y - 0.28, 0.795), pill((0.04, 0.04, 0.01), 0.08, printed(POSTER, rng), rng)),
     ]
 
 
 def _things_on_tables(rng: np.random.Generator) -> list[PlacedSolid]:
-    things = [PlacedSolid(upright(0.65, 0.02, 0.875), capsule(0.13, 0.0, _printed(POSTER, rng), rng))]
+    things = [PlacedSolid(upright(0.65, 0.02, 0.875), capsule(0.13, 0.0, printed(POSTER, rng), rng))]
     for y, half_height in ((-0.05, 0.06), (0.10, 0.10), (-0.78, 0.09), (0.78, 0.13)):
         place = upright(0.2 + rng.uniform(-0.05, 0.15), y, 0.745 + half_height, rng.uniform(-40.0, 40.0))
-        things.append(PlacedSolid(place, box((0.10, 0.055, half_height), _printed(CARTON, rng), rng)))
+        things.append(PlacedSolid(place, box((0.10, 0.055, half_height), printed(CARTON, rng), rng)))
     return things
 
 
@@ -156,13 +156,13 @@ def _storage(rng: np.random.Generator) -> list[PlacedSolid]:
     """Cabinets and shelves along the walls, cartons on the low ones and on the floor."""
     things = []
     for x, y, half_x, half_y, height, look in _CABINETS:
-        colors = _printed(look, rng) if look is BOOKS else look
+        colors = printed(look, rng) if look is BOOKS else look
         things.append(PlacedSolid(upright(x, y, height / 2), box((half_x, half_y, height / 2), colors, rng)))
     places = [(x, y, height) for x, y, _, _, height, _ in _LOW_CABINETS]
     for x, y, z in (*places, *((x, y, 0.0) for x, y in _CARTONS_ON_FLOOR)):
         a, b, c = rng.uniform(0.11, 0.19, 3)
         things.append(
-            PlacedSolid(upright(x, y, z + c, rng.uniform(-25.0, 25.0)), box((a, b, c), _printed(CARTON, rng), rng))
+            PlacedSolid(upright(x, y, z + c, rng.uniform(-25.0, 25.0)), box((a, b, c), printed(CARTON, rng), rng))
         )
     return things
 
@@ -182,4 +182,4 @@ _POSTERS = (  # x, y, z, half x, half y, half z
 
 
 def _posters(rng: np.random.Generator) -> list[PlacedSolid]:
-    return [PlacedSolid(upright(x, y, z), box((a, b, c), _printed(POSTER, rng), rng)) for x, y, z, a, b, c in _POSTERS]
+    return [PlacedSolid(upright(x, y, z), box((a, b, c), printed(POSTER, rng), rng)) for x, y, z, a, b, c in _POSTERS]

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, UInt, UInt8
 
 from jaxslam.config.validation import Range, ValidatedConfig
 from jaxslam.datasets.synthetic.shading import unpack_color
+from jaxslam.errors import ConfigError
 from jaxslam.runtime.compile_cache import FUSION_EMITTERS
 from jaxslam.runtime.compiled import compiled
 
@@ -49,6 +50,12 @@ class SensorConfig(ValidatedConfig):
     exposure_samples: Annotated[int, Range(at_least=1, at_most=31)] = 3
     gain_swing: Annotated[float, Range(at_least=0, below=1)] = 0.12
     image_noise: Annotated[float, Range(at_least=0, at_most=100)] = 2.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.exposure_samples % 2 == 0:
+            got = f"{self.exposure_samples}: one moment is the frame's own"
+            raise ConfigError(f"SensorConfig.exposure_samples: expected an odd integer, got {got}")
 
 
 def scaled_sensor(config: SensorConfig, factor: float) -> SensorConfig:

@@ -16,6 +16,20 @@ from jaxslam.datasets.synthetic.sensor_noise import SensorConfig, measure, senso
 from jaxslam.datasets.synthetic.shading import Light
 from jaxslam.sensors.camera import Camera
 
+START_NS = 1_600_000_000_000_000_000
+"""Time of the first frame of every rendered recording."""
+
+
+def frame_times_us(num_frames: int, fps: float) -> np.ndarray:
+    """Return the times of frames since the first, `(n,)` int64 microseconds: six decimals of a second hold them."""
+    return np.round(np.arange(num_frames) * (1e6 / fps)).astype(np.int64)
+
+
+def automatic_gain(time_s: float, swing: float, phases: np.ndarray) -> float:
+    """Return the factor of brightness of an automatic exposure that wanders by `swing`, with two `phases`."""
+    waves = np.sin(2.0 * np.pi * time_s / np.array([9.0, 5.3]) + phases)
+    return float(1.0 + swing * (0.7 * waves[0] + 0.3 * waves[1]))
+
 
 class Stage:
     """Everything that can be seen, packed for rendering.
@@ -51,7 +65,7 @@ class Stage:
         self._static_from_world = rigid.inverse(np.stack([placed.T_world_solid for placed in static]))
 
     def solid_from_cam(self, time_s: np.ndarray, world_from_cam: np.ndarray) -> np.ndarray:
-        """Where the solids are for a camera at `(t,)` times and `(t, 4, 4)` places: `(t, slots, 3, 4)` float32."""
+        """Return transforms to the solids for `(t, 4, 4)` places of a camera at `(t,)` times: `(t, slots, 3, 4)`."""
         from_world = [np.broadcast_to(self._static_from_world, (len(time_s), *self._static_from_world.shape))]
         for actor in self._actors:
             root = rigid.matrix_from_pose(actor.root(time_s))
@@ -69,11 +83,13 @@ class TakenPicture(NamedTuple):
         exact: Depth, owners and color of the middle of the exposure.
         rgb: `(height, width, 3)` uint8.
         depth_m: `(height, width)` float32, 0 where missing.
+        right: `(height, width, 3)` uint8 of the right camera of a pair; `None` without one.
     """
 
     exact: Rendering
     rgb: np.ndarray
     depth_m: np.ndarray
+    right: np.ndarray | None = None
 
 
 class VirtualCamera:
@@ -99,14 +115,19 @@ class VirtualCamera:
         self._stage, self._camera, self._sensor = stage, camera, sensor
         self._pose_at, self._gain_at = pose_at, gain_at
 
-    def take(self, time_s: float, key: jax.Array, to_the_right_m: float = 0.0) -> TakenPicture:
-        """Take a picture.
+    def take(self, time_s: float, key: jax.Array) -> TakenPicture:
+        """Take a picture, or both of a pair.
 
         Args:
             time_s: Middle of the exposure, seconds since the start.
             key: Random key of the noise.
-            to_the_right_m: How far to the right of the camera's place the picture is taken.
         """
+        left, baseline_m = self._take(time_s, key, 0.0), self._camera.baseline_m
+        if baseline_m is None:
+            return left
+        return left._replace(right=self._take(time_s, jax.random.fold_in(key, 1), baseline_m).rgb)
+
+    def _take(self, time_s: float, key: jax.Array, to_the_right_m: float) -> TakenPicture:
         moments = self._expose(time_s, to_the_right_m)
         own = moments[len(moments) // 2]
         colors, sensor = tuple(moment.color for moment in moments), sensor_params(self._sensor)
