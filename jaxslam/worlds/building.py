@@ -1,27 +1,29 @@
 """What a world is built of: solids that stand still, and actors that do not."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from jaxslam.datasets.synthetic.actors import GroundMotion, Person, Walk
 from jaxslam.datasets.synthetic.homogeneous import transform
 from jaxslam.datasets.synthetic.primitives import PlacedSolid, Solid, box, pill, scaled_solid, upright
+from jaxslam.datasets.synthetic.render import BACKDROP
 from jaxslam.datasets.synthetic.room import printed
+from jaxslam.datasets.synthetic.seated_people import SeatedBody
 from jaxslam.datasets.synthetic.shading import Light
 from jaxslam.datasets.synthetic.texture import Material
 from jaxslam.geometry.so3 import axis_rotation, matrices, multiply
 from jaxslam.worlds import description
-from jaxslam.worlds.description import Kind, Lighting, Look, Opening, Part, Room, Side, Thing, World
+from jaxslam.worlds.description import Hand, Kind, Lighting, Look, Opening, Part, Room, Side, Thing, World, focal_px
+from jaxslam.worlds.hand_actor import HandActor
 from jaxslam.worlds.motion import RouteWalk
+from jaxslam.worlds.roads import RoadLooks, road_solids
 
-BACKDROP_NUMBER = -1
-"""Number of the backdrop in masks of instances."""
-_BACKDROP_M = 30.0
-"""Distance of the backdrop from everything that the description places."""
+_GROUND_M = 0.25
+"""Half the thickness of the ground."""
 _OUT_OF_SIGHT_M = 1e4
 _CARRIED_M = (0.36, 0.0, 0.95)
 """Where a carried thing is, in the axes of the person."""
@@ -40,6 +42,7 @@ class Instance(NamedTuple):
         turn: Its direction against that of the motion, in radians.
         from_s: Time at which it appears.
         until_s: Time at which it is gone.
+        rests: Whether it never moves from its place.
     """
 
     label: str
@@ -49,6 +52,7 @@ class Instance(NamedTuple):
     turn: float
     from_s: float
     until_s: float
+    rests: bool = False
 
     def is_there(self, time_s: np.ndarray) -> np.ndarray:
         """Tell at which of `(t,)` times it is there."""
@@ -65,6 +69,31 @@ class Instance(NamedTuple):
         return np.concatenate([axis_rotation(2, heading + self.turn), position, height], axis=1)
 
 
+class HandInstance(Instance):
+    """A hand before the lens: its origin is that of the camera, and it moves as long as it is there."""
+
+    pose_at: Callable[[np.ndarray], np.ndarray]
+
+    @classmethod
+    def of(cls, hand: Hand, pose_at: Callable[[np.ndarray], np.ndarray]) -> "HandInstance":
+        """Return the instance of a hand, with poses of the camera."""
+
+        def walk(time_s: np.ndarray) -> GroundMotion:
+            return GroundMotion(pose_at(time_s)[:, 4:6], np.zeros(len(time_s)), np.zeros(len(time_s)))
+
+        instance = cls("person", True, walk, 0.0, 0.0, hand.from_s, hand.until_s)
+        instance.pose_at = pose_at
+        return instance
+
+    def is_moving(self, time_s: np.ndarray) -> np.ndarray:
+        """Tell at which of `(t,)` times it is there."""
+        return self.is_there(time_s)
+
+    def poses(self, time_s: np.ndarray) -> np.ndarray:
+        """Poses of the camera at `(t,)` times: `(t, 7)`, wxyz_xyz."""
+        return self.pose_at(time_s)
+
+
 class Built(NamedTuple):
     """A world as the renderer takes it.
 
@@ -74,15 +103,15 @@ class Built(NamedTuple):
         actors: What moves, or is there for some time only.
         actor_numbers: Number of each of them.
         instances: Things and people; number `k` is `instances[k - 1]`.
-        light: The light.
+        lights: The light at the beginning, and each later one.
     """
 
     static: list[PlacedSolid]
     static_numbers: list[int]
-    actors: "list[InstanceActor]"
+    actors: "list[InstanceActor | HandActor]"
     actor_numbers: list[int]
     instances: list[Instance]
-    light: Light
+    lights: list[Light]
 
 
 class InstanceActor:
@@ -123,12 +152,15 @@ class _Placed(NamedTuple):
 class _WalkingParts(NamedTuple):
     """The solids of a person, and then those of the thing that the person carries."""
 
-    person: Person
+    person: "_Body"
     carried: np.ndarray
 
     def parts(self, time_s: np.ndarray) -> np.ndarray:
         held = np.broadcast_to(self.carried, (len(time_s), *self.carried.shape))
         return np.concatenate([self.person.parts(time_s), held], axis=1)
+
+
+_Body: TypeAlias = Person | SeatedBody
 
 
 class _Standing:
@@ -142,14 +174,17 @@ class _Standing:
         return GroundMotion(np.broadcast_to(self._at, (n, 2)), np.full(n, self._heading), np.zeros(n))
 
 
-def build(world: World) -> Built:
-    """Build a world, with the catalog's looks and kinds in it.
+def build(world: World, pose_at: Callable[[np.ndarray], np.ndarray]) -> Built:
+    """Build a world that is expanded, with the catalog's looks and kinds in it.
 
     Args:
         world: The world; every name in it is known.
+        pose_at: `(t, 7)` poses `T_world_cam` of its camera, wxyz_xyz, at `(t,)` seconds; its `scale` is in them.
     """
     looks = {name: _Finish(look) for name, look in world.looks.items()}
-    built = Built([_backdrop(world, looks)], [BACKDROP_NUMBER], [], [], [], _light(world.lighting))
+    lights = [_light(lighting) for lighting in (world.lighting, *(change.light for change in world.light_changes))]
+    built = Built([_backdrop(world, looks)], [BACKDROP], [], [], [], lights)
+    _add_ground(built, world, looks)
     for index, room in enumerate(world.rooms):
         solids = _room(room, looks, np.random.default_rng([world.seed, 701, index]))
         built.static.extend(solids)
@@ -159,7 +194,14 @@ def build(world: World) -> Built:
     for index, person in enumerate(world.people):
         carried = None if person.carries is None else world.kinds[person.carries]
         _add_person(built, person, carried, looks, np.random.default_rng([world.seed, 703, index]))
-    return built if world.scale == 1.0 else _scaled(built, world.scale)
+    built = built if world.scale == 1.0 else _scaled(built, world.scale)
+    for index, hand in enumerate(world.hands):
+        rng = np.random.default_rng([world.seed, 707, index])
+        tan = world.camera.height / focal_px(world.camera)
+        built.instances.append(HandInstance.of(hand, pose_at))
+        built.actors.append(HandActor(hand, pose_at, tan, rng, world.scale))
+        built.actor_numbers.append(len(built.instances))
+    return built
 
 
 def _scaled(built: Built, factor: float) -> Built:
@@ -168,15 +210,19 @@ def _scaled(built: Built, factor: float) -> Built:
         each._replace(walk=partial(_scaled_walk, each.walk, factor), height_m=factor * each.height_m)
         for each in built.instances
     ]
-    actors = [
+    actors: list[InstanceActor | HandActor] = [
         actor.scaled(instances[number - 1], factor)
         for number, actor in zip(built.actor_numbers, built.actors, strict=True)
+        if isinstance(actor, InstanceActor)
     ]
-    light = built.light._replace(
-        lamp_m=np.float32(factor) * built.light.lamp_m, fading_per_m2=built.light.fading_per_m2 / np.float32(factor**2)
-    )
+    lights = [
+        light._replace(
+            lamp_m=np.float32(factor) * light.lamp_m, fading_per_m2=light.fading_per_m2 / np.float32(factor**2)
+        )
+        for light in built.lights
+    ]
     static = [PlacedSolid(_scaled_place(place, factor), scaled_solid(solid, factor)) for place, solid in built.static]
-    return built._replace(static=static, actors=actors, instances=instances, light=light)
+    return built._replace(static=static, actors=actors, instances=instances, lights=lights)
 
 
 def _scaled_place(T_world_solid: np.ndarray, factor: float) -> np.ndarray:
@@ -215,6 +261,7 @@ def _add_thing(built: Built, thing: Thing, kind: Kind, looks: _Finishes, rng: np
         turn=0.0 if route is None else float(np.deg2rad(thing.turn_deg)),
         from_s=thing.from_s,
         until_s=np.inf if thing.until_s is None else thing.until_s,
+        rests=route is None,
     )
     built.instances.append(instance)
     number = len(built.instances)
@@ -231,7 +278,10 @@ def _add_person(
     built: Built, person: description.Person, carried: Kind | None, looks: _Finishes, rng: np.random.Generator
 ) -> None:
     walk: Walk = _Standing(person.at_m, person.turn_deg) if person.route is None else RouteWalk(person.route)
-    body = Person(walk, float(rng.uniform(0.0, 2.0 * np.pi)), rng)
+    if person.sits:
+        body: _Body = SeatedBody(rng)
+    else:
+        body = Person(walk, float(rng.uniform(0.0, 2.0 * np.pi)), rng)
     until_s = np.inf if person.until_s is None else person.until_s
     instance = Instance("person", True, walk, 0.0, 0.0, person.from_s, until_s)
     solids, held = list(body.solids), np.zeros((0, 4, 4))
@@ -268,18 +318,41 @@ def _turned(turn_deg: Sequence[float]) -> np.ndarray:
     return multiply(z, multiply(y, x))
 
 
+def _add_ground(built: Built, world: World, looks: _Finishes) -> None:
+    """Add the ground and the roads on it."""
+    solids = []
+    rng = np.random.default_rng([world.seed, 706])
+    if world.ground is not None:
+        low, high = _extent(world)
+        half, (x, y, _) = 0.5 * (high - low), 0.5 * (low + high)
+        material = looks[world.ground].material(rng)
+        slab = box((float(half[0]), float(half[1]), _GROUND_M), material, rng)
+        solids.append(PlacedSolid(upright(float(x), float(y), -_GROUND_M), slab))
+    for road in world.roads.values():
+        materials = RoadLooks(*(looks[name].material(rng) for name in (road.surface, road.paving, road.line)))
+        solids += road_solids(road, materials, rng)
+    built.static.extend(solids)
+    built.static_numbers.extend([0] * len(solids))
+
+
 def _backdrop(world: World, looks: _Finishes) -> PlacedSolid:
     """A box around everything, seen from inside."""
+    low, high = _extent(world)
+    rng = np.random.default_rng([world.seed, 700])
+    half_x, half_y, half_z = 0.5 * (high - low)
+    shell = box((float(half_x), float(half_y), float(half_z)), looks[world.backdrop].material(rng), rng)
+    return PlacedSolid(upright(*(0.5 * (low + high))), shell)
+
+
+def _extent(world: World) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest coordinates of a world, its backdrop included."""
     points = [np.array([*point[:2], 0.0]) for route in _routes(world) for point in route]
     points += [np.array(point) for point in world.way.points_m or (world.way.at_m,)]
     for room in world.rooms:
         half = 0.5 * np.array(room.size_m)
         points += [np.array([*room.at_m, 0.0]) - half, np.array([*room.at_m, 0.0]) + 2.0 * half]
-    low, high = np.min(points, axis=0) - _BACKDROP_M, np.max(points, axis=0) + _BACKDROP_M
-    rng = np.random.default_rng([world.seed, 700])
-    half_x, half_y, half_z = 0.5 * (high - low)
-    shell = box((float(half_x), float(half_y), float(half_z)), looks[world.backdrop].material(rng), rng)
-    return PlacedSolid(upright(*(0.5 * (low + high))), shell)
+    points += [np.array([*point, 0.0]) for road in world.roads.values() for point in road.points_m]
+    return np.min(points, axis=0) - world.backdrop_m, np.max(points, axis=0) + world.backdrop_m
 
 
 def _routes(world: World) -> list[Sequence[Sequence[float]]]:

@@ -58,6 +58,7 @@ class PointWay:
         position = self._smooth.position(within_s)
         if self._way.look == "ahead":
             swing = np.deg2rad(self._way.swing_deg) * np.sin(2.0 * np.pi * within_s / _SWING_PERIOD_S)
+            swing += np.pi if self._way.backward else 0.0
             down = np.full(len(time_s), np.deg2rad(self._way.down_deg))
             angles = np.stack([self._smooth.heading(within_s) + swing, down, np.zeros(len(time_s))], axis=1)
         else:

@@ -21,6 +21,9 @@ Point: TypeAlias = tuple[float, float, float]
 Side: TypeAlias = Literal["north", "south", "east", "west"]
 """Walls of a room: north is towards +y, east towards +x."""
 
+Ends: TypeAlias = Literal["back", "reverse", "loop", "stop"]
+"""What happens at the last point of a way."""
+
 
 @dataclass(frozen=True)
 class Look(ValidatedConfig):
@@ -108,24 +111,35 @@ class Route(ValidatedConfig):
     """A way on the floor, at a constant speed but at corners and ends, which are rounded.
 
     Attributes:
-        points_m: Points `(x, y)` on the floor; at least two.
+        points_m: Points `(x, y)` on the floor; at least two, or none with `along`.
         speed_m_per_s: Speed along the way.
-        ends: At the last point: `back` to the first one and on, round in a `loop` to the first one and on, or `stop`.
+        ends: At the last point: `back` to the first one and on, `reverse` to it without turning, round in a `loop` to
+            the first one and on, or `stop`.
         pause_s: Time of rest at the first and the last point; with `loop`, at the first one.
         delay_s: Time at the first point before it begins; what has no `stop` is so far behind on its way instead.
         backward: Whether it goes backward, as a car that reverses.
+        along: Name of the road it goes along; `None` for a way through points.
+        beside_m: Distance from the middle of the road, positive on its left side; or pairs of a distance along the
+            road and one from its middle, with straight lines between them, for a change of lanes.
+        from_m: Distance along the road at which it begins.
+        until_m: Distance along the road at which it ends; `None` for the end of the road. With less than `from_m` it
+            goes against the direction of the road.
     """
 
-    points_m: tuple[Plan, ...]
+    points_m: tuple[Plan, ...] = ()
     speed_m_per_s: Annotated[float, Range(above=0, at_most=100)] = 1.0
-    ends: Literal["back", "loop", "stop"] = "back"
+    ends: Ends = "back"
     pause_s: Annotated[float, Range(at_least=0)] = 0.0
     delay_s: Annotated[float, Range(at_least=0)] = 0.0
     backward: bool = False
+    along: str | None = None
+    beside_m: float | tuple[Plan, ...] = 0.0
+    from_m: Annotated[float, Range(at_least=0)] = 0.0
+    until_m: Annotated[float, Range(at_least=0)] | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check_points("Route.points_m", self.points_m)
+        _check_way("Route", self.points_m, self.along, "along")
 
 
 @dataclass(frozen=True)
@@ -157,12 +171,13 @@ class Thing(ValidatedConfig):
 
 @dataclass(frozen=True)
 class Person(ValidatedConfig):
-    """A person who walks a route, or stands.
+    """A person who walks a route, stands or sits.
 
     Attributes:
-        at_m: `(x, y)` of one who stands.
-        turn_deg: Direction that one who stands faces.
-        route: The way of one who walks; `None` for one who stands.
+        at_m: `(x, y)` of one who stands or sits.
+        turn_deg: Direction that one who stands or sits faces.
+        route: The way of one who walks; `None` for one who does not.
+        sits: Whether the person sits, at the height of a chair, sways, looks about and raises an arm now and then.
         carries: Name of the kind of thing that the person carries before the chest; `None` for nothing.
         from_s: Time at which the person appears.
         until_s: Time at which the person is gone; `None` for never.
@@ -171,6 +186,7 @@ class Person(ValidatedConfig):
     at_m: Plan = (0.0, 0.0)
     turn_deg: float = 0.0
     route: Route | None = None
+    sits: bool = False
     carries: str | None = None
     from_s: Annotated[float, Range(at_least=0)] = 0.0
     until_s: Annotated[float, Positive] | None = None
@@ -178,6 +194,58 @@ class Person(ValidatedConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         _check_span("Person", self.from_s, self.until_s)
+        if self.sits and (self.route is not None or self.carries is not None):
+            raise ConfigError("Person.sits: expected one who neither walks nor carries, got a route or carries")
+
+
+@dataclass(frozen=True)
+class Group(ValidatedConfig):
+    """People who come from all sides, stand together facing each other, and part again.
+
+    Attributes:
+        people: Number of people.
+        at_m: `(x, y)` of the middle of the place where they stand.
+        radius_m: Distance from the middle at which they stand.
+        come_from_m: Distance from the middle at which they begin and to which they go.
+        meet_s: Time at which the first one arrives; the others follow within three seconds.
+        stay_s: Time for which each of them stands there, then goes back and comes again after as long.
+        speed_m_per_s: Speed at which they walk.
+    """
+
+    people: Annotated[int, Range(at_least=1, at_most=40)]
+    at_m: Plan = (0.0, 0.0)
+    radius_m: Length = 0.9
+    come_from_m: Length = 3.0
+    meet_s: Annotated[float, Range(at_least=0)] = 5.0
+    stay_s: Annotated[float, Range(at_least=0)] = 6.0
+    speed_m_per_s: Annotated[float, Range(above=0, at_most=5)] = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.come_from_m <= self.radius_m:
+            got = f"{self.come_from_m:g}"
+            raise ConfigError(f"Group.come_from_m: expected more than radius_m, {self.radius_m:g}, got {got}")
+
+
+@dataclass(frozen=True)
+class Hand(ValidatedConfig):
+    """A hand that comes before the lens from below, stays and goes.
+
+    Attributes:
+        from_s: Time at which it begins to come.
+        until_s: Time at which it is gone.
+        before_m: Distance from the camera.
+        covers: Share of the height of the picture that it reaches up to.
+    """
+
+    from_s: Annotated[float, Range(at_least=0)]
+    until_s: Annotated[float, Positive]
+    before_m: Annotated[float, Range(at_least=0.1, at_most=1)] = 0.2
+    covers: Annotated[float, Range(above=0, at_most=1)] = 0.7
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_span("Hand", self.from_s, self.until_s)
 
 
 @dataclass(frozen=True)
@@ -226,6 +294,90 @@ class Room(ValidatedConfig):
 
 
 @dataclass(frozen=True)
+class Row(ValidatedConfig):
+    """Things in a row beside a road.
+
+    Attributes:
+        kinds: Names of kinds; the seed chooses among them.
+        every_m: Distance along the road from one place to the next.
+        beside_m: Distance from the middle of the road.
+        side: Side of the road.
+        share: Probability that something stands in a place.
+        vary_m: Largest shift from the place, along the road and across it.
+        turn_deg: Direction that they face; 0 faces the road, and -90 is that of traffic on the right.
+        vary_deg: Largest turn from there.
+        scale: Smallest and largest factor of their size.
+        from_m: Distance along the road at which the row begins.
+        until_m: Distance along the road at which it ends; `None` for the end of the road.
+    """
+
+    kinds: tuple[str, ...]
+    every_m: Length
+    beside_m: Annotated[float, Range(at_least=0)]
+    side: Literal["left", "right", "both"] = "both"
+    share: Annotated[float, Share] = 1.0
+    vary_m: Plan = (0.0, 0.0)
+    turn_deg: float = 0.0
+    vary_deg: Annotated[float, Range(at_least=0)] = 0.0
+    scale: tuple[Length, Length] = (1.0, 1.0)
+    from_m: Annotated[float, Range(at_least=0)] = 0.0
+    until_m: Annotated[float, Positive] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.kinds:
+            raise ConfigError("Row.kinds: expected at least one kind, got none")
+
+
+@dataclass(frozen=True)
+class Road(ValidatedConfig):
+    """A road on the ground with a dashed line, curbs, sidewalks and what stands beside them.
+
+    Attributes:
+        points_m: Points `(x, y)` of its middle; corners become arcs.
+        closed: Whether it goes round to the first point; it begins where the arc of the first corner does.
+        corner_m: Radius of its middle at corners, less where the points are closer.
+        width_m: Distance from curb to curb; 0 for a line on which nothing is but its rows.
+        sidewalk_m: Width of the sidewalks; 0 for none.
+        curb_m: Height of curbs and sidewalks above the road.
+        surface: Name of the look of the road.
+        paving: Name of the look of sidewalks and curbs.
+        line: Name of the look of the dashed line.
+        rows: What stands beside it.
+    """
+
+    points_m: tuple[Plan, ...]
+    closed: bool = False
+    corner_m: Annotated[float, Range(at_least=0)] = 20.0
+    width_m: Annotated[float, Range(at_least=0)] = 7.0
+    sidewalk_m: Annotated[float, Range(at_least=0)] = 2.0
+    curb_m: Annotated[float, Range(at_least=0)] = 0.13
+    surface: str = "asphalt"
+    paving: str = "concrete"
+    line: str = "road paint"
+    rows: tuple[Row, ...] = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_points("Road.points_m", self.points_m)
+
+
+@dataclass(frozen=True)
+class Place(ValidatedConfig):
+    """Another world that is part of this one: its rooms, roads, things and people.
+
+    Attributes:
+        world: Name of the world, or a YAML file beside this one.
+        at_m: Where its origin is.
+        turn_deg: Its turn: 0, 90, 180 or 270.
+    """
+
+    world: str
+    at_m: Plan = (0.0, 0.0)
+    turn_deg: Literal[0, 90, 180, 270] = 0
+
+
+@dataclass(frozen=True)
 class Lighting(ValidatedConfig):
     """Light from one direction, and from everywhere.
 
@@ -235,6 +387,8 @@ class Lighting(ValidatedConfig):
         ambient: Share of the light that comes from everywhere.
         lamp_m: Place of a lamp around which all light fades; `None` for light that is the same everywhere.
         reach_m: Distance from the lamp at which half of the light is left.
+        flicker: Share by which all light is now less, now more than on average.
+        flicker_hz: Frequency of that: 100 or 120 for lamps on mains power.
     """
 
     from_m: Point = (-0.45, 0.30, 0.84)
@@ -242,11 +396,28 @@ class Lighting(ValidatedConfig):
     ambient: Annotated[float, Share] = 0.5
     lamp_m: Point | None = None
     reach_m: Length = 4.2
+    flicker: Annotated[float, Share] = 0.0
+    flicker_hz: Annotated[float, Range(above=0, at_most=1000)] = 100.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not any(self.from_m):
             raise ConfigError(f"Lighting.from_m: expected a direction, got {self.from_m}")
+
+
+@dataclass(frozen=True)
+class LightChange(ValidatedConfig):
+    """Another light from a time on.
+
+    Attributes:
+        at_s: The time.
+        light: The light from then on.
+        over_s: Time in which one light fades into the other.
+    """
+
+    at_s: Annotated[float, Range(at_least=0)]
+    light: Lighting
+    over_s: Annotated[float, Range(at_least=0)] = 0.0
 
 
 @dataclass(frozen=True)
@@ -289,20 +460,27 @@ class Way(ValidatedConfig):
     """The way of the camera: through points, held by a hand, or that of a trajectory in a file.
 
     Attributes:
-        points_m: Points `(x, y, z)` it passes; at least two, or none with a `file`.
+        points_m: Points `(x, y, z)` it passes; at least two, or none with a `file` or `along`.
         file: File of a trajectory of the camera in the layout of TUM RGB-D, KITTI or EuRoC, z up; splines go through
             its poses. Of the other fields only `at_m`, `turn_deg`, `from_s` and `tremor` count then.
         at_m: Place of the trajectory's origin in the world.
         turn_deg: Turn of the trajectory about the vertical.
         from_s: Time on the way, or in the trajectory, at which the recording begins.
         speed_m_per_s: Speed along the way.
-        ends: At the last point: `back` to the first one and on, round in a `loop`, or `stop`.
+        ends: At the last point: `back` to the first one and on, `reverse` to it without turning, round in a `loop`, or
+            `stop`.
         pause_s: Time of rest at the first and the last point.
         look: `ahead` along the way, or the point `(x, y, z)` it looks at.
         turn_s: Time over which it turns at a corner, looking ahead.
         down_deg: Angle by which it looks down from ahead.
         swing_deg: Amplitude by which it looks left and right from ahead, with a period of eight seconds.
         tremor: Factor of the tremor of the hand: 1 for 2 mm and 0.15 degrees; 0 for none.
+        backward: Whether it looks back along the way, as from a car that reverses.
+        along: Name of the road it goes along; `None` for a way through points.
+        beside_m: See `Route`.
+        from_m: See `Route`.
+        until_m: See `Route`.
+        height_m: Height above the road.
     """
 
     points_m: tuple[Point, ...] = ()
@@ -311,20 +489,25 @@ class Way(ValidatedConfig):
     turn_deg: float = 0.0
     from_s: Annotated[float, Range(at_least=0)] = 0.0
     speed_m_per_s: Annotated[float, Range(above=0, at_most=100)] = 0.5
-    ends: Literal["back", "loop", "stop"] = "back"
+    ends: Ends = "back"
     pause_s: Annotated[float, Range(at_least=0)] = 0.0
     look: Literal["ahead"] | Point = "ahead"
     turn_s: Length = 2.4
     down_deg: Annotated[float, Range(at_least=-90, at_most=90)] = 8.0
     swing_deg: Annotated[float, Range(at_least=0, at_most=180)] = 0.0
     tremor: Annotated[float, Range(at_least=0)] = 1.0
+    backward: bool = False
+    along: str | None = None
+    beside_m: float | tuple[Plan, ...] = 0.0
+    from_m: Annotated[float, Range(at_least=0)] = 0.0
+    until_m: Annotated[float, Range(at_least=0)] | None = None
+    height_m: Length = 1.65
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.file is None:
-            _check_points("Way.points_m", self.points_m)
-        elif self.points_m:
-            raise ConfigError("Way: expected points_m or a file, got both")
+        if self.file is not None and self.along is not None:
+            raise ConfigError("Way: expected points_m, a file or along, got a file and along")
+        _check_way("Way", self.points_m, self.file or self.along, "a file" if self.file else "along")
 
 
 @dataclass(frozen=True)
@@ -337,7 +520,10 @@ class WorldCamera(ValidatedConfig):
         fps: Frames a second.
         fx: Focal length in pixels, along rows and columns; `None` for `525 * width / 640`.
         baseline_m: Baseline of a rectified stereo pair; `None` for a camera that measures depth.
-        sensor: Its faults.
+        rolling_shutter_s: Time from the exposure of the first row to that of the last; 0 if all are taken at once.
+        gamma: Exponent by which brightness is `brightness ** (1 / gamma)`; 1 for pictures as bright as the light.
+        vignetting: Share of the light that is missing in the corners of the picture.
+        sensor: Its other faults.
     """
 
     width: Annotated[int, Range(at_least=8, at_most=8192)] = 640
@@ -345,7 +531,15 @@ class WorldCamera(ValidatedConfig):
     fps: Annotated[float, Range(above=0, at_most=1000)] = 30.0
     fx: Length | None = None
     baseline_m: Annotated[float, Range(above=0, at_most=10)] | None = None
+    rolling_shutter_s: Annotated[float, Range(at_least=0, at_most=1)] = 0.0
+    gamma: Annotated[float, Range(above=0, at_most=5)] = 1.0
+    vignetting: Annotated[float, Range(at_least=0, below=1)] = 0.0
     sensor: SensorConfig = field(default_factory=SensorConfig)
+
+
+def focal_px(camera: WorldCamera) -> float:
+    """Return the focal length of a camera in pixels."""
+    return 525.0 * camera.width / 640.0 if camera.fx is None else camera.fx
 
 
 @dataclass(frozen=True)
@@ -357,13 +551,20 @@ class World(ValidatedConfig):
         seconds: Length of the recording.
         way: The way of the camera.
         seed: Chooses textures, clothes, pictures, tremor and noise.
+        places: Other worlds that are part of this one.
         rooms: The rooms.
+        roads: Roads by name.
+        ground: Name of the look of flat ground everywhere, at height 0; `None` for none.
         things: Things that stand or move.
         people: People.
+        groups: People who meet.
+        hands: Hands before the lens.
         kinds: Kinds of things beside those of the catalog, by name.
         looks: Looks beside those of the catalog, by name.
         backdrop: Name of the look of what lies behind everything: the sky, or the dark behind an open door.
-        lighting: The light.
+        backdrop_m: Distance of the backdrop from everything else.
+        lighting: The light at the beginning.
+        light_changes: Other light later, in the order of time.
         exposure: Changes of the brightness of the pictures, in the order of time.
         faults: Times in which the camera does not deliver.
         camera: The camera.
@@ -375,13 +576,20 @@ class World(ValidatedConfig):
     seconds: Annotated[float, Range(above=0, at_most=86400)]
     way: Way
     seed: Annotated[int, Range(at_least=0, below=2**31)] = 0
+    places: tuple[Place, ...] = ()
     rooms: tuple[Room, ...] = ()
+    roads: Mapping[str, Road] = field(default_factory=dict)
+    ground: str | None = None
     things: tuple[Thing, ...] = ()
     people: tuple[Person, ...] = ()
+    groups: tuple[Group, ...] = ()
+    hands: tuple[Hand, ...] = ()
     kinds: Mapping[str, Kind] = field(default_factory=dict)
     looks: Mapping[str, Look] = field(default_factory=dict)
     backdrop: str = "dusk"
+    backdrop_m: Length = 30.0
     lighting: Lighting = field(default_factory=Lighting)
+    light_changes: tuple[LightChange, ...] = ()
     exposure: tuple[Exposure, ...] = ()
     faults: tuple[Fault, ...] = ()
     camera: WorldCamera = field(default_factory=WorldCamera)
@@ -389,9 +597,10 @@ class World(ValidatedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        times = [change.at_s for change in self.exposure]
-        if times != sorted(times):
-            raise ConfigError(f"World.exposure: expected times in order, got {times}")
+        for name, changes in (("exposure", self.exposure), ("light_changes", self.light_changes)):
+            times = [change.at_s for change in changes]
+            if times != sorted(times):
+                raise ConfigError(f"World.{name}: expected times in order, got {times}")
 
 
 @dataclass(frozen=True)
@@ -410,6 +619,18 @@ class Catalog(ValidatedConfig):
 def _check_span(of: str, from_s: float, until_s: float | None) -> None:
     if until_s is not None and until_s <= from_s:
         raise ConfigError(f"{of}.until_s: expected more than from_s, {from_s}, got {until_s}")
+
+
+def _check_way(of: str, points: tuple[tuple[float, ...], ...], other: str | None, name: str) -> None:
+    """Refuse a way with neither points nor something else that tells it, or with both.
+
+    Raises:
+        ConfigError: If it is one.
+    """
+    if other is None:
+        _check_points(f"{of}.points_m", points)
+    elif points:
+        raise ConfigError(f"{of}: expected points_m or {name}, got both")
 
 
 def _check_points(name: str, points: tuple[tuple[float, ...], ...]) -> None:

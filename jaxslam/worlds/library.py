@@ -1,15 +1,19 @@
 """The worlds that come with jaxslam, and those in files of the user."""
 
 import functools
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 from jaxslam.config.loading import configs_dir
 from jaxslam.config.validation import from_mapping
 from jaxslam.errors import ConfigError, nearest
 from jaxslam.io.yaml_files import read_mapping
 from jaxslam.worlds.description import Catalog, World
+from jaxslam.worlds.expansion import placed
+
+_Named = TypeVar("_Named")
 
 
 def worlds() -> list[str]:
@@ -36,8 +40,57 @@ def load_world(name: str | Path) -> World:
     world = from_mapping(World, read_mapping(path, ConfigError), str(path))
     with_catalog(world, str(path))
     way = world.way
-    # A file beside the description, wherever that is read from.
-    return world if way.file is None else replace(world, way=replace(way, file=str(path.parent / way.file)))
+    # Files beside the description, wherever that is read from.
+    places = tuple(replace(each, world=_beside(each.world, path.parent)) for each in world.places)
+    return replace(
+        world,
+        places=places,
+        way=way if way.file is None else replace(way, file=str(path.parent / way.file)),
+    )
+
+
+def _beside(name: str, folder: Path) -> str:
+    """The name of a world, or a YAML file in a folder."""
+    return str(folder / name) if Path(name).suffix in {".yaml", ".yml"} else name
+
+
+def with_places(world: World, within: tuple[str, ...] = ()) -> World:
+    """The world with all that other worlds in it hold: their rooms, roads, things, people, kinds and looks.
+
+    Args:
+        world: The world.
+        within: Names of the worlds that this one is part of.
+
+    Raises:
+        ConfigError: If there is no such world, it holds itself, or two of them have roads, kinds or looks of the same
+            name that differ.
+    """
+    whole = world
+    for each in world.places:
+        if each.world in within:
+            raise ConfigError(f"places: world: expected one that is not part of itself, got '{each.world}'")
+        part = placed(with_places(load_world(each.world), (*within, each.world)), each)
+        whole = replace(
+            whole,
+            rooms=(*whole.rooms, *part.rooms),
+            things=(*whole.things, *part.things),
+            people=(*whole.people, *part.people),
+            groups=(*whole.groups, *part.groups),
+            roads=_joined("roads", whole.roads, part.roads, each.world),
+            kinds=_joined("kinds", whole.kinds, part.kinds, each.world),
+            looks=_joined("looks", whole.looks, part.looks, each.world),
+        )
+    return replace(whole, places=())
+
+
+def _joined(field: str, ours: Mapping[str, _Named], theirs: Mapping[str, _Named], world: str) -> dict[str, _Named]:
+    """Entries by name of a world and of one that is part of it."""
+    unlike = [name for name, entry in theirs.items() if ours.get(name, entry) != entry]
+    if unlike:
+        raise ConfigError(
+            f"places: {world}: {field}: expected other names or the same entries, got another {unlike[0]}"
+        )
+    return {**ours, **theirs}
 
 
 def with_catalog(world: World, place: str = "world") -> World:
@@ -76,6 +129,14 @@ def _check_names(full: World, place: str) -> None:
         for field in ("floor", "walls", "ceiling"):
             _check_name(getattr(room, field), full.looks, f"{place}: rooms[{index}]: {field}")
     _check_name(full.backdrop, full.looks, f"{place}: backdrop")
+    if full.ground is not None:
+        _check_name(full.ground, full.looks, f"{place}: ground")
+    for name, road in full.roads.items():
+        for field in ("surface", "paving", "line"):
+            _check_name(getattr(road, field), full.looks, f"{place}: roads: {name}: {field}")
+        for index, row in enumerate(road.rows):
+            for kind in row.kinds:
+                _check_name(kind, full.kinds, f"{place}: roads: {name}: rows[{index}]: kinds")
     for index, thing in enumerate(full.things):
         _check_name(thing.kind, full.kinds, f"{place}: things[{index}]: kind")
     for index, person in enumerate(full.people):

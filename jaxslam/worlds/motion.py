@@ -5,21 +5,18 @@ or turns at once; a cubic spline through the samples has continuous acceleration
 """
 
 from collections.abc import Sequence
-from typing import Literal, TypeAlias
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
 from jaxslam.datasets.synthetic.actors import GroundMotion
-from jaxslam.worlds.description import Route
+from jaxslam.worlds.description import Ends, Route
 
 _STEP_S = 0.05
-_SMOOTH_S = 0.6
-"""Width of each of the two averages of positions over time."""
+_SMOOTH_S, _SMOOTH_M = 0.6, 6.0
+"""Width of each of the two averages of positions over time, and how far something goes in it at most."""
 _SLOW_M_PER_S = 0.02
 """Below this speed a direction of motion says nothing."""
-
-Ends: TypeAlias = Literal["back", "loop", "stop"]
 
 
 class SmoothWay:
@@ -42,19 +39,25 @@ class SmoothWay:
         Args:
             points_m: Points it passes, `(k, d)`.
             speed_m_per_s: Speed along it.
-            ends: At the last point: `back` to the first one and on, round in a `loop`, or `stop`.
+            ends: See `description.Ends`.
             pause_s: Time of rest at the first and the last point; with `loop`, at the first one.
             turn_s: Width of each of the two averages of directions over time.
         """
+        smooth_s = min(_SMOOTH_S, _SMOOTH_M / speed_m_per_s)
         times, places = _timetable(np.asarray(points_m, np.float64), speed_m_per_s, ends, pause_s)
         self.seconds, self._repeats = float(times[-1]), ends != "stop"
-        margin_s = 0.0 if self._repeats else 2.0 * max(_SMOOTH_S, turn_s)
+        margin_s = 0.0 if self._repeats else 2.0 * max(smooth_s, turn_s)
         num_steps = max(int(np.ceil((self.seconds + 2.0 * margin_s) / _STEP_S)), 8)
         samples = np.linspace(-margin_s, self.seconds + margin_s, num_steps + 1)
         self._step_s, self._bounds = samples[1] - samples[0], "periodic" if self._repeats else "not-a-knot"
         at = np.stack([np.interp(samples, times, column) for column in places.T], axis=1)
-        self._positions = self._smooth_spline(samples, at, _SMOOTH_S)
-        heading = _headings(self._positions(samples, 1)[:, :2])
+        self._positions = self._smooth_spline(samples, at, smooth_s)
+        velocity = self._positions(samples, 1)[:, :2]
+        if ends == "reverse":
+            # It changes direction in the middle of each rest.
+            goes_on = np.abs(samples - 0.5 * pause_s - 0.25 * self.seconds) < 0.25 * self.seconds
+            velocity = np.where(goes_on[:, None], velocity, -velocity)
+        heading = _headings(velocity)
         # A way round turns by a multiple of a full turn: what is left without that repeats too.
         turns = np.round((heading[-1] - heading[0]) / (2.0 * np.pi)) if self._repeats else 0.0
         self._turn_rate = 2.0 * np.pi * turns / self.seconds
@@ -108,7 +111,7 @@ def _timetable(points: np.ndarray, speed: float, ends: Ends, pause_s: float) -> 
     rest_s = 0.0 if ends == "loop" else pause_s
     times = np.concatenate([[0.0], pause_s + arrivals, [pause_s + arrivals[-1] + rest_s]])
     places = np.concatenate([points[:1], points, points[-1:]])
-    if ends == "back":
+    if ends in {"back", "reverse"}:
         times = np.concatenate([times, times[-1] + arrivals])
         places = np.concatenate([places, points[::-1]])
     return times, places

@@ -8,9 +8,12 @@ import numpy as np
 
 from jaxslam.datasets.synthetic.dataset import DEPTH_COUNTS_PER_M
 from jaxslam.datasets.synthetic.primitives import PlacedSolid
-from jaxslam.datasets.synthetic.sensor_noise import scaled_sensor
+from jaxslam.datasets.synthetic.render import BACKDROP
+from jaxslam.datasets.synthetic.sensor_noise import LensParams, scaled_sensor
+from jaxslam.datasets.synthetic.shading import Light
 from jaxslam.datasets.synthetic.virtual_camera import (
     START_NS,
+    Optics,
     Stage,
     TakenPicture,
     VirtualCamera,
@@ -21,10 +24,11 @@ from jaxslam.errors import ConfigError
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame
 from jaxslam.trajectory.trajectory import Trajectory
-from jaxslam.worlds.building import BACKDROP_NUMBER, build
+from jaxslam.worlds.building import build
 from jaxslam.worlds.camera_way import camera_way
-from jaxslam.worlds.description import World
-from jaxslam.worlds.library import load_world, with_catalog
+from jaxslam.worlds.description import World, focal_px
+from jaxslam.worlds.expansion import expanded
+from jaxslam.worlds.library import load_world, with_catalog, with_places
 
 _FLAT_M = 0.051
 """Half the thickness of floors and ceilings, and a little."""
@@ -96,7 +100,7 @@ class WorldRecording:
         self.name = "world" if isinstance(world, World) else Path(world).stem
         self.world = world = world if isinstance(world, World) else load_world(world)
         filmed = world.camera
-        fx = 525.0 * filmed.width / 640.0 if filmed.fx is None else filmed.fx
+        fx = focal_px(filmed)
         self.camera = Camera(
             self.name,
             filmed.width,
@@ -116,16 +120,20 @@ class WorldRecording:
         if not len(elapsed_us):
             raise ConfigError("World.faults: expected some frames that are not missing, got none")
         self._time_s, self.timestamps_ns = 1e-6 * elapsed_us, START_NS + 1000 * elapsed_us
-        self._way = camera_way(world)
+        whole = expanded(with_catalog(with_places(world)))
+        self._way = camera_way(whole)
         self.ground_truth = Trajectory(self.timestamps_ns, self._way.poses(self._time_s))
-        self._built = built = build(with_catalog(world))
+        self._built = built = build(whole, self._way.poses)
         self.instances = tuple(built.instances)
         self.labels = tuple(instance.label for instance in built.instances)
         self.movable = tuple(instance.movable for instance in built.instances)
         numbers = {"static_numbers": built.static_numbers, "actor_numbers": built.actor_numbers}
         sensor = scaled_sensor(filmed.sensor, world.scale)
-        self._stage = Stage(built.static, built.actors, built.light, **numbers)
-        self._filming = VirtualCamera(self._stage, self.camera, sensor, self._way.poses, self._gain)
+        self._stage = Stage(built.static, built.actors, self._light, **numbers)
+        ideal = filmed.gamma == 1.0 and filmed.vignetting == 0.0
+        optics = Optics(filmed.rolling_shutter_s, None if ideal else LensParams(filmed.vignetting, filmed.gamma))
+        self._filming = VirtualCamera(self._stage, self.camera, sensor, self._way.poses, self._gain, optics)
+        self._poses = np.array([each.poses(np.zeros(1))[0] for each in built.instances]).reshape(-1, 7)
         self._key = jax.random.key(world.seed)
         self._gain_phases = np.random.default_rng([world.seed, 601]).uniform(0.0, 2.0 * np.pi, 2)
 
@@ -152,8 +160,10 @@ class WorldRecording:
             rgb, depth_m = np.zeros_like(rgb), np.zeros_like(depth_m)
             right = None if right is None else np.zeros_like(right)
         instance_mask = np.maximum(np.asarray(taken.exact.owner), 0)
-        moves = np.array([False, *(each.is_moving(now)[0] for each in self.instances)])
-        poses = [each.poses(now)[0] for each in self.instances]
+        moves, poses = np.zeros(len(self.instances) + 1, bool), self._poses.copy()
+        for number, instance in enumerate(self.instances, 1):
+            if not instance.rests:
+                moves[number], poses[number - 1] = instance.is_moving(now)[0], instance.poses(now)[0]
         return WorldFrame(
             timestamp_ns=int(self.timestamps_ns[index]),
             rgb=rgb,
@@ -162,7 +172,7 @@ class WorldRecording:
             instance_mask=instance_mask,
             moving_mask=moves[instance_mask],
             T_world_cam=self.ground_truth.T_world_cam[index].copy(),
-            T_world_instance=np.stack(poses) if poses else np.zeros((0, 7)),
+            T_world_instance=poses,
             right=right,
         )
 
@@ -200,17 +210,32 @@ class WorldRecording:
         lines = [f"{number} {int(movable)} {label}" for number, (label, movable) in enumerate(rows, 1)]
         return "\n".join(["# number movable label", *lines]) + "\n"
 
+    def _light(self, time_s: float) -> Light:
+        """Light at a time, without its flicker."""
+        lights = self._built.lights
+        light = lights[0]
+        for change, later in zip(self.world.light_changes, lights[1:], strict=True):
+            if time_s >= change.at_s:
+                share = 1.0 if change.over_s == 0.0 else min((time_s - change.at_s) / change.over_s, 1.0)
+                light = Light(*(a + np.float32(share) * (b - a) for a, b in zip(light, later, strict=True)))
+        return light
+
     def _gain(self, time_s: float) -> float:
-        """Factor of brightness: what the exposure says, and an automatic one that wanders."""
+        """Factor of brightness: what the exposure says, an automatic one that wanders, and lamps that flicker."""
         wander = automatic_gain(time_s, self.world.camera.sensor.gain_swing, self._gain_phases)
         times, factors = [0.0], [1.0]
         for change in self.world.exposure:
             times += [change.at_s, change.at_s + change.over_s]
             factors += [factors[-1], change.factor]
-        steps = np.searchsorted(times, time_s, side="right") - 1
-        after = min(steps + 1, len(times) - 1)
-        share = 0.0 if times[after] == times[steps] else (time_s - times[steps]) / (times[after] - times[steps])
-        return float(wander * (factors[steps] + share * (factors[after] - factors[steps])))
+        return float(wander * self._flicker(time_s) * np.interp(time_s, times, factors))
+
+    def _flicker(self, time_s: float) -> float:
+        """Factor of the light of lamps that flicker, on average over an exposure."""
+        lighting = self.world.lighting
+        for change in self.world.light_changes:
+            lighting = change.light if time_s >= change.at_s else lighting
+        over_exposure = np.sinc(lighting.flicker_hz * self.world.camera.sensor.exposure_s)
+        return float(1.0 + lighting.flicker * over_exposure * np.sin(2.0 * np.pi * lighting.flicker_hz * time_s))
 
 
 def _outline(placed: PlacedSolid) -> np.ndarray:
@@ -220,4 +245,4 @@ def _outline(placed: PlacedSolid) -> np.ndarray:
 
 def _shows_backdrop(taken: TakenPicture) -> np.ndarray:
     """Tell which pixels show nothing but the backdrop, `(height, width)` bool."""
-    return np.asarray(taken.exact.owner) == BACKDROP_NUMBER
+    return np.asarray(taken.exact.owner) == BACKDROP

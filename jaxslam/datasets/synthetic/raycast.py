@@ -29,10 +29,27 @@ class Shapes(NamedTuple):
         unit_from_cam: Affine maps from camera coordinates to those in which a box is the cube from -1 to 1 and a
             capsule has radius 1 and its axis along z.
         stem: Half length of a capsule's axis in those coordinates; 0 for boxes.
+        change: What the maps change by from the first row of the tile to the first row of the one below, with a
+            rolling shutter; `None` if all rows are taken at once.
     """
 
     unit_from_cam: Float[Array, "n 3 4"]
     stem: Float[Array, " n"]
+    change: Float[Array, "n 3 4"] | None = None
+
+
+class Rays(NamedTuple):
+    """The rays `(x, y, 1)` of a tile.
+
+    Attributes:
+        x: First component.
+        y: Second component.
+        share: Share of the tile's rows above that of the ray.
+    """
+
+    x: Plane
+    y: Plane
+    share: Plane
 
 
 class InTile(NamedTuple):
@@ -43,12 +60,12 @@ class InTile(NamedTuple):
 
 
 def solids_in_tiles(
-    corners: Float[Array, "3 8 n"], intrinsics: Float[Array, " 4"], rows: int, columns: int
+    corners: Float[Array, "3 c n"], intrinsics: Float[Array, " 4"], rows: int, columns: int
 ) -> Bool[Array, "tiles n"]:
     """Whether the bounding box of each solid may reach into each tile.
 
     Args:
-        corners: The corners of the bounding boxes in camera coordinates.
+        corners: The corners of the bounding boxes in camera coordinates, at one time or several.
         intrinsics: `fx, fy, cx, cy` in pixels.
         rows: Rows of tiles.
         columns: Columns of tiles.
@@ -62,7 +79,7 @@ def solids_in_tiles(
     return (along[:, None, :] & across[None, :, :] & ahead[None, None, :]).reshape(rows * columns, -1)
 
 
-def _between(x: Float[Array, "8 n"], z: Float[Array, "8 n"], edges: Float[Array, " k"]) -> Bool[Array, "j n"]:
+def _between(x: Float[Array, "c n"], z: Float[Array, "c n"], edges: Float[Array, " k"]) -> Bool[Array, "j n"]:
     """Between neighboring edges, with a pixel to spare: false where all corners lie beyond the same edge."""
     below = jnp.all(x[None] < (edges[:, None, None] - 1.0) * z[None], axis=1)
     above = jnp.all(x[None] > (edges[:, None, None] + 1.0) * z[None], axis=1)
@@ -71,25 +88,30 @@ def _between(x: Float[Array, "8 n"], z: Float[Array, "8 n"], edges: Float[Array,
 
 def compact(reaches: Bool[Array, "tiles n"], first: int) -> InTile:
     """List the solids that reach into each tile; `first` is the index of the first column."""
-    order = jnp.argsort(~reaches, axis=1, stable=True).astype(jnp.int32)
-    return InTile(order + first, jnp.sum(reaches, axis=1, dtype=jnp.int32))
+    tiles, n = reaches.shape
+    # A sort takes sixteen times as long.
+    place = jnp.where(reaches, jnp.cumsum(reaches, axis=1, dtype=jnp.int32) - 1, n)
+    columns = jnp.broadcast_to(jnp.arange(first, first + n, dtype=jnp.int32), reaches.shape)
+    rows = jnp.arange(tiles, dtype=jnp.int32)[:, None]
+    indices = jnp.zeros(reaches.shape, jnp.int32).at[rows, place].set(columns, mode="drop")
+    return InTile(indices, jnp.sum(reaches, axis=1, dtype=jnp.int32))
 
 
-def nearest_solid(shapes: Shapes, x: Plane, y: Plane, boxes: InTile, capsules: InTile) -> Int[Array, " p"]:
-    """The nearest solid along each ray `(x, y, 1)` of a tile, packed: see `unpack`."""
+def nearest_solid(shapes: Shapes, rays: Rays, boxes: InTile, capsules: InTile) -> Int[Array, " p"]:
+    """The nearest solid along each ray of a tile, packed: see `unpack`."""
     mask = _index_mask(shapes)
 
     def box(k: Int[Array, ""], nearest: Int[Array, " p"]) -> Int[Array, " p"]:
         which = boxes.indices[k]
-        enter, leave = _slabs(*_into(shapes.unit_from_cam[which], x, y))
+        enter, leave = _slabs(*_into(shapes, which, rays))
         return jnp.minimum(nearest, _packed(enter, enter < leave, which, mask))
 
     def capsule(k: Int[Array, ""], nearest: Int[Array, " p"]) -> Int[Array, " p"]:
         which = capsules.indices[k]
-        depth, hit = _round(*_into(shapes.unit_from_cam[which], x, y), shapes.stem[which])
+        depth, hit = _round(*_into(shapes, which, rays), shapes.stem[which])
         return jnp.minimum(nearest, _packed(depth, hit, which, mask))
 
-    _, wall = _slabs(*_into(shapes.unit_from_cam[0], x, y))
+    _, wall = _slabs(*_into(shapes, 0, rays))
     nearest = _packed(wall, wall > 0.0, jnp.int32(0), mask)
     nearest = jax.lax.fori_loop(0, boxes.n_reaching, box, nearest)
     return jax.lax.fori_loop(0, capsules.n_reaching, capsule, nearest)
@@ -110,13 +132,29 @@ def _packed(depth: Plane, hit: Bool[Array, " p"], which: Int[Array, ""], mask: n
     return jnp.where(hit & (depth > _NEAR_M), (bits & ~mask) | which, _NOTHING)
 
 
-def _into(transform: Float[Array, "3 4"], x: Plane, y: Plane) -> tuple[Float[Array, " 3"], Vectors]:
-    """Origin and directions of the rays `(x, y, 1)` in the coordinates of a solid."""
-    a, b, c = (row[0] * x + row[1] * y + row[2] for row in transform)
-    return transform[:, 3], (a, b, c)
+Origin: TypeAlias = Float[Array, " 3"] | Vectors
+"""The one origin of all rays, or that of each."""
 
 
-def _slabs(origin: Float[Array, " 3"], rays: Vectors) -> tuple[Plane, Plane]:
+def _into(shapes: Shapes, which: Int[Array, ""] | int, rays: Rays) -> tuple[Origin, Vectors]:
+    """Origins and directions of rays in the coordinates of a solid."""
+    transform = shapes.unit_from_cam[which]
+    a, b, c = (_directions(row, rays) for row in transform)
+    if shapes.change is None:
+        return transform[:, 3], (a, b, c)
+    change = shapes.change[which]
+    x, y, z = (rays.share * _directions(row, rays) for row in change)
+    start_x, start_y, start_z = (
+        start + rays.share * moved for start, moved in zip(transform[:, 3], change[:, 3], strict=True)
+    )
+    return (start_x, start_y, start_z), (a + x, b + y, c + z)
+
+
+def _directions(row: Float[Array, " 4"], rays: Rays) -> Plane:
+    return row[0] * rays.x + row[1] * rays.y + row[2]
+
+
+def _slabs(origin: Origin, rays: Vectors) -> tuple[Plane, Plane]:
     """Depths at which rays enter and leave the cube from -1 to 1 (slab method, Kay & Kajiya 1986)."""
     inverse = [1.0 / jnp.where(jnp.abs(ray) < 1e-9, 1e-9, ray) for ray in rays]
     middle = [-start * slope for start, slope in zip(origin, inverse, strict=True)]
@@ -126,7 +164,7 @@ def _slabs(origin: Float[Array, " 3"], rays: Vectors) -> tuple[Plane, Plane]:
     return enter, leave
 
 
-def _round(origin: Float[Array, " 3"], rays: Vectors, stem: Float[Array, ""]) -> tuple[Plane, Bool[Array, " p"]]:
+def _round(origin: Origin, rays: Vectors, stem: Float[Array, ""]) -> tuple[Plane, Bool[Array, " p"]]:
     """Depths at which rays enter a capsule of radius 1, and whether they do.
 
     Distances to the axis are measured from the point of closest approach, which keeps float32 accurate for thin

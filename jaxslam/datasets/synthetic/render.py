@@ -3,6 +3,7 @@
 Rays have unit depth, so that a distance along a ray is a depth along the optical axis.
 """
 
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -15,7 +16,7 @@ from jaxslam.datasets.synthetic.raycast import (
     TILE_HEIGHT,
     TILE_WIDTH,
     InTile,
-    Plane,
+    Rays,
     Shapes,
     compact,
     nearest_solid,
@@ -27,7 +28,8 @@ from jaxslam.datasets.synthetic.texture import N_WORDS
 from jaxslam.runtime.compile_cache import FUSION_EMITTERS
 from jaxslam.runtime.compiled import compiled
 
-_CAPACITY_STEP = 64
+BACKDROP = -1
+"""Owner of the solid behind everything, such as the sky."""
 
 
 class RenderScene(NamedTuple):
@@ -38,7 +40,7 @@ class RenderScene(NamedTuple):
         capsule_size: Radii in meters.
         capsule_stem: Half lengths of the axes in units of the third radius.
         surface: Texture parameters, six surfaces a solid.
-        owner: 0 for static solids, otherwise the number of the actor.
+        owner: 0 for static solids, `BACKDROP` for what is behind everything, otherwise the number of the actor.
         used: Whether the entry holds a solid.
         light: Light of the scene.
     """
@@ -56,13 +58,14 @@ class CameraView(NamedTuple):
     """One camera pose and where the solids are at that moment.
 
     Attributes:
-        solid_from_cam: Rigid transforms from camera coordinates to those of each solid.
-        world_from_cam: Rigid transform from camera to world coordinates.
+        solid_from_cam: Rigid transforms from camera coordinates to those of each solid. With a rolling shutter, those
+            at the times of the first row of each row of tiles, and of one row of tiles more.
+        world_from_cam: Rigid transform from camera to world coordinates; with a rolling shutter, that of the middle.
         intrinsics: `fx, fy, cx, cy` in pixels.
         offset: Position of each ray in its pixel, `(u, v)`, 0 for the center.
     """
 
-    solid_from_cam: Float[Array, "n 3 4"]
+    solid_from_cam: Float[Array, "n 3 4"] | Float[Array, "rows n 3 4"]
     world_from_cam: Float[Array, "3 4"]
     intrinsics: Float[Array, " 4"]
     offset: Float[Array, " 2"]
@@ -84,29 +87,59 @@ class Rendering(NamedTuple):
     owner: Int[Array, "h w"]
 
 
-def pack_scene(solids: list[Solid], owner: list[int], light: Light) -> tuple[RenderScene, np.ndarray]:
+class PackedSolids(NamedTuple):
+    """Solids as rows of arrays, in the order given.
+
+    Attributes:
+        size: Half extents of boxes, radii of capsules, `(n, 3)` meters.
+        stem: Half lengths of the axes of capsules in units of the third radius, `(n,)`; 0 for boxes.
+        surface: Texture parameters of six sides, `(n, 6, N_WORDS)`.
+        owner: Number of the actor of each, `(n,)`; 0 for none.
+        is_box: Whether it is a box, `(n,)`.
+    """
+
+    size: np.ndarray
+    stem: np.ndarray
+    surface: np.ndarray
+    owner: np.ndarray
+    is_box: np.ndarray
+
+
+def pack_solids(solids: Sequence[Solid], owner: Sequence[int]) -> PackedSolids:
+    """Pack solids, with the number of the actor of each, 0 for none."""
+    return PackedSolids(
+        np.array([solid.size for solid in solids], np.float32),
+        np.array([solid.stem or 0.0 for solid in solids], np.float32),
+        np.array([solid.surface for solid in solids], np.uint32),
+        np.array(owner, np.int32),
+        np.array([solid.stem is None for solid in solids]),
+    )
+
+
+def arrange_scene(
+    packed: PackedSolids, chosen: np.ndarray, light: Light, capacity: Callable[[int], int]
+) -> tuple[RenderScene, np.ndarray]:
     """Arrange solids for rendering.
 
     Args:
-        solids: The room first, then any boxes and capsules.
-        owner: The number of the actor of each solid, 0 for none.
+        packed: The solids.
+        chosen: Indices of those to render; the first one is the box around everything.
         light: Light of the scene.
+        capacity: Number of entries for a number of boxes, or of capsules: each new one is compiled.
 
     Returns:
-        The scene, and the slot of each solid in it, `(len(solids),)`: the row of its transform in a `View`.
+        The scene, and the slot of each chosen solid in it: the row of its transform in a `CameraView`.
     """
-    boxes = [i for i, solid in enumerate(solids) if solid.stem is None]
-    capsules = [i for i, solid in enumerate(solids) if solid.stem is not None]
-    n_boxes, n = _capacity(len(boxes)), _capacity(len(boxes)) + _capacity(len(capsules))
-    slots = np.zeros(len(solids), np.int64)
-    slots[boxes] = np.arange(len(boxes))
-    slots[capsules] = n_boxes + np.arange(len(capsules))
+    is_box = packed.is_box[chosen]
+    num_boxes = int(is_box.sum())
+    n_boxes = capacity(num_boxes)
+    n = n_boxes + capacity(len(chosen) - num_boxes)
+    slots = np.where(is_box, np.cumsum(is_box) - 1, n_boxes + np.cumsum(~is_box) - 1)
     size, stem = np.ones((n, 3), np.float32), np.zeros(n, np.float32)
     surface = np.ones((n, 6, N_WORDS), np.uint32)
     owners, used = np.zeros(n, np.int32), np.zeros(n, bool)
-    for slot, solid, number in zip(slots, solids, owner, strict=True):
-        size[slot], stem[slot], surface[slot] = solid.size, solid.stem or 0.0, solid.surface
-        owners[slot], used[slot] = number, True
+    size[slots], stem[slots], surface[slots] = packed.size[chosen], packed.stem[chosen], packed.surface[chosen]
+    owners[slots], used[slots] = packed.owner[chosen], True
     scene = RenderScene(
         jnp.asarray(size[:n_boxes]),
         jnp.asarray(size[n_boxes:]),
@@ -119,59 +152,98 @@ def pack_scene(solids: list[Solid], owner: list[int], light: Light) -> tuple[Ren
     return scene, slots
 
 
-def _capacity(count: int) -> int:
-    return _CAPACITY_STEP * -(-max(count, 1) // _CAPACITY_STEP)
-
-
-@compiled(when="first use", static=("height", "width"), options=FUSION_EMITTERS)
-def render(scene: RenderScene, view: CameraView, *, height: int, width: int) -> Rendering:
+@compiled(when="first use", static=("height", "width", "rows"), options=FUSION_EMITTERS)
+def render(
+    scene: RenderScene, view: CameraView, first: int = 0, *, height: int, width: int, rows: int | None = None
+) -> Rendering:
     """Cast one ray a pixel.
 
     Args:
         scene: Solids and light of the scene.
         view: From where it is seen.
+        first: First row of tiles to render, if not all.
         height: Rows of the image, static.
         width: Columns of the image, static.
+        rows: Rows of tiles to render, static; `None` for all.
     """
     n_boxes = scene.box_size.shape[0]
-    rows, columns = -(-height // TILE_HEIGHT), -(-width // TILE_WIDTH)
+    all_rows, columns = tile_rows(height), -(-width // TILE_WIDTH)
     size = jnp.concatenate([scene.box_size, scene.capsule_size])
     stem = jnp.concatenate([jnp.zeros(n_boxes, scene.capsule_stem.dtype), scene.capsule_stem])
-    shapes = Shapes(view.solid_from_cam / size[:, :, None], stem)
-    reaches = solids_in_tiles(_corners(view, size, stem), view.intrinsics, rows, columns) & scene.used[None]
+    rolls = view.solid_from_cam.ndim == 4
+    unit_from_cam = view.solid_from_cam / (size[None, :, :, None] if rolls else size[:, :, None])
+    reaches = _reaches(view, size, stem, all_rows, columns) & scene.used[None]
     boxes, capsules = compact(reaches[:, 1:n_boxes], 1), compact(reaches[:, n_boxes:], n_boxes)
-    sun = jnp.einsum("nij,kj,k->ni", view.solid_from_cam[:, :, :3], view.world_from_cam[:, :3], scene.light.towards_sun)
-    table = jnp.concatenate([shapes.unit_from_cam.reshape(-1, 12), size, stem[:, None], sun], axis=1)
+    turned = (view.solid_from_cam[all_rows // 2] if rolls else view.solid_from_cam)[:, :, :3]
+    sun = jnp.einsum("nij,kj,k->ni", turned, view.world_from_cam[:, :3], scene.light.towards_sun)
+    # Nothing turns the sky towards the sun.
+    sun = jnp.where((scene.owner == BACKDROP)[:, None], 0.0, sun)
+    own = jnp.concatenate([size, stem[:, None], sun], axis=1)
+    table = None if rolls else jnp.concatenate([unit_from_cam.reshape(-1, 12), own], axis=1)
 
     def render_tile(tile: tuple[Array, InTile, InTile]) -> tuple[Array, ...]:
         index, boxes, capsules = tile
-        x, y = _rays(view, (index // columns) * TILE_HEIGHT, (index % columns) * TILE_WIDTH)
-        depth, which = unpack(shapes, nearest_solid(shapes, x, y, boxes, capsules))
-        hits = Hits(x, y, depth, which, which < n_boxes)
+        rays = _rays(view, (index // columns) * TILE_HEIGHT, (index % columns) * TILE_WIDTH)
+        shapes, looks, changes = Shapes(unit_from_cam, stem), table, None
+        if rolls:
+            above = unit_from_cam[index // columns]
+            shapes = Shapes(above, stem, unit_from_cam[index // columns + 1] - above)
+            looks = jnp.concatenate([above.reshape(-1, 12), own], axis=1)
+            changes = shapes.change.reshape(-1, 12)
+        depth, which = unpack(shapes, nearest_solid(shapes, rays, boxes, capsules))
+        hits = Hits(rays, depth, which, which < n_boxes)
         return (
-            *shade(table, scene.surface, hits, view.world_from_cam, view.intrinsics[0], scene.light),
+            *shade(looks, scene.surface, hits, view.world_from_cam, view.intrinsics[0], scene.light, changes),
             scene.owner[which],
         )
 
-    planes = jax.lax.map(render_tile, (jnp.arange(rows * columns, dtype=jnp.int32), boxes, capsules))
+    tiles = (jnp.arange(all_rows * columns, dtype=jnp.int32), boxes, capsules)
+    if rows is None:
+        rows = all_rows
+    else:
+        tiles = jax.tree.map(lambda each: jax.lax.dynamic_slice_in_dim(each, first * columns, rows * columns), tiles)
+    planes = jax.lax.map(render_tile, tiles)
     return Rendering(*(_untile(plane, rows, columns)[:height, :width] for plane in planes))
 
 
-def _corners(view: CameraView, size: Float[Array, "n 3"], stem: Float[Array, " n"]) -> Float[Array, "3 8 n"]:
+def tile_rows(height: int) -> int:
+    """Return the number of rows of tiles of an image of `height` rows."""
+    return -(-height // TILE_HEIGHT)
+
+
+def _reaches(
+    view: CameraView, size: Float[Array, "n 3"], stem: Float[Array, " n"], rows: int, columns: int
+) -> Bool[Array, "tiles n"]:
+    """Whether each solid may reach into each tile."""
+    if view.solid_from_cam.ndim == 3:
+        return solids_in_tiles(_corners(view.solid_from_cam, size, stem), view.intrinsics, rows, columns)
+    corners = jax.vmap(lambda solid_from_cam: _corners(solid_from_cam, size, stem))(view.solid_from_cam)
+    # Over the time of a row of tiles, a corner is between where it is at the beginning and at the end.
+    over_time = jnp.concatenate([corners[:-1], corners[1:]], axis=2)
+    reaches = [
+        solids_in_tiles(over_time[row], view.intrinsics, rows, columns).reshape(rows, columns, -1)[row]
+        for row in range(rows)
+    ]
+    return jnp.concatenate(reaches)
+
+
+def _corners(
+    solid_from_cam: Float[Array, "n 3 4"], size: Float[Array, "n 3"], stem: Float[Array, " n"]
+) -> Float[Array, "3 8 n"]:
     """The corners of the bounding boxes of all solids in camera coordinates."""
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)
     bounds = size.at[:, 2].multiply(1.0 + stem)
-    local = signs[:, None, :] * bounds[None] - view.solid_from_cam[None, :, :, 3]
-    return jnp.einsum("nij,kni->jkn", view.solid_from_cam[:, :, :3], local)
+    local = signs[:, None, :] * bounds[None] - solid_from_cam[None, :, :, 3]
+    return jnp.einsum("nij,kni->jkn", solid_from_cam[:, :, :3], local)
 
 
-def _rays(view: CameraView, row: Int[Array, ""], column: Int[Array, ""]) -> tuple[Plane, Plane]:
-    """Rays `(x, y, 1)` through the pixels of one tile."""
+def _rays(view: CameraView, row: Int[Array, ""], column: Int[Array, ""]) -> Rays:
+    """Rays through the pixels of one tile."""
     fx, fy, cx, cy = view.intrinsics
     v, u = np.divmod(np.arange(TILE_HEIGHT * TILE_WIDTH, dtype=np.int32), np.int32(TILE_WIDTH))
     x = ((u + column).astype(jnp.float32) + view.offset[0] - cx) / fx
     y = ((v + row).astype(jnp.float32) + view.offset[1] - cy) / fy
-    return x, y
+    return Rays(x, y, jnp.asarray(v / np.float32(TILE_HEIGHT)))
 
 
 def _untile(tiles: Array, rows: int, columns: int) -> Array:

@@ -39,31 +39,16 @@ _PLACES = (_Place(0.45, 1.22, -90.0), _Place(0.45, -1.22, 90.0))
 MAX_SEATED = len(_PLACES)
 
 
-class SeatedPerson:
-    """A person on a chair; the same fifteen solids as one who walks."""
+class SeatedBody:
+    """A body that sits on a chair; the same fifteen solids as one that walks."""
 
-    label = "person"
-
-    def __init__(self, place: int, seed: int) -> None:
-        """Choose size, clothes and the phases of the motions.
-
-        Args:
-            place: Number of the chair, from 0 to below `MAX_SEATED`.
-            seed: Seed of the scene.
-        """
-        rng = np.random.default_rng([seed, 500, place])
-        self._place = _PLACES[place]
+    def __init__(self, rng: np.random.Generator) -> None:
+        """Choose size, clothes and the phases of the motions."""
         self._scale = rng.uniform(0.94, 1.0)
         self._phase = rng.uniform(0.0, 2.0 * np.pi, 5)
         self._pace = rng.uniform(0.85, 1.1)
         self._arm = int(rng.integers(2))
         self.solids: list[Solid] = body(self._scale, rng)
-
-    def root(self, time_s: np.ndarray) -> np.ndarray:
-        """Poses of the point on the floor under the hips, x forward, which rests: `(t, 7)`, wxyz_xyz."""
-        turn = axis_rotation(2, np.deg2rad(self._place.facing_deg))
-        pose = np.concatenate([turn, [self._place.x, self._place.y, 0.0]])
-        return np.broadcast_to(pose, (len(time_s), 7))
 
     def parts(self, time_s: np.ndarray) -> np.ndarray:
         """Placements of the body's solids in its frame: `(t, 15, 4, 4)`."""
@@ -86,6 +71,28 @@ class SeatedPerson:
             0.45 * wave(3, 7.3),
             (0.5 + 0.5 * wave(4, 5.2)) ** 3,
         )
+
+
+class SeatedPerson(SeatedBody):
+    """A person on a chair at the desk."""
+
+    label = "person"
+
+    def __init__(self, place: int, seed: int) -> None:
+        """Choose what `SeatedBody` does.
+
+        Args:
+            place: Number of the chair, from 0 to below `MAX_SEATED`.
+            seed: Seed of the scene.
+        """
+        super().__init__(np.random.default_rng([seed, 500, place]))
+        self._place = _PLACES[place]
+
+    def root(self, time_s: np.ndarray) -> np.ndarray:
+        """Poses of the point on the floor under the hips, x forward, which rests: `(t, 7)`, wxyz_xyz."""
+        turn = axis_rotation(2, np.deg2rad(self._place.facing_deg))
+        pose = np.concatenate([turn, [self._place.x, self._place.y, 0.0]])
+        return np.broadcast_to(pose, (len(time_s), 7))
 
 
 def chairs(seated: int, seed: int) -> list[PlacedSolid]:

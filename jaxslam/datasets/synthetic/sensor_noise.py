@@ -101,6 +101,18 @@ class SensorParams(NamedTuple):
     image_noise: float
 
 
+class LensParams(NamedTuple):
+    """What lens and amplifier do to the light.
+
+    Attributes:
+        vignetting: Share of the light that is missing in the corners of the picture.
+        gamma: Exponent by which brightness is `brightness ** (1 / gamma)`.
+    """
+
+    vignetting: float
+    gamma: float
+
+
 def sensor_params(config: SensorConfig) -> SensorParams:
     """The numbers of a configuration that `measure` takes."""
     return SensorParams(
@@ -122,9 +134,10 @@ def measure(
     depth_m: Float[Array, "h w"],
     incidence: Float[Array, "h w"],
     fx: float,
-    gain: float,
+    gain: float | np.ndarray,
     params: SensorParams,
     key: Array,
+    lens: LensParams | None = None,
 ) -> tuple[UInt8[Array, "3 h w"], Float[Array, "h w"]]:
     """One measured frame.
 
@@ -133,23 +146,35 @@ def measure(
         depth_m: Exact depth.
         incidence: Cosine of the angle between ray and surface normal.
         fx: Focal length in pixels.
-        gain: Brightness factor of this frame.
+        gain: Brightness factor of this frame, or of each row, `(1, h, 1)`.
         params: From `sensor_params`.
         key: Random key of this frame.
+        lens: Faults of the lens; `None` for none.
 
     Returns:
         Red, green and blue of eight bits, and depth in meters, 0 where missing.
     """
     # All in the depth's type: a recording is the same bytes where float64 is enabled.
-    fx, gain, params = jax.tree.map(lambda number: jnp.asarray(number, depth_m.dtype), (fx, gain, params))
+    numbers = (fx, gain, params, lens)
+    fx, gain, params, lens = jax.tree.map(lambda number: jnp.asarray(number, depth_m.dtype), numbers)
     color_key, depth_key = jax.random.split(key)
     mean = sum(map(unpack_color, exposures[1:]), start=unpack_color(exposures[0])) / len(exposures)
     noise = params.image_noise * jax.random.normal(color_key, mean.shape, mean.dtype)
-    rgb = jnp.clip(jnp.round(255.0 * gain * mean + noise), 0.0, 255.0).astype(jnp.uint8)
+    bright = 255.0 * gain * mean if lens is None else 255.0 * _through_lens(gain * mean, lens)
+    rgb = jnp.clip(jnp.round(bright + noise), 0.0, 255.0).astype(jnp.uint8)
     kept = _inside_limits(depth_m, incidence, params) & _lit(depth_m, fx, params.shadow_baseline_m)
     kept = kept & ~_on_edge(depth_m, params.edge_jump)
     measured = _noisy_depth(depth_m, jax.random.normal(depth_key, depth_m.shape, depth_m.dtype), params)
     return rgb, jnp.where(kept, measured, 0.0)
+
+
+def _through_lens(light: Float[Array, "3 h w"], lens: LensParams) -> Float[Array, "3 h w"]:
+    """Brightness as amplified, darker the farther from the middle of the picture."""
+    height, width = light.shape[1:]
+    v, u = (jnp.linspace(-1.0, 1.0, count, dtype=light.dtype) * (0.5 * count) for count in (height, width))
+    corner = 0.25 * (height**2 + width**2)
+    kept = 1.0 - lens.vignetting * (v[:, None] ** 2 + u[None] ** 2) / corner
+    return jnp.maximum(kept[None] * light, 0.0) ** (1.0 / lens.gamma)
 
 
 def _inside_limits(

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped, UInt
 
-from jaxslam.datasets.synthetic.raycast import Plane, Vectors
+from jaxslam.datasets.synthetic.raycast import Plane, Rays, Vectors
 from jaxslam.datasets.synthetic.texture import as_surface, texture_color
 
 _LEVELS = 800.0
@@ -51,18 +51,16 @@ ROOM_LIGHT = Light(
 
 
 class Hits(NamedTuple):
-    """Hits of the rays `(x, y, 1)` of a tile.
+    """Hits of the rays of a tile.
 
     Attributes:
-        x: First component of the rays.
-        y: Second component of the rays.
+        rays: The rays.
         depth: Depth of the hit, good to a few digits.
         which: Index of the solid.
         is_box: Whether that is a box.
     """
 
-    x: Plane
-    y: Plane
+    rays: Rays
     depth: Plane
     which: Int[Array, " p"]
     is_box: Bool[Array, " p"]
@@ -75,6 +73,7 @@ def shade(
     world_from_cam: Float[Array, "3 4"],
     focal: Float[Array, ""],
     light: Light,
+    change: Float[Array, "n 12"] | None = None,
 ) -> tuple[UInt[Array, " p"], Plane, Plane]:
     """Color and exact place of hits.
 
@@ -86,20 +85,24 @@ def shade(
         world_from_cam: Rigid transform from camera to world coordinates.
         focal: Focal length in pixels.
         light: Light of the scene.
+        change: What the first 12 numbers of `table` change by over the rows of the tile; `None` for nothing.
 
     Returns:
         Packed color, depth, and the cosine between ray and surface normal.
     """
     planes = _gather(table, hits.which)
+    rays = hits.rays
+    if change is not None:
+        planes = planes.at[:12].add(rays.share[None] * _gather(change, hits.which))
     size, stem, sun = (planes[12], planes[13], planes[14]), planes[15], (planes[16], planes[17], planes[18])
     origin = (planes[3], planes[7], planes[11])
-    ray = _each(lambda k: planes[4 * k] * hits.x + planes[4 * k + 1] * hits.y + planes[4 * k + 2])
+    ray = _each(lambda k: planes[4 * k] * rays.x + planes[4 * k + 1] * rays.y + planes[4 * k + 2])
     point = _each(lambda k: origin[k] + hits.depth * ray[k])
     depth = hits.depth - _newton_step(point, ray, stem, hits)
     point = _each(lambda k: origin[k] + depth * ray[k])
     axis, normal = _normal(point, size, stem, hits.is_box)
     metric_ray = _each(lambda k: size[k] * ray[k])
-    incidence = jnp.abs(_dot(normal, metric_ray)) / jnp.sqrt(1.0 + hits.x * hits.x + hits.y * hits.y)
+    incidence = jnp.abs(_dot(normal, metric_ray)) / jnp.sqrt(1.0 + rays.x * rays.x + rays.y * rays.y)
     place = _each(lambda k: size[k] * point[k])
     u, v = jnp.where(axis == 0, place[1], place[0]), jnp.where(axis == 2, place[1], place[2])
     side = 6 * hits.which + 2 * axis + (_component(point, axis) > 0.0).astype(jnp.int32)
@@ -151,7 +154,8 @@ def _brightness(
 ) -> Plane:
     """Ambient light, light from one direction that wraps round, both fading with the distance from a lamp."""
     start = world_from_cam[:, 3] - light.lamp_m
-    turned = _each(lambda k: world_from_cam[k, 0] * hits.x + world_from_cam[k, 1] * hits.y + world_from_cam[k, 2])
+    x, y = hits.rays.x, hits.rays.y
+    turned = _each(lambda k: world_from_cam[k, 0] * x + world_from_cam[k, 1] * y + world_from_cam[k, 2])
     from_lamp = _each(lambda k: start[k] + depth * turned[k])
     wrapped = light.ambient + light.directed * (0.5 + 0.5 * towards_sun)
     return light.brightness * wrapped / (1.0 + _dot(from_lamp, from_lamp) * light.fading_per_m2)

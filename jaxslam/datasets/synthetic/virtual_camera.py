@@ -1,6 +1,7 @@
 """A camera in a rendered scene: what it measures at any time, and the exact picture behind it."""
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import cv2
@@ -11,9 +12,19 @@ import numpy as np
 from jaxslam.datasets.synthetic import homogeneous as rigid
 from jaxslam.datasets.synthetic.actors import Actor
 from jaxslam.datasets.synthetic.primitives import PlacedSolid
-from jaxslam.datasets.synthetic.render import CameraView, Rendering, pack_scene, render
-from jaxslam.datasets.synthetic.sensor_noise import SensorConfig, measure, sensor_params
+from jaxslam.datasets.synthetic.raycast import TILE_HEIGHT
+from jaxslam.datasets.synthetic.render import (
+    CameraView,
+    Rendering,
+    RenderScene,
+    arrange_scene,
+    pack_solids,
+    render,
+    tile_rows,
+)
+from jaxslam.datasets.synthetic.sensor_noise import LensParams, SensorConfig, measure, sensor_params
 from jaxslam.datasets.synthetic.shading import Light
+from jaxslam.runtime.threads import usable_cores
 from jaxslam.sensors.camera import Camera
 
 START_NS = 1_600_000_000_000_000_000
@@ -31,18 +42,20 @@ def automatic_gain(time_s: float, swing: float, phases: np.ndarray) -> float:
     return float(1.0 + swing * (0.7 * waves[0] + 0.3 * waves[1]))
 
 
-class Stage:
-    """Everything that can be seen, packed for rendering.
+_SMALL_SCENE = 512
+"""Solids up to which all are rendered, in sight or not."""
+_SMALLEST_PX = 1.0
+"""Radius below which a solid of a large scene is left out of the picture."""
 
-    Attributes:
-        scene: The solids and the light.
-    """
+
+class Stage:
+    """Everything that can be seen, packed for rendering."""
 
     def __init__(
         self,
         static: Sequence[PlacedSolid],
         actors: Sequence[Actor],
-        light: Light,
+        light: Light | Callable[[float], Light],
         *,
         static_numbers: Sequence[int] | None = None,
         actor_numbers: Sequence[int] | None = None,
@@ -52,28 +65,77 @@ class Stage:
         Args:
             static: What stands still; first a box around everything, seen from inside.
             actors: What moves.
-            light: Light of the scene.
+            light: Light of the scene, or that at a time.
             static_numbers: Number of each of `static` in masks; by default 0.
             actor_numbers: Number of each actor in masks; by default 1, 2 and so on.
         """
         self._actors = tuple(actors)
+        self._light_at = light if callable(light) else lambda _: light
         numbers = [0] * len(static) if static_numbers is None else list(static_numbers)
         for number, actor in zip(actor_numbers or range(1, len(actors) + 1), actors, strict=True):
             numbers += [number] * len(actor.solids)
         solids = [placed.solid for placed in static] + [solid for actor in actors for solid in actor.solids]
-        self.scene, self._slots = pack_scene(solids, numbers, light)
+        self._packed = pack_solids(solids, numbers)
         self._static_from_world = rigid.inverse(np.stack([placed.T_world_solid for placed in static]))
+        self._centers = np.stack([placed.T_world_solid[:3, 3] for placed in static])
+        size, stem = self._packed.size[: len(static)], self._packed.stem[: len(static)]
+        self._radii = np.linalg.norm(size * np.stack([0.0 * stem + 1, 0.0 * stem + 1, 1.0 + stem], axis=1), axis=1)
+        self._is_small = len(solids) <= _SMALL_SCENE
+        if self._is_small:
+            self.scene, self._slots = self._arranged(np.arange(len(solids)), 0.0)
 
-    def solid_from_cam(self, time_s: np.ndarray, world_from_cam: np.ndarray) -> np.ndarray:
-        """Return transforms to the solids for `(t, 4, 4)` places of a camera at `(t,)` times: `(t, slots, 3, 4)`."""
-        from_world = [np.broadcast_to(self._static_from_world, (len(time_s), *self._static_from_world.shape))]
+    def seen_from(
+        self, time_s: np.ndarray, world_from_cam: np.ndarray, camera: Camera
+    ) -> tuple[RenderScene, np.ndarray]:
+        """Return the solids in sight of a camera that is at `(t, 4, 4)` places at `(t,)` times.
+
+        The light is that of the middle one.
+
+        Returns:
+            The solids, and transforms to them from the camera, `(t, slots, 3, 4)` float32.
+        """
+        middle_s = float(time_s[len(time_s) // 2])
+        if self._is_small:
+            light = Light(*map(jnp.asarray, self._light_at(middle_s)))
+            chosen, scene, slots = np.arange(len(self._packed.stem)), self.scene._replace(light=light), self._slots
+        else:
+            chosen = self._in_sight(world_from_cam, camera)
+            scene, slots = self._arranged(chosen, middle_s)
+        static = chosen[chosen < len(self._centers)]
+        from_world = [np.broadcast_to(self._static_from_world[static], (len(time_s), len(static), 4, 4))]
         for actor in self._actors:
             root = rigid.matrix_from_pose(actor.root(time_s))
             from_world.append(rigid.inverse(root[:, None] @ actor.parts(time_s)))
-        transforms = np.zeros((len(time_s), len(self.scene.owner), 3, 4), np.float32)
+        transforms = np.zeros((len(time_s), len(scene.owner), 3, 4), np.float32)
         transforms[:] = np.eye(4)[:3]
-        transforms[:, self._slots] = (np.concatenate(from_world, axis=1) @ world_from_cam[:, None])[:, :, :3]
-        return transforms
+        transforms[:, slots] = (np.concatenate(from_world, axis=1) @ world_from_cam[:, None])[:, :, :3]
+        return scene, transforms
+
+    def _arranged(self, chosen: np.ndarray, time_s: float) -> tuple[RenderScene, np.ndarray]:
+        capacity = _next_64 if self._is_small else _next_power_of_2
+        return arrange_scene(self._packed, chosen, self._light_at(time_s), capacity)
+
+    def _in_sight(self, world_from_cam: np.ndarray, camera: Camera) -> np.ndarray:
+        """Indices of the static solids that are in the picture at one of the places, and of all that move."""
+        cam_from_world = rigid.inverse(world_from_cam)
+        x, y, z = np.moveaxis(self._centers @ np.swapaxes(cam_from_world[:, :3, :3], 1, 2), -1, 0)
+        x, y, z = (each + cam_from_world[:, k, 3:] for k, each in enumerate((x, y, z)))
+        in_sight = (z > -self._radii) & (self._radii * camera.fx > _SMALLEST_PX * z)
+        for along, half in ((x, 0.5 * camera.width / camera.fx), (y, 0.5 * camera.height / camera.fy)):
+            # Distance from the planes through the edges of the picture, for any principal point near its middle.
+            slope = 1.1 * half
+            in_sight &= np.abs(along) - slope * z < self._radii * np.hypot(1.0, slope)
+        static = in_sight.any(axis=0)
+        static[0] = True
+        return np.concatenate([np.flatnonzero(static), np.arange(len(static), len(self._packed.stem))])
+
+
+def _next_64(count: int) -> int:
+    return 64 * -(-max(count, 1) // 64)
+
+
+def _next_power_of_2(count: int) -> int:
+    return 1 << max(count - 1, 63).bit_length()
 
 
 class TakenPicture(NamedTuple):
@@ -92,6 +154,18 @@ class TakenPicture(NamedTuple):
     right: np.ndarray | None = None
 
 
+class Optics(NamedTuple):
+    """How a camera exposes and what its lens does; by default, all rows at once and nothing.
+
+    Attributes:
+        rolling_shutter_s: Time from the exposure of the first row to that of the last; 0 for all at once.
+        lens: Faults of the lens; `None` for none.
+    """
+
+    rolling_shutter_s: float = 0.0
+    lens: LensParams | None = None
+
+
 class VirtualCamera:
     """Takes pictures of a stage, with the faults of a real camera."""
 
@@ -102,6 +176,7 @@ class VirtualCamera:
         sensor: SensorConfig,
         pose_at: Callable[[np.ndarray], np.ndarray],
         gain_at: Callable[[float], float],
+        optics: Optics | None = None,
     ) -> None:
         """Set up a camera.
 
@@ -111,7 +186,9 @@ class VirtualCamera:
             sensor: The faults.
             pose_at: `(t, 7)` poses `T_world_cam`, wxyz_xyz, at `(t,)` seconds since the start.
             gain_at: Factor of brightness at a time.
+            optics: How it exposes.
         """
+        self._optics = optics or Optics()
         self._stage, self._camera, self._sensor = stage, camera, sensor
         self._pose_at, self._gain_at = pose_at, gain_at
 
@@ -119,40 +196,86 @@ class VirtualCamera:
         """Take a picture, or both of a pair.
 
         Args:
-            time_s: Middle of the exposure, seconds since the start.
+            time_s: Middle of the exposure, seconds since the start; with a rolling shutter, of the middle row.
             key: Random key of the noise.
         """
-        left, baseline_m = self._take(time_s, key, 0.0), self._camera.baseline_m
+        baseline_m = self._camera.baseline_m
         if baseline_m is None:
-            return left
-        return left._replace(right=self._take(time_s, jax.random.fold_in(key, 1), baseline_m).rgb)
+            return self._measured(time_s, self._expose(time_s, (0.0,))[0], key)
+        left, right = self._expose(time_s, (0.0, baseline_m))
+        taken = self._measured(time_s, right, jax.random.fold_in(key, 1))
+        return self._measured(time_s, left, key)._replace(right=taken.rgb)
 
-    def _take(self, time_s: float, key: jax.Array, to_the_right_m: float) -> TakenPicture:
-        moments = self._expose(time_s, to_the_right_m)
+    def _measured(self, time_s: float, moments: list[Rendering], key: jax.Array) -> TakenPicture:
         own = moments[len(moments) // 2]
         colors, sensor = tuple(moment.color for moment in moments), sensor_params(self._sensor)
-        gain = self._gain_at(time_s)
-        channels, depth_m = measure(colors, own.depth_m, own.incidence, self._camera.fx, gain, sensor, key)
+        rows = self._row_times(np.arange(self._camera.height))
+        gain = self._gain_at(time_s) if len(rows) == 1 else self._gain_of_rows(time_s + rows)
+        lens = self._optics.lens
+        channels, depth_m = measure(colors, own.depth_m, own.incidence, self._camera.fx, gain, sensor, key, lens)
         # XLA needs as long to interleave the channels as to render a moment.
         return TakenPicture(own, cv2.merge(list(np.asarray(channels))), np.asarray(depth_m))
 
-    def _expose(self, time_s: float, to_the_right_m: float) -> list[Rendering]:
-        """The moments of one exposure, evenly in time, each on its own row and column within the pixel."""
+    def _gain_of_rows(self, times_s: np.ndarray) -> np.ndarray:
+        return np.array([self._gain_at(float(time_s)) for time_s in times_s])[None, :, None]
+
+    def _expose(self, time_s: float, to_the_right_m: Sequence[float]) -> list[list[Rendering]]:
+        """The moments of one exposure, evenly in time, each on its own row and column within the pixel, by camera."""
         n = self._sensor.exposure_samples
         rank = np.arange(n)
         centered = (rank + 0.5) / n - 0.5
         offsets = np.stack([centered, centered[(2 * rank + (n + 1) // 2) % n]], axis=1)
-        views = self._views(time_s + self._sensor.exposure_s * centered, offsets, to_the_right_m)
-        height, width = self._camera.height, self._camera.width
-        return [render(self._stage.scene, view, height=height, width=width) for view in views]
+        scene, views = self._views(time_s + self._sensor.exposure_s * centered, offsets, to_the_right_m)
+        renderings = _render_all(scene, views, self._camera)
+        return [renderings[n * k : n * (k + 1)] for k in range(len(to_the_right_m))]
 
-    def _views(self, time_s: np.ndarray, offsets: np.ndarray, to_the_right_m: float) -> list[CameraView]:
-        world_from_cam = rigid.matrix_from_pose(self._pose_at(time_s))
-        world_from_cam[:, :3, 3] += to_the_right_m * world_from_cam[:, :3, 0]
-        solid_from_cam = self._stage.solid_from_cam(time_s, world_from_cam)
-        camera = self._camera
+    def _row_times(self, rows: np.ndarray) -> np.ndarray:
+        """Times of `(r,)` rows since that of the middle one, `(r,)`; a single 0 if all are taken at once."""
+        share = rows / max(self._camera.height - 1, 1) - 0.5
+        return self._optics.rolling_shutter_s * share if self._optics.rolling_shutter_s > 0.0 else np.zeros(1)
+
+    def _views(
+        self, time_s: np.ndarray, offsets: np.ndarray, to_the_right_m: Sequence[float]
+    ) -> tuple[RenderScene, list[CameraView]]:
+        """What is in sight of cameras side by side, and the views of each at `(t,)` times, camera by camera."""
+        camera, num_views = self._camera, len(time_s) * len(to_the_right_m)
+        since_s = self._row_times(np.arange(tile_rows(camera.height) + 1) * TILE_HEIGHT)
+        times = np.tile((time_s[:, None] + since_s).ravel(), len(to_the_right_m))
+        world_from_cam = rigid.matrix_from_pose(self._pose_at(times))
+        aside_m = np.repeat(to_the_right_m, len(time_s) * len(since_s))
+        world_from_cam[:, :3, 3] += aside_m[:, None] * world_from_cam[:, :3, 0]
+        scene, solid_from_cam = self._stage.seen_from(times, world_from_cam, camera)
+        by_view = solid_from_cam.reshape(num_views, len(since_s), *solid_from_cam.shape[1:])
+        places = world_from_cam.reshape(num_views, len(since_s), 4, 4)[:, len(since_s) // 2, :3].astype(np.float32)
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
-        return [
-            CameraView(*map(jnp.asarray, (solids, place[:3].astype(np.float32), intrinsics, offset.astype(np.float32))))
-            for solids, place, offset in zip(solid_from_cam, world_from_cam, offsets, strict=True)
+        shifts = np.tile(offsets.astype(np.float32), (len(to_the_right_m), 1))
+        views = [
+            CameraView(*map(jnp.asarray, (solids[0] if len(since_s) == 1 else solids, place, intrinsics, shift)))
+            for solids, place, shift in zip(by_view, places, shifts, strict=True)
         ]
+        return scene, views
+
+
+def _render_all(scene: RenderScene, views: list[CameraView], camera: Camera) -> list[Rendering]:
+    """Render views on all processor cores: XLA renders one at a time, and those it is given at once in turn."""
+    size, rows = {"height": camera.height, "width": camera.width}, tile_rows(camera.height)
+    cores = min(usable_cores(), len(views) * rows)
+    if len(views) % cores == 0:
+        parts = [(view, 0, None) for view in views]
+    else:
+        share = -(-rows // cores)
+        firsts = range(0, rows, share)
+        parts = [(view, first, min(share, rows - first)) for view in views for first in firsts]
+    with ThreadPoolExecutor(cores) as pool:
+        done = list(
+            pool.map(lambda part: jax.block_until_ready(render(scene, part[0], part[1], rows=part[2], **size)), parts)
+        )
+    each = len(done) // len(views)
+    return [_stacked(done[k : k + each], camera.height) for k in range(0, len(done), each)]
+
+
+def _stacked(parts: list[Rendering], height: int) -> Rendering:
+    """Put parts of a picture of `height` rows below each other."""
+    if len(parts) == 1:
+        return parts[0]
+    return Rendering(*(np.concatenate(planes)[:height] for planes in zip(*parts, strict=True)))

@@ -1,6 +1,7 @@
 """Recordings of worlds against their own truth."""
 
 import dataclasses
+import itertools
 import subprocess
 import sys
 
@@ -14,7 +15,19 @@ from jaxslam.datasets.synthetic.homogeneous import inverse, matrix_from_pose
 from jaxslam.datasets.synthetic.write_tum import write_tum
 from jaxslam.errors import ConfigError
 from jaxslam.worlds import World, WorldRecording, load_world, worlds
-from jaxslam.worlds.description import Exposure, Fault, Person, Room, Route, Thing, Way, WorldCamera
+from jaxslam.worlds.description import (
+    Exposure,
+    Fault,
+    Hand,
+    LightChange,
+    Lighting,
+    Person,
+    Room,
+    Route,
+    Thing,
+    Way,
+    WorldCamera,
+)
 
 CAMERA = WorldCamera(width=160, height=120)
 PERFECT = dataclasses.replace(CAMERA, sensor=PERFECT_SENSOR)
@@ -236,3 +249,115 @@ def test_the_camera_of_every_world_keeps_clear_of_everything(name):
     for index in np.linspace(0, len(recording) - 1, 60).astype(int):
         frame = recording.render(int(index))
         assert frame.exact_depth_m[frame.exact_depth_m > 0].min() > 0.25, f"frame {index}"
+
+
+FAST = dataclasses.replace(
+    ROOM,
+    things=(),
+    people=(),
+    way=Way(((-1.5, 0.0, 1.4), (-1.0, 1.0, 1.4)), speed_m_per_s=2.0, turn_s=0.4, pause_s=0.2),
+)
+ROLLS = dataclasses.replace(PERFECT, rolling_shutter_s=0.03)
+
+
+def test_each_row_of_a_rolling_shutter_is_taken_from_its_own_pose():
+    recording = WorldRecording(dataclasses.replace(FAST, camera=ROLLS))
+    turns = [abs(first @ second) for first, second in itertools.pairwise(recording.ground_truth.T_world_cam[:, :4])]
+    index = int(np.argmin(turns))  # while it turns fastest
+    frame = recording.render(index)
+    times = 1e-9 * (recording.timestamps_ns[index] - recording.timestamps_ns[0]) + 0.03 * np.linspace(-0.5, 0.5, 120)
+    poses = matrix_from_pose(recording._way.poses(times))
+    turn_deg = np.rad2deg(np.arccos((np.trace(poses[0, :3, :3].T @ poses[-1, :3, :3]) - 1.0) / 2.0))
+    assert turn_deg > 2.0
+    inside = np.abs(points(recording, frame) @ [0, 0, 1.0]) > 0
+    for row in (0, 30, 59, 60, 90, 119):
+        world = moved(poses[row], points(recording, frame)[row])
+        planes = [world[:, 2], world[:, 2] - 2.5, np.abs(world[:, 0]) - 2.5, np.abs(world[:, 1]) - 2.0]
+        floor_or_wall = np.abs(planes).min(axis=0)
+        assert inside[row].all()
+        # Pictures hang a centimeter before the walls.
+        assert np.quantile(floor_or_wall, 0.5) < 2e-4
+        assert floor_or_wall.max() < 0.03
+
+
+def test_a_camera_at_rest_sees_the_same_with_a_rolling_shutter(room):
+    rest = Way(((-1.5, 0.0, 1.4), (-1.2, 0.5, 1.4)), pause_s=30.0, look=(1.0, 0.0, 0.8), tremor=0.0)
+    still = dataclasses.replace(ROOM, things=ROOM.things[:1], people=ROOM.people[1:], way=rest)
+    whole, rolling = (WorldRecording(dataclasses.replace(still, camera=each)).render(60) for each in (PERFECT, ROLLS))
+    np.testing.assert_allclose(whole.exact_depth_m, rolling.exact_depth_m, rtol=1e-5)
+    assert np.mean(whole.rgb != rolling.rgb) < 1e-3
+
+
+def test_vignetting_darkens_the_corners_and_gamma_brightens_the_dark(room):
+    plain = room.render(0).rgb.astype(np.float64)
+    dim = WorldRecording(dataclasses.replace(ROOM, camera=dataclasses.replace(PERFECT, vignetting=0.5)))
+    ratio = np.divide(dim.render(0).rgb, plain, where=plain > 80, out=np.full(plain.shape, np.nan))
+    assert np.nanmedian(ratio[55:65, 75:85]) == pytest.approx(1.0, abs=0.01)
+    assert np.nanmedian(ratio[:6, :8]) == pytest.approx(0.53, abs=0.03)
+    bright = WorldRecording(dataclasses.replace(ROOM, camera=dataclasses.replace(PERFECT, gamma=2.2)))
+    np.testing.assert_allclose(bright.render(0).rgb, 255.0 * (plain / 255.0) ** (1 / 2.2), atol=3.0 + 0.0)
+
+
+def test_lamps_flicker_from_frame_to_frame_and_band_by_band():
+    lamps = Lighting(flicker=0.3, flicker_hz=104.0)
+    flickering = dataclasses.replace(ROOM, lighting=lamps)
+    usual, changed = WorldRecording(ROOM), WorldRecording(flickering)
+    ratios = [np.median(changed.render(k).rgb[60:] / np.maximum(usual.render(k).rgb[60:], 1.0)) for k in range(0, 9, 2)]
+    assert np.ptp(ratios) > 0.2
+    usual, changed = (
+        WorldRecording(dataclasses.replace(world, camera=ROLLS)).render(0).rgb.astype(np.float64)
+        for world in (ROOM, flickering)
+    )
+    rows = np.median(changed / np.maximum(usual, 1.0), axis=(1, 2))
+    expected = 1.0 + 0.3 * np.sin(2.0 * np.pi * 104.0 * 0.03 * np.linspace(-0.5, 0.5, 120))
+    np.testing.assert_allclose(rows, expected, atol=0.03)
+
+
+def test_another_light_comes_at_its_time():
+    later = LightChange(1.0, Lighting(brightness=0.4), over_s=1.0)
+    usual, changed = WorldRecording(ROOM), WorldRecording(dataclasses.replace(ROOM, light_changes=(later,)))
+    np.testing.assert_array_equal(usual.render(29).rgb, changed.render(29).rgb)
+    for index, factor in ((45, 0.5 * (1.0 + 0.4 / 1.1)), (70, 0.4 / 1.1)):
+        before, after = (recording.render(index).rgb.astype(np.float64) for recording in (usual, changed))
+        assert np.median(after[before > 80] / before[before > 80]) == pytest.approx(factor, abs=0.02)
+
+
+def test_a_hand_comes_before_the_lens_and_goes():
+    recording = WorldRecording(dataclasses.replace(ROOM, hands=(Hand(1.0, 2.0, covers=0.8),)))
+    number = len(recording.labels)
+    assert recording.labels[-1] == "person"
+    there = [recording.render(index).instance_mask == number for index in (29, 33, 45, 61)]
+    assert not there[0].any()
+    assert not there[3].any()
+    assert 0 < there[1].sum() < there[2].sum()
+    assert there[2].mean() > 0.15
+    assert there[2].any(axis=1).argmax() == pytest.approx(0.2 * 120, abs=3)
+    frame = recording.render(45)
+    assert frame.moving_mask[there[2]].all()
+    assert frame.exact_depth_m[there[2]].max() < 0.25
+
+
+@pytest.mark.parametrize("ends", ["reverse", "back"])
+def test_a_camera_that_reverses_does_not_turn(ends):
+    way = Way(((-1.5, 0.0, 1.4), (1.0, 0.0, 1.4)), speed_m_per_s=1.0, ends=ends, pause_s=0.4, turn_s=0.6, tremor=0.0)
+    poses = WorldRecording(dataclasses.replace(ROOM, way=way)).ground_truth.T_world_cam
+    ahead = matrix_from_pose(poses)[:, :3, 2]
+    turned = np.rad2deg(np.arccos(np.clip(ahead @ ahead[30], -1.0, 1.0))).max()
+    assert turned < 1.0 if ends == "reverse" else turned > 170.0
+    assert poses[:, 4].max() > 0.8
+    assert abs(poses[-30, 4] - poses[0, 4]) < 1.5
+
+
+def test_frames_are_the_same_bytes_on_one_core():
+    code = (
+        "import hashlib\n"
+        "from jaxslam.worlds import WorldRecording\n"
+        "frame = WorldRecording('kitchen').render(30)\n"
+        "print(hashlib.sha256(frame.rgb.tobytes() + frame.depth_m.tobytes()).hexdigest())\n"
+    )
+    pinned = "import os\nos.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\n"
+    printed = [
+        subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True).stdout
+        for text in (code, pinned + code)
+    ]
+    assert printed[0] == printed[1]
