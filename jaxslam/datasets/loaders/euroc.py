@@ -14,13 +14,13 @@ from jaxslam.datasets.paired_images import ImagePairs, check_present, check_ster
 from jaxslam.datasets.protocol import Fit, Loader, Unmatched
 from jaxslam.errors import CameraError, DatasetError
 from jaxslam.geometry.se3 import between, compose
+from jaxslam.io.text_rows import text_rows
 from jaxslam.io.yaml_files import read_mapping
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.image_files import read_gray
 from jaxslam.sensors.rectification import RectifiedPair
 from jaxslam.sensors.stereo_rig import Rig
 from jaxslam.sensors.stereo_rig_formats import lens_of_kalibr, transform_of
-from jaxslam.trajectory.formats import text_rows
 from jaxslam.trajectory.trajectory import Trajectory, read_euroc
 
 _CAMERAS = ("cam0", "cam1")
