@@ -1,6 +1,7 @@
 """The worlds that come with jaxslam, and those in files of the user."""
 
 import functools
+import os
 from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,9 @@ from jaxslam.config.validation import from_mapping
 from jaxslam.errors import ConfigError, nearest
 from jaxslam.io.yaml_files import read_mapping
 from jaxslam.worlds.description import Catalog, World
+
+_DATA = "JAXSLAM_DATA"
+"""Environment variable that names the folder of recordings."""
 
 
 def worlds() -> list[str]:
@@ -24,7 +28,8 @@ def load_world(name: str | Path) -> World:
         name: A name from `worlds()`, or a YAML file.
 
     Raises:
-        ConfigError: If there is none of that name, or a key or value in the file is wrong.
+        ConfigError: If there is none of that name, a key or value in the file is wrong, or it names a file in
+            `$JAXSLAM_DATA` and that is not set.
     """
     path = Path(name)
     if path.suffix not in {".yaml", ".yml"}:
@@ -35,9 +40,39 @@ def load_world(name: str | Path) -> World:
             )
     world = from_mapping(World, read_mapping(path, ConfigError), str(path))
     with_catalog(world, str(path))
-    way = world.way
-    # A file beside the description, wherever that is read from.
-    return world if way.file is None else replace(world, way=replace(way, file=str(path.parent / way.file)))
+    return _with_paths(world, path)
+
+
+def _with_paths(world: World, description: Path) -> World:
+    """The world of a description with the paths of its files from here, not from the folder of the description."""
+
+    def found(given: str | None, key: str) -> str | None:
+        return None if given is None else _path_of(given, description.parent, f"{description}: {key}")
+
+    way, imu = replace(world.way, file=found(world.way.file, "way: file")), world.imu
+    if imu is not None:
+        imu = replace(imu, sheet=found(imu.sheet, "imu: sheet"), file=found(imu.file, "imu: file"))
+    return replace(world, way=way, imu=imu)
+
+
+def _path_of(given: str, folder: Path, key: str) -> str:
+    """Return the path of a file that a description names: in its folder, or in that of recordings.
+
+    Args:
+        given: Path that the description has; one that begins with `$JAXSLAM_DATA/` lies in the folder of recordings.
+        folder: Folder of the description.
+        key: Place of the path in the description, for messages.
+
+    Raises:
+        ConfigError: The folder of recordings is needed and not known.
+    """
+    first, _, rest = given.partition("/")
+    if first != f"${_DATA}":
+        return str(folder / given)
+    recordings = os.environ.get(_DATA)
+    if not recordings:
+        raise ConfigError(f"{key}: expected {_DATA} to name the folder of recordings, got none for '{given}'")
+    return str(Path(recordings) / rest)
 
 
 def with_catalog(world: World, place: str = "world") -> World:
