@@ -3,7 +3,7 @@
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -72,22 +72,26 @@ class RenderWorld:
     """Name of a world, as `world list` prints it, or a YAML file."""
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")]
     """Folder of the recording; it must not exist, or be empty."""
+    layout: Literal["tum", "euroc", "kitti"] | None = None
+    """Layout of its files: that of TUM RGB-D, EuRoC MAV or KITTI odometry. By default tum with a depth camera, euroc
+    with a stereo pair and an IMU, kitti with a stereo pair alone."""
 
     def main(self) -> None:
         """Run the command."""
-        from jaxslam.datasets.synthetic.write_tum import write_tum  # noqa: PLC0415 - loads JAX
+        from jaxslam.datasets.synthetic.write_recording import write_recording  # noqa: PLC0415 - loads JAX
 
         recording = _opened(self.name)
         with progress_bar("Rendering") as progress:
             task = progress.add_task("", total=len(recording))
-            write_tum(
+            to_open = write_recording(
                 recording,
                 self.folder,
+                self.layout,
                 lambda done, total: progress.update(task, completed=done, total=total),
                 texts={"labels.txt": recording.labels_text()},
             )
         plain_console.print(f"{len(recording)} frames: {self.folder}")
-        plain_console.print(f"To track it: jaxslam run {self.folder}")
+        plain_console.print(f"To track it: jaxslam run {to_open}")
 
 
 def _opened(name: str) -> "WorldRecording":

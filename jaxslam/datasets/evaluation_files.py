@@ -10,7 +10,8 @@ from jaxtyping import Int
 
 from jaxslam.datasets.image_lists import read_file_list
 from jaxslam.errors import DatasetError, TrajectoryError
-from jaxslam.trajectory.formats import PoseRows, read_rows, read_times, text_rows
+from jaxslam.io.text_rows import text_rows
+from jaxslam.trajectory.formats import PoseRows, read_rows, read_times
 from jaxslam.trajectory.trajectory import Trajectory, of_rows
 
 _FRAME_LISTS = ("rgb.txt", "times.txt")

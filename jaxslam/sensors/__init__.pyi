@@ -4,6 +4,17 @@ from .frame import Frame as Frame
 from .frame import check_frame as check_frame
 from .frame_arrays import FrameArrays as FrameArrays
 from .frame_arrays import stack_frames as stack_frames
+from .imu import ImuSamples as ImuSamples
+from .imu import ImuSheet as ImuSheet
+from .imu import ImuStates as ImuStates
+from .imu_files import read_imu_samples as read_imu_samples
+from .imu_files import read_imu_sheet as read_imu_sheet
+from .imu_files import write_imu_samples as write_imu_samples
+from .imu_files import write_imu_sheet as write_imu_sheet
+from .imu_preintegration import ImuDelta as ImuDelta
+from .imu_preintegration import ImuState as ImuState
+from .imu_preintegration import predict as predict
+from .imu_preintegration import preintegrate as preintegrate
 from .rectification import RectifiedPair as RectifiedPair
 from .rectification import load_camera as load_camera
 from .stereo_rig import Lens as Lens

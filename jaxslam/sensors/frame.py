@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from jaxslam.errors import FrameError, brief_repr
+from jaxslam.sensors.imu import ImuSamples
 
 _INT64 = np.iinfo(np.int64)
 
@@ -30,10 +31,12 @@ class Frame:
             image but within a second of it; `None` if both have the same time.
         right: Image of the right camera of a rectified pair, with the shape and type of `image`, the left one; `None`
             for a camera that measures depth. With a right image, `depth_m` is only the start value of stereo matching.
+        imu: Samples of an IMU after the frame before, up to this frame's time, on the same clock; `None` without an
+            IMU. jaxslam does not use them yet.
 
     Raises:
-        FrameError: If a field has the wrong type or shape, the images differ in size, or there is neither depth nor a
-            right image.
+        FrameError: If a field has the wrong type or shape, the images differ in size, there is neither depth nor a
+            right image, or a sample of the IMU is later than the frame.
     """
 
     timestamp_ns: int
@@ -42,6 +45,7 @@ class Frame:
     dynamic_mask: np.ndarray | None = None
     depth_timestamp_ns: int | None = None
     right: np.ndarray | None = None
+    imu: ImuSamples | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "timestamp_ns", _timestamp("timestamp_ns", self.timestamp_ns))
@@ -63,6 +67,8 @@ class Frame:
                 )
         if self.dynamic_mask is not None:
             _check_plane("dynamic_mask", self.dynamic_mask, np.bool_, self.size)
+        if self.imu is not None:
+            _check_imu(self.imu, self.timestamp_ns)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -144,6 +150,14 @@ def _check_plane(field: str, plane: object, dtype: type[np.generic], size: tuple
         raise FrameError(f"{field}: {expected}, got shape {plane.shape}")
     if plane.shape != size[::-1]:
         raise FrameError(f"{field}: expected the image's {_by(size)} pixels, got {_by(plane.shape[::-1])}")
+
+
+def _check_imu(imu: object, timestamp_ns: int) -> None:
+    if not isinstance(imu, ImuSamples):
+        raise FrameError(f"imu: expected a jaxslam.sensors.ImuSamples, got {type(imu).__name__}")
+    if len(imu) and imu.timestamps_ns[-1] > timestamp_ns:
+        late_ns = int(imu.timestamps_ns[-1]) - timestamp_ns
+        raise FrameError(f"imu: expected samples up to the frame's time, got one {late_ns} ns later")
 
 
 def _dtype_hint(field: str, dtype: np.dtype) -> str:

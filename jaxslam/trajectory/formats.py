@@ -1,6 +1,5 @@
 """Read the rows of trajectory files: TUM, KITTI, and the ground truth of EuRoC."""
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,11 +8,10 @@ from typing import Literal, TypeAlias
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxslam.errors import JaxSlamError, TrajectoryError, one_line
+from jaxslam.errors import TrajectoryError, one_line
 from jaxslam.geometry.so3 import quaternions
+from jaxslam.io.text_rows import PathLike, read_text, text_rows
 from jaxslam.io.timestamps import nanoseconds
-
-PathLike: TypeAlias = str | os.PathLike[str]
 
 NOT_FINITE = "holds a number that is not finite"
 
@@ -120,31 +118,8 @@ def read_times(path: PathLike) -> Int[np.ndarray, " n"]:
     return _stamps(path, rows)
 
 
-def text_rows(path: PathLike, error: type[JaxSlamError], *, commas: bool = False) -> list[tuple[int, list[str]]]:
-    """Read the number and the words of every line that is neither empty nor a comment.
-
-    Args:
-        path: Path of the file.
-        error: Class of the error to raise.
-        commas: Whether words are separated by commas instead of spaces.
-
-    Raises:
-        JaxSlamError: An `error`, if the file cannot be read.
-    """
-    split = (lambda line: [word.strip() for word in line.split(",")]) if commas else str.split
-    rows = ((number, split(line)) for number, line in enumerate(_text(path, error).split("\n"), 1))
-    return [(number, words) for number, words in rows if any(words) and not words[0].startswith("#")]
-
-
-def _text(path: PathLike, error: type[JaxSlamError]) -> str:
-    try:
-        return Path(path).read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as problem:
-        raise error(f"{path}: cannot be read: {one_line(problem)}") from problem
-
-
 def _is_euroc(path: PathLike) -> bool:
-    lines = [line for line in _text(path, TrajectoryError).split("\n") if line.strip()]
+    lines = [line for line in read_text(path, TrajectoryError).split("\n") if line.strip()]
     first = next((line for line in lines if not line.lstrip().startswith("#")), "")
     headed = bool(lines) and lines[0].lstrip().startswith("#") and "," in lines[0]
     return "," in first and (headed or Path(path).suffix.lower() == ".csv")

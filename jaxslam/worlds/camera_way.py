@@ -69,7 +69,11 @@ class PointWay:
 
 
 class FileWay:
-    """The way of a trajectory in a file: splines through its poses, smooth up to the acceleration."""
+    """The way of a trajectory in a file: splines through its poses, smooth up to the acceleration.
+
+    Attributes:
+        start_ns: Time of the start on the clock of the file, nanoseconds.
+    """
 
     def __init__(self, way: Way, file: str, seconds: float, scale: float, seed: int) -> None:
         """Read the trajectory.
@@ -94,6 +98,7 @@ class FileWay:
         if times_s[-1] < way.from_s + seconds:
             needed = f"from_s + seconds, {way.from_s + seconds:g} s"
             raise ConfigError(f"{file}: expected a trajectory of {needed}, got {times_s[-1]:.3f} s")
+        self.start_ns = int(stamps[0]) + round(1e9 * way.from_s)
         turn = axis_rotation(2, np.deg2rad(way.turn_deg))
         places = poses[:, 4:] @ matrices(turn).T + np.array(way.at_m)
         self._position = CubicSpline(times_s, places)

@@ -543,6 +543,41 @@ def focal_px(camera: WorldCamera) -> float:
 
 
 @dataclass(frozen=True)
+class WorldImu(ValidatedConfig):
+    """The IMU beside the camera: synthesized along the way of the camera, or samples of a real one.
+
+    A figure that is `None` is that of the sheet.
+
+    Attributes:
+        sheet: File of a data sheet as `jaxslam.sensors.read_imu_sheet` takes; `None` for `ADIS16448`, EuRoC's IMU.
+        rate_hz: Samples per second.
+        gyroscope_noise_density: Density of the white noise of angular rates, rad/s/sqrt(Hz).
+        gyroscope_random_walk: Density of the random walk of their bias, rad/s^2/sqrt(Hz).
+        accelerometer_noise_density: Density of the white noise of specific forces, m/s^2/sqrt(Hz).
+        accelerometer_random_walk: Density of the random walk of their bias, m/s^3/sqrt(Hz).
+        T_imu_cam: `qw qx qy qz x y z` pose of the camera in IMU axes, meters.
+        noise_free: Whether samples are exact: without noise and bias.
+        file: File of real samples in the layout of EuRoC's `imu0/data.csv`, plain or `.gz`, on the clock of the
+            trajectory in `way.file`.
+    """
+
+    sheet: str | None = None
+    rate_hz: Annotated[float, Range(above=0, at_most=10_000)] | None = None
+    gyroscope_noise_density: Annotated[float, Range(at_least=0)] | None = None
+    gyroscope_random_walk: Annotated[float, Range(at_least=0)] | None = None
+    accelerometer_noise_density: Annotated[float, Range(at_least=0)] | None = None
+    accelerometer_random_walk: Annotated[float, Range(at_least=0)] | None = None
+    T_imu_cam: tuple[float, float, float, float, float, float, float] | None = None
+    noise_free: bool = False
+    file: str | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.file is not None and self.noise_free:
+            raise ConfigError("WorldImu: expected noise_free or a file, got both")
+
+
+@dataclass(frozen=True)
 class World(ValidatedConfig):
     """A world: places, what is in them, light, and how it is filmed.
 
@@ -569,7 +604,8 @@ class World(ValidatedConfig):
         faults: Times in which the camera does not deliver.
         camera: The camera.
         scale: Factor of all lengths and speeds of the world, and of the ranges and noise of the sensor: pictures stay
-            the same, and depth and poses grow.
+            the same, and depth and poses grow. Gravity, and the noise of an IMU, stay as they are.
+        imu: The IMU; `None` for none.
     """
 
     about: str
@@ -594,6 +630,7 @@ class World(ValidatedConfig):
     faults: tuple[Fault, ...] = ()
     camera: WorldCamera = field(default_factory=WorldCamera)
     scale: Annotated[float, Range(at_least=0.01, at_most=100)] = 1.0
+    imu: WorldImu | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -601,6 +638,8 @@ class World(ValidatedConfig):
             times = [change.at_s for change in changes]
             if times != sorted(times):
                 raise ConfigError(f"World.{name}: expected times in order, got {times}")
+        if self.imu is not None and self.imu.file is not None:
+            _check_real_imu(self.way, self.scale)
 
 
 @dataclass(frozen=True)
@@ -631,6 +670,13 @@ def _check_way(of: str, points: tuple[tuple[float, ...], ...], other: str | None
         _check_points(f"{of}.points_m", points)
     elif points:
         raise ConfigError(f"{of}: expected points_m or {name}, got both")
+
+
+def _check_real_imu(way: Way, scale: float) -> None:
+    """Refuse a way on which a real IMU has not been."""
+    if way.file is None or way.tremor or scale != 1:
+        got = f"file {way.file}, tremor {way.tremor:g} and scale {scale:g}"
+        raise ConfigError(f"WorldImu.file: expected a way.file with way.tremor 0 and a World.scale of 1, got {got}")
 
 
 def _check_points(name: str, points: tuple[tuple[float, ...], ...]) -> None:

@@ -10,6 +10,7 @@ from jaxslam.config.loading import configs_dir
 from jaxslam.config.validation import from_mapping
 from jaxslam.errors import ConfigError, nearest
 from jaxslam.io.yaml_files import read_mapping
+from jaxslam.worlds.data_paths import beside
 from jaxslam.worlds.description import Catalog, World
 from jaxslam.worlds.expansion import placed
 
@@ -28,10 +29,11 @@ def load_world(name: str | Path) -> World:
         name: A name from `worlds()`, or a YAML file.
 
     Raises:
-        ConfigError: If there is none of that name, or a key or value in the file is wrong.
+        ConfigError: If there is none of that name, a key or value in the file is wrong, or it names a file in
+            `$JAXSLAM_DATA` and that is not set.
     """
     path = Path(name)
-    if path.suffix not in {".yaml", ".yml"}:
+    if not _is_file(str(name)):
         path = _folder() / f"{name}.yaml"
         if str(name) not in worlds():
             raise ConfigError(
@@ -39,19 +41,28 @@ def load_world(name: str | Path) -> World:
             )
     world = from_mapping(World, read_mapping(path, ConfigError), str(path))
     with_catalog(world, str(path))
-    way = world.way
-    # Files beside the description, wherever that is read from.
-    places = tuple(replace(each, world=_beside(each.world, path.parent)) for each in world.places)
-    return replace(
-        world,
-        places=places,
-        way=way if way.file is None else replace(way, file=str(path.parent / way.file)),
+    return _with_paths(world, path.parent)
+
+
+def _with_paths(world: World, folder: Path) -> World:
+    """The world with paths of its files that are right wherever they are read from."""
+
+    def found(given: str | None) -> str | None:
+        return None if given is None else beside(given, folder)
+
+    way, imu, people = replace(world.way, file=found(world.way.file)), world.imu, world.real_people
+    if imu is not None:
+        imu = replace(imu, sheet=found(imu.sheet), file=found(imu.file))
+    if people is not None:
+        people = replace(people, recording=beside(people.recording, folder), network=beside(people.network, folder))
+    places = tuple(
+        replace(each, world=beside(each.world, folder)) if _is_file(each.world) else each for each in world.places
     )
+    return replace(world, way=way, imu=imu, real_people=people, places=places)
 
 
-def _beside(name: str, folder: Path) -> str:
-    """The name of a world, or a YAML file in a folder."""
-    return str(folder / name) if Path(name).suffix in {".yaml", ".yml"} else name
+def _is_file(name: str) -> bool:
+    return Path(name).suffix in {".yaml", ".yml"}
 
 
 def with_places(world: World, within: tuple[str, ...] = ()) -> World:

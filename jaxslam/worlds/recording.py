@@ -23,11 +23,13 @@ from jaxslam.datasets.synthetic.virtual_camera import (
 from jaxslam.errors import ConfigError
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame
+from jaxslam.sensors.imu import ImuSamples
 from jaxslam.trajectory.trajectory import Trajectory
 from jaxslam.worlds.building import build
 from jaxslam.worlds.camera_way import camera_way
 from jaxslam.worlds.description import World, focal_px
 from jaxslam.worlds.expansion import expanded
+from jaxslam.worlds.imu import record_imu
 from jaxslam.worlds.library import load_world, with_catalog, with_places
 
 _FLAT_M = 0.051
@@ -48,6 +50,7 @@ class WorldFrame:
         T_world_cam: `(7,)` float64 pose of the camera, wxyz_xyz.
         T_world_instance: `(n, 7)` float64 poses of things and people, wxyz_xyz; number `k` is in row `k - 1`.
         right: `(height, width, 3)` uint8, what the right camera of a pair measured; `None` without one.
+        imu: Samples of the IMU since the frame before; `None` without one.
     """
 
     timestamp_ns: int
@@ -59,6 +62,7 @@ class WorldFrame:
     T_world_cam: np.ndarray
     T_world_instance: np.ndarray
     right: np.ndarray | None = None
+    imu: ImuSamples | None = None
 
     @property
     def mask_images(self) -> dict[str, np.ndarray]:
@@ -69,7 +73,8 @@ class WorldFrame:
     @property
     def measured(self) -> Frame:
         """Return what a camera would deliver: no mask of moving objects, and no depth for a stereo pair."""
-        return Frame(self.timestamp_ns, self.rgb, self.depth_m if self.right is None else None, right=self.right)
+        depth_m = self.depth_m if self.right is None else None
+        return Frame(self.timestamp_ns, self.rgb, depth_m, right=self.right, imu=self.imu)
 
 
 class WorldRecording:
@@ -85,6 +90,9 @@ class WorldRecording:
         ground_truth: Trajectory of the camera.
         labels: Class label of each thing and person; that of number `k` is `labels[k - 1]`.
         movable: Whether each can move.
+        imu: Data sheet of the IMU, with the place of the camera on it; `None` without one.
+        imu_samples: All its samples, from the first frame or before to the last or after; `None` without one.
+        imu_states: What is true of it at the times of the frames; `None` without one.
     """
 
     def __init__(self, world: World | str | Path) -> None:
@@ -96,6 +104,7 @@ class WorldRecording:
         Raises:
             ConfigError: If there is no such world, or something in its description is wrong.
             TrajectoryError: If the file of its way cannot be read.
+            DatasetError: If the file of samples of its IMU cannot be read.
         """
         self.name = "world" if isinstance(world, World) else Path(world).stem
         self.world = world = world if isinstance(world, World) else load_world(world)
@@ -123,6 +132,7 @@ class WorldRecording:
         whole = expanded(with_catalog(with_places(world)))
         self._way = camera_way(whole)
         self.ground_truth = Trajectory(self.timestamps_ns, self._way.poses(self._time_s))
+        self.imu, self.imu_samples, self.imu_states = record_imu(whole, self._way, self.timestamps_ns)
         self._built = built = build(whole, self._way.poses)
         self.instances = tuple(built.instances)
         self.labels = tuple(instance.label for instance in built.instances)
@@ -174,7 +184,13 @@ class WorldRecording:
             T_world_cam=self.ground_truth.T_world_cam[index].copy(),
             T_world_instance=poses,
             right=right,
+            imu=self._imu_of(index),
         )
+
+    def _imu_of(self, index: int) -> ImuSamples | None:
+        if self.imu_samples is None:
+            return None
+        return self.imu_samples.since_last_frame(self.timestamps_ns, index, self.camera.fps)
 
     def _take(self, index: int) -> TakenPicture:
         return self._filming.take(float(self._time_s[index]), jax.random.fold_in(self._key, int(self._numbers[index])))

@@ -1,4 +1,4 @@
-"""Recordings in the layout of EuRoC MAV: `mav0/cam0`, `mav0/cam1`, stereo pairs before rectification.
+"""Recordings in the layout of EuRoC MAV: `mav0/cam0`, `mav0/cam1`, stereo pairs before rectification, and `mav0/imu0`.
 
 Source: Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016.
 """
@@ -12,18 +12,21 @@ import numpy as np
 
 from jaxslam.datasets.paired_images import ImagePairs, check_present, check_stereo, moved
 from jaxslam.datasets.protocol import Fit, Loader, Unmatched
-from jaxslam.errors import CameraError, DatasetError
+from jaxslam.errors import CameraError, ConfigError, DatasetError
 from jaxslam.geometry.se3 import between, compose
+from jaxslam.io.text_rows import text_rows
 from jaxslam.io.yaml_files import read_mapping
 from jaxslam.sensors.camera import Camera
+from jaxslam.sensors.frame import Frame
 from jaxslam.sensors.image_files import read_gray
+from jaxslam.sensors.imu import ImuSamples, ImuSheet
+from jaxslam.sensors.imu_files import read_imu_samples, read_imu_sheet
 from jaxslam.sensors.rectification import RectifiedPair
 from jaxslam.sensors.stereo_rig import Rig
 from jaxslam.sensors.stereo_rig_formats import lens_of_kalibr, transform_of
-from jaxslam.trajectory.formats import text_rows
 from jaxslam.trajectory.trajectory import Trajectory, read_euroc
 
-_CAMERAS = ("cam0", "cam1")
+_CAMERAS, _IMU = ("cam0", "cam1"), "imu0"
 _LIST, _SENSOR, _TRUTH = "data.csv", "sensor.yaml", Path("state_groundtruth_estimate0") / "data.csv"
 
 
@@ -38,13 +41,16 @@ class EurocDataset(ImagePairs):
         camera: The rectified left camera, with the baseline.
         timestamps_ns: `(n,)` int64 timestamps in nanoseconds, strictly increasing.
         unmatched: Number of images of the left and of the right camera without a partner.
+        imu: Data sheet of `imu0`, with the place of `camera` on it; `None` without `imu0`.
+        imu_samples: All samples of `imu0`, those between and around the frames; `None` without `imu0`.
     """
 
     def __init__(self, folder: Path, camera: Camera | RectifiedPair) -> None:
         """Match the images of the two lists; they are decoded on access.
 
         Raises:
-            DatasetError: If a list is missing or malformed, a listed image is missing, or nothing matches.
+            DatasetError: If a list is missing or malformed, a listed image is missing, nothing matches, or a file of
+                `imu0` is missing or malformed.
             CameraError: If the camera is not a stereo pair, or `T_BS` of `cam0` is missing or malformed.
         """
         self._taken_with(camera)
@@ -64,6 +70,14 @@ class EurocDataset(ImagePairs):
         self._T_body_camera = _T_body_left(self._root)
         if self._pair is not None:
             self._T_body_camera = compose(self._T_body_camera, self._pair.T_left_camera)
+        self.imu, self.imu_samples = _imu(self._root / _IMU, self._T_body_camera)
+
+    def _frame(self, index: int, first: np.ndarray, second: np.ndarray) -> Frame:
+        frame = super()._frame(index, first, second)
+        if self.imu_samples is None:
+            return frame
+        index = range(len(self))[index]
+        return replace(frame, imu=self.imu_samples.since_last_frame(self.timestamps_ns, index, self.camera.fps))
 
     def _truth(self) -> Trajectory | None:
         path = self._root / _TRUTH
@@ -80,6 +94,16 @@ def _mav(folder: Path) -> Path:
 
 def _name(mav: Path) -> str:
     return mav.parent.name if mav.name == "mav0" else mav.name
+
+
+def _imu(folder: Path, T_body_camera: np.ndarray) -> tuple[ImuSheet, ImuSamples] | tuple[None, None]:
+    """Return the data sheet and the samples of an IMU, if its folder is there."""
+    if not folder.is_dir():
+        return None, None
+    try:
+        return read_imu_sheet(folder / _SENSOR, T_body_camera), read_imu_samples(folder / _LIST)
+    except ConfigError as problem:
+        raise DatasetError(str(problem)) from None
 
 
 def _listed(folder: Path) -> dict[int, Path]:

@@ -5,4 +5,6 @@ from .ground_truth_detector import SceneDetector as SceneDetector
 from .ground_truth_masks import with_true_masks as with_true_masks
 from .sensor_noise import PERFECT_SENSOR as PERFECT_SENSOR
 from .sensor_noise import SensorConfig as SensorConfig
+from .write_euroc import write_euroc as write_euroc
+from .write_kitti import write_kitti as write_kitti
 from .write_tum import write_tum as write_tum

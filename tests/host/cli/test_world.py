@@ -52,6 +52,33 @@ def test_render_writes_a_recording_that_opens(tmp_path, capsys):
     assert len(open_dataset(tmp_path / "tiny")) == 6
 
 
+@pytest.mark.parametrize(
+    ("lines", "options", "file", "to_open"),
+    [
+        ("", (), "rgb.txt", ""),
+        ("camera: {width: 64, height: 48, baseline_m: 0.1}", (), "poses/00.txt", "sequences/00"),
+        ("camera: {width: 64, height: 48, baseline_m: 0.1}\nimu: {rate_hz: 100}", (), "mav0/imu0/data.csv", ""),
+        ("camera: {width: 64, height: 48, baseline_m: 0.1}", ("--layout", "euroc"), "mav0/cam1/data.csv", ""),
+    ],
+)
+def test_render_chooses_the_layout_by_the_camera(tmp_path, capsys, lines, options, file, to_open):
+    world = Path(tiny(tmp_path))
+    if lines:
+        world.write_text(TINY.replace("camera: {width: 64, height: 48}", lines))
+    main(["world", "render", str(world), str(tmp_path / "out"), *options])
+    assert f"jaxslam run {tmp_path / 'out' / to_open}" in " ".join(capsys.readouterr().out.split())
+    assert (tmp_path / "out" / file).is_file()
+    assert (tmp_path / "out" / to_open / "labels.txt").is_file()
+    assert len(open_dataset(tmp_path / "out" / to_open)) == 6
+
+
+def test_a_layout_that_does_not_suit_the_camera_is_an_error(tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["world", "render", tiny(tmp_path), str(tmp_path / "out"), "--layout", "kitti"])
+    assert ended.value.code == 1
+    assert "expected a stereo pair (baseline_m), got a camera with depth images" in capsys.readouterr().err
+
+
 def test_an_unknown_world_is_an_error_in_one_line(capsys):
     with pytest.raises(SystemExit) as ended:
         main(["world", "show", "kitchn"])

@@ -5,16 +5,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from raw_pairs import BASELINE_M, FISHEYE, HEIGHT, RADTAN, WIDTH, RawRoom, write_euroc
+from raw_pairs import BASELINE_M, FISHEYE, HEIGHT, RADTAN, T_BODY_LEFT, WIDTH, RawRoom, write_euroc
 
 from jaxslam import Camera, Slam, TrackStatus, load_config
 from jaxslam.datasets import Associated, open_dataset
+from jaxslam.datasets.loaders.euroc import EurocDataset
+from jaxslam.datasets.synthetic.virtual_camera import START_NS
 from jaxslam.errors import CameraError, DatasetError, TrajectoryError
+from jaxslam.geometry.se3 import compose
 from jaxslam.sensors.stereo_rig import Lens
 from jaxslam.trajectory.evaluation import evaluate
+from jaxslam.trajectory.trajectory import read_euroc
 
 FRAMES = 12
 TINY = (Lens(64, 48, 42.0, 42.0, 31.0, 24.0, RADTAN[0].distortion), Lens(64, 48, 42.0, 42.0, 32.0, 23.0))
+NOISE = """gyroscope_noise_density: 1.6968e-04
+gyroscope_random_walk: 1.9393e-05
+accelerometer_noise_density: 2.0e-3
+accelerometer_random_walk: 3.0e-3
+"""
 
 
 @pytest.fixture(scope="module", params=[RADTAN, FISHEYE], ids=["radtan", "equidistant"])
@@ -79,6 +88,71 @@ class TestFolder:
         assert (dataset[0].image != open_dataset(tiny)[0].image).any()
         with pytest.raises(CameraError, match="baseline_m: expected meters for a stereo pair"):
             open_dataset(tiny, camera="bonn")
+
+
+def add_imu(recording: Path, T_BS: str = "[1, 0, 0, 0, 0, 0, 0]") -> Path:
+    """An IMU at 200 Hz from 20 ms before the first frame; each row holds its number as the first rate."""
+    folder = recording / "mav0" / "imu0"
+    folder.mkdir()
+    (folder / "sensor.yaml").write_text(f"sensor_type: imu\nT_BS: {T_BS}\nrate_hz: 200\n{NOISE}")
+    rows = [f"{START_NS - 20_000_000 + 5_000_000 * row},{row},0,0,0,0,9.81" for row in range(40)]
+    (folder / "data.csv").write_text("#timestamp [ns],w_RS_S_x [rad s^-1],...\n" + "\n".join(rows) + "\n")
+    return folder
+
+
+class TestImu:
+    def test_frames_have_the_samples_since_the_last(self, tiny: Path) -> None:
+        add_imu(tiny)
+        dataset = open_dataset(tiny)
+        assert isinstance(dataset, EurocDataset)
+        assert dataset.imu_samples is not None
+        assert len(dataset.imu_samples) == 40
+        assert dataset.timestamps_ns[0] == START_NS
+        rows = [frame.imu.gyro_rad_per_s[:, 0].tolist() for frame in dataset if frame.imu is not None]
+        # Frames are 50 ms apart; before the first one there are 20 ms of samples.
+        assert rows == [list(range(5)), list(range(5, 15)), list(range(15, 25))]
+        last = dataset[-1].imu
+        assert last is not None
+        assert last.gyro_rad_per_s[0, 0] == 15
+
+    def test_the_sheet_places_the_rectified_camera(self, tiny: Path) -> None:
+        add_imu(tiny)
+        dataset = open_dataset(tiny)
+        assert isinstance(dataset, EurocDataset)
+        assert dataset.imu is not None
+        assert dataset.imu.rate_hz == 200
+        truth, bodies = dataset.ground_truth, read_euroc(tiny / "mav0" / "state_groundtruth_estimate0" / "data.csv")
+        assert truth is not None
+        T_imu_cam = np.array(dataset.imu.T_imu_cam)
+        np.testing.assert_allclose(compose(bodies.T_world_cam, T_imu_cam[None]), truth.T_world_cam, atol=1e-9)
+        assert abs(T_imu_cam[:4] @ T_BODY_LEFT[:4]) < 1 - 1e-5  # rectification turns the camera
+
+    def test_none_without_a_folder(self, tiny: Path) -> None:
+        dataset = open_dataset(tiny)
+        assert isinstance(dataset, EurocDataset)
+        assert dataset.imu is dataset.imu_samples is dataset[0].imu is None
+
+    @pytest.mark.parametrize(
+        ("file", "change", "message"),
+        [
+            ("data.csv", (",3,0", ",three,0"), r"imu0/data\.csv:5: expected nanoseconds, three angular rates"),
+            ("data.csv", ("\n1599", "\n1699"), r"imu0/data\.csv:6: expected a time after 1699"),
+            ("sensor.yaml", ("rate_hz", "rate"), r"imu0/sensor\.yaml: missing 'rate_hz'"),
+            ("sensor.yaml", ("T_BS", "T_SB"), r"imu0/sensor\.yaml: T_BS: expected a 4 x 4 matrix"),
+        ],
+    )
+    def test_malformed(self, tiny: Path, file: str, change: tuple[str, str], message: str) -> None:
+        path = add_imu(tiny) / file
+        assert change[0] in path.read_text()
+        path.write_text(path.read_text().replace(*change))
+        with pytest.raises(DatasetError, match=message):
+            open_dataset(tiny)
+
+    @pytest.mark.parametrize("file", ["data.csv", "sensor.yaml"])
+    def test_missing(self, tiny: Path, file: str) -> None:
+        (add_imu(tiny) / file).unlink()
+        with pytest.raises(DatasetError, match=rf"imu0/{file}: cannot be read"):
+            open_dataset(tiny)
 
 
 class TestBad:
