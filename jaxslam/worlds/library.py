@@ -9,6 +9,7 @@ from jaxslam.config.loading import configs_dir
 from jaxslam.config.validation import from_mapping
 from jaxslam.errors import ConfigError, nearest
 from jaxslam.io.yaml_files import read_mapping
+from jaxslam.worlds.data_paths import beside
 from jaxslam.worlds.description import Catalog, World
 
 
@@ -35,9 +36,7 @@ def load_world(name: str | Path) -> World:
             )
     world = from_mapping(World, read_mapping(path, ConfigError), str(path))
     with_catalog(world, str(path))
-    way = world.way
-    # A file beside the description, wherever that is read from.
-    return world if way.file is None else replace(world, way=replace(way, file=str(path.parent / way.file)))
+    return _with_paths(world, path.parent)
 
 
 def with_catalog(world: World, place: str = "world") -> World:
@@ -61,6 +60,17 @@ def catalog() -> Catalog:
     """Return the looks and kinds that any world can use."""
     path = configs_dir() / "world_catalog.yaml"
     return from_mapping(Catalog, read_mapping(path, ConfigError), str(path))
+
+
+def _with_paths(world: World, folder: Path) -> World:
+    """The world with files that lie beside the description, wherever that is read from."""
+    way, people = world.way, world.real_people
+    if way.file is not None:
+        world = replace(world, way=replace(way, file=beside(way.file, folder)))
+    if people is not None:
+        recording, network = beside(people.recording, folder), beside(people.network, folder)
+        world = replace(world, real_people=replace(people, recording=recording, network=network))
+    return world
 
 
 def _folder() -> Path:
