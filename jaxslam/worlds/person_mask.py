@@ -12,8 +12,16 @@ from jaxtyping import Bool, Float32, UInt8
 
 _BORDER_PX = 8
 """Distance from the border of the network's mask within which depth and color decide."""
-_MIN_PX = 600
-"""Area of the smallest person, or part of one."""
+_MIN_PX, _MIN_SHARE = 1000, 0.05
+"""Area of the smallest part of a person, and as a share of the largest part."""
+_HOLE_PX = 200
+"""Area up to which a hole in a person is filled."""
+_RIM_PX = 2
+"""Width of the rim of people that has the color of what was behind, too."""
+_CORE_PX = 1500
+"""Smallest area of depth well inside the network's mask that is a person's, and not that of a gap between legs."""
+_STRAY_PX = 7
+"""Radius up to which pixels of people that seem to be farther than those around are errors of the sensor."""
 _STEP, _STEP_M = 0.04, 0.06
 """Difference of depth to the people around that is more than noise: a share of the depth, plus meters."""
 _NEAR_PX = 25
@@ -35,14 +43,14 @@ Plane = Float32[np.ndarray, "h w"]
 def refined_mask(mask: Mask, depth_m: Plane, image: UInt8[np.ndarray, "h w 3"]) -> Mask:
     """Return a network's mask of people with sharp borders, without specks.
 
-    The outermost pixels of people are left out: they have the color of what was behind, too.
+    The rim of people is left out: it has the color of what was behind, too.
 
     Args:
         mask: `(h, w)` mask of people.
         depth_m: `(h, w)` depth in meters; 0 where missing. People need none, it then has no vote.
         image: `(h, w, 3)` RGB.
     """
-    mask = _without_specks(mask)
+    mask = _people_only(mask)
     inner, outer = _eroded(mask, _BORDER_PX), _dilated(mask, _BORDER_PX)
     as_people, behind = _compare_depth(inner, depth_m)
     people, background = inner & ~behind, _eroded(~outer | behind, 2)
@@ -55,13 +63,14 @@ def refined_mask(mask: Mask, depth_m: Plane, image: UInt8[np.ndarray, "h w 3"]) 
     )
     chosen = cv2.GaussianBlur(votes.astype(np.float32), (0, 0), _SMOOTH_PX) > 0
     chosen |= people & (distance_px > _SURE_PX)
-    return _eroded(_without_specks(_smoothed(chosen & outer & ~behind)), 1)
+    return _eroded(_people_only(_smoothed(chosen & outer & ~behind)), _RIM_PX)
 
 
 def filled_depth(mask: Mask, depth_m: Plane) -> Plane:
     """Return the depth of people with that of the nearest pixel where it is missing; 0 outside of the mask.
 
-    A person without any depth is too near for the sensor: nearer than everything, and has depth 0.
+    Pixels that are farther than those around are corrected: depth is out of place there. A person without any depth
+    is too near for the sensor: nearer than everything, and has depth 0.
 
     Args:
         mask: `(h, w)` mask of people.
@@ -74,15 +83,16 @@ def filled_depth(mask: Mask, depth_m: Plane) -> Plane:
     nearest = np.asarray(labels, np.int32)
     depths_m = np.zeros(int(nearest.max()) + 1, np.float32)
     depths_m[nearest[known]] = depth_m[known]
-    count, parts = cv2.connectedComponents(_bytes(mask), connectivity=4)
-    part = np.asarray(parts, np.int32)
-    has_depth = np.bincount(part[known], minlength=count) > 0
-    return np.where(mask & has_depth[part], depths_m[nearest], np.float32(0))
+    part, areas_px = _parts(mask)
+    has_depth = np.bincount(part[known], minlength=len(areas_px)) > 0
+    filled_m = np.where(has_depth[part], depths_m[nearest], np.float32(0))
+    opened_m = cv2.morphologyEx(np.where(mask, filled_m, np.float32(np.inf)), cv2.MORPH_OPEN, _disk(_STRAY_PX))
+    return np.where(mask, opened_m, np.float32(0))
 
 
 def _compare_depth(inner: Mask, depth_m: Plane) -> tuple[Mask, Mask]:
     """Tell which pixels have a depth as the people around, and which have another."""
-    core = _without_specks(inner & (depth_m > 0) & ~_at_step(depth_m))
+    core = _without_specks(inner & (depth_m > 0) & ~_at_step(depth_m), _CORE_PX)
     window = np.ones((2 * _BORDER_PX + 9,) * 2, np.uint8)
     nearest_m = cv2.erode(np.where(core, depth_m, np.float32(np.inf)), window)
     farthest_m = cv2.dilate(np.where(core, depth_m, np.float32(0)), window)
@@ -120,11 +130,25 @@ def _inside_px(mask: Mask) -> Plane:
     return np.asarray(cv2.distanceTransform(_bytes(mask), cv2.DIST_L2, 5), np.float32)
 
 
-def _without_specks(mask: Mask) -> Mask:
-    _, part, measures, _ = cv2.connectedComponentsWithStats(_bytes(mask), connectivity=4)
-    large = measures[:, cv2.CC_STAT_AREA] >= _MIN_PX
+def _without_specks(mask: Mask, at_least_px: float) -> Mask:
+    """Keep the connected parts of a mask that have an area."""
+    part, areas_px = _parts(mask)
+    large = areas_px >= at_least_px
     large[0] = False  # what is not in the mask
-    return large[np.asarray(part, np.int32)]
+    return large[part]
+
+
+def _parts(mask: Mask) -> tuple[np.ndarray, np.ndarray]:
+    """Number the connected parts of a mask from 1, and return their areas; number 0 is the rest."""
+    _, part, measures, _ = cv2.connectedComponentsWithStats(_bytes(mask), connectivity=4)
+    return np.asarray(part, np.int32), measures[:, cv2.CC_STAT_AREA]
+
+
+def _people_only(mask: Mask) -> Mask:
+    """Take away parts that are too small for people, and fill small holes."""
+    largest_px = _parts(mask)[1][1:].max(initial=0)
+    kept = _without_specks(mask, max(_MIN_PX, _MIN_SHARE * largest_px))
+    return ~_without_specks(~kept, _HOLE_PX)
 
 
 def _smoothed(mask: Mask) -> Mask:
