@@ -30,7 +30,8 @@ _CLEAR_COLOR = 40.0
 """Difference of RGB distances, 0 to 255, at which color is sure."""
 _NETWORK, _COLOR, _DEPTH_OUTSIDE = 0.8, 1.2, 0.6
 """Weights of the votes; that of depth is 1, and less outside the network's mask, where the floor is beside the feet."""
-
+_NO_DEPTH = 0.5
+"""Vote of missing depth against people: most of it is background in the shadow of the sensor's light."""
 _SMOOTH_PX = 1.2
 """Standard deviation of the blur of the votes."""
 _SURE_PX = 12
@@ -47,7 +48,7 @@ def refined_mask(mask: Mask, depth_m: Plane, image: UInt8[np.ndarray, "h w 3"]) 
 
     Args:
         mask: `(h, w)` mask of people.
-        depth_m: `(h, w)` depth in meters; 0 where missing. People need none, it then has no vote.
+        depth_m: `(h, w)` depth in meters; 0 where missing.
         image: `(h, w, 3)` RGB.
     """
     mask = _people_only(mask)
@@ -58,6 +59,7 @@ def refined_mask(mask: Mask, depth_m: Plane, image: UInt8[np.ndarray, "h w 3"]) 
     votes = (
         np.where(as_people, np.where(mask, 1.0, _DEPTH_OUTSIDE), 0.0)
         - behind
+        - np.where(depth_m > 0, 0.0, _NO_DEPTH)
         + _COLOR * _color_vote(image, people, background)
         + _NETWORK * np.clip(distance_px / _BORDER_PX, -1.0, 1.0)
     )
