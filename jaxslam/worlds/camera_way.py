@@ -1,15 +1,19 @@
 """The way of the camera of a world: poses at any time."""
 
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 from scipy.interpolate import CubicSpline
+from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from jaxslam.datasets.synthetic.camera_path import hand_tremor, looking_at, poses_of
 from jaxslam.errors import ConfigError
+from jaxslam.geometry.se3 import compose
 from jaxslam.geometry.so3 import axis_rotation, matrices, multiply
 from jaxslam.trajectory import trajectory
+from jaxslam.worlds.data_paths import data_path
 from jaxslam.worlds.description import Way, World
 from jaxslam.worlds.motion import SmoothWay
 
@@ -30,12 +34,12 @@ def camera_way(world: World) -> CameraWay:
     """Return the way of the camera of a world.
 
     Raises:
-        ConfigError: The trajectory in a file is shorter than the recording.
+        ConfigError: The trajectory in a file is shorter than the recording, or a variable in its path is not set.
         TrajectoryError: The file cannot be read.
     """
     if world.way.file is None:
         return PointWay(world.way, world.seed, world.scale)
-    return FileWay(world.way, world.way.file, world.seconds, world.scale, world.seed)
+    return FileWay(world.way, str(data_path(world.way.file, Path())), world.seconds, world.scale, world.seed)
 
 
 class PointWay:
@@ -94,7 +98,8 @@ class FileWay:
         stamps, first = np.unique(given.timestamps_ns, return_index=True)
         if len(stamps) < _MIN_POSES:
             raise ConfigError(f"{file}: expected at least {_MIN_POSES} poses, got {len(stamps)}")
-        poses, times_s = given.T_world_cam[first], 1e-9 * (stamps - stamps[0])
+        times_s = 1e-9 * (stamps - stamps[0])
+        poses = compose(_smoothed(given.T_world_cam[first], times_s, way.smooth_s), np.array([way.T_body_cam]))
         if times_s[-1] < way.from_s + seconds:
             needed = f"from_s + seconds, {way.from_s + seconds:g} s"
             raise ConfigError(f"{file}: expected a trajectory of {needed}, got {times_s[-1]:.3f} s")
@@ -111,6 +116,20 @@ class FileWay:
         rotation = self._rotation(within_s) * Rotation.from_euler("ZYX", turned)
         position = self._scale * (self._position(within_s) + moved)
         return np.concatenate([rotation.as_quat()[:, [3, 0, 1, 2]], position], axis=1)
+
+
+def _smoothed(poses: np.ndarray, times_s: np.ndarray, over_s: float) -> np.ndarray:
+    """Average `(n, 7)` poses at `(n,)` times over a time; those at the ends, with the first and last pose repeated."""
+    width = round(over_s / float(np.median(np.diff(times_s))))
+    if width < 2:
+        return poses
+    same_side = np.cumprod(np.where(np.sum(poses[1:, :4] * poses[:-1, :4], axis=1) < 0, -1.0, 1.0))
+    signs = np.concatenate([[1.0], same_side])[:, None]
+    smooth = uniform_filter1d(
+        np.concatenate([signs * poses[:, :4], poses[:, 4:]], axis=1), width, axis=0, mode="nearest"
+    )
+    smooth[:, :4] /= np.linalg.norm(smooth[:, :4], axis=1, keepdims=True)
+    return smooth
 
 
 def _phases(seed: int) -> np.ndarray:

@@ -5,6 +5,7 @@ along x. Axes of a thing: x ahead, y to its left, z up, origin on the floor unde
 """
 
 import itertools
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Literal, TypeAlias
@@ -17,12 +18,16 @@ Color: TypeAlias = tuple[Annotated[float, Share], Annotated[float, Share], Annot
 Length: TypeAlias = Annotated[float, Positive]
 Plan: TypeAlias = tuple[float, float]
 Point: TypeAlias = tuple[float, float, float]
+Pose: TypeAlias = tuple[float, float, float, float, float, float, float]
 
 Side: TypeAlias = Literal["north", "south", "east", "west"]
 """Walls of a room: north is towards +y, east towards +x."""
 
 Ends: TypeAlias = Literal["back", "reverse", "loop", "stop"]
 """What happens at the last point of a way."""
+
+_UNIT_TOLERANCE = 1e-3
+"""Difference from 1 of the length of a quaternion that is written with few digits."""
 
 
 @dataclass(frozen=True)
@@ -462,7 +467,9 @@ class Way(ValidatedConfig):
     Attributes:
         points_m: Points `(x, y, z)` it passes; at least two, or none with a `file` or `along`.
         file: File of a trajectory of the camera in the layout of TUM RGB-D, KITTI or EuRoC, z up; splines go through
-            its poses. Of the other fields only `at_m`, `turn_deg`, `from_s` and `tremor` count then.
+            its poses. Of the other fields only the next two and `at_m`, `turn_deg`, `from_s` and `tremor` count then.
+        T_body_cam: `(7,)` wxyz_xyz pose of the camera in the axes of the body whose poses the file holds.
+        smooth_s: Time over which the poses of the file are averaged, against the noise of a motion capture; 0 for none.
         at_m: Place of the trajectory's origin in the world.
         turn_deg: Turn of the trajectory about the vertical.
         from_s: Time on the way, or in the trajectory, at which the recording begins.
@@ -485,6 +492,8 @@ class Way(ValidatedConfig):
 
     points_m: tuple[Point, ...] = ()
     file: str | None = None
+    T_body_cam: Pose = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    smooth_s: Annotated[float, Range(at_least=0)] = 0.0
     at_m: Point = (0.0, 0.0, 0.0)
     turn_deg: float = 0.0
     from_s: Annotated[float, Range(at_least=0)] = 0.0
@@ -508,6 +517,9 @@ class Way(ValidatedConfig):
         if self.file is not None and self.along is not None:
             raise ConfigError("Way: expected points_m, a file or along, got a file and along")
         _check_way("Way", self.points_m, self.file or self.along, "a file" if self.file else "along")
+        length = math.hypot(*self.T_body_cam[:4])
+        if abs(length - 1.0) > _UNIT_TOLERANCE:
+            raise ConfigError(f"Way.T_body_cam: expected a quaternion of length 1, then a place, got length {length:g}")
 
 
 @dataclass(frozen=True)
@@ -518,7 +530,10 @@ class WorldCamera(ValidatedConfig):
         width: Pixels of a row.
         height: Pixels of a column.
         fps: Frames a second.
-        fx: Focal length in pixels, along rows and columns; `None` for `525 * width / 640`.
+        fx: Focal length in pixels, along rows; `None` for `525 * width / 640`.
+        fy: Focal length in pixels, along columns; `None` for `fx`.
+        cx: Column of the principal point, from the center of the first pixel; `None` for the middle.
+        cy: Row of the principal point, from the center of the first pixel; `None` for the middle.
         baseline_m: Baseline of a rectified stereo pair; `None` for a camera that measures depth.
         rolling_shutter_s: Time from the exposure of the first row to that of the last; 0 if all are taken at once.
         gamma: Exponent by which brightness is `brightness ** (1 / gamma)`; 1 for pictures as bright as the light.
@@ -530,6 +545,9 @@ class WorldCamera(ValidatedConfig):
     height: Annotated[int, Range(at_least=8, at_most=8192)] = 480
     fps: Annotated[float, Range(above=0, at_most=1000)] = 30.0
     fx: Length | None = None
+    fy: Length | None = None
+    cx: float | None = None
+    cy: float | None = None
     baseline_m: Annotated[float, Range(above=0, at_most=10)] | None = None
     rolling_shutter_s: Annotated[float, Range(at_least=0, at_most=1)] = 0.0
     gamma: Annotated[float, Range(above=0, at_most=5)] = 1.0
@@ -578,6 +596,25 @@ class WorldImu(ValidatedConfig):
 
 
 @dataclass(frozen=True)
+class RealPeople(ValidatedConfig):
+    """People of a real recording with depth, cut out by a network and set by their depth into the pictures.
+
+    Paths begin with `$JAXSLAM_DATA/` or `$JAXSLAM_MODELS/`, or are relative to the description's folder.
+
+    Attributes:
+        recording: Folder of the recording.
+        network: File of an ONNX network that gives masks of people.
+        from_s: Time in the recording at the start of the world's.
+        mirrored: Whether left and right of the recording are exchanged.
+    """
+
+    recording: str
+    network: str
+    from_s: Annotated[float, Range(at_least=0)] = 0.0
+    mirrored: bool = False
+
+
+@dataclass(frozen=True)
 class World(ValidatedConfig):
     """A world: places, what is in them, light, and how it is filmed.
 
@@ -594,6 +631,7 @@ class World(ValidatedConfig):
         people: People.
         groups: People who meet.
         hands: Hands before the lens.
+        real_people: People of a real recording; `None` for none.
         kinds: Kinds of things beside those of the catalog, by name.
         looks: Looks beside those of the catalog, by name.
         backdrop: Name of the look of what lies behind everything: the sky, or the dark behind an open door.
@@ -620,6 +658,7 @@ class World(ValidatedConfig):
     people: tuple[Person, ...] = ()
     groups: tuple[Group, ...] = ()
     hands: tuple[Hand, ...] = ()
+    real_people: RealPeople | None = None
     kinds: Mapping[str, Kind] = field(default_factory=dict)
     looks: Mapping[str, Look] = field(default_factory=dict)
     backdrop: str = "dusk"
@@ -640,6 +679,8 @@ class World(ValidatedConfig):
                 raise ConfigError(f"World.{name}: expected times in order, got {times}")
         if self.imu is not None and self.imu.file is not None:
             _check_real_imu(self.way, self.scale)
+        if self.real_people is not None:
+            _check_with_real_people(self)
 
 
 @dataclass(frozen=True)
@@ -653,6 +694,19 @@ class Catalog(ValidatedConfig):
 
     looks: Mapping[str, Look]
     kinds: Mapping[str, Kind]
+
+
+def _check_with_real_people(world: World) -> None:
+    """Refuse what pictures of real people cannot follow.
+
+    Raises:
+        ConfigError: The camera is a stereo pair, or the exposure changes.
+    """
+    if world.camera.baseline_m is not None:
+        got = f"a stereo pair (baseline_m {world.camera.baseline_m:g})"
+        raise ConfigError(f"World.real_people: expected a camera with depth, got {got}")
+    if world.exposure:
+        raise ConfigError("World.exposure: expected none with real_people, whose colors are as recorded, got some")
 
 
 def _check_span(of: str, from_s: float, until_s: float | None) -> None:

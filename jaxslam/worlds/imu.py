@@ -1,6 +1,7 @@
 """The IMU of a world: samples synthesized along the way of the camera, or those of a real flight."""
 
 from dataclasses import fields, replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ from jaxslam.sensors.imu import ImuSamples, ImuSheet, ImuStates
 from jaxslam.sensors.imu_files import read_imu_samples, read_imu_sheet
 from jaxslam.sensors.imu_preintegration import GRAVITY_M_PER_S2
 from jaxslam.worlds.camera_way import CameraWay, FileWay
+from jaxslam.worlds.data_paths import data_path
 from jaxslam.worlds.description import World, WorldImu
 
 ADIS16448 = ImuSheet(
@@ -92,7 +94,9 @@ def record_imu(world: World, way: CameraWay, frames_ns: np.ndarray) -> ImuRecord
     truth = _motion(way, T_cam_imu, frames_s)
     states = ImuStates(frames_ns, truth.T_world_imu, truth.velocity_m_per_s)
     if world.imu.file is not None and isinstance(way, FileWay):
-        return ImuRecord(sheet, _real_samples(world.imu.file, way, frames_ns, world.camera.fps), states)
+        return ImuRecord(
+            sheet, _real_samples(str(data_path(world.imu.file, Path())), way, frames_ns, world.camera.fps), states
+        )
     count = int(np.ceil(frames_s[-1] * sheet.rate_hz - 1e-6)) + 1
     since_ns = np.round(np.arange(count) * (1e9 / sheet.rate_hz)).astype(np.int64)
     noise_sheet = _without_noise(sheet) if world.imu.noise_free else sheet
@@ -103,7 +107,7 @@ def record_imu(world: World, way: CameraWay, frames_ns: np.ndarray) -> ImuRecord
 
 def _sheet(imu: WorldImu, scale: float) -> ImuSheet:
     """Return the data sheet with the figures that the description gives, and the camera's place in scale."""
-    sheet = ADIS16448 if imu.sheet is None else read_imu_sheet(imu.sheet)
+    sheet = ADIS16448 if imu.sheet is None else read_imu_sheet(data_path(imu.sheet, Path()))
     given = {field.name: getattr(imu, field.name) for field in fields(ImuSheet)}
     sheet = replace(sheet, **{name: value for name, value in given.items() if value is not None})
     qw, qx, qy, qz, x, y, z = sheet.T_imu_cam

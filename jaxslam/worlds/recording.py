@@ -31,6 +31,7 @@ from jaxslam.worlds.description import World, focal_px
 from jaxslam.worlds.expansion import expanded
 from jaxslam.worlds.imu import record_imu
 from jaxslam.worlds.library import load_world, with_catalog, with_places
+from jaxslam.worlds.real_people import LABEL, PeopleCutter
 
 _FLAT_M = 0.051
 """Half the thickness of floors and ceilings, and a little."""
@@ -44,11 +45,14 @@ class WorldFrame:
         timestamp_ns: Time of the middle of the exposure.
         rgb: `(height, width, 3)` uint8, as measured; where the camera has a fault, what it delivers.
         depth_m: `(height, width)` float32 depth as measured by a camera that does; 0 where missing.
-        exact_depth_m: `(height, width)` float32 depth at the centers of the pixels; 0 on the backdrop.
-        instance_mask: `(height, width)` int32 numbers of things and people; 0 on rooms and the backdrop.
+        exact_depth_m: `(height, width)` float32 depth at the centers of the pixels; 0 on the backdrop. On real people
+            it is the measured depth of their recording, 0 where that is missing.
+        instance_mask: `(height, width)` int32 numbers of things and people; 0 on rooms and the backdrop. Real people
+            have the last number, one for all, and count as moving.
         moving_mask: `(height, width)` bool, true on what moves in this frame.
         T_world_cam: `(7,)` float64 pose of the camera, wxyz_xyz.
         T_world_instance: `(n, 7)` float64 poses of things and people, wxyz_xyz; number `k` is in row `k - 1`.
+            NaN for real people, whose poses nobody knows.
         right: `(height, width, 3)` uint8, what the right camera of a pair measured; `None` without one.
         imu: Samples of the IMU since the frame before; `None` without one.
     """
@@ -104,7 +108,8 @@ class WorldRecording:
         Raises:
             ConfigError: If there is no such world, or something in its description is wrong.
             TrajectoryError: If the file of its way cannot be read.
-            DatasetError: If the file of samples of its IMU cannot be read.
+            DatasetError: If samples of its IMU, or the recording of its real people, cannot be read.
+            ModelError: If the network that cuts real people out cannot be read.
         """
         self.name = "world" if isinstance(world, World) else Path(world).stem
         self.world = world = world if isinstance(world, World) else load_world(world)
@@ -115,9 +120,9 @@ class WorldRecording:
             filmed.width,
             filmed.height,
             fx,
-            fx,
-            0.5 * (filmed.width - 1),
-            0.5 * (filmed.height - 1),
+            fx if filmed.fy is None else filmed.fy,
+            0.5 * (filmed.width - 1) if filmed.cx is None else filmed.cx,
+            0.5 * (filmed.height - 1) if filmed.cy is None else filmed.cy,
             depth_scale_per_m=None if filmed.baseline_m else DEPTH_COUNTS_PER_M,
             fps=filmed.fps,
             baseline_m=filmed.baseline_m and world.scale * filmed.baseline_m,
@@ -137,13 +142,21 @@ class WorldRecording:
         self.instances = tuple(built.instances)
         self.labels = tuple(instance.label for instance in built.instances)
         self.movable = tuple(instance.movable for instance in built.instances)
+        self._real_people = None
+        if world.real_people is not None:
+            self._real_people = PeopleCutter(world.real_people, self.camera, world.seconds, world.scale)
+            self.labels, self.movable = (*self.labels, LABEL), (*self.movable, True)
         numbers = {"static_numbers": built.static_numbers, "actor_numbers": built.actor_numbers}
         sensor = scaled_sensor(filmed.sensor, world.scale)
         self._stage = Stage(built.static, built.actors, self._light, **numbers)
         ideal = filmed.gamma == 1.0 and filmed.vignetting == 0.0
         optics = Optics(filmed.rolling_shutter_s, None if ideal else LensParams(filmed.vignetting, filmed.gamma))
         self._filming = VirtualCamera(self._stage, self.camera, sensor, self._way.poses, self._gain, optics)
-        self._poses = np.array([each.poses(np.zeros(1))[0] for each in built.instances]).reshape(-1, 7)
+        self._poses = np.full((len(self.labels), 7), np.nan)
+        for row, instance in enumerate(built.instances):
+            self._poses[row] = instance.poses(np.zeros(1))[0]
+        # Real people move.
+        self._moves = np.arange(len(self.labels) + 1) > len(built.instances)
         self._key = jax.random.key(world.seed)
         self._gain_phases = np.random.default_rng([world.seed, 601]).uniform(0.0, 2.0 * np.pi, 2)
 
@@ -170,7 +183,7 @@ class WorldRecording:
             rgb, depth_m = np.zeros_like(rgb), np.zeros_like(depth_m)
             right = None if right is None else np.zeros_like(right)
         instance_mask = np.maximum(np.asarray(taken.exact.owner), 0)
-        moves, poses = np.zeros(len(self.instances) + 1, bool), self._poses.copy()
+        moves, poses = self._moves.copy(), self._poses.copy()
         for number, instance in enumerate(self.instances, 1):
             if not instance.rests:
                 moves[number], poses[number - 1] = instance.is_moving(now)[0], instance.poses(now)[0]
@@ -193,7 +206,11 @@ class WorldRecording:
         return self.imu_samples.since_last_frame(self.timestamps_ns, index, self.camera.fps)
 
     def _take(self, index: int) -> TakenPicture:
-        return self._filming.take(float(self._time_s[index]), jax.random.fold_in(self._key, int(self._numbers[index])))
+        time_s = float(self._time_s[index])
+        taken = self._filming.take(time_s, jax.random.fold_in(self._key, int(self._numbers[index])))
+        if self._real_people is None:
+            return taken
+        return self._real_people.set_into(taken, time_s, len(self.labels))
 
     def _source(self, index: int) -> int:
         """Return the frame whose picture is delivered: an earlier one where the camera is frozen."""

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from jaxslam.errors import ConfigError, TrajectoryError
+from jaxslam.geometry.se3 import angle, between, compose, inverse
 from jaxslam.trajectory import trajectory
 from jaxslam.trajectory.trajectory import Trajectory
 from jaxslam.worlds import World, WorldRecording, load_world
@@ -68,6 +69,37 @@ def test_a_file_is_placed_and_scaled(tmp_path):
     np.testing.assert_allclose(poses[:, 4:], 2 * np.stack([1 - y, 2 + x, z], axis=1), atol=1e-5)
     ahead = optical_axis(way.poses(times_s[:50]))
     np.testing.assert_allclose(optical_axis(poses)[:, 0], -ahead[:, 1], atol=1e-5)
+
+
+def test_a_file_of_a_body_that_carries_the_camera(tmp_path):
+    way, times_s = camera_way(WORLD), np.arange(0.0, 6.0, 0.05)
+    T_body_cam = (0.6, 0.0, 0.8, 0.0, 0.1, -0.2, 0.3)
+    poses = way.poses(times_s)
+    bodies = compose(poses, inverse(np.array([T_body_cam])))
+    carried = Way(file=saved(tmp_path, bodies, times_s), T_body_cam=T_body_cam, tremor=0.0)
+    got = camera_way(dataclasses.replace(WORLD, way=carried)).poses(times_s[:80])
+    np.testing.assert_allclose(got[:, 4:], poses[:80, 4:], atol=1e-5)
+    assert np.abs(np.sum(got[:, :4] * poses[:80, :4], axis=1)).min() > 1 - 1e-9
+    with pytest.raises(ConfigError, match=r"Way.T_body_cam: expected a quaternion of length 1.*got length 2"):
+        Way(file="way.txt", T_body_cam=(2.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+
+
+def test_noise_of_a_file_is_smoothed(tmp_path):
+    way, times_s = (
+        camera_way(dataclasses.replace(WORLD, way=dataclasses.replace(POINTS, tremor=0.0))),
+        np.arange(0, 6, 0.03),
+    )
+    poses, rng = way.poses(times_s), np.random.default_rng(0)
+    noise = np.concatenate([np.ones((200, 1)), rng.normal(0, 0.004, (200, 3)), rng.normal(0, 0.004, (200, 3))], axis=1)
+    noise[::2, :4] *= -1  # the same rotations
+    file, within = saved(tmp_path, compose(poses, noise), times_s), times_s[20:120]
+    errors = []
+    for smooth_s in (0.0, 0.2):
+        read = camera_way(dataclasses.replace(WORLD, way=Way(file=file, smooth_s=smooth_s, tremor=0.0)))
+        off = between(poses[20:120], read.poses(within))
+        errors.append((np.sqrt(np.mean(angle(off) ** 2)), np.sqrt(np.mean(off[:, 4:] ** 2))))
+    assert errors[1][0] < 0.6 * errors[0][0]
+    assert errors[1][1] < 0.6 * errors[0][1]
 
 
 def test_a_file_lies_beside_the_description(tmp_path):
