@@ -250,7 +250,7 @@ class WorldRecording:
         for change, later in zip(self.world.light_changes, lights[1:], strict=True):
             if time_s >= change.at_s:
                 share = 1.0 if change.over_s == 0.0 else min((time_s - change.at_s) / change.over_s, 1.0)
-                light = Light(*(a + np.float32(share) * (b - a) for a, b in zip(light, later, strict=True)))
+                light = light.blended(later, share)
         return light
 
     def _gain(self, time_s: float) -> float:

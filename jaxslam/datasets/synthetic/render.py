@@ -179,17 +179,22 @@ def render(
     # Nothing turns the sky towards the sun.
     sun = jnp.where((scene.owner == BACKDROP)[:, None], 0.0, sun)
     own = jnp.concatenate([size, stem[:, None], sun], axis=1)
-    table = None if rolls else jnp.concatenate([unit_from_cam.reshape(-1, 12), own], axis=1)
+    first_pose = unit_from_cam[0] if rolls else unit_from_cam
+    table = jnp.concatenate([first_pose.reshape(-1, 12), own], axis=1)
+
+    def shapes_and_looks(row: Array) -> tuple[Shapes, Array, Array | None]:
+        """Shapes of the solids as a row of tiles sees them, their rows of the table, and what those change by."""
+        if not rolls:
+            return Shapes(unit_from_cam, stem), table, None
+        above = unit_from_cam[row]
+        change = unit_from_cam[row + 1] - above
+        looks = jnp.concatenate([above.reshape(-1, 12), own], axis=1)
+        return Shapes(above, stem, change), looks, change.reshape(-1, 12)
 
     def render_tile(tile: tuple[Array, InTile, InTile]) -> tuple[Array, ...]:
         index, boxes, capsules = tile
         rays = _rays(view, (index // columns) * TILE_HEIGHT, (index % columns) * TILE_WIDTH)
-        shapes, looks, changes = Shapes(unit_from_cam, stem), table, None
-        if rolls:
-            above = unit_from_cam[index // columns]
-            shapes = Shapes(above, stem, unit_from_cam[index // columns + 1] - above)
-            looks = jnp.concatenate([above.reshape(-1, 12), own], axis=1)
-            changes = shapes.change.reshape(-1, 12)
+        shapes, looks, changes = shapes_and_looks(index // columns)
         depth, which = unpack(shapes, nearest_solid(shapes, rays, boxes, capsules))
         hits = Hits(rays, depth, which, which < n_boxes)
         return (

@@ -168,7 +168,7 @@ def measure(
     return rgb, jnp.where(kept, measured, 0.0)
 
 
-def _through_lens(light: Float[Array, "3 h w"], lens: LensParams) -> Float[Array, "3 h w"]:
+def _through_lens(light: Array | np.ndarray, lens: LensParams) -> Float[Array, "3 h w"]:
     """Brightness as amplified, darker the farther from the middle of the picture."""
     height, width = light.shape[1:]
     v, u = (jnp.linspace(-1.0, 1.0, count, dtype=light.dtype) * (0.5 * count) for count in (height, width))

@@ -6,7 +6,7 @@ channel in one word, a quarter of what eight bits can show.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -37,6 +37,11 @@ class Light(NamedTuple):
     brightness: Float[Array, ""] | np.float32
     ambient: Float[Array, ""] | np.float32
     directed: Float[Array, ""] | np.float32
+
+    def blended(self, other: "Light", share: float) -> "Light":
+        """Return this light with a share of another one."""
+        mix: Any = lambda mine, theirs: np.asarray(mine + share * (theirs - mine), np.float32)
+        return Light(*map(mix, self, other))
 
 
 ROOM_LIGHT = Light(

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import jax
@@ -278,4 +278,5 @@ def _stacked(parts: list[Rendering], height: int) -> Rendering:
     """Put parts of a picture of `height` rows below each other."""
     if len(parts) == 1:
         return parts[0]
-    return Rendering(*(np.concatenate(planes)[:height] for planes in zip(*parts, strict=True)))
+    planes: Any = (np.concatenate(each)[:height] for each in zip(*parts, strict=True))
+    return Rendering(*planes)

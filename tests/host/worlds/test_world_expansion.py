@@ -34,6 +34,7 @@ def test_a_quarter_turn_turns_rooms_doors_things_and_routes():
     chair, carton = turned.things
     assert chair.at_m == pytest.approx((9.5, 1.5))
     assert chair.turn_deg == 100
+    assert carton.route is not None
     np.testing.assert_allclose(carton.route.points_m, [[10.0, 0.0], [10.0, 1.0]])
     assert turned.people[0].turn_deg == 180
 
