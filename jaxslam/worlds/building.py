@@ -259,7 +259,7 @@ def _add_thing(built: Built, thing: Thing, kind: Kind, looks: _Finishes, rng: np
         walk=_Standing(thing.at_m, thing.turn_deg) if route is None else RouteWalk(route),
         height_m=height_m,
         turn=0.0 if route is None else float(np.deg2rad(thing.turn_deg)),
-        from_s=thing.from_s,
+        from_s=_appears_s(thing),
         until_s=np.inf if thing.until_s is None else thing.until_s,
         rests=route is None,
     )
@@ -283,7 +283,7 @@ def _add_person(
     else:
         body = Person(walk, float(rng.uniform(0.0, 2.0 * np.pi)), rng)
     until_s = np.inf if person.until_s is None else person.until_s
-    instance = Instance("person", True, walk, 0.0, 0.0, person.from_s, until_s)
+    instance = Instance("person", True, walk, 0.0, 0.0, _appears_s(person), until_s)
     solids, held = list(body.solids), np.zeros((0, 4, 4))
     if carried is not None:
         more, held = _parts(carried, looks, rng, 1.0)
@@ -291,6 +291,11 @@ def _add_person(
     built.instances.append(instance)
     built.actors.append(InstanceActor(instance, solids, _WalkingParts(body, held)))
     built.actor_numbers.append(len(built.instances))
+
+
+def _appears_s(item: Thing | description.Person) -> float:
+    """Time at which something appears: what is there from the start is there while the first picture is exposed."""
+    return item.from_s if item.from_s > 0.0 else -np.inf
 
 
 def _parts(kind: Kind, looks: _Finishes, rng: np.random.Generator, scale: float) -> tuple[list[Solid], np.ndarray]:

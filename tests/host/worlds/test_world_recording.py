@@ -377,3 +377,30 @@ def test_frames_are_the_same_bytes_on_one_core():
         for text in (code, pinned + code)
     ]
     assert printed[0] == printed[1]
+
+
+def test_nothing_of_the_start_is_missing_while_the_first_picture_is_exposed():
+    """A thing that leaves later is as solid in the first picture as one that stays."""
+    blurred = dataclasses.replace(CAMERA, sensor=dataclasses.replace(PERFECT_SENSOR, exposure_s=0.02))
+    stays = dataclasses.replace(ROOM, things=(Thing("chair", (0.6, -0.6)),), people=(), camera=blurred)
+    leaves = dataclasses.replace(stays, things=(Thing("chair", (0.6, -0.6), until_s=2.0),))
+    np.testing.assert_array_equal(*(WorldRecording(world).render(0).rgb for world in (stays, leaves)))
+
+
+@pytest.mark.slow
+def test_memory_does_not_grow_with_the_length():
+    code = (
+        "import dataclasses, psutil\n"
+        "from jaxslam.worlds import WorldRecording, load_world\n"
+        "kitchen = load_world('kitchen')\n"
+        "camera = dataclasses.replace(kitchen.camera, width=160, height=120)\n"
+        "recording = WorldRecording(dataclasses.replace(kitchen, seconds=70, camera=camera))\n"
+        "used = []\n"
+        "for index in range(2100):\n"
+        "    recording.render(index)\n"
+        "    if index in (99, 2099):\n"
+        "        used.append(psutil.Process().memory_info().rss)\n"
+        "print((used[1] - used[0]) / 2**20)\n"
+    )
+    printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert float(printed) < 50
