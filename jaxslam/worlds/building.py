@@ -1,7 +1,6 @@
 """What a world is built of: solids that stand still, and actors that do not."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple, TypeAlias
 
@@ -11,23 +10,23 @@ from jaxslam.datasets.synthetic.actors import GroundMotion, Person, Walk
 from jaxslam.datasets.synthetic.homogeneous import transform
 from jaxslam.datasets.synthetic.primitives import PlacedSolid, Solid, box, pill, scaled_solid, upright
 from jaxslam.datasets.synthetic.render import BACKDROP
-from jaxslam.datasets.synthetic.room import printed
 from jaxslam.datasets.synthetic.seated_people import SeatedBody
 from jaxslam.datasets.synthetic.shading import Light
 from jaxslam.datasets.synthetic.texture import Material
 from jaxslam.geometry.so3 import axis_rotation, matrices, multiply
 from jaxslam.worlds import description
-from jaxslam.worlds.description import Hand, Kind, Lighting, Look, Opening, Part, Room, Side, Thing, World, focal_px
+from jaxslam.worlds.description import Hand, Kind, Lighting, Part, Thing, World, focal_px
+from jaxslam.worlds.finish import Finish, Finishes
 from jaxslam.worlds.hand_actor import HandActor
 from jaxslam.worlds.motion import RouteWalk
 from jaxslam.worlds.roads import RoadLooks, road_solids
+from jaxslam.worlds.rooms import room_solids
 
 _GROUND_M = 0.25
 """Half the thickness of the ground."""
 _OUT_OF_SIGHT_M = 1e4
 _CARRIED_M = (0.36, 0.0, 0.95)
 """Where a carried thing is, in the axes of the person."""
-_PICTURE_M, _HUNG_M, _TRIES = ((0.35, 0.35), (0.9, 0.8)), (1.25, 1.75), 20
 _MOVING_M_PER_S = 1e-3
 
 
@@ -181,12 +180,12 @@ def build(world: World, pose_at: Callable[[np.ndarray], np.ndarray]) -> Built:
         world: The world; every name in it is known.
         pose_at: `(t, 7)` poses `T_world_cam` of its camera, wxyz_xyz, at `(t,)` seconds; its `scale` is in them.
     """
-    looks = {name: _Finish(look) for name, look in world.looks.items()}
+    looks = {name: Finish(look) for name, look in world.looks.items()}
     lights = [_light(lighting) for lighting in (world.lighting, *(change.light for change in world.light_changes))]
     built = Built([_backdrop(world, looks)], [BACKDROP], [], [], [], lights)
     _add_ground(built, world, looks)
     for index, room in enumerate(world.rooms):
-        solids = _room(room, looks, np.random.default_rng([world.seed, 701, index]))
+        solids = room_solids(room, looks, np.random.default_rng([world.seed, 701, index]))
         built.static.extend(solids)
         built.static_numbers.extend([0] * len(solids))
     for index, thing in enumerate(world.things):
@@ -234,22 +233,7 @@ def _scaled_walk(walk: Walk, factor: float, time_s: np.ndarray) -> GroundMotion:
     return GroundMotion(factor * position, heading, factor * speed)
 
 
-class _Finish:
-    """A look, which gives each thing colors of its own if it is printed."""
-
-    def __init__(self, look: Look) -> None:
-        fields = asdict(look)
-        self._printed = fields.pop("printed")
-        self._material = Material(**fields)
-
-    def material(self, rng: np.random.Generator) -> Material:
-        return printed(self._material, rng) if self._printed else self._material
-
-
-_Finishes = Mapping[str, _Finish]
-
-
-def _add_thing(built: Built, thing: Thing, kind: Kind, looks: _Finishes, rng: np.random.Generator) -> None:
+def _add_thing(built: Built, thing: Thing, kind: Kind, looks: Finishes, rng: np.random.Generator) -> None:
     solids, places = _parts(kind, looks, rng, thing.scale)
     height_m = float(thing.at_m[2]) if len(thing.at_m) > 2 else 0.0
     route = thing.route
@@ -275,7 +259,7 @@ def _add_thing(built: Built, thing: Thing, kind: Kind, looks: _Finishes, rng: np
 
 
 def _add_person(
-    built: Built, person: description.Person, carried: Kind | None, looks: _Finishes, rng: np.random.Generator
+    built: Built, person: description.Person, carried: Kind | None, looks: Finishes, rng: np.random.Generator
 ) -> None:
     walk: Walk = _Standing(person.at_m, person.turn_deg) if person.route is None else RouteWalk(person.route)
     if person.sits:
@@ -298,7 +282,7 @@ def _appears_s(item: Thing | description.Person) -> float:
     return item.from_s if item.from_s > 0.0 else -np.inf
 
 
-def _parts(kind: Kind, looks: _Finishes, rng: np.random.Generator, scale: float) -> tuple[list[Solid], np.ndarray]:
+def _parts(kind: Kind, looks: Finishes, rng: np.random.Generator, scale: float) -> tuple[list[Solid], np.ndarray]:
     """The solids of a thing, and their places in its axes, `(k, 4, 4)`."""
     finish = {name: looks[name].material(rng) for name in dict.fromkeys(part.look for part in kind.parts)}
     solids = [_solid(part, finish[part.look], rng, scale) for part in kind.parts]
@@ -323,7 +307,7 @@ def _turned(turn_deg: Sequence[float]) -> np.ndarray:
     return multiply(z, multiply(y, x))
 
 
-def _add_ground(built: Built, world: World, looks: _Finishes) -> None:
+def _add_ground(built: Built, world: World, looks: Finishes) -> None:
     """Add the ground and the roads on it."""
     solids = []
     rng = np.random.default_rng([world.seed, 706])
@@ -340,7 +324,7 @@ def _add_ground(built: Built, world: World, looks: _Finishes) -> None:
     built.static_numbers.extend([0] * len(solids))
 
 
-def _backdrop(world: World, looks: _Finishes) -> PlacedSolid:
+def _backdrop(world: World, looks: Finishes) -> PlacedSolid:
     """A box around everything, seen from inside."""
     low, high = _extent(world)
     rng = np.random.default_rng([world.seed, 700])
@@ -377,90 +361,3 @@ def _light(lighting: Lighting) -> Light:
         ambient=np.float32(lighting.ambient),
         directed=np.float32(1.0 - lighting.ambient),
     )
-
-
-class _Wall(NamedTuple):
-    """A wall of a room: middle of its inner side on the floor, directions along it and out of the room, length."""
-
-    middle: np.ndarray
-    along: np.ndarray
-    outward: np.ndarray
-    length_m: float
-
-
-def _wall(room: Room, side: Side) -> _Wall:
-    length, width, _ = room.size_m
-    x, y = room.at_m
-    if side in {"north", "south"}:
-        sign = 1.0 if side == "north" else -1.0
-        middle, along, outward = (x, y + sign * 0.5 * width), (1.0, 0.0), (0.0, sign)
-        return _Wall(np.array(middle), np.array(along), np.array(outward), length)
-    sign = 1.0 if side == "east" else -1.0
-    middle, along, outward = (x + sign * 0.5 * length, y), (0.0, 1.0), (sign, 0.0)
-    return _Wall(np.array(middle), np.array(along), np.array(outward), width)
-
-
-def _room(room: Room, looks: _Finishes, rng: np.random.Generator) -> list[PlacedSolid]:
-    length, width, height = room.size_m
-    (x, y), thick = room.at_m, room.wall_m
-    slab = (0.5 * length + thick, 0.5 * width + thick, 0.05)
-    solids = [
-        PlacedSolid(upright(x, y, -0.05), box(slab, looks[room.floor].material(rng), rng)),
-        PlacedSolid(upright(x, y, height + 0.05), box(slab, looks[room.ceiling].material(rng), rng)),
-    ]
-    material = looks[room.walls].material(rng)
-    sides: tuple[Side, ...] = ("north", "south", "east", "west")
-    for side in sides:
-        wall, openings = _wall(room, side), [opening for opening in room.openings if opening.wall == side]
-        for low_m, high_m, bottom_m, top_m in _wall_pieces(wall.length_m + 2.0 * thick, height, openings):
-            piece = _on_wall(wall, 0.5 * (low_m + high_m), 0.5 * (bottom_m + top_m), 0.5 * thick)
-            half = _wall_box(wall, 0.5 * (high_m - low_m), 0.5 * thick, 0.5 * (top_m - bottom_m))
-            solids.append(PlacedSolid(piece, box(half, material, rng)))
-    return solids + _pictures(room, looks, rng)
-
-
-def _wall_pieces(length_m: float, height_m: float, openings: list[Opening]) -> list[tuple[float, float, float, float]]:
-    """The parts of a wall around its openings: from, to along it, from, to above the floor."""
-    pieces, reached = [], -0.5 * length_m
-    for opening in sorted(openings, key=lambda opening: opening.along_m):
-        low, high = opening.along_m - 0.5 * opening.width_m, opening.along_m + 0.5 * opening.width_m
-        pieces += [
-            (reached, low, 0.0, height_m),
-            (low, high, 0.0, opening.bottom_m),
-            (low, high, opening.top_m, height_m),
-        ]
-        reached = high
-    pieces.append((reached, 0.5 * length_m, 0.0, height_m))
-    return [piece for piece in pieces if piece[1] > piece[0] and piece[3] > piece[2]]
-
-
-def _on_wall(wall: _Wall, along_m: float, height_m: float, outward_m: float) -> np.ndarray:
-    x, y = wall.middle + along_m * wall.along + outward_m * wall.outward
-    return upright(float(x), float(y), height_m)
-
-
-def _wall_box(wall: _Wall, half_along: float, half_out: float, half_up: float) -> tuple[float, float, float]:
-    along, out = np.abs(wall.along), np.abs(wall.outward)
-    x, y = half_along * along + half_out * out
-    return float(x), float(y), half_up
-
-
-def _pictures(room: Room, looks: _Finishes, rng: np.random.Generator) -> list[PlacedSolid]:
-    """Pictures on the walls, beside the openings and each other where there is space."""
-    hung: dict[Side, list[tuple[float, float]]] = {"north": [], "south": [], "east": [], "west": []}
-    for opening in room.openings:
-        hung[opening.wall].append((opening.along_m, opening.width_m))
-    solids = []
-    for _ in range(room.pictures):
-        for _ in range(_TRIES):
-            side = rng.choice(sorted(hung))
-            wall = _wall(room, side)
-            (width, height), up = rng.uniform(*_PICTURE_M), rng.uniform(*_HUNG_M)
-            along = rng.uniform(-0.5, 0.5) * (wall.length_m - width)
-            if all(abs(along - other) > 0.5 * (width + taken) + 0.05 for other, taken in hung[side]):
-                hung[side].append((along, width))
-                half = _wall_box(wall, 0.5 * width, 0.01, 0.5 * height)
-                picture = box(half, looks["poster"].material(rng), rng)
-                solids.append(PlacedSolid(_on_wall(wall, along, up, -0.01), picture))
-                break
-    return solids
