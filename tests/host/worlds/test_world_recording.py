@@ -384,7 +384,8 @@ def test_nothing_of_the_start_is_missing_while_the_first_picture_is_exposed():
     blurred = dataclasses.replace(CAMERA, sensor=dataclasses.replace(PERFECT_SENSOR, exposure_s=0.02))
     stays = dataclasses.replace(ROOM, things=(Thing("chair", (0.6, -0.6)),), people=(), camera=blurred)
     leaves = dataclasses.replace(stays, things=(Thing("chair", (0.6, -0.6), until_s=2.0),))
-    np.testing.assert_array_equal(*(WorldRecording(world).render(0).rgb for world in (stays, leaves)))
+    first, second = (WorldRecording(world).render(0).rgb for world in (stays, leaves))
+    np.testing.assert_array_equal(first, second)
 
 
 @pytest.mark.slow
