@@ -77,7 +77,7 @@ def run_suite(options: RunsOfSuite, name: str, rows: Collection[str] | None = No
         for why in dict.fromkeys(absent.values()):
             names = ", ".join(name for name in absent if absent[name] == why)
             plain_console.print(f"Not run: {names}: {why}")
-        present = [job for job in jobs if job.clip.recording not in absent]
+        present = [job for job in jobs if job.clip.source not in absent]
         collected = Collected(present, earlier)
         report = _Report(suite, collected, absent, out)
         try:

@@ -131,7 +131,7 @@ def _key_of_parts(name: str, values: Iterable[Any]) -> str | None:
 def _file(program: str) -> Path | None:
     """Return the file of a program; `None` if it is not kept."""
     folder: str | None = jax.config.values["jax_compilation_cache_dir"]
-    sources = _sources()
+    sources = sources_hash()
     if not folder or not jax.config.values["jax_enable_compilation_cache"] or sources is None or " at 0x" in program:
         return None
     names = (name for name in sorted(jax.config.values) if not name.startswith("jax_persistent_cache"))
@@ -141,8 +141,8 @@ def _file(program: str) -> Path | None:
 
 
 @functools.cache
-def _sources() -> str | None:
-    """Hash of all that a trace depends on but its arguments; `None` if it may not be what was loaded."""
+def sources_hash() -> str | None:
+    """Hash the sources of jaxslam and the versions of what traces them; `None` if they may not be what was loaded."""
     versions = [platform.python_version(), *(f"{name} {metadata.version(name)}" for name in _TRACED_WITH)]
     digest = hashlib.sha256(" ".join(versions).encode())
     files = source_files()

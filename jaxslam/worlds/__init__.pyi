@@ -24,3 +24,5 @@ from .library import load_world as load_world
 from .library import worlds as worlds
 from .recording import WorldFrame as WorldFrame
 from .recording import WorldRecording as WorldRecording
+from .stored_world import StoredWorld as StoredWorld
+from .stored_world import worlds_dir as worlds_dir

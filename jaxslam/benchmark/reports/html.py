@@ -75,7 +75,7 @@ def _by_rate(suite: Suite, results: Sequence[Mapping[str, Any]]) -> dict[str, li
     sources: dict[object, str] = {}
     groups: dict[str, list[Mapping[str, Any]]] = {}
     for clip in suite.sequences:
-        name = sources.setdefault((clip.recording, clip.room, clip.start, clip.stop), clip.recording or clip.name)
+        name = sources.setdefault((clip.source, clip.room, clip.start, clip.stop), clip.recording or clip.name)
         groups.setdefault(name, []).extend(
             result for result in results if result["sequence"] == clip.name and result["status"] == "done"
         )

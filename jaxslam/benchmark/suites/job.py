@@ -21,7 +21,13 @@ from typing import Any
 import numpy as np
 
 from jaxslam.benchmark.reference_flow import flow_time_ms
-from jaxslam.benchmark.suites.provenance import camera_sha256, data_sha256, networks_sha256, sources_sha256
+from jaxslam.benchmark.suites.provenance import (
+    camera_sha256,
+    data_sha256,
+    networks_sha256,
+    sources_sha256,
+    world_sha256,
+)
 from jaxslam.benchmark.suites.run_names import flattened, run_folder
 from jaxslam.benchmark.suites.suite import Sequence as Clip
 from jaxslam.config.loading import load_config, to_yaml
@@ -40,6 +46,7 @@ from jaxslam.runtime.threads import bound_threads
 from jaxslam.semantics.from_config import preset_needs_network
 from jaxslam.slam.slam import Slam
 from jaxslam.visualization.snapshots import RunPictures
+from jaxslam.worlds.stored_world import StoredWorld
 
 RESULT = "result.json"
 """The last file of a run to be written: where it is, the run is done."""
@@ -115,6 +122,8 @@ def opened(clip: Clip, root: Path | None, rooms: Path | None = None) -> tuple[Da
         dataset.render_all()
     elif clip.room is not None:
         dataset = SyntheticDataset(clip.room)
+    elif clip.world:
+        dataset = _world(clip)
     else:
         folder = find_recording(clip.recording, root)
         if folder is None:
@@ -124,6 +133,23 @@ def opened(clip: Clip, root: Path | None, rooms: Path | None = None) -> tuple[Da
         if clip.sensor not in (None, taken_with):
             raise BenchmarkError(f"{clip.name}: sensor: expected {clip.sensor}, got a recording of {taken_with}")
     return (dataset if clip.whole else Subset(dataset, clip.start, clip.stop, clip.every)), folder
+
+
+def _world(clip: Clip) -> StoredWorld:
+    """The world of a clip, whose frames are in the user's cache before anything is timed.
+
+    Raises:
+        BenchmarkError: If it is of another sensor than the clip says, or it cannot be opened.
+    """
+    try:
+        world = StoredWorld(clip.world)
+    except JaxSlamError as error:
+        raise BenchmarkError(f"{clip.name}: {error}") from None
+    taken_with = "stereo" if world.camera.is_stereo else "rgbd"
+    if clip.sensor not in (None, taken_with):
+        raise BenchmarkError(f"{clip.name}: sensor: expected {clip.sensor}, got a world of {taken_with}")
+    world.render_all(range(len(world))[clip.start : clip.stop : clip.every])
+    return world
 
 
 def stored(job: Job, out: Path) -> tuple[dict[str, Any], list[str]] | None:
@@ -249,7 +275,7 @@ def run_here(folder: Path, root: Path | None, rooms: Path | None) -> None:
         "flow_ms": None if flow_ms is None else round(flow_ms, 4),
         **ratios,
         "sources_sha256": sources,
-        "data_sha256": None if recording is None else data_sha256(recording),
+        "data_sha256": _data_sha256(job.clip, recording),
         "camera_sha256": camera_sha256(job.clip),
         "lacks_network": slam.without_network is not None and preset_needs_network(job.preset),
         "networks_sha256": networks_sha256(job.config.semantics),
@@ -257,6 +283,12 @@ def run_here(folder: Path, root: Path | None, rooms: Path | None) -> None:
     }
     result |= {_CHECKSUM: _checksum(result)}
     write_atomically(folder / RESULT, (json.dumps(result, indent=2) + "\n").encode(), BenchmarkError)
+
+
+def _data_sha256(clip: Clip, recording: Path | None) -> str | None:
+    if clip.world:
+        return world_sha256(clip.world)
+    return None if recording is None else data_sha256(recording)
 
 
 def _num_images(whole: Dataset) -> int:

@@ -14,6 +14,8 @@ from jaxslam.benchmark.suites.suite import Sequence as Clip
 from jaxslam.benchmark.suites.suite import Suite
 from jaxslam.datasets.catalog import known_recordings
 from jaxslam.errors import BenchmarkError
+from jaxslam.worlds.library import load_world
+from jaxslam.worlds.stored_world import description_hash, why_not_here
 
 _OPENING, _CLOSING, _QUOTES = "([{", ")]}", "'\""
 
@@ -41,7 +43,7 @@ def plan(
 
 
 def missing(suite: Suite, found: Collection[str]) -> dict[str, str]:
-    """Recordings that are not there, by name, and how to get them.
+    """Recordings that are not there, and worlds that need some, by name, and how to get them.
 
     Args:
         suite: Suite to run.
@@ -50,7 +52,9 @@ def missing(suite: Suite, found: Collection[str]) -> dict[str, str]:
     names = [clip.recording for clip in suite.sequences if clip.recording and clip.recording not in found]
     public = known_recordings()
     way = lambda name: f"; to get it: jaxslam data get {name}" if name in public else ", nor in `jaxslam data list`"
-    return {name: f"not there{way(name)}" for name in names}
+    absent = {name: f"not there{way(name)}" for name in names}
+    worlds = dict.fromkeys(clip.world for clip in suite.sequences if clip.world)
+    return absent | {world: why for world in worlds if (why := why_not_here(load_world(world))) is not None}
 
 
 def swept(suite: Suite, sweeps: Iterable[str]) -> Suite:
@@ -175,8 +179,13 @@ def _same_place(first: str, second: str) -> bool:
 
 
 def _plain_clip(clip: Clip) -> dict[str, Any]:
-    plain = _changed_fields(clip, Clip(clip.name, clip.recording, clip.room))
-    plain |= {"recording": clip.recording} if clip.room is None else {"room": _changed_fields(clip.room)}
+    plain = _changed_fields(clip, Clip(clip.name, clip.recording, clip.room, clip.world))
+    if clip.room is not None:
+        plain |= {"room": _changed_fields(clip.room)}
+    elif clip.world:
+        plain |= {"world": description_hash(load_world(clip.world))}
+    else:
+        plain |= {"recording": clip.recording}
     if clip.camera is not None and Path(clip.camera).is_file():  # the same file wherever it lies
         plain["camera"] = hashlib.sha256(Path(clip.camera).read_bytes()).hexdigest()
     return plain

@@ -18,6 +18,8 @@ from jaxslam.io.download import sha256_of
 from jaxslam.runtime.machine import machine
 from jaxslam.runtime.trace_cache import source_files
 from jaxslam.semantics.from_config import network_files
+from jaxslam.worlds.library import load_world
+from jaxslam.worlds.stored_world import description_hash
 
 _MAX_HASHED_BYTES = 5_000_000
 _HASHED = (".txt", ".yaml", ".csv")
@@ -54,12 +56,11 @@ def identities(runs: Sequence[Run], root: Path | None) -> list[dict[str, Any]]:
     known = _Known(root)
     found = []
     for run in runs:
-        folder = known.folder(run.clip.recording) if run.clip.recording else None
         found.append(
             here
             | {
                 "sources_sha256": sources,
-                "data_sha256": None if folder is None else known.data(folder),
+                "data_sha256": known.input(run.clip),
                 "camera_sha256": camera_sha256(run.clip),
                 "networks_sha256": known.networks(run.config.semantics),
             }
@@ -124,6 +125,15 @@ def data_sha256(folder: Path) -> str:
     return digest.hexdigest()
 
 
+def world_sha256(world: str) -> str:
+    """Hash of the description of a world and the files that it names.
+
+    Raises:
+        JaxSlamError: If there is no such world, or a file cannot be read.
+    """
+    return description_hash(load_world(world))
+
+
 def camera_sha256(clip: Clip) -> str | None:
     """Hash of the camera file of a sequence; `None` if it names none, or a known camera."""
     return sha256_of(Path(clip.camera)) if clip.camera is not None and Path(clip.camera).is_file() else None
@@ -161,6 +171,14 @@ class _Known:
 
     def __init__(self, root: Path | None) -> None:
         """With the folder in which recordings are looked for first."""
-        self.folder = functools.cache(lambda recording: find_recording(recording, root))
-        self.data = functools.cache(data_sha256)
+        self._folder = functools.cache(lambda recording: find_recording(recording, root))
+        self._data = functools.cache(data_sha256)
+        self._world = functools.cache(world_sha256)
         self.networks = functools.cache(_networks_or_problem)
+
+    def input(self, clip: Clip) -> str | None:
+        """Hash of the recording or the world of a sequence; `None` for a room, or what is not on this machine."""
+        if clip.world:
+            return self._world(clip.world)
+        folder = self._folder(clip.recording) if clip.recording else None
+        return None if folder is None else self._data(folder)

@@ -10,6 +10,9 @@ sequences:
     camera: my_camera.yaml           # if the recording's folder does not tell; beside the suite's file, or a known one
   - name: room                       # what it is called in tables; a recording's own name if not given
     room: {frames: 90, people: 2}    # rendered, see `SyntheticConfig`; `baseline_m: 0.1` makes stereo pairs of it
+  - world: flat                      # rendered, one of `jaxslam world list` or a YAML file beside the suite's
+    start: 300
+    stop: 500
   - recording: kitti_00
     sensor: stereo                   # or rgbd: what the recording must be; whichever it is if not given
     runs: 20                         # how often this one, if not as often as the others
@@ -40,12 +43,13 @@ _Positive = Range(at_least=1)
 
 @dataclass(frozen=True)
 class Sequence(ValidatedConfig):
-    """A recording or a part of one, or a rendered room.
+    """A recording, a rendered room or a world, or a part of one.
 
     Attributes:
         name: Name in tables and of folders.
-        recording: Name of the recording's folder; empty for a room.
-        room: Settings of the rendered room; `None` for a recording.
+        recording: Name of the recording's folder; empty for one that is rendered.
+        room: Settings of the rendered room; `None` for others.
+        world: Name of the rendered world, or its file; empty for others.
         start: First frame.
         stop: Frame after the last one; `None` for the end of the recording.
         every: Step between frames, as if the camera were slower; 1 for all frames.
@@ -59,6 +63,7 @@ class Sequence(ValidatedConfig):
     name: str
     recording: str = ""
     room: SyntheticConfig | None = None
+    world: str = ""
     start: Annotated[int, Range(at_least=0)] = 0
     stop: Annotated[int, _Positive] | None = None
     every: Annotated[int, _Positive] = 1
@@ -68,8 +73,10 @@ class Sequence(ValidatedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if bool(self.recording) == (self.room is not None):
-            raise BenchmarkError(f"sequence {self.name}: expected either `recording` or `room`, got both or neither")
+        given = [bool(self.recording), self.room is not None, bool(self.world)]
+        if sum(given) != 1:
+            expected = "one of `recording`, `room` and `world`"
+            raise BenchmarkError(f"sequence {self.name}: expected {expected}, got {sum(given) or 'none'}")
         if self.room is not None and self.sensor not in (None, "stereo" if self.room.baseline_m else "rgbd"):
             raise BenchmarkError(
                 f"sequence {self.name}: expected a `room` with baseline_m for stereo, and without for rgbd, got"
@@ -77,6 +84,11 @@ class Sequence(ValidatedConfig):
             )
         if not self.name or "/" in self.name or self.name.startswith("."):
             raise BenchmarkError(f"sequence: expected a name that can be a folder's, got '{self.name}'")
+
+    @property
+    def source(self) -> str:
+        """Name of the recording or world that it is a part of; empty for a room."""
+        return self.recording or self.world
 
     @property
     def whole(self) -> bool:
@@ -212,15 +224,21 @@ def check_masks(sequences: Iterable[Sequence], config: Config) -> None:
     Raises:
         BenchmarkError: If the settings ask for true masks of a recording.
     """
-    recordings = [sequence.name for sequence in sequences if sequence.room is None]
+    recordings = [sequence.name for sequence in sequences if sequence.recording]
     if config.semantics.model == SCENE and recordings:
-        raise BenchmarkError(f"semantics.model: '{SCENE}' expected rendered rooms, got the recording {recordings[0]}")
+        raise BenchmarkError(
+            f"semantics.model: '{SCENE}' expected rendered rooms or worlds, got the recording {recordings[0]}"
+        )
 
 
 def _sequence(entry: object, place: str, file: Path) -> Sequence:
     fields = checked_mapping(entry, place, BenchmarkError)
     if "recording" in fields:
         fields.setdefault("name", fields["recording"])
+    if isinstance(world := fields.get("world"), str):
+        fields.setdefault("name", Path(world).stem)
+        if (file.parent / world).is_file():
+            fields["world"] = str((file.parent / world).absolute())
     if isinstance(camera := fields.get("camera"), str) and (file.parent / camera).is_file():
         fields["camera"] = str((file.parent / camera).absolute())  # not where the run happens to be
     return from_mapping(Sequence, fields, place)

@@ -1,13 +1,9 @@
 """A rendered room whose frames are kept in files, for those who track it several times."""
 
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from jaxslam.datasets.synthetic.dataset import SyntheticConfig, SyntheticDataset, SyntheticFrame
-from jaxslam.errors import DatasetError
-from jaxslam.io.atomic_files import replacing
+from jaxslam.datasets.synthetic.frame_files import FrameFiles, arrays_of
 
 
 class StoredRoom(SyntheticDataset):
@@ -22,7 +18,7 @@ class StoredRoom(SyntheticDataset):
 
     def __init__(self, config: SyntheticConfig, folder: Path) -> None:
         super().__init__(config)
-        self._folder = folder
+        self._files = FrameFiles(folder)
 
     def render(self, index: int) -> SyntheticFrame:
         """Frame `index` with its ground truth.
@@ -32,25 +28,15 @@ class StoredRoom(SyntheticDataset):
             DatasetError: If it cannot be kept.
         """
         index = range(len(self))[index]
-        path = self._path(index)
-        if path.exists():
-            with np.load(path) as arrays:
-                return SyntheticFrame(int(self.timestamps_ns[index]), **arrays)
+        arrays = self._files.read(index)
+        if arrays is not None:
+            return SyntheticFrame(int(self.timestamps_ns[index]), **arrays)
         frame = super().render(index)
-        arrays: dict[str, Any] = {name: value for name, value in vars(frame).items() if isinstance(value, np.ndarray)}
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-        except OSError as problem:
-            raise DatasetError(f"{self._folder}: cannot be made: {problem.strerror}") from None
-        with replacing(path, DatasetError) as temporary, temporary.open("wb") as file:
-            np.savez(file, **arrays)
+        self._files.write(index, arrays_of(frame))
         return frame
 
     def render_all(self) -> None:
         """Render what is not there yet, so that no time taken later is that of rendering."""
         for index in range(len(self)):
-            if not self._path(index).exists():
+            if not self._files.has(index):
                 self.render(index)
-
-    def _path(self, index: int) -> Path:
-        return self._folder / f"{index}.npz"

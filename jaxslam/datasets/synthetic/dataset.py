@@ -142,6 +142,7 @@ class SyntheticDataset:
             baseline_m=config.baseline_m,
         )
         self.actors = cast(config.path, config.people, config.boxes, config.seated, config.parked, config.seed)
+        self.labels = tuple(actor.label for actor in self.actors)
         static = furnish(config.seed) + chairs(config.seated, config.seed)
         self._stage = Stage(static, self.actors, ROOM_LIGHT)
         self._filming = VirtualCamera(self._stage, self.camera, config.sensor, self._pose, self._gain)

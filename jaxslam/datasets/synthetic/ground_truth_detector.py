@@ -4,19 +4,63 @@ import hashlib
 import threading
 import zlib
 from collections.abc import Iterable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import UInt8
 
-from jaxslam.datasets.synthetic.dataset import SyntheticDataset, SyntheticFrame
 from jaxslam.errors import ConfigError, DatasetError, nearest
 from jaxslam.semantics import Detections, no_detections
+from jaxslam.semantics.class_names import COCO
+from jaxslam.sensors.camera import Camera
+from jaxslam.sensors.frame import Frame
 
 _LABELS = ("person", "box")
 
 
+class LabeledFrame(Protocol):
+    """A rendered frame in which the numbers of things and people are known."""
+
+    @property
+    def timestamp_ns(self) -> int:
+        """Time of the frame."""
+        ...
+
+    @property
+    def rgb(self) -> np.ndarray:
+        """Color as measured, `(height, width, 3)` uint8."""
+        ...
+
+    @property
+    def instance_mask(self) -> np.ndarray:
+        """Numbers, `(height, width)` int32; 0 on what has none."""
+        ...
+
+    @property
+    def measured(self) -> Frame:
+        """What a camera would deliver."""
+        ...
+
+
+@runtime_checkable
+class LabeledRecording(Protocol):
+    """A rendered recording in which the labels of things and people are known: a room, or a world."""
+
+    name: str
+    camera: Camera
+    timestamps_ns: np.ndarray
+    labels: tuple[str, ...]
+    """Label of each; that of number `k` is `labels[k - 1]`."""
+
+    def __len__(self) -> int: ...
+
+    def render(self, index: int) -> LabeledFrame:
+        """Frame `index` with its ground truth."""
+        ...
+
+
 class SceneDetector:
-    """Finds what moves in the frames of a synthetic recording, exactly: a `Detector`.
+    """Finds things and people of some labels in the frames of a rendered recording, exactly: a `Detector`.
 
     A frame is known by the bytes of its image. Frames are rendered once more for that, in turn, until the image is
     found; what is kept of each is about a kilobyte. May be called from any thread.
@@ -24,8 +68,8 @@ class SceneDetector:
 
     def __init__(
         self,
-        dataset: SyntheticDataset,
-        rendered: Iterable[SyntheticFrame] = (),
+        dataset: LabeledRecording,
+        rendered: Iterable[LabeledFrame] = (),
         labels: Iterable[str] = _LABELS,
     ) -> None:
         """Take a recording whose frames will come.
@@ -33,21 +77,23 @@ class SceneDetector:
         Args:
             dataset: The recording.
             rendered: Frames of it that are rendered already: they need not be once more.
-            labels: Labels to find: `person`, which networks know, and `box`, carried boxes, which they do not.
+            labels: Labels to find: `person` and others of COCO, which networks know, and `box`, carried boxes, which
+                they do not.
 
         Raises:
-            ConfigError: A label is neither.
+            ConfigError: A label is none of those, and none of the recording.
         """
         self._dataset, self._labels = dataset, frozenset(labels)
-        if unknown := sorted(self._labels.difference(_LABELS)):
-            raise ConfigError(f"labels: no actor is a '{unknown[0]}'{nearest(unknown[0], _LABELS)}")
+        known = {*_LABELS, *COCO, *dataset.labels}
+        if unknown := sorted(self._labels - known):
+            raise ConfigError(f"labels: no actor is a '{unknown[0]}'{nearest(unknown[0], sorted(known))}")
         self._actors: dict[bytes, bytes] = {}
         self._lock = threading.Lock()
         known_ns = [self._keep(frame) for frame in rendered]
         self._unseen = iter(np.flatnonzero(~np.isin(dataset.timestamps_ns, known_ns)).tolist())
 
     def __call__(self, image: UInt8[np.ndarray, "h w 3"], /) -> Detections:
-        """Everything that moves in a frame of the recording, one mask an actor, with a score of 1; largest first.
+        """What has one of the labels in a frame of the recording, one mask each, with a score of 1; largest first.
 
         Args:
             image: The image of one of its frames, as it is.
@@ -55,18 +101,20 @@ class SceneDetector:
         Raises:
             DatasetError: It is none of them.
         """
+        if not image.any():  # a camera that fails shows nothing, whatever is there
+            return no_detections()
         compressed = self._found(image)
         if compressed is None:
             raise DatasetError(
                 f"image: expected that of one of the {len(self._dataset)} frames of {self._dataset.name},"
                 f" got another of shape {image.shape}"
             )
-        numbers = np.frombuffer(zlib.decompress(compressed), np.uint8).reshape(image.shape[:2])
+        numbers = np.frombuffer(zlib.decompress(compressed), np.uint16).reshape(image.shape[:2])
         return self._detections(numbers)
 
     def _found(self, image: np.ndarray) -> bytes | None:
         """Return the mask of every actor in an image; `None` if it is not of the recording."""
-        if image.shape != (self._dataset.height, self._dataset.width, 3):
+        if image.shape != (self._dataset.camera.height, self._dataset.camera.width, 3):
             return None
         key = _digest(image)
         with self._lock:
@@ -74,18 +122,20 @@ class SceneDetector:
                 self._keep(self._dataset.render(index))
             return self._actors.get(key)
 
-    def note(self, frame: SyntheticFrame) -> None:
+    def note(self, frame: LabeledFrame) -> None:
         """Remember where everybody is in a frame of the recording, so that it need not be rendered once more."""
         with self._lock:
             self._keep(frame)
 
-    def _keep(self, frame: SyntheticFrame) -> int:
+    def _keep(self, frame: LabeledFrame) -> int:
         """Remember where everybody is in a frame; gives its time."""
-        self._actors[_digest(frame.rgb)] = zlib.compress(frame.instance_mask.astype(np.uint8).tobytes(), 1)
+        key = _digest(frame.rgb)
+        if key not in self._actors:  # a camera that is frozen goes on showing what was there before
+            self._actors[key] = zlib.compress(frame.instance_mask.astype(np.uint16).tobytes(), 1)
         return frame.timestamp_ns
 
     def _detections(self, numbers: np.ndarray) -> Detections:
-        label = {k: self._dataset.actors[k - 1].label for k in np.unique(numbers[numbers > 0]).tolist()}
+        label = {k: self._dataset.labels[k - 1] for k in np.unique(numbers[numbers > 0]).tolist()}
         found = [k for k in label if label[k] in self._labels]
         if not found:
             return no_detections()

@@ -1,12 +1,11 @@
-"""Tracking a rendered room with true masks: the setting `semantics.model: scene`."""
+"""Tracking a rendered recording with true masks: the setting `semantics.model: scene`."""
 
 import numpy as np
 
 from jaxslam.config.schema import SemanticsConfig
 from jaxslam.datasets.prefetch import Subset
 from jaxslam.datasets.protocol import Dataset
-from jaxslam.datasets.synthetic.dataset import SyntheticDataset
-from jaxslam.datasets.synthetic.ground_truth_detector import SceneDetector
+from jaxslam.datasets.synthetic.ground_truth_detector import LabeledRecording, SceneDetector
 from jaxslam.errors import ConfigError
 from jaxslam.semantics.from_config import SCENE
 from jaxslam.sensors.camera import Camera
@@ -17,7 +16,8 @@ from jaxslam.trajectory.trajectory import Trajectory
 def with_true_masks(dataset: Dataset, config: SemanticsConfig) -> tuple[Dataset, SceneDetector | None]:
     """Recording to track, and the detector of moving objects where the settings ask for the ground truth.
 
-    `labels` say of what: `[person]` is a perfect network that is blind to boxes, `[person, box]` knows all.
+    `labels` say of what: `[person]` is a perfect network that is blind to boxes and cars, `[person, box]` knows all
+    that moves in a room.
 
     Args:
         dataset: Recording to track.
@@ -28,15 +28,17 @@ def with_true_masks(dataset: Dataset, config: SemanticsConfig) -> tuple[Dataset,
         other `model`, the recording as it is, and `None`.
 
     Raises:
-        ConfigError: If that is no rendered room, nor a part of one, if a label is neither `person` nor `box`, or if
-            masks shall be made by prompts, which has nothing to add to the truth.
+        ConfigError: If that is no rendered room or world, nor a part of one, if a label is unknown, or if masks shall
+            be made by prompts, which has nothing to add to the truth.
     """
     if config.model != SCENE:
         return dataset, None
     part = isinstance(dataset, Subset)
     room, indices = (dataset.whole, dataset.indices) if part else (dataset, range(len(dataset)))
-    if not isinstance(room, SyntheticDataset):
-        raise ConfigError(f"semantics.model: '{SCENE}' expected a rendered room, got the recording {dataset.name}")
+    if not isinstance(room, LabeledRecording):
+        raise ConfigError(
+            f"semantics.model: '{SCENE}' expected a rendered room or world, got the recording {dataset.name}"
+        )
     for key in ("prompt_encoder", "prompt_decoder", "examples"):
         if (value := getattr(config, key)) is not None:
             raise ConfigError(f"semantics.{key}: expected null with semantics.model={SCENE}, got '{value}'")
@@ -45,9 +47,9 @@ def with_true_masks(dataset: Dataset, config: SemanticsConfig) -> tuple[Dataset,
 
 
 class _Noted:
-    """A room or a part of one; the detector is told of what is rendered."""
+    """A rendered recording or a part of one; the detector is told of what is rendered."""
 
-    def __init__(self, dataset: Dataset, room: SyntheticDataset, indices: range, detector: SceneDetector) -> None:
+    def __init__(self, dataset: Dataset, room: LabeledRecording, indices: range, detector: SceneDetector) -> None:
         self._room, self._indices, self._detector = room, indices, detector
         self.name: str = dataset.name
         self.camera: Camera = dataset.camera
