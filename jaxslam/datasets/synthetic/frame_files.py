@@ -27,7 +27,7 @@ class FrameFiles:
     def read(self, index: int) -> dict[str, Any] | None:
         """Read the arrays of frame `index` by name; `None` if there are none, or the file is damaged."""
         try:
-            with np.load(self._path(index)) as arrays:
+            with self._path(index).open("rb") as file, np.load(file) as arrays:
                 return dict(arrays)
         except FileNotFoundError:
             return None
