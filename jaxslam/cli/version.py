@@ -11,6 +11,7 @@ from jaxslam.datasets.catalog import recordings_dir
 from jaxslam.runtime.compile_cache import compile_cache_dir
 from jaxslam.runtime.machine import machine
 from jaxslam.semantics.model_zoo import models_dir
+from jaxslam.worlds.stored_world import worlds_dir
 
 
 def version_text() -> str:
@@ -26,5 +27,6 @@ def version_text() -> str:
             f"compiled code: {compile_cache_dir()}",
             f"networks: {models_dir()}",
             f"recordings: {recordings_dir()}",
+            f"rendered frames: {worlds_dir()}",
         ]
     )

@@ -23,7 +23,7 @@ from jaxslam.worlds.recording import WorldFrame, WorldRecording
 _log = logging.getLogger(__name__)
 
 LIMIT_BYTES = 4 << 30
-"""Default size of the cache: 15 minutes of rendering 640x480 pixels."""
+"""Default size of the cache: some 1000 frames of 640x480 pixels."""
 
 
 def worlds_dir() -> Path:
