@@ -48,7 +48,7 @@ class ShowWorld(WithJson):
         """Run the command."""
         from jaxslam.visualization.world_pictures import write_world_pictures  # noqa: PLC0415 - loads JAX
 
-        recording = _opened(self.name)
+        recording = _opened(self.name, stored=True)
         folder = self.out or Path("results") / "worlds" / recording.name
         with progress_bar("Rendering") as progress:
             task = progress.add_task("", total=None)
@@ -80,7 +80,7 @@ class RenderWorld:
         """Run the command."""
         from jaxslam.datasets.synthetic.write_recording import write_recording  # noqa: PLC0415 - loads JAX
 
-        recording = _opened(self.name)
+        recording = _opened(self.name, stored=False)
         with progress_bar("Rendering") as progress:
             task = progress.add_task("", total=len(recording))
             to_open = write_recording(
@@ -94,12 +94,14 @@ class RenderWorld:
         plain_console.print(f"To track it: jaxslam run {to_open}")
 
 
-def _opened(name: str) -> "WorldRecording":
+def _opened(name: str, *, stored: bool) -> "WorldRecording":
+    """Open a world; frames that are likely to be looked at again are stored."""
     from jaxslam.runtime.compile_cache import enable_compile_cache  # noqa: PLC0415 - loads JAX
     from jaxslam.worlds.recording import WorldRecording  # noqa: PLC0415
+    from jaxslam.worlds.stored_world import StoredWorld  # noqa: PLC0415
 
     enable_compile_cache()
-    return WorldRecording(name)
+    return StoredWorld(name) if stored else WorldRecording(name)
 
 
 def _figures(recording: "WorldRecording") -> dict[str, Any]:
