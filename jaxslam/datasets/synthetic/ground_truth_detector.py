@@ -87,6 +87,7 @@ class SceneDetector:
         known = {*_LABELS, *COCO, *dataset.labels}
         if unknown := sorted(self._labels - known):
             raise ConfigError(f"labels: no actor is a '{unknown[0]}'{nearest(unknown[0], sorted(known))}")
+        self._shape = dataset.camera.height, dataset.camera.width, 3
         self._actors: dict[bytes, bytes] = {}
         self._lock = threading.Lock()
         known_ns = [self._keep(frame) for frame in rendered]
@@ -101,7 +102,7 @@ class SceneDetector:
         Raises:
             DatasetError: It is none of them.
         """
-        if not image.any():  # a camera that fails shows nothing, whatever is there
+        if image.shape == self._shape and not image.any():  # a camera that fails shows nothing, whatever is there
             return no_detections()
         compressed = self._found(image)
         if compressed is None:
@@ -114,7 +115,7 @@ class SceneDetector:
 
     def _found(self, image: np.ndarray) -> bytes | None:
         """Return the mask of every actor in an image; `None` if it is not of the recording."""
-        if image.shape != (self._dataset.camera.height, self._dataset.camera.width, 3):
+        if image.shape != self._shape:
             return None
         key = _digest(image)
         with self._lock:

@@ -111,7 +111,10 @@ class TestSuite:
                 "expected a `room` with baseline_m for stereo",
             ),
             (SUITE.replace("semantics.model", "semantic.model"), "semantic: unknown key"),
-            (SUITE.replace("model=null", "model=scene"), "'scene' expected rendered rooms, got the recording start"),
+            (
+                SUITE.replace("model=null", "model=scene"),
+                "'scene' expected rendered rooms or worlds, got the recording start",
+            ),
             (SUITE.replace("[semantics.model=null]", "semantics"), "set: expected a list, each text, got 'semantics'"),
             (SUITE + "variants: [a]", "variants: expected `key: value` lines"),
             (SUITE + "variants: {a: [track.num_points=x]}", "num_points"),

@@ -89,12 +89,14 @@ class TestWithTrueMasks:
         name = "walk"
         if part:
             dataset, name = Subset(dataset, 1, 3), r"walk\[1:3\]"
-        with pytest.raises(ConfigError, match=f"semantics.model: 'scene' expected a rendered room, got .* {name}$"):
+        with pytest.raises(
+            ConfigError, match=f"semantics.model: 'scene' expected a rendered room or world, got .* {name}$"
+        ):
             with_true_masks(dataset, TRUTH)
 
     def test_unknown_label(self, room: SyntheticDataset) -> None:
-        with pytest.raises(ConfigError, match=r"labels: no actor is a 'car'"):
-            with_true_masks(room, dataclasses.replace(TRUTH, labels=("car",)))
+        with pytest.raises(ConfigError, match=r"labels: no actor is a 'cart'"):
+            with_true_masks(room, dataclasses.replace(TRUTH, labels=("cart",)))
 
     @pytest.mark.parametrize("key", ["prompt_encoder", "prompt_decoder", "examples"])
     def test_nothing_is_prompted_for(self, room: SyntheticDataset, key: str) -> None:
