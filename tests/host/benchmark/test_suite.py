@@ -113,7 +113,7 @@ class TestSuite:
             (SUITE.replace("semantics.model", "semantic.model"), "semantic: unknown key"),
             (
                 SUITE.replace("model=null", "model=scene"),
-                "'scene' expected rendered rooms or worlds, got the recording start",
+                "expected rendered rooms or worlds, got the recording start",
             ),
             (SUITE.replace("[semantics.model=null]", "semantics"), "set: expected a list, each text, got 'semantics'"),
             (SUITE + "variants: [a]", "variants: expected `key: value` lines"),
