@@ -106,7 +106,7 @@ def called(a: Any = (1.0, 2.0), plan: Plan = _TWICE) -> Given:
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """Where traces are kept; as if nothing had been edited just now."""
-    monkeypatch.setattr(trace_cache, "_sources", lambda: "these")
+    monkeypatch.setattr(trace_cache, "sources_hash", lambda: "these")
     before = jax.config.values[FOLDER]
     jax.config.update(FOLDER, str(tmp_path))
     traces.clear()
@@ -198,7 +198,7 @@ class TestOther:
 
     def test_sources(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         called()
-        monkeypatch.setattr(trace_cache, "_sources", lambda: "others")
+        monkeypatch.setattr(trace_cache, "sources_hash", lambda: "others")
         called()
         assert len(kept(folder)) == 2
 
@@ -234,7 +234,7 @@ class TestOther:
 
 
 class TestSources:
-    """`_sources` itself, of which the other tests know nothing."""
+    """`sources_hash` itself, of which the other tests know nothing."""
 
     @pytest.fixture(autouse=True)
     def sources(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], str | None]:
@@ -248,7 +248,7 @@ class TestSources:
         monkeypatch.setattr(trace_cache, "_PACKAGES", ("ours",))
         monkeypatch.setattr(trace_cache, "_loaded", time.time() + 60)
         self.patch = monkeypatch
-        return trace_cache._sources.__wrapped__
+        return trace_cache.sources_hash.__wrapped__
 
     def test_hash_is_of_the_content(self, sources: Callable[[], str | None]) -> None:
         first = sources()
