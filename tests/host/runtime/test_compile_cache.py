@@ -25,7 +25,7 @@ ENABLED = "jax_enable_compilation_cache"
 
 @pytest.fixture(autouse=True)
 def _settings_stay(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(trace_cache, "_sources", lambda: "these")
+    monkeypatch.setattr(trace_cache, "sources_hash", lambda: "these")
     before = {name: jax.config.values[name] for name in (FOLDER, MIN_S, ENABLED)}
     compilation_cache.reset_cache()
     yield
