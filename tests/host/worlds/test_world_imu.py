@@ -235,14 +235,12 @@ class TestPaths:
     def test_need_the_folder_of_recordings(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (tmp_path / "flight.yaml").write_text(REAL)
         monkeypatch.delenv("JAXSLAM_DATA", raising=False)
-        with pytest.raises(ConfigError, match=r"flight\.yaml: way: file: expected JAXSLAM_DATA to name the folder"):
-            load_world(tmp_path / "flight.yaml")
-        monkeypatch.setenv("JAXSLAM_DATA", "/recordings")
         world = load_world(tmp_path / "flight.yaml")
-        assert world.way.file == "/recordings/imu/euroc_V103/groundtruth.txt"
+        assert world.way.file == "$JAXSLAM_DATA/imu/euroc_V103/groundtruth.txt"
         assert world.imu is not None
-        assert world.imu.sheet == "/recordings/imu/sensor.yaml"
-        assert world.imu.file == "/recordings/imu/euroc_V103/imu0.csv.gz"
+        assert world.imu.sheet == "$JAXSLAM_DATA/imu/sensor.yaml"
+        with pytest.raises(ConfigError, match="JAXSLAM_DATA: expected the folder in which"):
+            WorldRecording(world)
 
     def test_lie_beside_the_description(self, tmp_path: Path) -> None:
         (tmp_path / "flight.yaml").write_text(REAL.replace("$JAXSLAM_DATA/", ""))
