@@ -98,7 +98,7 @@ class ImuSheet(ValidatedConfig):
 
 @dataclass(frozen=True, eq=False)
 class ImuStates:
-    """What is true of an IMU at some times.
+    """True states of an IMU at some times.
 
     Attributes:
         timestamps_ns: `(n,)` int64 times, nanoseconds.

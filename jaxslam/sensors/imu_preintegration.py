@@ -36,7 +36,7 @@ class ImuDelta(NamedTuple):
 
 
 class ImuState(NamedTuple):
-    """Where an IMU is, and how fast.
+    """Pose and velocity of an IMU.
 
     Attributes:
         T_world_imu: `(7,)` float64 pose, wxyz_xyz.

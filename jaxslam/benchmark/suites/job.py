@@ -129,9 +129,9 @@ def opened(clip: Clip, root: Path | None, rooms: Path | None = None) -> tuple[Da
         if folder is None:
             raise BenchmarkError(f"{clip.recording}: not on this machine; to get it: jaxslam data get {clip.recording}")
         dataset = open_dataset(folder, camera=clip.camera)
-        taken_with = "stereo" if dataset.camera.is_stereo else "rgbd"
-        if clip.sensor not in (None, taken_with):
-            raise BenchmarkError(f"{clip.name}: sensor: expected {clip.sensor}, got a recording of {taken_with}")
+    taken_with = "stereo" if dataset.camera.is_stereo else "rgbd"
+    if clip.sensor not in (None, taken_with):
+        raise BenchmarkError(f"{clip.name}: sensor: expected {clip.sensor}, got a recording of {taken_with}")
     return (dataset if clip.whole else Subset(dataset, clip.start, clip.stop, clip.every)), folder
 
 
@@ -139,15 +139,12 @@ def _world(clip: Clip) -> StoredWorld:
     """The world of a clip, whose frames are in the user's cache before anything is timed.
 
     Raises:
-        BenchmarkError: If it is of another sensor than the clip says, or it cannot be opened.
+        BenchmarkError: If it cannot be opened.
     """
     try:
         world = StoredWorld(clip.world)
     except JaxSlamError as error:
         raise BenchmarkError(f"{clip.name}: {error}") from None
-    taken_with = "stereo" if world.camera.is_stereo else "rgbd"
-    if clip.sensor not in (None, taken_with):
-        raise BenchmarkError(f"{clip.name}: sensor: expected {clip.sensor}, got a world of {taken_with}")
     world.render_all(range(len(world))[clip.start : clip.stop : clip.every])
     return world
 

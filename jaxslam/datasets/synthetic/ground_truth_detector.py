@@ -9,50 +9,35 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import UInt8
 
+from jaxslam.datasets.synthetic.recording_folder import RenderedFrame, RenderedRecording
 from jaxslam.errors import ConfigError, DatasetError, nearest
 from jaxslam.semantics import Detections, no_detections
 from jaxslam.semantics.class_names import COCO
-from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame
 
 _LABELS = ("person", "box")
 
 
-class LabeledFrame(Protocol):
+class LabeledFrame(RenderedFrame, Protocol):
     """A rendered frame in which the numbers of things and people are known."""
 
     @property
-    def timestamp_ns(self) -> int:
-        """Time of the frame."""
-        ...
-
-    @property
-    def rgb(self) -> np.ndarray:
-        """Color as measured, `(height, width, 3)` uint8."""
-        ...
-
-    @property
     def instance_mask(self) -> np.ndarray:
-        """Numbers, `(height, width)` int32; 0 on what has none."""
+        """Numbers, `(height, width)` int32; 0 on pixels without one."""
         ...
 
     @property
     def measured(self) -> Frame:
-        """What a camera would deliver."""
+        """Frame as a camera would deliver it."""
         ...
 
 
 @runtime_checkable
-class LabeledRecording(Protocol):
+class LabeledRecording(RenderedRecording, Protocol):
     """A rendered recording in which the labels of things and people are known: a room, or a world."""
 
-    name: str
-    camera: Camera
-    timestamps_ns: np.ndarray
     labels: tuple[str, ...]
     """Label of each; that of number `k` is `labels[k - 1]`."""
-
-    def __len__(self) -> int: ...
 
     def render(self, index: int) -> LabeledFrame:
         """Frame `index` with its ground truth."""
@@ -94,7 +79,7 @@ class SceneDetector:
         self._unseen = iter(np.flatnonzero(~np.isin(dataset.timestamps_ns, known_ns)).tolist())
 
     def __call__(self, image: UInt8[np.ndarray, "h w 3"], /) -> Detections:
-        """What has one of the labels in a frame of the recording, one mask each, with a score of 1; largest first.
+        """Find all with one of the labels in a frame of the recording: one mask each, a score of 1, largest first.
 
         Args:
             image: The image of one of its frames, as it is.

@@ -219,7 +219,7 @@ def tile_rows(height: int) -> int:
 def _reaches(
     view: CameraView, size: Float[Array, "n 3"], stem: Float[Array, " n"], rows: int, columns: int
 ) -> Bool[Array, "tiles n"]:
-    """Whether each solid may reach into each tile."""
+    """Tell which solids may reach into which tiles."""
     if view.solid_from_cam.ndim == 3:
         return solids_in_tiles(_corners(view.solid_from_cam, size, stem), view.intrinsics, rows, columns)
     corners = jax.vmap(lambda solid_from_cam: _corners(solid_from_cam, size, stem))(view.solid_from_cam)

@@ -102,7 +102,7 @@ class SensorParams(NamedTuple):
 
 
 class LensParams(NamedTuple):
-    """What lens and amplifier do to the light.
+    """Faults of lens and amplifier.
 
     Attributes:
         vignetting: Share of the light that is missing in the corners of the picture.

@@ -78,8 +78,9 @@ class Stage:
         self._packed = pack_solids(solids, numbers)
         self._static_from_world = rigid.inverse(np.stack([placed.T_world_solid for placed in static]))
         self._centers = np.stack([placed.T_world_solid[:3, 3] for placed in static])
-        size, stem = self._packed.size[: len(static)], self._packed.stem[: len(static)]
-        self._radii = np.linalg.norm(size * np.stack([0.0 * stem + 1, 0.0 * stem + 1, 1.0 + stem], axis=1), axis=1)
+        extent_m = self._packed.size[: len(static)].copy()
+        extent_m[:, 2] *= 1.0 + self._packed.stem[: len(static)]
+        self._radii = np.linalg.norm(extent_m, axis=1)
         self._is_small = len(solids) <= _SMALL_SCENE
         if self._is_small:
             self.scene, self._slots = self._arranged(np.arange(len(solids)), 0.0)
@@ -155,7 +156,7 @@ class TakenPicture(NamedTuple):
 
 
 class Optics(NamedTuple):
-    """How a camera exposes and what its lens does; by default, all rows at once and nothing.
+    """Exposure of the rows and faults of the lens; by default, all rows at once and none.
 
     Attributes:
         rolling_shutter_s: Time from the exposure of the first row to that of the last; 0 for all at once.
@@ -237,7 +238,7 @@ class VirtualCamera:
     def _views(
         self, time_s: np.ndarray, offsets: np.ndarray, to_the_right_m: Sequence[float]
     ) -> tuple[RenderScene, list[CameraView]]:
-        """What is in sight of cameras side by side, and the views of each at `(t,)` times, camera by camera."""
+        """Return the scene in sight of cameras side by side, and their views at `(t,)` times, camera by camera."""
         camera, num_views = self._camera, len(time_s) * len(to_the_right_m)
         since_s = self._row_times(np.arange(tile_rows(camera.height) + 1) * TILE_HEIGHT)
         times = np.tile((time_s[:, None] + since_s).ravel(), len(to_the_right_m))
