@@ -2,10 +2,12 @@
 
 A tile only looks at the solids whose bounds reach into it, in loops of data-dependent length: what is out of sight
 costs nothing. Each loop carries one plane of integers, the depth's bits with the index of the solid in the lowest of
-them: positive floats are ordered as their bits are, so that the nearest hit is a minimum, one pass over the tile a
-solid.
+them: positive floats are ordered as their bits are, so that the nearest hit is a minimum, one pass over some rows of
+the tile a solid.
 """
 
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple, TypeAlias
 
 import jax
@@ -18,8 +20,13 @@ Vectors: TypeAlias = tuple[Plane, Plane, Plane]
 """One vector a pixel, one plane a component."""
 
 TILE_HEIGHT, TILE_WIDTH = 60, 80
+_WINDOW_ROWS = (10, 30, TILE_HEIGHT)
+"""Numbers of rows of a tile that are searched for a solid: the first that holds it. On a road, where most solids are
+far away, casting rays takes half as long as with all rows.
+"""
 _NEAR_M = 0.05
 _NOTHING = np.int32(0x7F000000)
+_FAR_ROW = np.float32(1e6)
 
 
 class Shapes(NamedTuple):
@@ -29,12 +36,14 @@ class Shapes(NamedTuple):
         unit_from_cam: Affine maps from camera coordinates to those in which a box is the cube from -1 to 1 and a
             capsule has radius 1 and its axis along z.
         stem: Half length of a capsule's axis in those coordinates; 0 for boxes.
+        rows: First row of the picture in which each solid may be, and the row after the last one.
         change: What the maps change by from the first row of the tile to the first row of the one below, with a
             rolling shutter; `None` if all rows are taken at once.
     """
 
     unit_from_cam: Float[Array, "n 3 4"]
     stem: Float[Array, " n"]
+    rows: Int[Array, "2 n"]
     change: Float[Array, "n 3 4"] | None = None
 
 
@@ -86,35 +95,71 @@ def _between(x: Float[Array, "c n"], z: Float[Array, "c n"], edges: Float[Array,
     return ~below[:-1] & ~above[1:]
 
 
+def rows_of_solids(corners: Float[Array, "3 c n"], intrinsics: Float[Array, " 4"]) -> Int[Array, "2 n"]:
+    """First row of the picture in which each solid may be, and the row after the last one: see `solids_in_tiles`."""
+    _, y, z = corners
+    v = intrinsics[1] * y / jnp.maximum(z, _NEAR_M) + intrinsics[3]
+    # With a pixel to spare; a solid that reaches behind the camera may be anywhere.
+    edges = jnp.stack([jnp.min(v, axis=0) - 1.5, jnp.max(v, axis=0) + 2.5])
+    anywhere = jnp.array([[-_FAR_ROW], [_FAR_ROW]])
+    edges = jnp.where(jnp.all(z > _NEAR_M, axis=0), jnp.clip(edges, -_FAR_ROW, _FAR_ROW), anywhere)
+    return jnp.floor(edges).astype(jnp.int32)
+
+
 def compact(reaches: Bool[Array, "tiles n"], first: int) -> InTile:
     """List the solids that reach into each tile; `first` is the index of the first column."""
     tiles, n = reaches.shape
-    # A sort takes sixteen times as long.
-    place = jnp.where(reaches, jnp.cumsum(reaches, axis=1, dtype=jnp.int32) - 1, n)
+    # `jnp.cumsum` takes three times as long, a sort fifty times.
+    place = jax.lax.associative_scan(jnp.add, reaches.astype(jnp.int32), axis=1) - 1
+    place = jnp.where(reaches, place + n * jnp.arange(tiles, dtype=jnp.int32)[:, None], tiles * n)
     columns = jnp.broadcast_to(jnp.arange(first, first + n, dtype=jnp.int32), reaches.shape)
-    rows = jnp.arange(tiles, dtype=jnp.int32)[:, None]
-    indices = jnp.zeros(reaches.shape, jnp.int32).at[rows, place].set(columns, mode="drop")
-    return InTile(indices, jnp.sum(reaches, axis=1, dtype=jnp.int32))
+    indices = jnp.zeros(tiles * n, jnp.int32).at[place.ravel()].set(columns.ravel(), mode="drop", unique_indices=True)
+    return InTile(indices.reshape(tiles, n), jnp.sum(reaches, axis=1, dtype=jnp.int32))
 
 
-def nearest_solid(shapes: Shapes, rays: Rays, boxes: InTile, capsules: InTile) -> Int[Array, " p"]:
-    """The nearest solid along each ray of a tile, packed: see `unpack`."""
+def nearest_solid(shapes: Shapes, rays: Rays, boxes: InTile, capsules: InTile, top: Int[Array, ""]) -> Int[Array, " p"]:
+    """The nearest solid along each ray of a tile, packed: see `unpack`.
+
+    Args:
+        shapes: All solids.
+        rays: The rays of the tile.
+        boxes: The boxes to look at.
+        capsules: The capsules to look at.
+        top: Row of the picture at which the tile begins.
+    """
     mask = _index_mask(shapes)
 
-    def box(k: Int[Array, ""], nearest: Int[Array, " p"]) -> Int[Array, " p"]:
-        which = boxes.indices[k]
+    def box(which: Int[Array, ""], rays: Rays) -> Int[Array, " p"]:
         enter, leave = _slabs(*_into(shapes, which, rays))
-        return jnp.minimum(nearest, _packed(enter, enter < leave, which, mask))
+        return _packed(enter, enter < leave, which, mask)
 
-    def capsule(k: Int[Array, ""], nearest: Int[Array, " p"]) -> Int[Array, " p"]:
-        which = capsules.indices[k]
+    def capsule(which: Int[Array, ""], rays: Rays) -> Int[Array, " p"]:
         depth, hit = _round(*_into(shapes, which, rays), shapes.stem[which])
-        return jnp.minimum(nearest, _packed(depth, hit, which, mask))
+        return _packed(depth, hit, which, mask)
+
+    def look_at(
+        solids: InTile,
+        cast: Callable[[Int[Array, ""], Rays], Int[Array, " p"]],
+        k: Int[Array, ""],
+        nearest: Int[Array, " p"],
+    ) -> Int[Array, " p"]:
+        which = solids.indices[k]
+        above, below = jnp.clip(shapes.rows[:, which] - top, 0, TILE_HEIGHT)
+
+        def in_window(rows: int, nearest: Int[Array, " p"]) -> Int[Array, " p"]:
+            start = jnp.minimum(above, TILE_HEIGHT - rows) * TILE_WIDTH
+            seen, window = jax.tree.map(
+                lambda plane: jax.lax.dynamic_slice(plane, (start,), (rows * TILE_WIDTH,)), (nearest, rays)
+            )
+            return jax.lax.dynamic_update_slice(nearest, jnp.minimum(seen, cast(which, window)), (start,))
+
+        too_small = sum((below - above > rows).astype(jnp.int32) for rows in _WINDOW_ROWS[:-1])
+        return jax.lax.switch(too_small, [partial(in_window, rows) for rows in _WINDOW_ROWS], nearest)
 
     _, wall = _slabs(*_into(shapes, 0, rays))
     nearest = _packed(wall, wall > 0.0, jnp.int32(0), mask)
-    nearest = jax.lax.fori_loop(0, boxes.n_reaching, box, nearest)
-    return jax.lax.fori_loop(0, capsules.n_reaching, capsule, nearest)
+    nearest = jax.lax.fori_loop(0, boxes.n_reaching, partial(look_at, boxes, box), nearest)
+    return jax.lax.fori_loop(0, capsules.n_reaching, partial(look_at, capsules, capsule), nearest)
 
 
 def unpack(shapes: Shapes, packed: Int[Array, " p"]) -> tuple[Plane, Int[Array, " p"]]:

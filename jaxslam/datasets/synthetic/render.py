@@ -4,7 +4,7 @@ Rays have unit depth, so that a distance along a ray is a depth along the optica
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,7 @@ from jaxslam.datasets.synthetic.raycast import (
     Shapes,
     compact,
     nearest_solid,
+    rows_of_solids,
     solids_in_tiles,
     unpack,
 )
@@ -140,16 +141,9 @@ def arrange_scene(
     owners, used = np.zeros(n, np.int32), np.zeros(n, bool)
     size[slots], stem[slots], surface[slots] = packed.size[chosen], packed.stem[chosen], packed.surface[chosen]
     owners[slots], used[slots] = packed.owner[chosen], True
-    scene = RenderScene(
-        jnp.asarray(size[:n_boxes]),
-        jnp.asarray(size[n_boxes:]),
-        jnp.asarray(stem[n_boxes:]),
-        jnp.asarray(surface.reshape(-1, N_WORDS)),
-        jnp.asarray(owners),
-        jnp.asarray(used),
-        Light(*map(jnp.asarray, light)),
-    )
-    return scene, slots
+    surfaces = surface.reshape(-1, N_WORDS)
+    arrays: Any = (size[:n_boxes], size[n_boxes:], stem[n_boxes:], surfaces, owners, used, light)
+    return jax.device_put(RenderScene(*arrays)), slots
 
 
 @compiled(when="first use", static=("height", "width", "rows"), options=FUSION_EMITTERS)
@@ -172,7 +166,8 @@ def render(
     stem = jnp.concatenate([jnp.zeros(n_boxes, scene.capsule_stem.dtype), scene.capsule_stem])
     rolls = view.solid_from_cam.ndim == 4
     unit_from_cam = view.solid_from_cam / (size[None, :, :, None] if rolls else size[:, :, None])
-    reaches = _reaches(view, size, stem, all_rows, columns) & scene.used[None]
+    reaches, rows_of = _reaches(view, size, stem, all_rows, columns)
+    reaches &= scene.used[None]
     boxes, capsules = compact(reaches[:, 1:n_boxes], 1), compact(reaches[:, n_boxes:], n_boxes)
     turned = (view.solid_from_cam[all_rows // 2] if rolls else view.solid_from_cam)[:, :, :3]
     sun = jnp.einsum("nij,kj,k->ni", turned, view.world_from_cam[:, :3], scene.light.towards_sun)
@@ -185,17 +180,18 @@ def render(
     def shapes_and_looks(row: Array) -> tuple[Shapes, Array, Array | None]:
         """Shapes of the solids as a row of tiles sees them, their rows of the table, and what those change by."""
         if not rolls:
-            return Shapes(unit_from_cam, stem), table, None
+            return Shapes(unit_from_cam, stem, rows_of), table, None
         above = unit_from_cam[row]
         change = unit_from_cam[row + 1] - above
         looks = jnp.concatenate([above.reshape(-1, 12), own], axis=1)
-        return Shapes(above, stem, change), looks, change.reshape(-1, 12)
+        return Shapes(above, stem, rows_of[row], change), looks, change.reshape(-1, 12)
 
     def render_tile(tile: tuple[Array, InTile, InTile]) -> tuple[Array, ...]:
         index, boxes, capsules = tile
-        rays = _rays(view, (index // columns) * TILE_HEIGHT, (index % columns) * TILE_WIDTH)
+        top = (index // columns) * TILE_HEIGHT
+        rays = _rays(view, top, (index % columns) * TILE_WIDTH)
         shapes, looks, changes = shapes_and_looks(index // columns)
-        depth, which = unpack(shapes, nearest_solid(shapes, rays, boxes, capsules))
+        depth, which = unpack(shapes, nearest_solid(shapes, rays, boxes, capsules, top))
         hits = Hits(rays, depth, which, which < n_boxes)
         return (
             *shade(looks, scene.surface, hits, view.world_from_cam, view.intrinsics[0], scene.light, changes),
@@ -218,10 +214,11 @@ def tile_rows(height: int) -> int:
 
 def _reaches(
     view: CameraView, size: Float[Array, "n 3"], stem: Float[Array, " n"], rows: int, columns: int
-) -> Bool[Array, "tiles n"]:
-    """Tell which solids may reach into which tiles."""
+) -> tuple[Bool[Array, "tiles n"], Int[Array, "*rows 2 n"]]:
+    """Tell which solids may reach into which tiles, and into which rows of the picture at the time of each."""
     if view.solid_from_cam.ndim == 3:
-        return solids_in_tiles(_corners(view.solid_from_cam, size, stem), view.intrinsics, rows, columns)
+        corners = _corners(view.solid_from_cam, size, stem)
+        return solids_in_tiles(corners, view.intrinsics, rows, columns), rows_of_solids(corners, view.intrinsics)
     corners = jax.vmap(lambda solid_from_cam: _corners(solid_from_cam, size, stem))(view.solid_from_cam)
     # Over the time of a row of tiles, a corner is between where it is at the beginning and at the end.
     over_time = jnp.concatenate([corners[:-1], corners[1:]], axis=2)
@@ -229,7 +226,7 @@ def _reaches(
         solids_in_tiles(over_time[row], view.intrinsics, rows, columns).reshape(rows, columns, -1)[row]
         for row in range(rows)
     ]
-    return jnp.concatenate(reaches)
+    return jnp.concatenate(reaches), jax.vmap(lambda each: rows_of_solids(each, view.intrinsics))(over_time)
 
 
 def _corners(

@@ -87,8 +87,8 @@ PERFECT_SENSOR = SensorConfig(
 """No faults but eight bits a channel; edges are still smooth."""
 
 
-class SensorParams(NamedTuple):
-    """A `SensorConfig` as scalars that can change without recompiling; the angle as its cosine."""
+class DepthParams(NamedTuple):
+    """What a `SensorConfig` says of depth, as scalars that can change without recompiling; the angle as its cosine."""
 
     depth_noise_per_m: float
     depth_step_per_m: float
@@ -98,7 +98,6 @@ class SensorParams(NamedTuple):
     min_cosine: float
     min_depth_m: float
     max_depth_m: float
-    image_noise: float
 
 
 class LensParams(NamedTuple):
@@ -113,9 +112,9 @@ class LensParams(NamedTuple):
     gamma: float
 
 
-def sensor_params(config: SensorConfig) -> SensorParams:
-    """The numbers of a configuration that `measure` takes."""
-    return SensorParams(
+def depth_params(config: SensorConfig) -> DepthParams:
+    """Return the numbers of a configuration that `measure_depth` takes."""
+    return DepthParams(
         config.depth_noise_per_m,
         config.depth_step_per_m,
         config.depth_unit_m,
@@ -124,48 +123,56 @@ def sensor_params(config: SensorConfig) -> SensorParams:
         float(np.cos(np.deg2rad(config.max_incidence_deg))) if config.max_incidence_deg < 90.0 else -1.0,
         config.min_depth_m,
         config.max_depth_m,
-        config.image_noise,
     )
 
 
 @compiled(when="first use", options=FUSION_EMITTERS)
-def measure(
+def measure_color(
     exposures: tuple[UInt[Array, "h w"], ...],
-    depth_m: Float[Array, "h w"],
-    incidence: Float[Array, "h w"],
-    fx: float,
     gain: float | np.ndarray,
-    params: SensorParams,
+    image_noise: float,
     key: Array,
     lens: LensParams | None = None,
-) -> tuple[UInt8[Array, "3 h w"], Float[Array, "h w"]]:
-    """One measured frame.
+) -> UInt8[Array, "3 h w"]:
+    """Return red, green and blue of eight bits.
 
     Args:
         exposures: Packed colors at the moments that are averaged.
+        gain: Brightness factor of this frame, or of each row, `(1, h, 1)`.
+        image_noise: Standard deviation of the noise in gray levels.
+        key: Random key of this frame.
+        lens: Faults of the lens; `None` for none.
+    """
+    # All in one type: a recording is the same bytes where float64 is enabled.
+    numbers = (gain, image_noise, lens)
+    gain, image_noise, lens = jax.tree.map(lambda number: jnp.asarray(number, jnp.float32), numbers)
+    color_key, _ = jax.random.split(key)
+    mean = sum(map(unpack_color, exposures[1:]), start=unpack_color(exposures[0])) / len(exposures)
+    noise = image_noise * jax.random.normal(color_key, mean.shape, mean.dtype)
+    bright = 255.0 * gain * mean if lens is None else 255.0 * _through_lens(gain * mean, lens)
+    return jnp.clip(jnp.round(bright + noise), 0.0, 255.0).astype(jnp.uint8)
+
+
+@compiled(when="first use", options=FUSION_EMITTERS)
+def measure_depth(
+    depth_m: Float[Array, "h w"], incidence: Float[Array, "h w"], fx: float, params: DepthParams, key: Array
+) -> Float[Array, "h w"]:
+    """Return depth in meters, 0 where missing.
+
+    Args:
         depth_m: Exact depth.
         incidence: Cosine of the angle between ray and surface normal.
         fx: Focal length in pixels.
-        gain: Brightness factor of this frame, or of each row, `(1, h, 1)`.
-        params: From `sensor_params`.
+        params: From `depth_params`.
         key: Random key of this frame.
-        lens: Faults of the lens; `None` for none.
-
-    Returns:
-        Red, green and blue of eight bits, and depth in meters, 0 where missing.
     """
     # All in the depth's type: a recording is the same bytes where float64 is enabled.
-    numbers = (fx, gain, params, lens)
-    fx, gain, params, lens = jax.tree.map(lambda number: jnp.asarray(number, depth_m.dtype), numbers)
-    color_key, depth_key = jax.random.split(key)
-    mean = sum(map(unpack_color, exposures[1:]), start=unpack_color(exposures[0])) / len(exposures)
-    noise = params.image_noise * jax.random.normal(color_key, mean.shape, mean.dtype)
-    bright = 255.0 * gain * mean if lens is None else 255.0 * _through_lens(gain * mean, lens)
-    rgb = jnp.clip(jnp.round(bright + noise), 0.0, 255.0).astype(jnp.uint8)
+    fx, params = jax.tree.map(lambda number: jnp.asarray(number, depth_m.dtype), (fx, params))
+    _, depth_key = jax.random.split(key)
     kept = _inside_limits(depth_m, incidence, params) & _lit(depth_m, fx, params.shadow_baseline_m)
     kept = kept & ~_on_edge(depth_m, params.edge_jump)
     measured = _noisy_depth(depth_m, jax.random.normal(depth_key, depth_m.shape, depth_m.dtype), params)
-    return rgb, jnp.where(kept, measured, 0.0)
+    return jnp.where(kept, measured, 0.0)
 
 
 def _through_lens(light: Array | np.ndarray, lens: LensParams) -> Float[Array, "3 h w"]:
@@ -178,13 +185,13 @@ def _through_lens(light: Array | np.ndarray, lens: LensParams) -> Float[Array, "
 
 
 def _inside_limits(
-    depth_m: Float[Array, "h w"], incidence: Float[Array, "h w"], params: SensorParams
+    depth_m: Float[Array, "h w"], incidence: Float[Array, "h w"], params: DepthParams
 ) -> Bool[Array, "h w"]:
     within = (depth_m >= params.min_depth_m) & (depth_m <= params.max_depth_m)
     return within & (incidence > params.min_cosine)
 
 
-def _noisy_depth(depth_m: Float[Array, "h w"], noise: Float[Array, "h w"], params: SensorParams) -> Float[Array, "h w"]:
+def _noisy_depth(depth_m: Float[Array, "h w"], noise: Float[Array, "h w"], params: DepthParams) -> Float[Array, "h w"]:
     """Noise and steps of the inverse depth, which disparity is proportional to; then steps of the depth."""
     inverse = 1.0 / depth_m + params.depth_noise_per_m * noise
     return _rounded(1.0 / jnp.maximum(_rounded(inverse, params.depth_step_per_m), 1e-3), params.depth_unit_m)

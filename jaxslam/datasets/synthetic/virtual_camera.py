@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import cv2
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.datasets.synthetic import homogeneous as rigid
@@ -22,7 +21,13 @@ from jaxslam.datasets.synthetic.render import (
     render,
     tile_rows,
 )
-from jaxslam.datasets.synthetic.sensor_noise import LensParams, SensorConfig, measure, sensor_params
+from jaxslam.datasets.synthetic.sensor_noise import (
+    LensParams,
+    SensorConfig,
+    depth_params,
+    measure_color,
+    measure_depth,
+)
 from jaxslam.datasets.synthetic.shading import Light
 from jaxslam.runtime.threads import usable_cores
 from jaxslam.sensors.camera import Camera
@@ -97,19 +102,21 @@ class Stage:
         """
         middle_s = float(time_s[len(time_s) // 2])
         if self._is_small:
-            light = Light(*map(jnp.asarray, self._light_at(middle_s)))
+            light = jax.device_put(self._light_at(middle_s))
             chosen, scene, slots = np.arange(len(self._packed.stem)), self.scene._replace(light=light), self._slots
         else:
             chosen = self._in_sight(world_from_cam, camera)
             scene, slots = self._arranged(chosen, middle_s)
-        static = chosen[chosen < len(self._centers)]
-        from_world = [np.broadcast_to(self._static_from_world[static], (len(time_s), len(static), 4, 4))]
+        static = self._static_from_world[chosen[chosen < len(self._centers)]]
+        # One product for all solids: a fortieth of the time of one for each.
+        from_cam = [(static[:, :3].reshape(-1, 4) @ world_from_cam).reshape(len(time_s), -1, 3, 4)]
         for actor in self._actors:
             root = rigid.matrix_from_pose(actor.root(time_s))
-            from_world.append(rigid.inverse(root[:, None] @ actor.parts(time_s)))
+            from_world = rigid.inverse(root[:, None] @ actor.parts(time_s))
+            from_cam.append((from_world @ world_from_cam[:, None])[:, :, :3])
         transforms = np.zeros((len(time_s), len(scene.owner), 3, 4), np.float32)
         transforms[:] = np.eye(4)[:3]
-        transforms[:, slots] = (np.concatenate(from_world, axis=1) @ world_from_cam[:, None])[:, :, :3]
+        transforms[:, slots] = np.concatenate(from_cam, axis=1)
         return scene, transforms
 
     def _arranged(self, chosen: np.ndarray, time_s: float) -> tuple[RenderScene, np.ndarray]:
@@ -201,21 +208,26 @@ class VirtualCamera:
             key: Random key of the noise.
         """
         baseline_m = self._camera.baseline_m
-        if baseline_m is None:
-            return self._measured(time_s, self._expose(time_s, (0.0,))[0], key)
-        left, right = self._expose(time_s, (0.0, baseline_m))
-        taken = self._measured(time_s, right, jax.random.fold_in(key, 1))
-        return self._measured(time_s, left, key)._replace(right=taken.rgb)
+        pair = self._expose(time_s, (0.0,) if baseline_m is None else (0.0, baseline_m))
+        own = pair[0][len(pair[0]) // 2]
+        with ThreadPoolExecutor(usable_cores()) as pool:
+            depth = pool.submit(lambda: np.asarray(self._depth(own, key)))
+            left, *right = pool.map(
+                lambda number: self._color(time_s, pair[number], jax.random.fold_in(key, number) if number else key),
+                range(len(pair)),
+            )
+        return TakenPicture(own, left, depth.result(), *right)
 
-    def _measured(self, time_s: float, moments: list[Rendering], key: jax.Array) -> TakenPicture:
-        own = moments[len(moments) // 2]
-        colors, sensor = tuple(moment.color for moment in moments), sensor_params(self._sensor)
+    def _depth(self, exact: Rendering, key: jax.Array) -> jax.Array:
+        return measure_depth(exact.depth_m, exact.incidence, self._camera.fx, depth_params(self._sensor), key)
+
+    def _color(self, time_s: float, moments: list[Rendering], key: jax.Array) -> np.ndarray:
+        colors = tuple(moment.color for moment in moments)
         rows = self._row_times(np.arange(self._camera.height))
-        gain = self._gain_at(time_s) if len(rows) == 1 else self._gain_of_rows(time_s + rows)
-        lens = self._optics.lens
-        channels, depth_m = measure(colors, own.depth_m, own.incidence, self._camera.fx, gain, sensor, key, lens)
+        gain = self._gain_of_rows(time_s + rows) if self._rolls else self._gain_at(time_s)
+        channels = measure_color(colors, gain, self._sensor.image_noise, key, self._optics.lens)
         # XLA needs as long to interleave the channels as to render a moment.
-        return TakenPicture(own, cv2.merge(list(np.asarray(channels))), np.asarray(depth_m))
+        return cv2.merge(list(np.asarray(channels)))
 
     def _gain_of_rows(self, times_s: np.ndarray) -> np.ndarray:
         return np.array([self._gain_at(float(time_s)) for time_s in times_s])[None, :, None]
@@ -233,7 +245,11 @@ class VirtualCamera:
     def _row_times(self, rows: np.ndarray) -> np.ndarray:
         """Times of `(r,)` rows since that of the middle one, `(r,)`; a single 0 if all are taken at once."""
         share = rows / max(self._camera.height - 1, 1) - 0.5
-        return self._optics.rolling_shutter_s * share if self._optics.rolling_shutter_s > 0.0 else np.zeros(1)
+        return self._optics.rolling_shutter_s * share if self._rolls else np.zeros(1)
+
+    @property
+    def _rolls(self) -> bool:
+        return self._optics.rolling_shutter_s > 0.0
 
     def _views(
         self, time_s: np.ndarray, offsets: np.ndarray, to_the_right_m: Sequence[float]
@@ -248,13 +264,11 @@ class VirtualCamera:
         scene, solid_from_cam = self._stage.seen_from(times, world_from_cam, camera)
         by_view = solid_from_cam.reshape(num_views, len(since_s), *solid_from_cam.shape[1:])
         places = world_from_cam.reshape(num_views, len(since_s), 4, 4)[:, len(since_s) // 2, :3].astype(np.float32)
-        intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
+        intrinsics: Any = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
         shifts = np.tile(offsets.astype(np.float32), (len(to_the_right_m), 1))
-        views = [
-            CameraView(*map(jnp.asarray, (solids[0] if len(since_s) == 1 else solids, place, intrinsics, shift)))
-            for solids, place, shift in zip(by_view, places, shifts, strict=True)
-        ]
-        return scene, views
+        # NumPy arrays, which a compiled function takes sooner than JAX puts them on the device.
+        arrays: Any = zip(by_view if self._rolls else by_view[:, 0], places, shifts, strict=True)
+        return scene, [CameraView(solids, place, intrinsics, shift) for solids, place, shift in arrays]
 
 
 def _render_all(scene: RenderScene, views: list[CameraView], camera: Camera) -> list[Rendering]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxslam.datasets.synthetic import PERFECT_SENSOR, SensorConfig, SyntheticConfig, SyntheticDataset
-from jaxslam.datasets.synthetic.sensor_noise import measure, sensor_params
+from jaxslam.datasets.synthetic.sensor_noise import depth_params, measure_color, measure_depth
 
 SHAPE = (120, 160)
 GRAY = np.uint32(400 | 400 << 10 | 400 << 20)
@@ -18,10 +18,9 @@ def measured(
     depth: np.ndarray, config: SensorConfig, *, incidence: float = 1.0, gain: float = 1.0, key: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Channels and depth of a gray picture."""
-    exposures = (np.full(SHAPE, GRAY),)
-    cosines = np.full(SHAPE, incidence, np.float32)
-    params = sensor_params(config)
-    channels, result = measure(exposures, depth.astype(np.float32), cosines, 525.0, gain, params, jax.random.key(key))
+    cosines, random = np.full(SHAPE, incidence, np.float32), jax.random.key(key)
+    channels = measure_color((np.full(SHAPE, GRAY),), gain, config.image_noise, random)
+    result = measure_depth(depth.astype(np.float32), cosines, 525.0, depth_params(config), random)
     return np.asarray(channels), np.asarray(result)
 
 
