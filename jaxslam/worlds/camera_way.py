@@ -12,6 +12,7 @@ from jaxslam.datasets.synthetic.camera_path import hand_tremor, looking_at, pose
 from jaxslam.errors import ConfigError
 from jaxslam.geometry.se3 import compose
 from jaxslam.geometry.so3 import axis_rotation, matrices, multiply
+from jaxslam.sensors.imu_preintegration import GRAVITY_M_PER_S2
 from jaxslam.trajectory import trajectory
 from jaxslam.worlds.data_paths import data_path
 from jaxslam.worlds.description import Way, World
@@ -69,7 +70,10 @@ class PointWay:
             angles = looking_at(position, np.array(self._way.look))
         moved, turned = hand_tremor(time_s, self._phases)
         position = self._scale * (position + self._way.tremor * moved)
-        return poses_of(position, angles + self._way.tremor * turned)
+        poses = poses_of(position, angles + self._way.tremor * turned)
+        if self._way.flies:
+            poses[:, :4] = multiply(_lean(self._smooth.acceleration(within_s)), poses[:, :4])
+        return poses
 
 
 class FileWay:
@@ -116,6 +120,15 @@ class FileWay:
         rotation = self._rotation(within_s) * Rotation.from_euler("ZYX", turned)
         position = self._scale * (self._position(within_s) + moved)
         return np.concatenate([rotation.as_quat()[:, [3, 0, 1, 2]], position], axis=1)
+
+
+def _lean(accel_m_per_s2: np.ndarray) -> np.ndarray:
+    """Return the least rotations, `(t, 4)` wxyz, that turn up to where the rotors of a multirotor pull it."""
+    pull = accel_m_per_s2 - GRAVITY_M_PER_S2
+    x, y, z = (pull / np.linalg.norm(pull, axis=1, keepdims=True)).T
+    # Half of a turn by twice the angle: 1 + cos, and the sine along the axis.
+    quaternion = np.stack([1.0 + z, -y, x, np.zeros_like(x)], axis=1)
+    return quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
 
 
 def _smoothed(poses: np.ndarray, times_s: np.ndarray, over_s: float) -> np.ndarray:

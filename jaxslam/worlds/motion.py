@@ -5,6 +5,7 @@ or turns at once; a cubic spline through the samples has continuous acceleration
 """
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -15,6 +16,8 @@ from jaxslam.worlds.description import Ends, Route
 _STEP_S = 0.05
 _SMOOTH_S, _SMOOTH_M = 0.6, 6.0
 """Width of each of the two averages of positions over time, and how far something goes in it at most."""
+_LEAN_S = 0.3
+"""Width of each of the two averages of accelerations over time: how soon a multirotor leans."""
 _SLOW_M_PER_S = 0.02
 """Below this speed a direction of motion says nothing."""
 
@@ -75,6 +78,15 @@ class SmoothWay:
         within = self._folded(time_s)
         speed = np.linalg.norm(self._positions(within, 1)[..., :2], axis=-1)
         return speed if self._repeats else np.where(within == time_s, speed, 0.0)
+
+    def acceleration(self, time_s: np.ndarray) -> np.ndarray:
+        """Accelerations at `(t,)` seconds, averaged over 0.3 s twice, `(t, d)` m/s^2."""
+        return self._accelerations(self._folded(time_s))
+
+    @cached_property
+    def _accelerations(self) -> CubicSpline:
+        samples = self._positions.x
+        return self._smooth_spline(samples, self._positions(samples, 2), _LEAN_S)
 
     def heading(self, time_s: np.ndarray) -> np.ndarray:
         """Directions of motion at `(t,)` seconds, `(t,)` radians from the x axis, continuous in time."""

@@ -35,6 +35,7 @@ class Way(ValidatedConfig):
         down_deg: Angle by which it looks down from ahead.
         swing_deg: Amplitude by which it looks left and right from ahead, with a period of eight seconds.
         tremor: Factor of the tremor of the hand: 1 for 2 mm and 0.15 degrees; 0 for none.
+        flies: Whether a multirotor carries it, which leans into its acceleration.
         backward: Whether it looks back along the way, as from a car that reverses.
         along: Name of the road it goes along; `None` for a way through points.
         beside_m: See `Route`.
@@ -58,6 +59,7 @@ class Way(ValidatedConfig):
     down_deg: Annotated[float, Range(at_least=-90, at_most=90)] = 8.0
     swing_deg: Annotated[float, Range(at_least=0, at_most=180)] = 0.0
     tremor: Annotated[float, Range(at_least=0)] = 1.0
+    flies: bool = False
     backward: bool = False
     along: str | None = None
     beside_m: float | tuple[Plan, ...] = 0.0

@@ -7,6 +7,7 @@ import pytest
 
 from jaxslam.errors import ConfigError, TrajectoryError
 from jaxslam.geometry.se3 import angle, between, compose, inverse
+from jaxslam.geometry.so3 import matrices
 from jaxslam.trajectory import trajectory
 from jaxslam.trajectory.trajectory import Trajectory
 from jaxslam.worlds import World, WorldRecording, load_world
@@ -39,6 +40,20 @@ def test_looks_at_a_point():
     to_point = np.array([1.0, 5.0, 0.5]) - poses[:, 4:]
     to_point /= np.linalg.norm(to_point, axis=1, keepdims=True)
     np.testing.assert_allclose(optical_axis(poses), to_point, atol=1e-9)
+
+
+def test_a_multirotor_leans_into_its_acceleration():
+    """Measured: up to 23 degrees between up and the pull of the rotors without leaning, 5 with it, as it lags."""
+    times_s = np.arange(0.0, 6.0, 0.01)
+    away_deg = {}
+    for flies in (False, True):
+        way = dataclasses.replace(POINTS, speed_m_per_s=2.0, down_deg=0.0, tremor=0.0, flies=flies)
+        poses = camera_way(dataclasses.replace(WORLD, way=way)).poses(times_s)
+        pull = np.gradient(np.gradient(poses[:, 4:], times_s, axis=0), times_s, axis=0) + np.array([0.0, 0.0, 9.81])
+        cosine = np.sum(-matrices(poses[:, :4])[:, :, 1] * pull, axis=1) / np.linalg.norm(pull, axis=1)
+        away_deg[flies] = np.rad2deg(np.arccos(cosine[5:-5])).max()
+    assert away_deg[False] > 20.0
+    assert away_deg[True] < 8.0
 
 
 def test_tremor_is_small_and_there():
