@@ -38,6 +38,7 @@ class TestPart:
         assert f"## optimize: {rows['optimize']['instructions']:,} instructions" in report
         assert content["cpu"] in report
 
+    @pytest.mark.slow
     def test_flow_of_a_recording_by_function(self, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
         write_tum(SyntheticDataset(SyntheticConfig(frames=12, width=320, height=240)), tmp_path / "room")
         options = [

@@ -22,7 +22,7 @@ from jaxslam.semantics.prompted import read_examples
 CONTRIBUTING = ROOT / ".github" / "CONTRIBUTING.md"
 _GETTING_STARTED = DOCS / "getting-started.md"
 _RECORDING = "recordings/room"
-_QUICK = {"cameras-and-recordings", "command-line", "determinism-and-caches", "worlds"}
+_QUICK = {"cameras-and-recordings", "command-line", "determinism-and-caches"}
 """Pages whose blocks take less than 20 s; all others are `slow`."""
 _BRITISH = re.compile(
     r"\b\w*(?:colour|centre|neighbour|behaviour|favour|grey|licence|catalogue|labelled|modelled|travell|cancell"

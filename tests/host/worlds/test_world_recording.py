@@ -251,7 +251,13 @@ def test_is_written_as_tum_with_numbers_and_labels(tmp_path):
     assert "4 1 person" in (tmp_path / "room" / "labels.txt").read_text()
 
 
-@pytest.mark.parametrize("name", worlds())
+QUICK = {"corridor", "drone", "kitchen", "light"}
+"""Worlds that are rendered within three seconds; all others are `slow`."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in worlds()]
+)
 def test_the_camera_of_every_world_keeps_clear_of_everything(name, request):
     """Of real people, no world keeps clear: they are where they were; and hands are there to cover the lens."""
     world = dataclasses.replace(load_world(name), real_people=None, hands=())
