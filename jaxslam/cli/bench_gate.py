@@ -32,6 +32,8 @@ class Gate(RunsOfSuite):
     """Replace the baseline by the figures measured now, and store this reason in it."""
     of: str | None = None
     """Suite to run if the baseline does not exist yet."""
+    errors_only: bool = False
+    """Leave times out of the new baseline, so that later runs are not compared by them."""
 
     def main(self) -> None:
         """Run the command."""
@@ -40,6 +42,8 @@ class Gate(RunsOfSuite):
 
         if self.baseline is None:
             raise BenchmarkError("bench gate: expected --baseline FILE")
+        if self.errors_only and self.update is None:
+            raise BenchmarkError("bench gate: --errors-only expected --update REASON, got none")
         before = self.before(self.baseline)
         suite = self.of or (None if before is None else before.suite)
         if suite is None:
@@ -133,7 +137,10 @@ def _write_baseline(path: Path, reason: str, options: Gate, suite: str, planned:
     check_reason(reason)
     results = replace(options, runs=max(planned["runs"], SEEDS_OF_NOISE)).results(suite)
     presets = tuple(dict.fromkeys(label["preset"] for label in planned["presets"].values()))
-    save_baseline(path, make_baseline(suite, presets, planned["runs"], reason, results, planned))
+    errors_only = options.errors_only
+    save_baseline(
+        path, make_baseline(suite, presets, planned["runs"], reason, results, planned, errors_only=errors_only)
+    )
     plain_console.print(f"Baseline: {path}")
     if options.json:
         print_json(json.loads(path.read_text(encoding="utf-8")))

@@ -74,6 +74,8 @@ def make_baseline(
     reason: str,
     results: Sequence[Mapping[str, Any]],
     plan: Mapping[str, Any],
+    *,
+    errors_only: bool = False,
 ) -> Baseline:
     """Make a baseline from the figures of runs.
 
@@ -84,6 +86,7 @@ def make_baseline(
         reason: Reason why these are the figures to compare with.
         results: Results of all runs; those with further seeds add to the spread of errors alone.
         plan: Sequences, presets and runs, from `jaxslam.benchmark.suites.plan.fingerprint`.
+        errors_only: Whether to leave out times, so that later runs are not compared by them.
 
     Raises:
         BenchmarkError: If a run failed, none was made, one has no ATE, or no reason is given.
@@ -93,6 +96,8 @@ def make_baseline(
     if failed or not results:
         raise BenchmarkError(f"baseline: expected runs that all ended well, got {len(failed)} of {len(results)} failed")
     figures = _figures_of([result for result in results if result["seed"] < runs], "median")
+    if errors_only:
+        figures = {row: {key: value for key, value in of.items() if key != _TIME} for row, of in figures.items()}
     machines, versions, noise = machine_of(results), versions_of(results), _noise_of(results)
     return Baseline(suite, tuple(presets), runs, reason, machines, versions, noise, figures, plan)
 
@@ -116,7 +121,8 @@ def differences(baseline: Baseline, results: Sequence[Mapping[str, Any]]) -> str
 
 def runs_at_once(baseline: Baseline) -> int:
     """Return the number of parallel runs: one if times will be compared, or else one per core."""
-    return 1 if machine_name(machine()) == baseline.machine else usable_cores()
+    has_times = any(_TIME in figures for figures in baseline.rows.values())
+    return 1 if has_times and machine_name(machine()) == baseline.machine else usable_cores()
 
 
 def complaints(baseline: Baseline, results: Sequence[Mapping[str, Any]]) -> list[Complaint]:

@@ -132,6 +132,16 @@ class TestComplaints:
         assert runs_at_once(here) == 1
         assert runs_at_once(baseline()) == usable_cores()
 
+    def test_a_baseline_of_errors_only_compares_no_times(self) -> None:
+        here = [{**run, **machine()} for run in results()]
+        before = make_baseline("smoke", LABELS, 2, "first", here, PLAN, errors_only=True)
+        assert runs_at_once(before) == usable_cores()
+        slow = [{**run, **machine()} for run in results(time=10.0)]
+        assert complaints(before, slow) == []
+        assert complaints(make_baseline("smoke", LABELS, 2, "first", here, PLAN), slow)
+        with pytest.raises(BenchmarkError, match="--errors-only expected --update REASON"):
+            Gate(baseline=Path("baseline.json"), errors_only=True).main()
+
     def test_differences_are_told(self) -> None:
         assert differences(baseline(), results()) == ""
         assert differences(baseline(), results(cpu="b")) == "b (avx2), 2 cores, not any (avx2), 2 cores"
