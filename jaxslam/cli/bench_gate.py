@@ -137,10 +137,9 @@ def _write_baseline(path: Path, reason: str, options: Gate, suite: str, planned:
     check_reason(reason)
     results = replace(options, runs=max(planned["runs"], SEEDS_OF_NOISE)).results(suite)
     presets = tuple(dict.fromkeys(label["preset"] for label in planned["presets"].values()))
-    errors_only = options.errors_only
-    save_baseline(
-        path, make_baseline(suite, presets, planned["runs"], reason, results, planned, errors_only=errors_only)
-    )
+    runs, errors_only = planned["runs"], options.errors_only
+    baseline = make_baseline(suite, presets, runs, reason, results, planned, errors_only=errors_only)
+    save_baseline(path, baseline)
     plain_console.print(f"Baseline: {path}")
     if options.json:
         print_json(json.loads(path.read_text(encoding="utf-8")))

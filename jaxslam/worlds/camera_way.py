@@ -123,10 +123,10 @@ class FileWay:
 
 
 def _lean(accel_m_per_s2: np.ndarray) -> np.ndarray:
-    """Return the least rotations, `(t, 4)` wxyz, that turn up to where the rotors of a multirotor pull it."""
+    """Return the smallest rotations, `(t, 4)` wxyz, from up to the direction in which rotors pull a multirotor."""
     pull = accel_m_per_s2 - GRAVITY_M_PER_S2
     x, y, z = (pull / np.linalg.norm(pull, axis=1, keepdims=True)).T
-    # Half of a turn by twice the angle: 1 + cos, and the sine along the axis.
+    # From a unit vector a to b, the quaternion is (1 + a . b, a x b), normalized.
     quaternion = np.stack([1.0 + z, -y, x, np.zeros_like(x)], axis=1)
     return quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
 

@@ -109,7 +109,7 @@ def rows_of_solids(corners: Float[Array, "3 c n"], intrinsics: Float[Array, " 4"
 def compact(reaches: Bool[Array, "tiles n"], first: int) -> InTile:
     """List the solids that reach into each tile; `first` is the index of the first column."""
     tiles, n = reaches.shape
-    # `jnp.cumsum` takes three times as long, a sort fifty times.
+    # `jnp.cumsum` takes three times as long.
     place = jax.lax.associative_scan(jnp.add, reaches.astype(jnp.int32), axis=1) - 1
     place = jnp.where(reaches, place + n * jnp.arange(tiles, dtype=jnp.int32)[:, None], tiles * n)
     columns = jnp.broadcast_to(jnp.arange(first, first + n, dtype=jnp.int32), reaches.shape)

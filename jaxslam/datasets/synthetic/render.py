@@ -166,7 +166,7 @@ def render(
     stem = jnp.concatenate([jnp.zeros(n_boxes, scene.capsule_stem.dtype), scene.capsule_stem])
     rolls = view.solid_from_cam.ndim == 4
     unit_from_cam = view.solid_from_cam / (size[None, :, :, None] if rolls else size[:, :, None])
-    reaches, rows_of = _reaches(view, size, stem, all_rows, columns)
+    reaches, rows_of = _tiles_and_rows(view, size, stem, all_rows, columns)
     reaches &= scene.used[None]
     boxes, capsules = compact(reaches[:, 1:n_boxes], 1), compact(reaches[:, n_boxes:], n_boxes)
     turned = (view.solid_from_cam[all_rows // 2] if rolls else view.solid_from_cam)[:, :, :3]
@@ -212,7 +212,7 @@ def tile_rows(height: int) -> int:
     return -(-height // TILE_HEIGHT)
 
 
-def _reaches(
+def _tiles_and_rows(
     view: CameraView, size: Float[Array, "n 3"], stem: Float[Array, " n"], rows: int, columns: int
 ) -> tuple[Bool[Array, "tiles n"], Int[Array, "*rows 2 n"]]:
     """Tell which solids may reach into which tiles, and into which rows of the picture at the time of each."""

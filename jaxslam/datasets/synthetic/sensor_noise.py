@@ -88,7 +88,7 @@ PERFECT_SENSOR = SensorConfig(
 
 
 class DepthParams(NamedTuple):
-    """What a `SensorConfig` says of depth, as scalars that can change without recompiling; the angle as its cosine."""
+    """Faults of depth as scalars that can change without recompiling; the angle as its cosine."""
 
     depth_noise_per_m: float
     depth_step_per_m: float
