@@ -16,8 +16,8 @@ from .map.types import Loops as Loops
 from .map.types import Map as Map
 from .map.types import MapPoints as MapPoints
 from .map.types import Observations as Observations
-from .runtime.compile_cache import FAST_COMPILE as FAST_COMPILE
 from .runtime.compile_cache import enable_compile_cache as enable_compile_cache
+from .runtime.compiler_options import FAST_COMPILE as FAST_COMPILE
 from .runtime.threads import prefer_one_thread as prefer_one_thread
 from .semantics.detections import Detections as Detections
 from .semantics.detections import Detector as Detector

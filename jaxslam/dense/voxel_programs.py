@@ -29,8 +29,8 @@ from jaxslam_kernels.se3 import to_world
 from jaxslam_kernels.types import Points, Weights
 from jaxtyping import Array, Float, Float16, Float32, Int, Int16, Int32, UInt8
 
-from jaxslam.runtime.compile_cache import SINGLE_THREAD
 from jaxslam.runtime.compiled import compiled
+from jaxslam.runtime.compiler_options import SINGLE_THREAD
 
 ROWS = 1024
 """Rows of the grid in a block: small, so that few rows of a block in view are out of view."""

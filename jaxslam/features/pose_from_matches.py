@@ -13,8 +13,8 @@ from jaxtyping import Float, Float32, Float64, Int, Int64
 
 from jaxslam.features.orb import FeaturePlan, Features
 from jaxslam.geometry.types import Pose
-from jaxslam.runtime.compile_cache import FAST_COMPILE
 from jaxslam.runtime.compiled import compiled
+from jaxslam.runtime.compiler_options import FAST_COMPILE
 from jaxslam.runtime.padding import padded
 from jaxslam.sensors.measurement import depth_sigma
 from jaxslam.sensors.sensor_model import SensorModel

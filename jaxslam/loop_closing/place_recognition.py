@@ -17,8 +17,8 @@ from jaxslam.geometry.se3 import IDENTITY, to_local
 from jaxslam.geometry.types import Pose
 from jaxslam.loop_closing.place_index import PlaceIndex
 from jaxslam.map.types import Keyframe, Map, has
-from jaxslam.runtime.compile_cache import FAST_COMPILE
 from jaxslam.runtime.compiled import compiled
+from jaxslam.runtime.compiler_options import FAST_COMPILE
 from jaxslam.sensors.sensor_model import SensorModel
 
 MIN_AGREEING = 12

@@ -15,8 +15,8 @@ from jaxslam.geometry.se3 import between, compose, inverse, rotate, to_local, tr
 from jaxslam.geometry.types import Ids, Points, Pose, Poses
 from jaxslam.map.edit import with_positions, without_observations
 from jaxslam.map.types import NONE, Map, Observations, covisible, has, observations_at, rows
-from jaxslam.runtime.compile_cache import FAST_COMPILE
 from jaxslam.runtime.compiled import compiled
+from jaxslam.runtime.compiler_options import FAST_COMPILE
 from jaxslam.runtime.padding import padded
 
 _NUM_FIXED = 4

@@ -25,8 +25,8 @@ from jaxslam.geometry.se3 import IDENTITY, to_local
 from jaxslam.geometry.types import Ids, Pose
 from jaxslam.map.edit import with_states
 from jaxslam.map.types import NONE, Map, has, rows, visibility
-from jaxslam.runtime.compile_cache import SINGLE_THREAD
 from jaxslam.runtime.compiled import committed, compiled
+from jaxslam.runtime.compiler_options import SINGLE_THREAD
 from jaxslam.runtime.padding import padded
 from jaxslam.sensors.frame_arrays import FrameArrays
 from jaxslam.sensors.measurement import depth_sigma, pixel_rays, predict_pixels

@@ -18,8 +18,8 @@ from jaxtyping import Array, Bool, Float
 
 from jaxslam.geometry.se3 import between, compose
 from jaxslam.runtime.aligned_memory import aligned_array
-from jaxslam.runtime.compile_cache import SINGLE_THREAD
 from jaxslam.runtime.compiled import compiled
+from jaxslam.runtime.compiler_options import SINGLE_THREAD
 from jaxslam.sensors.downscale import Downscaler, ImageGrid
 
 _COARSE_WIDTH = 160

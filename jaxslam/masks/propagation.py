@@ -30,8 +30,8 @@ from jaxtyping import Array, Bool, Float, Float32, Int, Int32, UInt8
 
 from jaxslam.masks.point_sampling import sample_mask
 from jaxslam.runtime.aligned_memory import aligned_array
-from jaxslam.runtime.compile_cache import SINGLE_THREAD
 from jaxslam.runtime.compiled import compiled
+from jaxslam.runtime.compiler_options import SINGLE_THREAD
 
 CAPACITY = 128
 """Largest number of points: for a person who fills a fifth of the image, one in about every other cell."""

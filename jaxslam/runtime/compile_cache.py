@@ -1,4 +1,4 @@
-"""Settings of XLA, JAX's compiler: the cache of compiled code, and compiler options."""
+"""The cache of compiled code: where XLA, JAX's compiler, keeps it between processes."""
 
 import functools
 import logging
@@ -82,25 +82,3 @@ def _is_writable(folder: Path) -> bool:
     except OSError as problem:
         _log.warning("%s: compiled code cannot be kept, so that starts take longer: %s", folder, problem.strerror)
         return False
-
-
-FAST_COMPILE: dict[str, bool | str] = {"xla_cpu_use_fusion_emitters": False}
-"""Compiler options of `jax.jit` for programs of many small parts, such as `track_step` and its gradient.
-
-They are written by XLA's older generator of code. The tracker with its map is compiled in 17 s instead of 35 (AMD EPYC,
-two cores), and a frame takes as long, within 3 %. The gradient of a step takes 0.8 GB of memory to compile instead of
-1.8, and three quarters of the time.
-"""
-
-SINGLE_THREAD: dict[str, bool | str] = {"xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"}
-"""Options of `jax.jit` for a program that runs beside another: one part after the other, all in the calling thread.
-
-XLA else hands parts that do not depend on each other to a pool of threads, even if that has one thread only, and they
-wait there behind those of other programs: beside optical flow, 0.3 ms of work for masks took 2.1 ms. A program that has
-the machine for itself is faster with the pool: the second part of the tracker's step takes 2.5 ms, and 3.3 without.
-"""
-
-FUSION_EMITTERS: dict[str, bool | str] = {"xla_cpu_use_fusion_emitters": True}
-"""Options of `jax.jit` for a program that computes much for every pixel: XLA's newer generator of code, whatever
-`XLA_FLAGS` says. With the older one a frame of a room takes 111 ms instead of 63 (640x480, one thread, AMD EPYC).
-"""

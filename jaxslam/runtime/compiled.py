@@ -4,11 +4,12 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial, wraps
+from functools import partial, update_wrapper, wraps
 from typing import Any, Literal, TypeAlias, TypeVar, cast
 
 import jax
 
+from jaxslam.runtime.compiler_options import known_options
 from jaxslam.runtime.garbage import collector_paused
 from jaxslam.runtime.trace_cache import cached_trace
 
@@ -79,6 +80,31 @@ def before_each_program(call: Callable[[], None]) -> Iterator[None]:
         del _this_thread.before_each
 
 
+class _WithOptions:
+    """A function that goes to `jax.jit` when it is called first: on import, XLA cannot be asked for its options."""
+
+    def __init__(self, function: Callable[..., Any], options: Mapping[str, bool | str], arguments: dict[str, Any]):
+        update_wrapper(self, function)
+        self._options, self._arguments = options, arguments
+        self._jitted: Any = None
+        self._lock = threading.Lock()
+
+    def _program(self) -> Any:
+        if self._jitted is None:
+            with self._lock:  # two threads would compile it twice
+                if self._jitted is None:
+                    function: Callable[..., Any] = cast(Any, self).__wrapped__
+                    options = known_options(self._options)
+                    self._jitted = jax.jit(function, **self._arguments, compiler_options=options or None)
+        return self._jitted
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        return self._program()(*args, **kwargs)
+
+    def lower(self, *args: Any, **kwargs: Any) -> Any:
+        return self._program().lower(*args, **kwargs)
+
+
 def compiled(
     *,
     when: When,
@@ -94,7 +120,7 @@ def compiled(
         when: Time at which it is compiled. `Slam.warm_up` must call every program marked `warm-up`; a test checks it.
         static: Names of the arguments that are no arrays: each value is compiled by itself.
         donate: Names of the arguments whose memory the result may take over; the caller must not use them again.
-        options: Compiler options, one of the sets of `jaxslam.runtime.compile_cache`.
+        options: Compiler options, one of the sets of `jaxslam.runtime.compiler_options`.
     """
 
     def decorate(function: Callable[..., R]) -> Callable[..., R]:
@@ -110,12 +136,8 @@ def compiled(
             with collector_paused():
                 return cached(*args, **kwargs)
 
-        jitted: Any = jax.jit(
-            traced,
-            static_argnames=static or None,
-            donate_argnames=donate or None,
-            compiler_options=None if options is None else dict(options),
-        )
+        arguments = {"static_argnames": static or None, "donate_argnames": donate or None}
+        jitted: Any = jax.jit(traced, **arguments) if options is None else _WithOptions(traced, options, arguments)
         return jitted
 
     return decorate

@@ -18,8 +18,8 @@ from jaxslam.masks.background_depth import SurfaceMemory
 from jaxslam.masks.box_to_mask import dilated
 from jaxslam.masks.propagation import PYRAMID_LEVELS, follow, make_origin, predicted_mask
 from jaxslam.runtime.aligned_memory import aligned_array
-from jaxslam.runtime.compile_cache import SINGLE_THREAD
 from jaxslam.runtime.compiled import committed, compiled
+from jaxslam.runtime.compiler_options import SINGLE_THREAD
 from jaxslam.runtime.stage_timer import StageTimes
 from jaxslam.semantics import Detector
 from jaxslam.sensors.camera import Camera

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.config.schema import Config
-from jaxslam.runtime.compile_cache import FAST_COMPILE, SINGLE_THREAD
 from jaxslam.runtime.compiled import committed, compiled, lower
+from jaxslam.runtime.compiler_options import FAST_COMPILE, SINGLE_THREAD
 from jaxslam.runtime.garbage import collector_paused
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame_arrays import FrameArrays

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxslam.errors import ConfigError, FrameError
-from jaxslam.runtime.compile_cache import FAST_COMPILE, SINGLE_THREAD
 from jaxslam.runtime.compiled import compiled
+from jaxslam.runtime.compiler_options import FAST_COMPILE, SINGLE_THREAD
 from jaxslam.sensors.frame_arrays import FrameArrays, check_gray_range
 from jaxslam.tracking.initial_state import DEFAULT_PLAN, init_state
 from jaxslam.tracking.state import TrackParams, TrackPlan, TrackState

@@ -27,8 +27,8 @@ from jaxtyping import Float, Int
 from jaxslam.errors import TrajectoryError, nearest
 from jaxslam.geometry.so3 import matrices
 from jaxslam.geometry.types import Pose
-from jaxslam.runtime.compile_cache import FAST_COMPILE
 from jaxslam.runtime.compiled import compiled
+from jaxslam.runtime.compiler_options import FAST_COMPILE
 from jaxslam.trajectory.coverage import Coverage, coverage_of
 from jaxslam.trajectory.evaluation_figures import ALIGNMENT_NAMES, Evaluation
 from jaxslam.trajectory.evaluation_notes import (

@@ -157,7 +157,6 @@ class WorldRecording:
             self._poses[row] = instance.poses(np.zeros(1))[0]
         # Real people move.
         self._moves = np.arange(len(self.labels) + 1) > len(built.instances)
-        self._key = jax.random.key(world.seed)
         self._gain_phases = np.random.default_rng([world.seed, 601]).uniform(0.0, 2.0 * np.pi, 2)
 
     def __len__(self) -> int:
@@ -207,7 +206,8 @@ class WorldRecording:
 
     def _take(self, index: int) -> TakenPicture:
         time_s = float(self._time_s[index])
-        taken = self._filming.take(time_s, jax.random.fold_in(self._key, int(self._numbers[index])))
+        key = jax.random.key(self.world.seed)  # not made before: arrays start JAX
+        taken = self._filming.take(time_s, jax.random.fold_in(key, int(self._numbers[index])))
         if self._real_people is None:
             return taken
         return self._real_people.set_into(taken, time_s, len(self.labels))

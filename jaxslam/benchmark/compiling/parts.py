@@ -15,7 +15,7 @@ from jaxslam.dense.dense_map import DenseMap
 from jaxslam.loop_closing.essential_graph import compile_graph
 from jaxslam.loop_closing.place_recognition import compile_recognition
 from jaxslam.mapping.local_mapping import LocalMapping, mapping_plan
-from jaxslam.runtime.compile_cache import FAST_COMPILE
+from jaxslam.runtime.compiler_options import FAST_COMPILE
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame
 from jaxslam.sensors.frame_arrays import FrameArrays, FrameMemory, frame_arrays
@@ -83,7 +83,8 @@ def _gradient(scene: Scene) -> Compile:
         return track_step(state, frame, params, plan)[1].T_world_cam.translation()[2]
 
     inputs = params, init_state(height, width, plan), frame_arrays(black, dt_s=1 / 30)
-    return lambda: jax.jit(jax.value_and_grad(forward_m), compiler_options=FAST_COMPILE).lower(*inputs).compile()
+    gradient = jax.jit(jax.value_and_grad(forward_m), compiler_options=FAST_COMPILE)
+    return lambda: gradient.lower(*inputs).compile()
 
 
 def _mapping(scene: Scene) -> Compile:

@@ -146,7 +146,6 @@ class SyntheticDataset:
         static = furnish(config.seed) + chairs(config.seated, config.seed)
         self._stage = Stage(static, self.actors, ROOM_LIGHT)
         self._filming = VirtualCamera(self._stage, self.camera, config.sensor, self._pose, self._gain)
-        self._key = jax.random.key(config.seed)
 
     def __len__(self) -> int:
         return self.config.frames
@@ -163,7 +162,8 @@ class SyntheticDataset:
         """
         index = range(len(self))[index]
         time_s = float(self._time_s[index])
-        taken = self._filming.take(time_s, jax.random.fold_in(self._key, index))
+        key = jax.random.fold_in(jax.random.key(self.config.seed), index)  # not made before: arrays start JAX
+        taken = self._filming.take(time_s, key)
         return SyntheticFrame(
             timestamp_ns=int(self.timestamps_ns[index]),
             rgb=taken.rgb,

@@ -26,8 +26,8 @@ from jaxslam.datasets.synthetic.raycast import (
 )
 from jaxslam.datasets.synthetic.shading import Hits, Light, shade
 from jaxslam.datasets.synthetic.texture import N_WORDS
-from jaxslam.runtime.compile_cache import FUSION_EMITTERS
 from jaxslam.runtime.compiled import compiled
+from jaxslam.runtime.compiler_options import FUSION_EMITTERS
 
 BACKDROP = -1
 """Owner of the solid behind everything, such as the sky."""

@@ -12,8 +12,8 @@ from jaxtyping import Array, Bool, Float, UInt, UInt8
 from jaxslam.config.validation import Range, ValidatedConfig
 from jaxslam.datasets.synthetic.shading import unpack_color
 from jaxslam.errors import ConfigError
-from jaxslam.runtime.compile_cache import FUSION_EMITTERS
 from jaxslam.runtime.compiled import compiled
+from jaxslam.runtime.compiler_options import FUSION_EMITTERS
 
 
 @dataclass(frozen=True)

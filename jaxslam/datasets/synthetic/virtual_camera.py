@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import cv2
@@ -88,8 +88,14 @@ class Stage:
         extent_m[:, 2] *= 1.0 + self._packed.stem[: len(static)]
         self._radii = np.linalg.norm(extent_m, axis=1)
         self._is_small = len(solids) <= _SMALL_SCENE
-        if self._is_small:
-            self.scene, self._slots = self._arranged(np.arange(len(solids)), 0.0)
+
+    @cached_property
+    def whole(self) -> tuple[RenderScene, np.ndarray]:
+        """All solids, and the slot of each; a small scene has them in every picture.
+
+        Made for the first picture: arrays start JAX, and a tracker made before it still sets the number of threads.
+        """
+        return self._arranged(np.arange(len(self._packed.stem)), 0.0)
 
     def seen_from(
         self, time_s: np.ndarray, world_from_cam: np.ndarray, camera: Camera
@@ -103,8 +109,8 @@ class Stage:
         """
         middle_s = float(time_s[len(time_s) // 2])
         if self._is_small:
-            light = jax.device_put(self._light_at(middle_s))
-            chosen, scene, slots = np.arange(len(self._packed.stem)), self.scene._replace(light=light), self._slots
+            chosen, (scene, slots) = np.arange(len(self._packed.stem)), self.whole
+            scene = scene._replace(light=jax.device_put(self._light_at(middle_s)))
         else:
             chosen = self._in_sight(world_from_cam, camera)
             scene, slots = self._arranged(chosen, middle_s)

@@ -8,11 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.runtime.compile_cache import FAST_COMPILE, SINGLE_THREAD
 from jaxslam.runtime.compiled import compiled, programs
+from jaxslam.runtime.compiler_options import FAST_COMPILE, SINGLE_THREAD
 
 ROOT = Path(__file__).resolve().parents[3]
-ELSEWHERE = {"runtime/compiled.py", "runtime/trace_cache.py", "benchmark/timing.py", "benchmark/compiling/parts.py"}
+ELSEWHERE = {
+    "runtime/compiled.py",
+    "runtime/compiler_options.py",
+    "runtime/trace_cache.py",
+    "benchmark/timing.py",
+    "benchmark/compiling/parts.py",
+}
 """Modules that may call `jax.jit`: what the decorator is made of, and benchmarks that compile a function anew."""
 
 

@@ -70,6 +70,15 @@ def test_preferred_before_the_first_array() -> None:
     assert said("import jaxslam; jaxslam.prefer_one_thread(); jnp.zeros(3); begin(1)") == ["threads 1 1 False"]
 
 
+@pytest.mark.parametrize(
+    "opened", ["datasets.synthetic import SyntheticDataset as Opened", "worlds import WorldRecording as Opened"]
+)
+def test_a_rendered_recording_may_be_opened_first(opened: str) -> None:
+    """As in the README: the recording, then the tracker of its camera."""
+    name = "'flat'" if "worlds" in opened else ""
+    assert said(f"from jaxslam.{opened}; Opened({name}); begin(1)") == ["threads 1 1 False"]
+
+
 def test_must_be_positive() -> None:
     with pytest.raises(ConfigError, match=r"run\.threads: expected .*, got 0"):
         load_config(overrides=["run.threads=0"])

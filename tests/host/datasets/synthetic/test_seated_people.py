@@ -138,8 +138,9 @@ class TestRoomWithoutThem:
     )
     def test_solids(self, seed: int, people: int, boxes: int, surfaces: int, sizes: int) -> None:
         room = SyntheticDataset(SyntheticConfig(seed=seed, people=people, boxes=boxes, width=64, height=48, frames=1))
-        micrometers = [np.round(1e6 * np.asarray(part, np.float64)).astype(np.int64) for part in room._stage.scene[:2]]
-        assert zlib.crc32(np.asarray(room._stage.scene.surface).tobytes()) == surfaces
+        scene, _ = room._stage.whole
+        micrometers = [np.round(1e6 * np.asarray(part, np.float64)).astype(np.int64) for part in scene[:2]]
+        assert zlib.crc32(np.asarray(scene.surface).tobytes()) == surfaces
         assert zlib.crc32(b"".join(part.tobytes() for part in micrometers)) == sizes
 
     def test_ways(self) -> None:

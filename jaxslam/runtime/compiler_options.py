@@ -1,0 +1,65 @@
+"""Compiler options of XLA, JAX's compiler, for the programs of jaxslam.
+
+XLA drops options from one release to the next, and refuses a program that asks for one it has dropped. They only decide
+how fast a program is compiled and runs, so that each is used where it is known.
+"""
+
+import functools
+import logging
+from collections.abc import Mapping
+from importlib import metadata
+
+import jax
+from jaxlib import version
+
+_log = logging.getLogger(__name__)
+
+_HAS_OLDER_GENERATOR = version.__version_info__ < (0, 11, 1)
+"""Whether the installed XLA has its older generator of code, and the option that chooses one."""
+
+FAST_COMPILE: dict[str, bool | str] = {"xla_cpu_use_fusion_emitters": False} if _HAS_OLDER_GENERATOR else {}
+"""Compiler options of `jax.jit` for programs of many small parts, such as `track_step` and its gradient.
+
+They are written by XLA's older generator of code; empty where jaxlib has none, from 0.11.1 on. The tracker is compiled
+in 17 s instead of 35 (AMD EPYC, two cores), and a frame takes as long, within 3 %. The gradient of a step takes 0.8 GB
+of memory to compile instead of 1.8, and three quarters of the time.
+"""
+
+SINGLE_THREAD: dict[str, bool | str] = {"xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"}
+"""Options of `jax.jit` for a program that runs beside another: one part after the other, all in the calling thread.
+
+XLA else hands parts that do not depend on each other to a pool of threads, even if that has one thread only, and they
+wait there behind those of other programs: beside optical flow, 0.3 ms of work for masks took 2.1 ms. A program that has
+the machine for itself is faster with the pool: the second part of the tracker's step takes 2.5 ms, and 3.3 without.
+"""
+
+FUSION_EMITTERS: dict[str, bool | str] = {"xla_cpu_use_fusion_emitters": True} if _HAS_OLDER_GENERATOR else {}
+"""Options of `jax.jit` for a program that computes much for every pixel: XLA's newer generator of code, whatever
+`XLA_FLAGS` says. With the older one a frame of a room takes 111 ms instead of 63 (640x480, one thread, AMD EPYC).
+"""
+
+
+def known_options(options: Mapping[str, bool | str]) -> dict[str, bool | str]:
+    """Return those of some compiler options that the installed XLA knows; the others are logged.
+
+    It starts JAX's backend, so that nothing can be set in `jax.config` about it afterwards.
+
+    Args:
+        options: Values by the names of the options.
+    """
+    return {name: value for name, value in options.items() if _is_known(name, value)}
+
+
+@functools.cache
+def _is_known(name: str, value: bool | str) -> bool:
+    """Whether XLA takes an option. Only compiling tells: 20 ms, once a process."""
+    try:
+        jax.jit(lambda: 0.0, compiler_options={name: value}).lower().compile()
+    except jax.errors.JaxRuntimeError as refusal:
+        if f"No such compile option: '{name}'" not in str(refusal):
+            raise
+        _log.info(
+            "jaxlib %s has no compiler option %s; programs are compiled without it", metadata.version("jaxlib"), name
+        )
+        return False
+    return True
