@@ -18,7 +18,7 @@ from jaxslam.trajectory.evaluation import Evaluation
 
 _COLUMNS = ("timestamp_s", *(field.name for field in fields(FrameRecord) if field.name != "timestamp_ns"))
 _ERROR_COLUMNS = ("timestamp_s", "x_m", "y_m", "z_m", "true_x_m", "true_y_m", "true_z_m", "error_m")
-_EARLIER_NAMES = {"num_looked_up": "num_keyframe_matches"}
+_EARLIER_NAMES = {"num_looked_up": "num_keyframe_matches", "is_keyframe": "keyframe"}
 """Columns that had another name when the file was written, each with its present name."""
 
 

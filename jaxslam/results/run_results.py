@@ -175,6 +175,7 @@ def _summary(
     slam: Slam, records: Sequence[FrameRecord], info: RunInfo, evaluation: Evaluation | None
 ) -> dict[str, Any]:
     figures = evaluation.summary() if evaluation is not None else {}
+    keyframe_reasons = Counter(record.keyframe.name for record in records if record.is_keyframe)
     wanted = ("ate_rmse_m", "ate_sim3_rmse_m", "sim3_scale", "rpe_trans_m_per_s", "rpe_rot_deg_per_s")
     return {
         "dataset": info.dataset.name,
@@ -189,6 +190,7 @@ def _summary(
         **_frame_counts(records),
         "keyframes": len(slam.map.ids),
         "keyframes_made": sum(record.is_keyframe for record in records),
+        "keyframe_reasons": dict(sorted(keyframe_reasons.items())),
         "map_points": len(slam.map.points.ids),
         "loops_closed": slam.loops_closed,
         "submaps": len(set(slam.map.submap.tolist())),

@@ -122,7 +122,7 @@ class FrameRecord:
     num_keyframe_matches: int = 0
     num_matched: int = 0
     residual_px: float = 0.0
-    is_keyframe: bool = False
+    keyframe: KeyframeReason = KeyframeReason.NONE
     dynamic_ratio: float = 0.0
     mask_source: MaskSource = MaskSource.NONE
     mask_age: int = -1
@@ -130,6 +130,11 @@ class FrameRecord:
     track_ms: float | None = None
     occluded_share: float | None = None
     submap: int | None = None
+
+    @property
+    def is_keyframe(self) -> bool:
+        """Whether the frame became a keyframe."""
+        return self.keyframe != KeyframeReason.NONE
 
     @classmethod
     def of(cls, result: "FrameResult | Rejected") -> "FrameRecord":
@@ -145,7 +150,7 @@ class FrameRecord:
             num_keyframe_matches=result.num_keyframe_matches,
             num_matched=result.num_matched,
             residual_px=result.residual_px,
-            is_keyframe=result.is_keyframe,
+            keyframe=result.keyframe,
             dynamic_ratio=result.dynamic_ratio,
             mask_source=result.mask_source,
             mask_age=result.mask_age,

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -86,11 +87,21 @@ class TestTables:
         np.testing.assert_allclose(read_track_ms(out / "frames.csv"), [float(row["track_ms"]) for row in rows])
         assert [float(row["timestamp_s"]) for row in rows] == sorted(float(row["timestamp_s"]) for row in rows)
 
+    def test_why_frames_became_keyframes(self, out: Path) -> None:
+        rows = list(csv.DictReader((out / "frames.csv").read_text().splitlines()))
+        reasons = Counter(row["keyframe"] for row in rows)
+        del reasons["NONE"]
+        summary = json.loads((out / "summary.json").read_text())
+        assert summary["keyframe_reasons"] == reasons
+        assert reasons["STARTED"] == 1
+        assert sum(reasons.values()) == summary["keyframes_made"]
+
     def test_earlier_names_are_read(self, out: Path, tmp_path: Path) -> None:
-        """A table written before `num_keyframe_matches` and `RELOCALIZED` had these names."""
+        """A table written before `num_keyframe_matches`, `keyframe` and `RELOCALIZED` had these names."""
         text = (out / "frames.csv").read_text()
         earlier = text.replace("num_keyframe_matches", "num_looked_up", 1).replace(",LOST,", ",RELOCALISED,", 1)
-        assert earlier.count("num_looked_up") == earlier.count("RELOCALISED") == 1
+        earlier = earlier.replace(",keyframe,", ",is_keyframe,", 1)
+        assert earlier.count("num_looked_up") == earlier.count("RELOCALISED") == earlier.count("is_keyframe") == 1
         (tmp_path / "frames.csv").write_text(earlier)
         np.testing.assert_array_equal(read_track_ms(tmp_path / "frames.csv"), read_track_ms(out / "frames.csv"))
 
