@@ -83,9 +83,9 @@ def before_each_program(call: Callable[[], None]) -> Iterator[None]:
 class _WithOptions:
     """A function that goes to `jax.jit` when it is called first: on import, XLA cannot be asked for its options."""
 
-    def __init__(self, function: Callable[..., Any], options: Mapping[str, bool | str], arguments: dict[str, Any]):
+    def __init__(self, function: Callable[..., Any], options: Mapping[str, bool | str], jit: Callable[..., Any]):
         update_wrapper(self, function)
-        self._options, self._arguments = options, arguments
+        self._options, self._jit = options, jit
         self._jitted: Any = None
         self._lock = threading.Lock()
 
@@ -94,8 +94,7 @@ class _WithOptions:
             with self._lock:  # two threads would compile it twice
                 if self._jitted is None:
                     function: Callable[..., Any] = cast(Any, self).__wrapped__
-                    options = known_options(self._options)
-                    self._jitted = jax.jit(function, **self._arguments, compiler_options=options or None)
+                    self._jitted = self._jit(function, compiler_options=known_options(self._options) or None)
         return self._jitted
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
@@ -136,8 +135,8 @@ def compiled(
             with collector_paused():
                 return cached(*args, **kwargs)
 
-        arguments = {"static_argnames": static or None, "donate_argnames": donate or None}
-        jitted: Any = jax.jit(traced, **arguments) if options is None else _WithOptions(traced, options, arguments)
+        jit: Any = partial(jax.jit, static_argnames=static or None, donate_argnames=donate or None)
+        jitted: Any = jit(traced) if options is None else _WithOptions(traced, options, jit)
         return jitted
 
     return decorate
