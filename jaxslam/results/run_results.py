@@ -189,7 +189,7 @@ def _summary(
         "seed": slam.config.run.seed,
         **_frame_counts(records),
         "keyframes": len(slam.map.ids),
-        "keyframes_made": sum(record.is_keyframe for record in records),
+        "keyframes_made": keyframe_reasons.total(),
         "keyframe_reasons": dict(sorted(keyframe_reasons.items())),
         "map_points": len(slam.map.points.ids),
         "loops_closed": slam.loops_closed,

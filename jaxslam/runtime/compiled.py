@@ -85,7 +85,7 @@ class _WithOptions:
 
     def __init__(self, function: Callable[..., Any], options: Mapping[str, bool | str], jit: Callable[..., Any]):
         update_wrapper(self, function)
-        self._options, self._jit = options, jit
+        self._function, self._options, self._jit = function, options, jit
         self._jitted: Any = None
         self._lock = threading.Lock()
 
@@ -93,8 +93,8 @@ class _WithOptions:
         if self._jitted is None:
             with self._lock:  # two threads would compile it twice
                 if self._jitted is None:
-                    function: Callable[..., Any] = cast(Any, self).__wrapped__
-                    self._jitted = self._jit(function, compiler_options=known_options(self._options) or None)
+                    options = known_options(self._options)
+                    self._jitted = self._jit(self._function, compiler_options=options or None)
         return self._jitted
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:

@@ -83,8 +83,7 @@ def _gradient(scene: Scene) -> Compile:
         return track_step(state, frame, params, plan)[1].T_world_cam.translation()[2]
 
     inputs = params, init_state(height, width, plan), frame_arrays(black, dt_s=1 / 30)
-    gradient = jax.jit(jax.value_and_grad(forward_m), compiler_options=FAST_COMPILE)
-    return lambda: gradient.lower(*inputs).compile()
+    return lambda: jax.jit(jax.value_and_grad(forward_m), compiler_options=FAST_COMPILE).lower(*inputs).compile()
 
 
 def _mapping(scene: Scene) -> Compile:
