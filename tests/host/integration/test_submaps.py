@@ -4,10 +4,10 @@ import csv
 import logging
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
 
 import numpy as np
 import pytest
+from compile_counts import num_compiled
 from replay import BLACK, SUBMAP, Played
 from room_round import TRACK, other_room, room
 
@@ -42,15 +42,15 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> tuple[Played, Path, list
     handler.emit = lambda record: lines.append(record.getMessage())  # type: ignore[method-assign]
     log.addHandler(handler)
     level, _ = log.level, log.setLevel(logging.INFO)
-    compiled, step = list[int](), cast(Any, _track_followed)
+    compiled = list[int]()
     try:
         with Slam(room().camera, QUICK) as slam:
             Played(slam, room(), ORDER[:2], FPS)
-            compiled.append(step._cache_size())
+            compiled.append(num_compiled(_track_followed))
             slam.reset()
             lines.clear()
             result = Played(slam, room(), ORDER, FPS)
-            compiled.append(step._cache_size())
+            compiled.append(num_compiled(_track_followed))
     finally:
         log.removeHandler(handler)
         log.setLevel(level)
