@@ -276,9 +276,13 @@ class BackEnd:
         """Return the current pose `(7,)` in the map of an anchored pose."""
         return self._link.pose(anchored)
 
-    def submap_of(self, anchored: AnchoredPose) -> int:
-        """Return the number of the submap that an anchored pose is in now."""
-        return self._link.submap_of(anchored.keyframe)
+    def keyframe_pose(self, keyframe_id: int) -> Pose:
+        """Return the current pose `(7,)` of a keyframe, which may be culled, or on its way to the map."""
+        return self._link.pose(AnchoredPose(keyframe_id, IDENTITY))
+
+    def keyframe_submap(self, keyframe_id: int) -> int:
+        """Return the number of the submap that such a keyframe is in now."""
+        return self._link.submap_of(keyframe_id)
 
     @property
     def submap_now(self) -> int:

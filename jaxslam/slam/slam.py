@@ -5,6 +5,8 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
+
 from jaxslam.config.schema import Config
 from jaxslam.datasets import Dataset
 from jaxslam.dense.point_cloud import DenseCloud
@@ -30,7 +32,7 @@ from jaxslam.slam.input_checks import InputChecks
 from jaxslam.slam.input_warnings import InputWarnings
 from jaxslam.slam.localization_stage import LocalizationStage
 from jaxslam.slam.mask_stage import MaskStage
-from jaxslam.slam.pose_history import PoseHistory, ordered_trajectory
+from jaxslam.slam.pose_history import PoseHistory
 from jaxslam.slam.program_compiler import ProgramCompiler
 from jaxslam.slam.recording_run import run_recording
 from jaxslam.slam.status_log import StatusLog
@@ -323,13 +325,14 @@ class Slam:
 
         Poses in submaps that are not linked to the map's frame are left out; `trajectories` has them.
         """
-        return self.trajectories.get(self.map.world_submap) or ordered_trajectory([])
+        nothing = Trajectory(np.zeros(0, np.int64), np.zeros((0, 7)))
+        return self.trajectories.get(self.map.world_submap, nothing)
 
     @property
     @one_at_a_time
     def trajectories(self) -> dict[int, Trajectory]:
         """All poses as known now, each in the frame of its submap, by the number of the submap."""
-        return self._history.by_submap(self._back.pose, self._back.submap_of)
+        return self._history.by_submap(self._back.keyframe_pose, self._back.keyframe_submap)
 
     def _begin(self) -> None:
         self.times = StageTimes()

@@ -14,7 +14,7 @@ class TestPoseHistory:
     def filled(self) -> PoseHistory:
         history = PoseHistory()
         for number, in_map_frame in enumerate((True, True, False)):
-            anchored = AnchoredPose(number, IDENTITY)
+            anchored = AnchoredPose(number, POSE)
             history.add(30 - 10 * number, POSE, anchored, in_map_frame=in_map_frame)
         return history
 
@@ -22,14 +22,26 @@ class TestPoseHistory:
         """In the order of time, and those of the map's frame only."""
         online = self.filled().online()
         assert online.timestamps_ns.tolist() == [20, 30]
-        np.testing.assert_array_equal(online.T_world_cam, [POSE, POSE])
+        np.testing.assert_allclose(online.T_world_cam, [POSE, POSE], atol=1e-7)
 
     def test_by_submap(self) -> None:
-        found = self.filled().by_submap(lambda anchored: POSE, lambda anchored: anchored.keyframe // 2)
+        found = self.filled().by_submap(
+            lambda keyframe: retract(POSE, keyframe * TWIST), lambda keyframe: keyframe // 2
+        )
         assert {submap: trajectory.timestamps_ns.tolist() for submap, trajectory in found.items()} == {
             0: [20, 30],
             1: [10],
         }
+        np.testing.assert_allclose(found[0].T_world_cam[0], compose(retract(POSE, TWIST), POSE), atol=1e-6)
+
+    def test_an_hour(self) -> None:
+        """More poses than one block holds, in 10 MB an hour at 30 Hz."""
+        history, number = PoseHistory(), 10_000
+        for frame in range(number):
+            history.add(frame, POSE, AnchoredPose(frame // 100, POSE), in_map_frame=True)
+        assert len(history) == number
+        assert history.online().timestamps_ns.tolist() == list(range(number))
+        assert history.num_bytes / number * 30 * 3600 < 10e6
 
     def test_empty(self) -> None:
         assert not PoseHistory()
