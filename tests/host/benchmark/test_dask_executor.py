@@ -225,6 +225,7 @@ class TestTrouble:
         killer.submit(killed_at_work, started[whom], started["worker"])
         return [suite_file(folder), "--runs", "1", "--out", str(folder / "out"), "--executor", executor]
 
+    @pytest.mark.slow
     def test_job_that_kills_its_workers(
         self, small_cluster: Cluster, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
@@ -236,6 +237,7 @@ class TestTrouble:
         assert run["problem"].startswith("workers that died while they had it: 1, last tcp://127.0.0.1:")
         assert run["problem"] in (tmp_path / "out" / "report.md").read_text()
 
+    @pytest.mark.slow
     def test_scheduler_that_is_gone(
         self, small_cluster: Cluster, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:

@@ -198,6 +198,7 @@ class TestGoingOn:
     def test_not_by_mistake(self, out: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert "--resume keeps them" in fails(capsys, suite_file(out.parent), "--out", str(out))
 
+    @pytest.mark.slow
     def test_what_differs_is_run_again(self, mine: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         """That alone, and it is said why; other presets and seeds stay in the report."""
         config = mine / "room/default/0/config.yaml"
@@ -246,6 +247,7 @@ class TestGoingOn:
 
 
 class TestTrouble:
+    @pytest.mark.slow
     def test_run_that_crashes(self, mine: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         """It is a row that says so; the others are there."""
         text = SUITE.replace("runs: 2", "runs: 1") + "  - recording: broken\n    camera: tum_fr1\n"
@@ -315,6 +317,7 @@ def command(out: Path, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     return command
 
 
+@pytest.mark.slow
 class TestGate:
     def test_nothing_is_worse(self, command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
         main([*command, "--json"])

@@ -18,6 +18,7 @@ fails = failing("bench", "compile")
 
 
 class TestPart:
+    @pytest.mark.slow
     def test_report_of_loop_closing(self, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
         main(["bench", "compile", "--only", "loop-closing", "--out", str(tmp_path), "--json"])
         content, _ = printed_json(capsys)

@@ -22,6 +22,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_table(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Two presets, twice each: every run has its folder, every preset its row, which says what it lacks."""
     chosen = ["--presets", "static", "ngd", "--runs", "2", "--allow-missing-model", "--json", "--set", *SETTINGS]

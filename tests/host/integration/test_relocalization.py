@@ -136,6 +136,7 @@ class TestPolicies:
             assert angle(apart) < 1e-6
         assert np.linalg.norm(played.results[-1].T_world_cam[4:] - last.T_world_cam[4:]) > 0.05
 
+    @pytest.mark.slow
     def test_submap_becomes_one_with_the_first(self) -> None:
         """A place A, a loss, a place B never seen, and on to A: all poses are in the world of A in the end."""
         order = [*range(110, 140), *[BLACK] * 20, *range(FRAMES)]
@@ -189,6 +190,7 @@ def localize(path: Path, out: Path) -> None:
 
 
 class TestFile:
+    @pytest.mark.slow
     def test_localize_in_another_process(self, mapped: tuple[Slam, Path], tmp_path: Path) -> None:
         """The poses of a run in memory, and a map that is the same to the bit."""
         slam, path = mapped

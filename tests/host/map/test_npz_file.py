@@ -361,6 +361,7 @@ def killed_while_saving(path: Path, times: int) -> int:
 
 
 class TestAtomic:
+    @pytest.mark.slow
     def test_kills_leave_a_good_map_and_no_litter(self, tmp_path):
         killed_while_saving(tmp_path / "a.map", 2)
 

@@ -246,6 +246,7 @@ class TestWeakFrames:
         assert result.num_matched >= CONFIG.track.weak_inliers
         assert (result.status, result.reason) == (TrackStatus.OK, TrackReason.NONE.text)
 
+    @pytest.mark.slow
     def test_of_a_wrong_pose_are_put_right(self) -> None:
         """Flow goes on from a state that is 4 cm off."""
         slam = Slam(room().camera, ALWAYS_WEAK)

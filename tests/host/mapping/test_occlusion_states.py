@@ -560,6 +560,7 @@ class TestRoomWithPeople:
         assert known.sum() > 100
         assert np.mean(off < 0.05) > 0.95
 
+    @pytest.mark.slow
     def test_same_bytes_again(self, tmp_path: Path) -> None:
         first, again = as_published(), _Run(settings())
         assert again.shares == first.shares
@@ -589,6 +590,7 @@ class TestRoomWithPeople:
             assert [slam.track(frame).occluded_share for frame in clip.frames[:8]] == [None] * 8
             slam.finish()
 
+    @pytest.mark.slow
     def test_in_threads(self) -> None:
         run = _Run(settings("run.deterministic=false"))
         assert run.occluded.sum() > 100
@@ -622,6 +624,7 @@ class TestRoomWithPeople:
             slam.finish()
             assert slam.map is first
 
+    @pytest.mark.slow
     def test_nothing_is_lost_where_mapping_goes_wrong(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """What came with a keyframe is taken in though its points are not."""
         add, failed = LocalMapping.add, []
@@ -659,6 +662,7 @@ class TestRoomWithPeople:
         assert max(shares) > 0.2
         assert sum(result.status is TrackStatus.LOST for result in run.results) < FRAMES // 2
 
+    @pytest.mark.slow
     def test_files_of_a_run(self, tmp_path: Path) -> None:
         clip, detector = _scene()
         clip = Clip(clip.source, clip.frames[:30])

@@ -346,7 +346,9 @@ class TestRoomWithNobodyInIt:
         assert [mask.mask.sum() for mask in masks] == [0] * len(masks)
         assert {(mask.source, mask.age) for mask in masks} == {(MaskSource.NONE, -1)}
 
-    @pytest.mark.parametrize(("path", "fps", "seconds"), CLIPS)
+    @pytest.mark.parametrize(
+        ("path", "fps", "seconds"), [CLIPS[0], *(pytest.param(*clip, marks=pytest.mark.slow) for clip in CLIPS[1:])]
+    )
     def test_nothing_is_new_to_the_tracker(self, path: CameraPathKind, fps: float, seconds: float) -> None:
         """Whose poses are not those of the truth, and worse with few frames a second."""
         with Slam(room(path, fps, 0, 0, seconds).camera, TRACKER) as slam:

@@ -69,6 +69,7 @@ def test_detector_of_ones_own_is_asked_once_an_image() -> None:
     assert detector.color_suspicion == ""
 
 
+@pytest.mark.slow
 def test_wrong_answer_is_told_with_the_frame() -> None:
     """Tracking goes on without it."""
     wrong: Any = lambda image: GOOD._replace(labels=("person",))

@@ -71,6 +71,7 @@ class WrongError(Exception):
 
 
 class TestDeterminism:
+    @pytest.mark.slow
     def test_two_runs_and_another_process(self, tmp_path: Path) -> None:
         """Trajectory and map, to the byte."""
         script = (
@@ -142,7 +143,12 @@ class TestClose:
         assert threads() == []
 
     @pytest.mark.parametrize(
-        ("owner", "method"), [(LocalMapping, "add"), (LoopClosing, "look"), (LocalMapping, "close_loop")]
+        ("owner", "method"),
+        [
+            (LocalMapping, "add"),
+            (LoopClosing, "look"),
+            pytest.param(LocalMapping, "close_loop", marks=pytest.mark.slow),
+        ],
     )
     def test_whatever_it_does(self, monkeypatch: pytest.MonkeyPatch, owner: type, method: str) -> None:
         """It adjusts, looks for a loop, or closes one, for five seconds."""
@@ -207,6 +213,7 @@ class TestClose:
         slam.close()
         assert threads() == []
 
+    @pytest.mark.slow
     def test_dropped_without_it(self) -> None:
         """The interpreter ends in time, and well, though mapping is at work."""
         script = (

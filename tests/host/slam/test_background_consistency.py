@@ -60,6 +60,7 @@ class TestOnlyPeople:
         assert len(weak) > len(results) / 4
         assert {result.status for result in weak} == {TrackStatus.WEAK}
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(("path", "reach_m"), [("rpy", 2.6), ("xyz", 2.6)])
     def test_nobody(self, path: CameraPathKind, reach_m: float) -> None:
         """Little depth, but of things at rest: the background confirms the pose, no frame is weak for it."""

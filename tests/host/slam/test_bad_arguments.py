@@ -277,6 +277,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
 def test_other_processes(tmp_path: Path) -> None:
     """A forked process is told so instead of hanging; a spawned one tracks."""

@@ -178,6 +178,7 @@ class TestClockThatWasSet:
 
 
 class TestTracking:
+    @pytest.mark.slow
     def test_recording_with_stamps_of_arrival(self, data_dir: Path) -> None:
         """In pairs 1 ms apart and with jitter of 10 ms, poses are as with the times of exposure, and none is lost."""
         dataset = open_dataset(data_dir / "tum/rgbd_dataset_freiburg1_rpy_excerpt")

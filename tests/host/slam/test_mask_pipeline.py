@@ -332,6 +332,7 @@ def config(*, new_surfaces: bool = True, **semantics: Any) -> Config:
 
 
 class TestSlam:
+    @pytest.mark.slow
     def test_people_do_not_matter(self) -> None:
         """Three people close to a moving camera: with masks as late as a network's, as good as with the truth."""
         errors = {}

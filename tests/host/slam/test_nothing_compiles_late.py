@@ -67,7 +67,7 @@ def script(slam: Slam, frames: list[Frame], compiled: list[str]) -> list[TrackSt
     return statuses
 
 
-@pytest.mark.parametrize("live", [False, True])
+@pytest.mark.parametrize("live", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_losses_and_submaps(compiled: list[str], *, live: bool) -> None:
     """Then a reset, and another tracker with the same settings."""
     jax.clear_caches()
@@ -84,6 +84,7 @@ def test_losses_and_submaps(compiled: list[str], *, live: bool) -> None:
     assert compiled == []
 
 
+@pytest.mark.slow
 def test_a_dense_map_that_is_full(compiled: list[str]) -> None:
     jax.clear_caches()
     with Slam(room().camera, DENSE) as slam:

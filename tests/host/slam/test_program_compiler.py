@@ -169,6 +169,7 @@ class TestClose:
         assert sorted(large) == sorted(set(large))
         assert len(large) == 3
 
+    @pytest.mark.slow
     def test_the_process_ends(self, tmp_path: Path) -> None:
         """In the middle of compiling, with nothing kept on the disk: it is not aborted."""
         script = (
@@ -194,7 +195,7 @@ class TestClose:
 
 
 class TestInTurn:
-    @pytest.mark.parametrize("dense", [False, True])
+    @pytest.mark.parametrize("dense", [False, pytest.param(True, marks=pytest.mark.slow)])
     def test_cold_as_warm(self, tmp_path: Path, *, dense: bool) -> None:
         """A loss among the first frames too: to the byte."""
         frames = loop().frames

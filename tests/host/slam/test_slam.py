@@ -76,6 +76,7 @@ class TestDeterminism:
             write_tum(tmp_path / name, tracker.trajectory)
         assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
+    @pytest.mark.slow
     def test_two_processes(self, slam: Slam, tmp_path: Path) -> None:
         """Another process, that compiles or loads from the cache for itself, writes the same bytes."""
         script = (

@@ -370,6 +370,7 @@ def test_a_camera_that_reverses_does_not_turn(ends):
     assert abs(poses[-30, 4] - poses[0, 4]) < 1.5
 
 
+@pytest.mark.slow
 def test_frames_are_the_same_bytes_on_one_core():
     code = (
         "import hashlib\n"

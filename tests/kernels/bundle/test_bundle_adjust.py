@@ -215,8 +215,12 @@ def _pose_errors(poses, others) -> float:
     return max(max(pose_error(a, b)) for a, b in zip(poses, others, strict=True))
 
 
+LOSSES = [pytest.param(loss, marks=pytest.mark.slow) if loss == "geman_mcclure" else loss for loss in get_args(Loss)]
+"""SciPy takes a minute with the one that is marked."""
+
+
 class TestReference:
-    @pytest.mark.parametrize("loss", get_args(Loss))
+    @pytest.mark.parametrize("loss", LOSSES)
     def test_matches_reference(self, loss):
         window = make_window(1)
         if loss == "geman_mcclure":  # has many minima: from where a convex enough one ends, as it is used

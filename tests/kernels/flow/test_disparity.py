@@ -153,6 +153,7 @@ class TestGradient:
                 np.testing.assert_allclose(np.sum(reverse[which] * direction), forward, rtol=1e-9)
                 np.testing.assert_allclose(forward, numeric, rtol=1e-5, atol=1e-7)
 
+    @pytest.mark.slow
     def test_gradient_of_what_is_not_found(self):
         left, right, points, guess, mask = _pair()
         gradient, found = _gradient(np.ones(N, np.float32), left, np.full_like(right, 90), points, guess, mask)

@@ -537,6 +537,7 @@ class TestInvariance:
         np.testing.assert_allclose(after.cost, before.cost, rtol=1e-8)
         assert _largest_difference(after.T_world_cam.wxyz_xyz, expected) < 1e-5
 
+    @pytest.mark.slow
     @few_examples
     @any_seed
     def test_order_of_edges_and_elimination(self, seed):

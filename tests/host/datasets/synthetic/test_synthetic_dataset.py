@@ -294,6 +294,7 @@ class TestHardness:
             errors.append(np.linalg.norm(pose[:3, 3] - truth[index, :3, 3]))
         return float(np.sqrt(np.mean(np.square(errors))))
 
+    @pytest.mark.slow
     def test_odometry_without_rejection_fails_only_where_people_walk(self):
         calm, crowded = self.error(people=0), self.error(people=2)
         assert calm < 0.06
