@@ -82,6 +82,15 @@ def angle(T: Transforms) -> Float[np.ndarray, "..."]:
     return np.asarray(2 * np.arctan2(np.linalg.norm(T[..., 1:4], axis=-1), np.abs(T[..., 0])))
 
 
+def displacement(first: Pose, second: Pose) -> Float[np.ndarray, "6"]:
+    """Return the `(6,)` tangent vector with which `retract` leads from the first `(7,)` transform to the second."""
+    change = between(first, second)
+    sine = np.linalg.norm(change[1:4])
+    turn = 2 * np.arctan2(sine, np.abs(change[0])) * np.copysign(1.0, change[0])
+    axis = change[1:4] / sine if sine > 0 else np.zeros(3)
+    return np.concatenate([change[4:], turn * axis])
+
+
 def retract(T: Pose, tangent: Num[np.ndarray, "6"]) -> Pose:
     """Retract a `(6,)` tangent vector at a `(7,)` transform: the product of `T` and the small motion.
 

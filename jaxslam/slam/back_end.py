@@ -10,6 +10,7 @@ from functools import partial
 from typing import Any, TypeAlias
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxslam.config.schema import Config
 from jaxslam.geometry.se3 import IDENTITY, compose
@@ -250,18 +251,25 @@ class BackEnd:
         """Localize a lost frame in the map; see `FrameLocalizer.relocalize`."""
         return self._localizer.relocalize(arrays, predicted)
 
-    def reset_at_pose(self, state: TrackState, recognized: AnchoredPose) -> TrackState:
-        """Return the tracker's state reset to a recognized pose, with keyframes of that place loaded."""
+    def reset_at_pose(self, state: TrackState, recognized: AnchoredPose, twist: Float[np.ndarray, "6"]) -> TrackState:
+        """Return the tracker's state reset to a recognized pose, with keyframes of that place loaded.
+
+        Args:
+            state: State of the tracker.
+            recognized: Pose in the map.
+            twist: `(6,)` velocity of the camera in its own axes, m/s, then rad/s; 0 if it is not known.
+        """
         self._link.set_reference_keyframe(recognized.keyframe)
         pose = self._link.pose(recognized)
-        state = self.start_submap(state, pose)
+        self._reloads.replace(())
+        state = self._link.reset_at_pose(state, pose, twist)
         self._reloads.replace(self._searches.reload(Reload(self.map, pose, self._link.submap_now(), frozenset())))
         return self._reloads.load_all(state)
 
     def start_submap(self, state: TrackState, T_world_cam: Pose) -> TrackState:
-        """Return the tracker's state reset to a pose `(7,)`, with which a new submap begins."""
+        """Return the tracker's state reset to a pose `(7,)`, at rest, with which a new submap begins."""
         self._reloads.replace(())
-        return self._link.reset_at_pose(state, T_world_cam)
+        return self._link.reset_at_pose(state, T_world_cam, np.zeros(6))
 
     def frame_tracked(self, T_world_cam: Pose, frame: int) -> None:
         """Request keyframes of the surroundings at intervals, if no new keyframes are made that request them."""

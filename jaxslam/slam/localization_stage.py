@@ -51,6 +51,8 @@ class LocalizationStage:
         self._tracker, self._back, self._programs = tracker, back_end, programs
         self._match_map, self._restart_after = config.track.match_map, config.track.restart_after
         self._begins_submaps = config.run.on_loss == "submap" and not localize_only
+        # Not as arrays of JAX: to compare with one would be compiled in the middle of a run.
+        self._fastest = float(tracker.params.max_speed_m_per_s), float(tracker.params.max_turn_rad_per_s)
         self._motion = ConstantVelocity()
         self._any_tracked = self._was_lost = False
         self._unrecognized = 0
@@ -113,7 +115,8 @@ class LocalizationStage:
         found, unknown = self._back.relocalize(arrays, predicted)
         self._unrecognized += unknown
         if found is not None:
-            self._tracker.state = self._back.reset_at_pose(self._tracker.state, found.anchored)
+            twist = self._velocity_to(found.anchored, dt_s)
+            self._tracker.state = self._back.reset_at_pose(self._tracker.state, found.anchored, twist)
             return self._relocalized(self._track_again(arrays), found, lost)
         if self._may_begin_submap and self._unrecognized > self._restart_after:
             pose = np.asarray(lost.T_world_cam.wxyz_xyz)
@@ -123,6 +126,13 @@ class LocalizationStage:
         if unknown and len(self._back.map.ids) and (self._was_lost or not self._any_tracked):
             lost = lost._replace(reason=np.int32(TrackReason.PLACE_NOT_IN_MAP))
         return LocalizedOutput(lost)
+
+    def _velocity_to(self, recognized: AnchoredPose, dt_s: float) -> Float[np.ndarray, "6"]:
+        """Return the mean velocity since the last tracked frame; 0 if that is too long ago, or the place is another."""
+        twist = self._motion.velocity_to(self._back.pose(recognized), dt_s)
+        same_world = self._any_tracked and self._back.keyframe_submap(recognized.keyframe) == self._back.submap_now
+        plausible = (np.linalg.norm(twist.reshape(2, 3), axis=1) < self._fastest).all()
+        return twist if same_world and plausible else np.zeros(6)
 
     def _track_again(self, arrays: FrameArrays) -> TrackOutput:
         """Track the frame from the state that was just reset."""

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float, Float64, Int64
 
-from jaxslam.geometry.se3 import IDENTITY, compose, retract
+from jaxslam.geometry.se3 import IDENTITY, compose, displacement, retract
 from jaxslam.geometry.types import Pose
 from jaxslam.slam.tracker_map_sync import AnchoredPose
 from jaxslam.trajectory.trajectory import Trajectory
@@ -124,6 +124,11 @@ class ConstantVelocity:
         """Predict the pose this many seconds after the last frame; `None` if the last pose is too old."""
         lost_s = self.lost_s + dt_s
         return retract(self._pose, self._twist * lost_s) if lost_s < _PREDICTED_S else None
+
+    def velocity_to(self, T_world_cam: Pose, dt_s: float) -> Float[np.ndarray, "6"]:
+        """Return the mean velocity to a pose this many seconds after the last frame; 0 if the last pose is too old."""
+        lost_s = self.lost_s + dt_s
+        return displacement(self._pose, T_world_cam) / lost_s if 0 < lost_s < _PREDICTED_S else np.zeros(6)
 
     def now(self) -> Float[np.ndarray, "7"]:
         """Predict the pose at the last frame, from at most one second of constant velocity."""

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from jaxslam.geometry.se3 import IDENTITY, angle, between, compose, inverse, to_local, transform
 from jaxslam.geometry.types import Pose
@@ -68,7 +69,8 @@ class TrackerMapSync:
             drops_points: Whether points may have to be dropped.
         """
         identity, nothing = IDENTITY.astype(np.float32), np.zeros(self._plan.num_points, np.float32)
-        state = _carried(_relocated(state, identity), identity, np.tile(identity, (len(self._slots), 1)))
+        still = np.zeros(6, np.float32)
+        state = _carried(_relocated(state, identity, still), identity, np.tile(identity, (len(self._slots), 1)))
         if self._plan.num_reloaded:
             plane, image = np.tile(nothing, (3, 1)), np.zeros(state.keyframes.images.shape[1:], np.uint8)
             places = (identity, plane[:2], plane)
@@ -106,10 +108,10 @@ class TrackerMapSync:
         self.reference = keyframe_id
         self._believed.setdefault(keyframe_id, self.map.pose(keyframe_id))
 
-    def reset_at_pose(self, state: TrackState, T_world_cam: Pose) -> TrackState:
-        """The tracker's state reset to a pose `(7,)`, without its keyframes."""
+    def reset_at_pose(self, state: TrackState, T_world_cam: Pose, twist: Float[np.ndarray, "6"]) -> TrackState:
+        """The tracker's state reset to a pose `(7,)` and a velocity `(6,)`, without its keyframes."""
         self._slots = [NONE] * len(self._slots)
-        return _relocated(state, T_world_cam.astype(np.float32))
+        return _relocated(state, T_world_cam.astype(np.float32), twist.astype(np.float32))
 
     def submap_now(self) -> int:
         """Number of the submap that the frames are in."""

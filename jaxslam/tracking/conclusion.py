@@ -53,7 +53,7 @@ class _Motion(NamedTuple):
 
     Attributes:
         T_world_cam: Pose of the frame; the last one while tracking is lost.
-        twist: `(6,)` velocity of the camera; 0 while tracking is lost.
+        twist: `(6,)` velocity of the camera; 0 while tracking is lost, that of the reset where it starts.
         start: Whether tracking is to start in the frame, at the pose.
         lost_frames: Number of frames since tracking was lost, this one included.
     """
@@ -103,7 +103,8 @@ def _motion(step: StepContext, estimate: FrameEstimate) -> _Motion:
     waited = lost_frames.astype(state.twist.dtype) > step.params.restart_after
     start = lost & ((state.phase == TrackPhase.START) | waited)
     pose = _choose(lost, state.T_world_cam, estimate.refined.T_world_cam)
-    twist = jnp.where(lost, 0, step.twist_to(estimate.refined.T_world_cam))
+    # A start at a recognized place keeps the velocity of the reset: without it, a fast camera is lost again at once.
+    twist = jnp.where(lost, jnp.where(start, state.twist, 0), step.twist_to(estimate.refined.T_world_cam))
     return _Motion(pose, twist, start, lost_frames)
 
 

@@ -113,8 +113,8 @@ def drop_points(state: TrackState, ids: Int[Array, " m"]) -> TrackState:
     )
 
 
-def reset_at_pose(state: TrackState, T_world_cam: Float[Array, "7"]) -> TrackState:
-    """Reset a lost tracker at a pose: the next step starts there at once.
+def reset_at_pose(state: TrackState, T_world_cam: Float[Array, "7"], twist: Float[Array, "6"]) -> TrackState:
+    """Reset a lost tracker at a pose and a velocity: the next step starts there at once.
 
     Its keyframes are dropped, because their poses relative to the new start are not known. Keyframes of the map can be
     loaded again with `load_keyframe`.
@@ -122,15 +122,17 @@ def reset_at_pose(state: TrackState, T_world_cam: Float[Array, "7"]) -> TrackSta
     Args:
         state: The state.
         T_world_cam: `(7,)` pose to start from, `wxyz_xyz`.
+        twist: `(6,)` velocity of the camera in its own axes, m/s, then rad/s; 0 if it is not known.
 
     Raises:
-        ValueError: While tracing, if the pose has another shape.
-        TypeError: While tracing, if it is not of the type of the state.
+        ValueError: While tracing, if the pose or the velocity has another shape.
+        TypeError: While tracing, if one of them is not of the type of the state.
     """
     check_array("T_world_cam", T_world_cam, (7,), state.twist.dtype, " as the state")
+    check_array("twist", twist, (6,), state.twist.dtype, " as the state")
     return state._replace(
         T_world_cam=SE3(T_world_cam),
-        twist=jnp.zeros_like(state.twist),
+        twist=twist,
         points=state.points._replace(valid=jnp.zeros_like(state.points.valid)),
         keyframes=state.keyframes._replace(weight=jnp.zeros_like(state.keyframes.weight)),
         phase=jnp.full_like(state.phase, TrackPhase.START),

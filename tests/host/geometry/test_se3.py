@@ -70,3 +70,13 @@ def test_angle_is_that_of_the_shorter_way_and_exact_near_zero():
     np.testing.assert_allclose(pose.angle(-T), expected, atol=1e-14)
     tiny = np.array([1.0, 5e-10, 0, 0, 0, 0, 0])
     assert pose.angle(tiny) == pytest.approx(1e-9, rel=1e-12)
+
+
+def test_displacement():
+    """What `retract` undoes, whichever sign the quaternions have."""
+    rng = np.random.default_rng(4)
+    for first in some_poses(9, seed=5):
+        tangent = rng.uniform(-1.5, 1.5, 6)  # less than half a turn
+        second = pose.retract(first, tangent) * np.array([-1, -1, -1, -1, 1, 1, 1])
+        np.testing.assert_allclose(pose.displacement(first, second), tangent, atol=1e-12)
+    np.testing.assert_array_equal(pose.displacement(IDENTITY, IDENTITY), np.zeros(6))

@@ -58,6 +58,15 @@ class TestConstantVelocity:
         assert after is not None
         np.testing.assert_allclose(after, retract(POSE, 0.3 * TWIST))
 
+    def test_velocity_to_a_recognized_place(self) -> None:
+        """The mean one; none if the last pose is too old to tell."""
+        motion = ConstantVelocity()
+        motion.tracked(POSE, np.zeros(6))
+        motion.lost(0.1, IDENTITY)
+        np.testing.assert_allclose(motion.velocity_to(retract(POSE, 0.3 * TWIST), 0.2), TWIST, atol=1e-9)
+        motion.lost(5.0, IDENTITY)
+        assert not motion.velocity_to(POSE, 0.2).any()
+
     def test_moves_with_the_world(self) -> None:
         motion, change = ConstantVelocity(), retract(IDENTITY, np.full(6, 0.3))
         motion.tracked(POSE, np.zeros(6))

@@ -332,7 +332,9 @@ class TestEdits:
         with pytest.raises(ValueError, match=re.escape("T_new_old_keyframes: expected (7, 7) as the keyframes")):
             apply_map_correction(state, jnp.zeros(7), jnp.zeros((3, 7)))
         with pytest.raises(ValueError, match=re.escape("T_world_cam: expected (7,) as the state, got (4, 4)")):
-            reset_at_pose(state, jnp.eye(4))
+            reset_at_pose(state, jnp.eye(4), jnp.zeros(6))
+        with pytest.raises(ValueError, match=re.escape("twist: expected (6,) as the state, got (3,)")):
+            reset_at_pose(state, jnp.zeros(7), jnp.zeros(3))
         with pytest.raises(TypeError, match="ids: expected int32, got float32"):
             drop_points(state, jnp.zeros(3))
 
