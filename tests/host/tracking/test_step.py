@@ -43,6 +43,7 @@ from jaxslam.tracking.state import (
     TrackState,
     TrackStatus,
 )
+from jaxslam.tracking.state_updates import reset_at_pose
 from jaxslam.tracking.step import track_step
 from jaxslam.tracking.step_context import StepContext
 
@@ -295,6 +296,19 @@ class TestPoseStatus:
             jax.eval_shape(partial(track_step, plan=plan), new_state(np.float64), frame, params(np.float64))
         assert given == [plan.pose_steps] * 2
         assert plan.pose_steps == (25 if plan is PLAN else 1000)
+
+
+def test_a_start_at_a_recognized_place_keeps_the_velocity(counted: Counted, frames: FrameArrays) -> None:
+    """The second frame is predicted by it; one that is lost has none."""
+    place, twist = jnp.array([1.0, 0, 0, 0, 0.2, 0, 0]), jnp.array([0.3, 0, 0, 0, 0.1, 0])
+    state, output = counted.step(reset_at_pose(new_state(), place, twist), at(frames, 0), params())
+    assert int(output.status) == TrackStatus.STARTED
+    np.testing.assert_array_equal(output.twist, twist)
+    np.testing.assert_array_equal(state.twist, twist)
+    black = at(frames, 1)._replace(image=jnp.zeros_like(at(frames, 1).image))
+    _, output = counted.step(state, black, params())
+    assert int(output.status) == TrackStatus.LOST
+    assert not np.asarray(output.twist).any()
 
 
 def test_pairs_are_matched_by_the_plan(monkeypatch: pytest.MonkeyPatch) -> None:
