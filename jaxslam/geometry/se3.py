@@ -86,7 +86,7 @@ def displacement(first: Pose, second: Pose) -> Float[np.ndarray, "6"]:
     """Return the `(6,)` tangent vector with which `retract` leads from the first `(7,)` transform to the second."""
     change = between(first, second)
     sine = np.linalg.norm(change[1:4])
-    turn = 2 * np.arctan2(sine, np.abs(change[0])) * np.copysign(1.0, change[0])
+    turn = angle(change) * np.copysign(1.0, change[0])
     axis = change[1:4] / sine if sine > 0 else np.zeros(3)
     return np.concatenate([change[4:], turn * axis])
 

@@ -261,7 +261,6 @@ class BackEnd:
         """
         self._link.set_reference_keyframe(recognized.keyframe)
         pose = self._link.pose(recognized)
-        self._reloads.replace(())
         state = self._link.reset_at_pose(state, pose, twist)
         self._reloads.replace(self._searches.reload(Reload(self.map, pose, self._link.submap_now(), frozenset())))
         return self._reloads.load_all(state)

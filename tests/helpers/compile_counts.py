@@ -1,13 +1,12 @@
-"""How often a function has been compiled, from jaxslam's register of compiled functions."""
+"""How many programs a function of `jaxslam.runtime.compiled` has been compiled to."""
 
-from collections.abc import Callable
 from typing import Any
 
-from jaxslam.runtime.compiled import programs
 
+def num_compiled(function: Any) -> int:
+    """Return the number of programs, also of one trace: arrays that are committed to a device make another one.
 
-def num_compiled(function: Callable[..., Any]) -> int:
-    """Return the number of times that a function of `jaxslam.runtime.compiled` was compiled in this process."""
-    name = f"{function.__module__}.{function.__qualname__}"
-    (found,) = [entry for entry in programs if entry.name == name]
-    return found.num_compiled
+    The register counts traces, and would miss that.
+    """
+    program = function._program() if hasattr(function, "_program") else function
+    return program._cache_size()
