@@ -32,6 +32,8 @@ MAX_SIGMA_M = 0.03
 """Largest standard deviation of the position in any direction, in meters."""
 _SIGMA_PX = 1.0
 """Standard deviation of each coordinate of a feature of octave 0."""
+_MAX_STEPS = 100
+"""Largest number of steps. With the few points that a crowd leaves, 25 do not always do."""
 _CHI2_GATES = (9.21, 11.34)
 """99 % quantiles of chi squared with two degrees of freedom and, where depth was measured, with three."""
 
@@ -172,4 +174,5 @@ def _refined(T_origin_cam: SE3, matches: Matches, sensor: SensorModel) -> PoseRe
         depth=matches.depth,
         sigma_px=matches.sigma_px,
         sigma_depth=matches_depth_sigma(matches, sensor),
+        max_steps=_MAX_STEPS,
     )
