@@ -31,6 +31,7 @@ from .sensors.frame_arrays import stack_frames as stack_frames
 from .sensors.rectification import RectifiedPair as RectifiedPair
 from .sensors.stereo_rig import Lens as Lens
 from .sensors.stereo_rig import Rig as Rig
+from .slam.frame_records import FrameRecords as FrameRecords
 from .slam.frame_result import FrameRecord as FrameRecord
 from .slam.frame_result import FrameResult as FrameResult
 from .slam.frame_result import Rejected as Rejected

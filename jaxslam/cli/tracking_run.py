@@ -15,8 +15,10 @@ from jaxslam.cli.interruption import Interruption
 from jaxslam.datasets import Dataset
 from jaxslam.errors import ConfigError, one_line
 from jaxslam.io.atomic_files import check_writable, make_folder
+from jaxslam.results.partial_results import PartialResults
 from jaxslam.results.run_results import RESULT_FILES, RunInfo, write_results
 from jaxslam.sensors.frame import Frame
+from jaxslam.slam.frame_records import FrameRecords
 from jaxslam.slam.frame_result import FrameRecord, FrameResult, Rejected
 from jaxslam.slam.slam import Slam
 from jaxslam.trajectory.evaluation import Evaluation
@@ -38,7 +40,7 @@ class _Meter:
     task: Any
     watchers: Sequence[_OnFrame]
     interruption: Interruption
-    records: list[FrameRecord] = field(default_factory=list)
+    records: FrameRecords = field(default_factory=FrameRecords)
     statuses: dict[str, int] = field(default_factory=dict)
 
     def __call__(self, frame: Frame | None, result: FrameResult | Rejected) -> None:
@@ -97,17 +99,18 @@ def track(
         make_folder(out, ConfigError)
         if save_map is not None:
             check_writable(save_map, "--save-map", ConfigError)
-        watchers = [pictures] if viewer is None else [pictures, viewer]
-        records, failure = _tracked(dataset, slam, watchers, interruption, quiet=quiet)
-        cut_short = None if failure is None else _why_cut_short(failure, interruption)
-        if cut_short is not None:
-            console.print(f"Cut short ({cut_short}): writing what was computed. Ctrl-C ends at once.", markup=False)
-        info = RunInfo(dataset, preset, time.perf_counter() - began, cut_short)
-        try:
-            summary, evaluation = write_results(out, slam, records, info, pictures)
-        except Exception:  # a second Ctrl-C ends at once, but a picture that fails costs no map
-            _save_map(slam, save_map)
-            raise
+        with PartialResults(out) as partial:
+            watchers = [pictures, partial] if viewer is None else [pictures, partial, viewer]
+            records, failure = _tracked(dataset, slam, watchers, interruption, quiet=quiet)
+            cut_short = None if failure is None else _why_cut_short(failure, interruption)
+            if cut_short is not None:
+                console.print(f"Cut short ({cut_short}): writing what was computed. Ctrl-C ends at once.", markup=False)
+            info = RunInfo(dataset, preset, time.perf_counter() - began, cut_short)
+            try:
+                summary, evaluation = write_results(out, slam, records, info, pictures)
+            except Exception:  # a second Ctrl-C ends at once, but a picture that fails costs no map
+                _save_map(slam, save_map)
+                raise
         if not quiet:
             _print_summary(summary, evaluation, out)
         _save_map(slam, save_map)
@@ -119,7 +122,7 @@ def track(
 
 def _tracked(
     dataset: Dataset, slam: Slam, watchers: Sequence[_OnFrame], interruption: Interruption, *, quiet: bool
-) -> tuple[list[FrameRecord], BaseException | None]:
+) -> tuple[FrameRecords, BaseException | None]:
     """The records of all frames, or of those until something ended the run, and what that was."""
     columns = (
         text_column("Tracking"),
@@ -128,7 +131,7 @@ def _tracked(
         TimeRemainingColumn(),
         text_column("{task.fields[status]}"),
     )
-    records: list[FrameRecord] = []
+    records = FrameRecords()
     try:
         with console.status("Compiling the tracker (some 20 s at the first start on a machine, then 1) ..."):
             slam.warm_up()

@@ -16,7 +16,7 @@ from jaxslam.io.timestamps import decimal_seconds, nanoseconds
 from jaxslam.slam.frame_result import FrameRecord
 from jaxslam.trajectory.evaluation import Evaluation
 
-_COLUMNS = ("timestamp_s", *(field.name for field in fields(FrameRecord) if field.name != "timestamp_ns"))
+COLUMNS = ("timestamp_s", *(field.name for field in fields(FrameRecord) if field.name != "timestamp_ns"))
 _ERROR_COLUMNS = ("timestamp_s", "x_m", "y_m", "z_m", "true_x_m", "true_y_m", "true_z_m", "error_m")
 _EARLIER_NAMES = {"num_looked_up": "num_keyframe_matches", "is_keyframe": "keyframe"}
 """Columns that had another name when the file was written, each with its present name."""
@@ -45,7 +45,7 @@ def write_frames(path: Path, records: Iterable[FrameRecord]) -> None:
     Raises:
         TrajectoryError: If the file cannot be written.
     """
-    _write(path, _COLUMNS, (_row(record) for record in records))
+    _write(path, COLUMNS, map(frame_row, records))
 
 
 def write_errors(path: Path, evaluation: Evaluation) -> None:
@@ -81,14 +81,15 @@ def read_track_ms(path: Path) -> Float[np.ndarray, " frames"]:
     Raises:
         TrajectoryError: If the file cannot be read or has other content.
     """
-    column = _COLUMNS.index("track_ms")
+    column = COLUMNS.index("track_ms")
     try:
-        return np.array([float(row[column]) for row in _read(path, _COLUMNS) if row[column]])
+        return np.array([float(row[column]) for row in _read(path, COLUMNS) if row[column]])
     except ValueError as problem:
         raise TrajectoryError(f"{path}: {problem}") from None
 
 
-def _row(record: FrameRecord) -> list[object]:
+def frame_row(record: FrameRecord) -> list[object]:
+    """Return the cells of a frame, in the order of `COLUMNS`."""
     values = asdict(record)
     stamp = decimal_seconds(values.pop("timestamp_ns"))
     return [stamp, *(_cell(value) for value in values.values())]

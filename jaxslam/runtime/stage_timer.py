@@ -8,15 +8,14 @@ from typing import TypeVar
 import numpy as np
 from jaxtyping import Float
 
+NUM_KEPT = 20_000
+"""Number of durations of a stage that are kept at least, so that hours of tracking take no more memory."""
 _Given = TypeVar("_Given")
 _Made = TypeVar("_Made")
 
 
 class StageTimes:
-    """Every recorded duration of every stage; any thread may add to it.
-
-    It takes eight bytes per stage and frame: 6 MB an hour at 30 frames a second.
-    """
+    """The latest durations of every stage, some ten minutes of them at 30 frames a second; any thread may add to it."""
 
     def __init__(self) -> None:
         """Create a record without durations."""
@@ -24,7 +23,10 @@ class StageTimes:
 
     def add(self, stage: str, seconds: float) -> None:
         """Record that a stage took so many seconds."""
-        self._ms.setdefault(stage, array("d")).append(1e3 * seconds)
+        times = self._ms.setdefault(stage, array("d"))
+        times.append(1e3 * seconds)
+        if len(times) >= 2 * NUM_KEPT:
+            del times[:NUM_KEPT]
 
     def timed(self, stage: str, work: Callable[[_Given], _Made]) -> Callable[[_Given], _Made]:
         """Wrap a function so that the duration of every call, also of one that raises, is recorded under `stage`."""
@@ -44,7 +46,10 @@ class StageTimes:
 
     @property
     def ms(self) -> Mapping[str, Float[np.ndarray, " times"]]:
-        """All durations of each stage, milliseconds, with the stages in the order of their first record."""
+        """Durations of each stage, milliseconds: at least the latest `NUM_KEPT`, all if there are fewer.
+
+        The stages are in the order of their first record.
+        """
         return {stage: np.array(times) for stage, times in self._ms.items()}
 
 

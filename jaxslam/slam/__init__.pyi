@@ -1,3 +1,4 @@
+from .frame_records import FrameRecords as FrameRecords
 from .frame_result import FrameRecord as FrameRecord
 from .frame_result import FrameResult as FrameResult
 from .frame_result import Rejected as Rejected

@@ -12,6 +12,7 @@ from jaxslam.datasets.realtime import in_real_time
 from jaxslam.errors import DatasetError, FrameError, JaxSlamError
 from jaxslam.sensors.frame import Frame
 from jaxslam.slam.argument_checks import check_recording
+from jaxslam.slam.frame_records import FrameRecords
 from jaxslam.slam.frame_result import FrameRecord, FrameResult, Rejected
 from jaxslam.tracking.state import TrackStatus
 
@@ -23,7 +24,7 @@ _log = logging.getLogger(__name__)
 
 def run_recording(
     slam: "Slam", dataset: Dataset, on_frame: Callable[[Frame | None, FrameResult | Rejected], None] | None = None
-) -> list[FrameRecord]:
+) -> FrameRecords:
     """Track every frame of a recording, then wait for mapping to finish.
 
     A frame that cannot be read or does not fit the camera is reported as `Rejected`, and the run goes on. With
@@ -42,7 +43,7 @@ def run_recording(
     """
     check_recording(dataset, slam.camera)
     slam.warm_up()
-    records: list[FrameRecord] = []
+    records = FrameRecords()
     with _frozen_garbage():
         for timestamp_ns, frame in zip(dataset.timestamps_ns, _frames_of(dataset, slam.config.run), strict=True):
             result = _tracked_or_rejected(slam, int(timestamp_ns), frame)

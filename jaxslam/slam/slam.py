@@ -27,7 +27,8 @@ from jaxslam.slam.back_end import BackEnd
 from jaxslam.slam.background_consistency import BackgroundConsistency
 from jaxslam.slam.call_guard import one_at_a_time, refuse_after_fork
 from jaxslam.slam.frame_clock import FrameClock
-from jaxslam.slam.frame_result import FrameRecord, FrameResult, Rejected, frame_result
+from jaxslam.slam.frame_records import FrameRecords
+from jaxslam.slam.frame_result import FrameResult, Rejected, frame_result
 from jaxslam.slam.input_checks import InputChecks
 from jaxslam.slam.input_warnings import InputWarnings
 from jaxslam.slam.localization_stage import LocalizationStage
@@ -234,7 +235,7 @@ class Slam:
 
     def run(
         self, dataset: Dataset, on_frame: Callable[[Frame | None, FrameResult | Rejected], None] | None = None
-    ) -> list[FrameRecord]:
+    ) -> FrameRecords:
         """Track a whole recording.
 
         A frame that cannot be read or does not fit is reported as `Rejected`, and the run goes on. With `run.realtime`,
@@ -244,6 +245,9 @@ class Slam:
             dataset: Recording of this camera.
             on_frame: Function called after every frame, for progress and pictures; the frame is `None` if it could not
                 be read.
+
+        Returns:
+            One record per frame: its result without arrays.
 
         Raises:
             DatasetError: If `dataset` is not a recording, or is one of another camera.

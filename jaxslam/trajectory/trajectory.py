@@ -9,7 +9,7 @@ from jaxtyping import Bool, Int
 from jaxslam.errors import TrajectoryError
 from jaxslam.geometry.se3 import between
 from jaxslam.geometry.so3 import matrices, slerp
-from jaxslam.geometry.types import Poses, Positions, Timestamps
+from jaxslam.geometry.types import Pose, Poses, Positions, Timestamps
 from jaxslam.io.atomic_files import write_atomically
 from jaxslam.io.timestamps import decimal_seconds
 from jaxslam.trajectory.formats import (
@@ -213,12 +213,13 @@ def write_tum(path: PathLike, trajectory: Trajectory) -> None:
     Raises:
         TrajectoryError: If the file cannot be written.
     """
-    poses = trajectory.T_world_cam[:, [4, 5, 6, 1, 2, 3, 0]]
-    lines = (
-        f"{decimal_seconds(stamp)} {_numbers(pose)}\n"
-        for stamp, pose in zip(trajectory.timestamps_ns.tolist(), poses.tolist(), strict=True)
-    )
+    lines = map(tum_line, trajectory.timestamps_ns.tolist(), trajectory.T_world_cam)
     write_atomically(path, "".join(lines).encode(), TrajectoryError)
+
+
+def tum_line(timestamp_ns: int, T_world_cam: Pose) -> str:
+    """Return the row of a pose in a TUM file: `timestamp tx ty tz qx qy qz qw`."""
+    return f"{decimal_seconds(timestamp_ns)} {_numbers(T_world_cam[[4, 5, 6, 1, 2, 3, 0]].tolist())}\n"
 
 
 def write_kitti(path: PathLike, trajectory: Trajectory, frames_ns: Int[np.ndarray, " m"] | None = None) -> int:
