@@ -81,14 +81,17 @@ class TrackConfig(ValidatedConfig):
     detect_below: Annotated[float, Share] = 0.8
     """New points are detected when less than this share of `num_points` is alive."""
     keyframe_below: Annotated[float, Share] = 0.8
-    """A keyframe is made when the frame shows less than this share of the points of every kept keyframe."""
+    """A keyframe is made when less than this share of the points of every keyframe that the tracker holds is in view,
+    unless `keyframe_views` keyframes show the view."""
     keyframe_followed_below: Annotated[float, Share] = 0.1
-    """A keyframe is made when less than this share of the tracked points already existed at the last keyframe."""
+    """A keyframe is made when less than this share of the tracked points already existed at the last keyframe, unless
+    `keyframe_views` keyframes show the view."""
+    keyframe_views: Annotated[int, Range(at_least=1)] = 4
+    """Number of keyframes with `keyframe_below` of their points in view from which on another one is no news; four
+    times as many where hardly a point of them is found, as in a crowd or in another light."""
     keyframe_points_below: Annotated[float, Share] = 0.0
     """A keyframe is made when less than this share of `num_points` is still tracked and `keyframe_weak_after_s` has
     passed; below half of the share, it is made at once."""
-    keyframe_after_s: Annotated[float, Positive] = 10.0
-    """A keyframe is made when the last one is older than this, seconds."""
     keyframe_weak_after_s: Annotated[float, Positive] = 0.3
     """While tracking is weak or has few points, a keyframe is made when the last one is older than this, seconds."""
     keyframe_policy: Literal["as_needed", "sparing"] = "as_needed"

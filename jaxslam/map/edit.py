@@ -5,7 +5,7 @@ affected. An id that is not in the map raises a `KeyError`, because it is a mist
 """
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64, Int
+from jaxtyping import Bool, Float, Float64, Int, UInt8
 
 from jaxslam.dynamics.occlusion import PointState
 from jaxslam.geometry.se3 import compose, transform
@@ -160,6 +160,21 @@ def with_positions(
         places[:, rows(slam_map.points.ids, point_ids)] = X_world
         slam_map = slam_map._replace(points=slam_map.points._replace(X_world=places))
     return slam_map
+
+
+def with_descriptors(slam_map: Map, point_ids: Int[np.ndarray, " n"], descriptors: UInt8[np.ndarray, "n 32"]) -> Map:
+    """Give descriptors to those of some points that have none.
+
+    Raises:
+        KeyError: If a point is not in the map.
+    """
+    row = rows(slam_map.points.ids, point_ids)
+    new = ~slam_map.points.has_descriptor[row]
+    if not new.any():
+        return slam_map
+    descriptor, has_descriptor = slam_map.points.descriptor.copy(), slam_map.points.has_descriptor.copy()
+    descriptor[row[new]], has_descriptor[row[new]] = descriptors[new], True
+    return slam_map._replace(points=slam_map.points._replace(descriptor=descriptor, has_descriptor=has_descriptor))
 
 
 def with_states(slam_map: Map, point_ids: Int[np.ndarray, " n"], states: Int[np.ndarray, " n"]) -> Map:

@@ -68,7 +68,8 @@ class Observations(NamedTuple):
     Attributes:
         keyframe: `(s,)` ids of the keyframes.
         point: `(s,)` ids of the points.
-        feature: `(s,)` index among the features of the keyframe; `NONE` for a point that was tracked by optical flow.
+        feature: `(s,)` index among the features of the keyframe; `NONE` for a point that was tracked by optical flow to
+            where it has no feature. A tracked point with a feature nearby is measured by flow all the same.
         uv_raw: `(2, s)` measured coordinates in the distorted image, pixels.
         uv: `(2, s)` coordinates in an ideal pinhole image without distortion and rolling shutter, pixels.
         depth: `(s,)` measured depth, meters; 0 where no valid depth was measured.

@@ -4,14 +4,16 @@ Source: Mur-Artal and Tardos, "ORB-SLAM2", 2017, and "ORB-SLAM", 2015, sections 
 """
 
 import numpy as np
+from jaxtyping import Bool, Int
 
 from jaxslam.geometry.types import Ids
 from jaxslam.map.edit import without_points
 from jaxslam.map.keyframe_removal import without_keyframe
-from jaxslam.map.types import NONE, Map, covisible, has, rows
+from jaxslam.map.types import NONE, Map, covisible, has, rows, surviving_keyframes
+from jaxslam.mapping.view_coverage import in_view, seen_alike
 
 CONFIRM_WITHIN = 3
-"""Number of keyframes after which a point must have been observed by others."""
+"""Number of keyframes after which a point must have been observed by others, if they look there."""
 _MIN_VIEWS, _MIN_VIEWS_WITHOUT_DEPTH = 2, 3
 """Minimum number of keyframes that observe a point; one more if none measured its depth, since two rays meet somewhere
 even if matched wrongly."""
@@ -24,7 +26,11 @@ KEEP_LATEST = 12
 
 
 def without_unconfirmed(slam_map: Map, keyframe_id: int) -> Map:
-    """Drop points that too few keyframes have observed some keyframes after their creation.
+    """Drop points that too few keyframes have observed, some keyframes after their creation, where the latest looks.
+
+    ORB-SLAM drops them wherever they are, but makes a keyframe every few frames. Here the next keyframes may be far
+    away: after a person passed before the lens of Bonn's `crowd`, 16 points were found of a map that dropped them, and
+    78 to 94 in one that did not.
 
     Args:
         slam_map: The map, or a part of it.
@@ -35,7 +41,19 @@ def without_unconfirmed(slam_map: Map, keyframe_id: int) -> Map:
     measured = np.bincount(row[slam_map.observations.depth > 0], minlength=len(slam_map.points.ids)) > 0
     enough = seen >= np.where(measured, _MIN_VIEWS, _MIN_VIEWS_WITHOUT_DEPTH)
     old = slam_map.points.reference_keyframe <= keyframe_id - CONFIRM_WITHIN
-    return without_points(slam_map, slam_map.points.ids[(old & ~enough) | (seen < 1)])
+    missed = np.flatnonzero(old & ~enough)
+    missed = missed[_should_be_seen(slam_map, keyframe_id, missed)]
+    leaves = seen < 1
+    leaves[missed] = True
+    return without_points(slam_map, slam_map.points.ids[leaves])
+
+
+def _should_be_seen(slam_map: Map, keyframe_id: int, row: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+    """Tell which points, given by their rows, are in view of a keyframe and seen as they were by their first one."""
+    X_world, now = slam_map.points.X_world[:, row], slam_map.pose(keyframe_id)
+    makers = surviving_keyframes(slam_map, slam_map.points.reference_keyframe[row])
+    then = slam_map.T_world_cam[rows(slam_map.ids, makers), 4:].T
+    return in_view(slam_map.camera, now, X_world) & seen_alike(X_world, then, now[4:, None])
 
 
 def without_redundant(slam_map: Map, keyframe_id: int, among: Ids) -> Map:

@@ -9,9 +9,10 @@ from jaxslam.features.orb import FeaturePlan, Features
 from jaxslam.features.pose_from_matches import FeaturePose, fit_pose, matches_of
 from jaxslam.geometry.se3 import angle, between, compose, to_local
 from jaxslam.geometry.types import Ids, Pose
-from jaxslam.map.types import Map, covisible, rows
+from jaxslam.map.types import Map, covisible, observations_at, rows
 from jaxslam.mapping.map_point_matching import described_points_in, find_points
 from jaxslam.mapping.occlusion_states import PointStates
+from jaxslam.mapping.view_coverage import in_view, seen_alike
 from jaxslam.sensors.sensor_model import SensorModel
 
 LOCAL_KEYFRAMES = 15
@@ -23,16 +24,15 @@ _NEAR_M, _NEAR_RAD = 0.15, 0.15
 _MIN_INLIERS, _MIN_CELLS = 15, 4
 """Minimum number of inliers, and of image cells they cover. Place recognition needs more, because an object may exist
 twice; here the camera pose is known approximately, and a person may leave little of the view."""
-_RADII_PX = (15.0, 5.0)
+RADII_PX = (15.0, 5.0)
 """Search radii around the predicted pixels at octave 0: the first one, and the one once the pose is better known."""
+WIDE_RADII_PX = (45.0, *RADII_PX)
+"""The same where the motion model may be violated: a camera that is shaken changes its velocity within a frame."""
 
+_NEAREST = 64
+"""Number of keyframes, the nearest ones, whose points are looked at: the cost does not grow with the map."""
 _MIN_POINTS = 60
 """Minimum number of its points in view for a keyframe to be used."""
-_MAX_TURN = 0.7
-"""Cosine of the largest angle between the directions from which a point was and is seen."""
-_SCALES = (0.5, 2.0)
-"""Bounds on the ratio of the earlier to the current distance of a point."""
-_MARGIN_PX = 8
 
 
 def local_keyframes(slam_map: Map, keyframe_id: int) -> Ids:
@@ -51,23 +51,19 @@ def keyframes_in_view(slam_map: Map, T_world_cam: Pose, submap: int, exclude: se
         exclude: Ids of keyframes to leave out.
         at_most: Maximum number of keyframes.
     """
-    camera = slam_map.camera
-    X = to_local(T_world_cam, slam_map.points.X_world)
-    z = np.where(X[2] > 0.1, X[2], np.inf)
-    uv = camera.project(np.stack([X[0], X[1], z]))
-    size = np.array([[camera.width], [camera.height]])
-    inside = (X[2] > 0.1) & ((uv > _MARGIN_PX) & (uv < size - _MARGIN_PX)).all(axis=0)
-    row, at = rows(slam_map.points.ids, slam_map.observations.point), rows(slam_map.ids, slam_map.observations.keyframe)
-    shown = np.flatnonzero(inside[row] & (slam_map.submap[at] == submap))
-    now = slam_map.points.X_world[:, row[shown]] - T_world_cam[4:, None]
-    then = slam_map.points.X_world[:, row[shown]] - slam_map.T_world_cam[at[shown], 4:].T
-    near, far = np.linalg.norm(now, axis=0), np.linalg.norm(then, axis=0)
-    alike = (now * then).sum(axis=0) > _MAX_TURN * near * far
-    alike &= (far > _SCALES[0] * near) & (far < _SCALES[1] * near)
-    counts = np.bincount(at[shown[alike]], minlength=len(slam_map.ids))
-    counts[np.isin(slam_map.ids, list(exclude))] = 0
-    order = np.lexsort((slam_map.ids, -counts))[:at_most]
-    return [int(slam_map.ids[index]) for index in order if counts[index] >= _MIN_POINTS]
+    others = np.flatnonzero((slam_map.submap == submap) & ~np.isin(slam_map.ids, list(exclude)))
+    apart = np.linalg.norm(slam_map.T_world_cam[others, 4:] - T_world_cam[4:], axis=1)
+    near = np.sort(others[np.argsort(apart, kind="stable")[:_NEAREST]])
+    of_near = np.zeros(slam_map.next_keyframe, bool)  # by id: searching all observations would take a second
+    of_near[slam_map.ids[near]] = True
+    seen = observations_at(slam_map.observations, np.flatnonzero(of_near[slam_map.observations.keyframe]))
+    X_world = slam_map.points.X_world[:, rows(slam_map.points.ids, seen.point)]
+    at = rows(slam_map.ids[near], seen.keyframe)
+    shown = in_view(slam_map.camera, T_world_cam, X_world)
+    shown &= seen_alike(X_world, slam_map.T_world_cam[near[at], 4:].T, T_world_cam[4:, None])
+    counts = np.bincount(at[shown], minlength=len(near))
+    order = np.lexsort((near, -counts))[:at_most]
+    return [int(slam_map.ids[near[index]]) for index in order if counts[index] >= _MIN_POINTS]
 
 
 def match_local_map(
@@ -78,6 +74,7 @@ def match_local_map(
     sensor: SensorModel,
     plan: FeaturePlan,
     states: PointStates | None = None,
+    radii_px: tuple[float, ...] = RADII_PX,
 ) -> FeaturePose | None:
     """Localize a frame against the local map from an approximate pose; `None` if too few points agree.
 
@@ -89,6 +86,7 @@ def match_local_map(
         sensor: Camera, and the error model of its depth.
         plan: Settings of feature extraction.
         states: Current point states, by which OCCLUDED points get more weight.
+        radii_px: Search radius of each pass around the predicted pixels at octave 0.
 
     Returns:
         The pose in the axes of the keyframe.
@@ -97,9 +95,9 @@ def match_local_map(
     near, at = local_keyframes(slam_map, keyframe_id), compose(origin, T_keyframe_cam)
     submap = int(slam_map.submap[slam_map.row(keyframe_id)])
     in_view = keyframes_in_view(slam_map, at, submap, set(near.tolist()), _IN_VIEW)
-    points = described_points_in(slam_map, np.append(near, np.array(in_view, np.int64)))
+    points = described_points_in(slam_map, np.append(near, np.array(in_view, np.int64)), plan)
     weight = slam_map.points.weight[rows(slam_map.points.ids, points.ids)]
-    for radius_px in _RADII_PX:
+    for radius_px in radii_px:
         expected = compose(origin, T_keyframe_cam)
         index, feature = find_points(slam_map, points, features, expected, plan, radius_px=radius_px)
         X, better_known = to_local(origin, points.X_world[:, index]), np.zeros(len(index))

@@ -24,8 +24,9 @@ from jaxslam.geometry.types import Ids, Pose
 from jaxslam.loop_closing.loop_correction import with_loop_closed
 from jaxslam.loop_closing.loop_detector import LoopClosure
 from jaxslam.map.dynamic_removal import DynamicObservations, without_dynamic, without_dynamic_points
-from jaxslam.map.edit import with_keyframe, with_observations, with_points
+from jaxslam.map.edit import with_descriptors, with_keyframe, with_observations, with_points
 from jaxslam.map.partial_map import PartialMap, extract_around, merge_back, most_shared
+from jaxslam.map.point_fusion import with_fused_points
 from jaxslam.map.types import (
     NONE,
     Keyframe,
@@ -41,7 +42,14 @@ from jaxslam.map.types import (
 from jaxslam.mapping.culling import CONFIRM_WITHIN, without_redundant, without_unconfirmed
 from jaxslam.mapping.local_bundle_adjustment import AdjustPlan, adjust_all, adjust_around, compile_adjustment
 from jaxslam.mapping.local_map_tracking import LOCAL_KEYFRAMES, local_keyframes
-from jaxslam.mapping.map_point_matching import described_points_in, feature_observations, find_points, fuse_duplicates
+from jaxslam.mapping.map_point_matching import (
+    described_points_in,
+    feature_observations,
+    features_at,
+    find_points,
+    fuse_duplicates,
+    points_of_features,
+)
 from jaxslam.mapping.occlusion_states import StateChanges, with_changes
 from jaxslam.mapping.point_creation import new_points, with_triangulated
 from jaxslam.mapping.track_table import TrackId, TrackTable
@@ -177,12 +185,12 @@ class LocalMapping:
         # 2. Extract the part of the map that the keyframe may change.
         known = self._tracks.points(new.tracks.id)
         part = _part(whole, new.id, known[has(whole.points.ids, known)])
-        # 3. Observations of the points tracked by optical flow, which ORB-SLAM does not have.
-        slam_map = self._with_tracks(part.map, new, known)
+        # 3. Observations of the points tracked by optical flow, which ORB-SLAM does not have, at features if there are.
+        slam_map = self._with_tracks(part.map, new, known, features)
         # 4. Matching of the local map by descriptor (V-D), here with the keyframe only and not with every frame.
-        slam_map, taken = self._with_found_points(slam_map, new.id, features)
+        slam_map = self._with_found_points(slam_map, new.id, features)
         # 5. New points: from measured depth (ORB-SLAM2, III), then triangulated with covisible keyframes (VI-C).
-        slam_map = self._with_new_points(slam_map, new.id, features, taken)
+        slam_map = self._with_new_points(slam_map, new.id, features)
         near, _ = covisible(slam_map, new.id)
         near = near[has(part.keyframes, near)]
         slam_map = with_triangulated(slam_map, new.id, near, self._plan.features)
@@ -239,8 +247,11 @@ class LocalMapping:
         self._tracks.mark_removed(movers.tracks, movers.keyframe)
         return slam_map, np.append(TrackId.of_map_points(gone), tracks)
 
-    def _with_tracks(self, slam_map: Map, new: NewKeyframe, known: Ids) -> Map:
-        """Add the observations of tracked points; a track without a map point becomes a new point."""
+    def _with_tracks(self, slam_map: Map, new: NewKeyframe, known: Ids, features: Features) -> Map:
+        """Add the observations of tracked points; a track without a map point becomes a new point.
+
+        A point where the keyframe has a feature takes its descriptor if it has none, so that it can be recognized.
+        """
         tracks = new.tracks
         uv, depth = jax.device_get(
             _ideal(tracks.uv_raw, tracks.X_cam[2].astype(np.float32), new.twist, new.frame, self._sensor)
@@ -260,12 +271,15 @@ class LocalMapping:
             point_submaps(slam_map)[rows(slam_map.points.ids, known[seen])] == slam_map.submap[slam_map.row(new.id)]
         )
         seen = seen[of_submap]
+        feature = features_at(features, tracks.uv_raw[:, seen])
+        shown = feature != NONE
+        slam_map = with_descriptors(slam_map, known[seen[shown]], features.descriptor[feature[shown]])
         return with_observations(
             slam_map,
             Observations(
                 keyframe=np.full(len(seen), new.id, np.int64),
                 point=known[seen],
-                feature=np.full(len(seen), NONE, np.int32),
+                feature=feature,
                 uv_raw=tracks.uv_raw[:, seen],
                 uv=uv[:, seen],
                 depth=depth[seen],
@@ -274,21 +288,29 @@ class LocalMapping:
             ),
         )
 
-    def _with_found_points(self, slam_map: Map, keyframe_id: int, features: Features) -> tuple[Map, Ids]:
-        """Match the points of the local map with a keyframe by descriptor; also return the matched features."""
-        points = described_points_in(slam_map, local_keyframes(slam_map, keyframe_id))
+    def _with_found_points(self, slam_map: Map, keyframe_id: int, features: Features) -> Map:
+        """Match the points of the local map with a keyframe by descriptor, and fuse them with tracked points there."""
         plan = self._plan.features
+        points = described_points_in(slam_map, local_keyframes(slam_map, keyframe_id), plan)
+        seen = slam_map.observations.point[slam_map.observations.keyframe == keyframe_id]
+        points = points.without(seen)
         index, feature = find_points(
             slam_map, points, features, slam_map.pose(keyframe_id), plan, radius_px=self._plan.search_px
         )
-        return with_observations(
-            slam_map, feature_observations(keyframe_id, features, points.ids[index], feature, plan)
-        ), feature
+        found, there = points.ids[index], points_of_features(slam_map, keyframe_id, len(features.octave))[feature]
+        free = there == NONE
+        slam_map = with_observations(
+            slam_map, feature_observations(keyframe_id, features, found[free], feature[free], plan)
+        )
+        drop, first = np.unique(np.maximum(found, there)[~free], return_index=True)
+        keep = np.minimum(found, there)[~free][first]
+        self._tracks.fuse(dict(zip(drop.tolist(), keep.tolist(), strict=True)))
+        return with_fused_points(slam_map, keep, drop)
 
-    def _with_new_points(self, slam_map: Map, keyframe_id: int, features: Features, taken: Ids) -> Map:
-        """Create a point for every unmatched feature with measured depth."""
-        free = np.flatnonzero(features.depth > 0)
-        free = free[~np.isin(free, taken)]
+    def _with_new_points(self, slam_map: Map, keyframe_id: int, features: Features) -> Map:
+        """Create a point for every feature with measured depth that shows no point yet."""
+        taken = points_of_features(slam_map, keyframe_id, len(features.octave)) != NONE
+        free = np.flatnonzero((features.depth > 0) & ~taken)
         uv, depth = features.uv[:, free].astype(np.float64), features.depth[free].astype(np.float64)
         X_cam = slam_map.camera.back_project(uv, depth)
         points = new_points(

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int, Int64, UInt8
+from jaxtyping import Float32, Float64, Int, Int32, Int64, UInt8
 
 from jaxslam.features.matching import NEAR, match_by_projection
 from jaxslam.features.orb import FeaturePlan, Features
@@ -15,6 +15,8 @@ from jaxslam.map.types import NONE, Map, Observations, empty_observations, obser
 
 _MARGIN_PX = 1.0
 _NEAREST_M = 0.1
+_SAME_PX = 2.0
+"""Largest distance of a tracked point from the feature that shows it."""
 _MAX_DEPTH_ERROR = 0.1
 """Largest difference between the depth of a point and the depth measured at a feature, as a share of the former."""
 
@@ -35,9 +37,14 @@ class DescribedPoints(NamedTuple):
     descriptor: UInt8[np.ndarray, "r 32"]
     size: Float64[np.ndarray, " r"]
 
+    def without(self, point_ids: Ids) -> "DescribedPoints":
+        """Return the points but for those with these ids."""
+        stays = ~np.isin(self.ids, point_ids)
+        return DescribedPoints(self.ids[stays], self.X_world[:, stays], self.descriptor[stays], self.size[stays])
 
-def described_points_in(slam_map: Map, keyframe_ids: Ids) -> DescribedPoints:
-    """Return the points with a descriptor that these keyframes observe."""
+
+def described_points_in(slam_map: Map, keyframe_ids: Ids, plan: FeaturePlan) -> DescribedPoints:
+    """Return the points with a descriptor that these keyframes observe at a feature."""
     seen = np.flatnonzero(
         np.isin(slam_map.observations.keyframe, keyframe_ids) & (slam_map.observations.feature != NONE)
     )
@@ -53,8 +60,50 @@ def described_points_in(slam_map: Map, keyframe_ids: Ids) -> DescribedPoints:
         ids[with_descriptor],
         X_world[:, with_descriptor],
         slam_map.points.descriptor[row[with_descriptor]],
-        (slam_map.observations.sigma_px[seen] * distance)[with_descriptor],
+        (plan.scale(_octaves(slam_map, seen)) * distance)[with_descriptor],
     )
+
+
+def _octaves(slam_map: Map, rows_of: Int[np.ndarray, " n"]) -> UInt8[np.ndarray, " n"]:
+    """Return the octave of the feature of each of some observations."""
+    owner, feature = slam_map.observations.keyframe[rows_of], slam_map.observations.feature[rows_of]
+    octave = np.zeros(len(rows_of), np.uint8)
+    for keyframe_id in np.unique(owner).tolist():
+        mine = owner == keyframe_id
+        octave[mine] = slam_map.keyframe(keyframe_id).features.octave[feature[mine]]
+    return octave
+
+
+def features_at(features: Features, uv_raw: Float32[np.ndarray, "2 n"]) -> Int32[np.ndarray, " n"]:
+    """Return the feature that shows each tracked point: the nearest one, at most once; `NONE` where none is near.
+
+    Args:
+        features: Features of the keyframe.
+        uv_raw: Positions of the points in its distorted image, pixels.
+    """
+    nothing = np.full(uv_raw.shape[1], NONE, np.int32)
+    if not (uv_raw.shape[1] and len(features.octave)):
+        return nothing
+    apart = np.square(uv_raw[:, :, None] - features.uv_raw[:, None, :]).sum(axis=0)
+    nearest = apart.argmin(axis=1)
+    apart = apart[np.arange(len(nearest)), nearest]
+    order = np.lexsort((apart, nearest))
+    _, first = np.unique(nearest[order], return_index=True)
+    chosen = order[first]
+    chosen = chosen[apart[chosen] < _SAME_PX**2]
+    nothing[chosen] = nearest[chosen]
+    return nothing
+
+
+def points_of_features(slam_map: Map, keyframe_id: int, num_features: int) -> Int64[np.ndarray, " f"]:
+    """Return the id of the point that each feature of a keyframe shows; `NONE` for a feature that shows none."""
+    seen = observations_at(
+        slam_map.observations,
+        np.flatnonzero((slam_map.observations.keyframe == keyframe_id) & (slam_map.observations.feature != NONE)),
+    )
+    points = np.full(num_features, NONE, np.int64)
+    points[seen.feature] = seen.point
+    return points
 
 
 def find_points(
@@ -140,20 +189,14 @@ def fuse_duplicates(
     Returns:
         The map, and the fused points: the ids kept, and for each the id dropped.
     """
-    points = described_points_in(slam_map, np.array([keyframe_id]))
+    points = described_points_in(slam_map, np.array([keyframe_id]), plan)
     kept, dropped, new = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [empty_observations()]
     for neighbor in neighbors.tolist():
         features = slam_map.keyframe(neighbor).features
-        seen = observations_at(slam_map.observations, np.flatnonzero(slam_map.observations.keyframe == neighbor))
-        unseen = ~np.isin(points.ids, seen.point)
-        wanted = DescribedPoints(
-            points.ids[unseen], points.X_world[:, unseen], points.descriptor[unseen], points.size[unseen]
-        )
+        wanted = points.without(slam_map.observations.point[slam_map.observations.keyframe == neighbor])
         index, feature = find_points(slam_map, wanted, features, slam_map.pose(neighbor), plan, radius_px=radius_px)
-        point_at = np.full(len(features.octave), NONE, np.int64)
-        by_feature = seen.feature != NONE
-        point_at[seen.feature[by_feature]] = seen.point[by_feature]
-        there, mine = point_at[feature], wanted.ids[index]
+        there = points_of_features(slam_map, neighbor, len(features.octave))[feature]
+        mine = wanted.ids[index]
         free = there == NONE
         new.append(feature_observations(neighbor, features, mine[free], feature[free], plan))
         kept.append(np.minimum(there, mine)[~free])

@@ -17,7 +17,8 @@ class TrackId:
     """Codec of the ids that the tracker gives to points.
 
     A point that the tracker detected itself has an id of 0 or more. A map point that it got with a reloaded keyframe
-    has the negative id `-1 - point`, so that neither is mistaken for the other.
+    has the negative id `-1 - point`, so that neither is mistaken for the other. It keeps that id while it is tracked,
+    even if the map point is fused with another one.
     """
 
     @staticmethod
@@ -43,12 +44,13 @@ class TrackTable:
         """Start with no tracks."""
         self._point_of: dict[int, int] = {}
         self._last_keyframe: dict[int, int] = {}
+        self._latest = NONE
 
     def points(self, tracks: Int[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
         """Look up the map points of tracks; `NONE` for a new track and `REMOVED` for one that must not become one."""
-        own = (self._point_of.get(track, NONE) for track in tracks.tolist())
-        points = np.fromiter(own, np.int64, len(tracks))
-        return np.where(TrackId.is_map_point(tracks), TrackId.map_points(tracks), points)
+        unless_known = np.where(TrackId.is_map_point(tracks), TrackId.map_points(tracks), NONE)
+        pairs = zip(tracks.tolist(), unless_known.tolist(), strict=True)
+        return np.fromiter((self._point_of.get(track, point) for track, point in pairs), np.int64, len(tracks))
 
     def tracks_of(self, points: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " m"]:
         """List the tracks whose map point is one of `points`."""
@@ -61,6 +63,7 @@ class TrackTable:
 
     def observed(self, tracks: Int[np.ndarray, " n"], keyframe: int) -> None:
         """Record that tracks were observed in a keyframe."""
+        self._latest = keyframe
         self._last_keyframe.update(dict.fromkeys(tracks.tolist(), keyframe))
 
     def mark_removed(self, tracks: Int[np.ndarray, " n"], keyframe: int) -> None:
@@ -71,6 +74,10 @@ class TrackTable:
 
     def fuse(self, into: Mapping[int, int]) -> None:
         """Follow map points that were fused: each key of `into` has become its value, which may be a key as well."""
+        gone = np.fromiter(into, np.int64, len(into))
+        for track, point in zip(TrackId.of_map_points(gone).tolist(), gone.tolist(), strict=True):
+            self._point_of.setdefault(track, point)
+            self._last_keyframe.setdefault(track, self._latest)
         for track, point in self._point_of.items() if into else ():
             while point in into:
                 point = into[point]  # noqa: PLW2901 - one may have been fused with a third

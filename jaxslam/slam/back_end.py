@@ -23,6 +23,7 @@ from jaxslam.map.dynamic_removal import DynamicObservations
 from jaxslam.map.types import NONE, Map, empty_map
 from jaxslam.mapping.local_mapping import mapping_plan
 from jaxslam.mapping.occlusion_states import PointStates
+from jaxslam.mapping.view_coverage import ViewCoverage
 from jaxslam.runtime.preload import import_scipy
 from jaxslam.runtime.stage_timer import StageTimes
 from jaxslam.runtime.worker import Worker, close_all, make_worker
@@ -39,10 +40,11 @@ from jaxslam.slam.place_jobs import IndexUpdate, LoopSearch, PlaceJob, PlaceResu
 from jaxslam.slam.reload_queue import ReloadQueue
 from jaxslam.slam.tracker import KeyframeDemand
 from jaxslam.slam.tracker_map_sync import AnchoredPose, TrackerMapSync, pose_of, tracks_of
+from jaxslam.tracking.from_config import with_dense_keyframes
 from jaxslam.tracking.state import TrackOutput, TrackPlan, TrackState, TrackStatus
 
-_RECALL_EVERY = 10
-"""Number of frames after which a tracker that only localizes requests keyframes of its surroundings."""
+_RELOAD_EVERY = 10
+"""Number of frames after which keyframes of the surroundings are requested again."""
 _Step: TypeAlias = Callable[[], None]
 _MAX_ON_THE_WAY = 2
 """Number of keyframes: one that mapping works on, and one whose result waits for the next `update`."""
@@ -53,6 +55,7 @@ class BackEnd:
 
     Attributes:
         dense: Thread of the dense map; `None` without `dense.enabled`, or with `localize_only`.
+        map_views: Number of keyframes of the map that show what the latest tracked frame does.
     """
 
     def __init__(
@@ -101,6 +104,7 @@ class BackEnd:
         self._states = PointStates(occlusion, sensor, start, most) if occlusion.enabled else None
         self._localizer = FrameLocalizer(sensor, self._plan.features, self._link, self._index, self._states)
         self._arrived: Map | None = None
+        self._coverage, self.map_views = ViewCoverage(with_dense_keyframes(config).keyframe_below), 0
         self._reloads = ReloadQueue(self._link, points_may_leave=self._semantics is not None)
         self._correction = IDENTITY
         self._gone: list[np.ndarray] = []  # track ids of points that the tracker must drop
@@ -262,7 +266,7 @@ class BackEnd:
         self._link.set_reference_keyframe(recognized.keyframe)
         pose = self._link.pose(recognized)
         state = self._link.reset_at_pose(state, pose, twist)
-        self._reloads.replace(self._searches.reload(Reload(self.map, pose, self._link.submap_now(), frozenset())))
+        self._reloads.replace(self._searches.reload(Reload(self.map, pose, self._link.submap_now())).keyframes)
         return self._reloads.load_all(state)
 
     def start_submap(self, state: TrackState, T_world_cam: Pose) -> TrackState:
@@ -271,8 +275,15 @@ class BackEnd:
         return self._link.reset_at_pose(state, T_world_cam, np.zeros(6))
 
     def frame_tracked(self, T_world_cam: Pose, frame: int) -> None:
-        """Request keyframes of the surroundings at intervals, if no new keyframes are made that request them."""
-        if self._localize_only and frame % _RECALL_EVERY == 0:
+        """Count the keyframes that show the view, and request those around at intervals.
+
+        Args:
+            T_world_cam: `(7,)` pose of the frame.
+            frame: Number of the frame.
+        """
+        if not self._localize_only:
+            self.map_views = self._coverage.num_views(self.map, T_world_cam, self._link.submap_now())
+        if frame % _RELOAD_EVERY == 0:
             self._request_reload(T_world_cam, frame)
 
     def anchor(self, T_world_cam: Pose) -> AnchoredPose:
@@ -402,10 +413,10 @@ class BackEnd:
             if isinstance(result, LoopClosure):
                 if not self._closed:
                     self._to_mapping.submit(result, frame)
-            elif result:
-                self._reloads.replace(result)
+            elif result is not None:
+                self._reloads.replace(result.keyframes, result.loaded)
 
     def _request_reload(self, T_world_cam: Pose, frame: int) -> None:
         if self._track_plan.num_reloaded and self._link.reference != NONE:
-            known = frozenset(self._link.latest())
-            self._to_places.submit(Reload(self.map, T_world_cam, self._link.submap_now(), known), frame)
+            held = frozenset(self._link.latest()), frozenset(self._link.loaded())
+            self._to_places.submit(Reload(self.map, T_world_cam, self._link.submap_now(), *held), frame)

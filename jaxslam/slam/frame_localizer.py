@@ -11,7 +11,7 @@ from jaxslam.geometry.se3 import compose, inverse, transform
 from jaxslam.geometry.types import Pose
 from jaxslam.loop_closing.place_index import PlaceIndex
 from jaxslam.loop_closing.place_recognition import recognize
-from jaxslam.mapping.local_map_tracking import match_local_map
+from jaxslam.mapping.local_map_tracking import RADII_PX, WIDE_RADII_PX, match_local_map
 from jaxslam.mapping.occlusion_states import PointStates
 from jaxslam.sensors.frame_arrays import FrameArrays
 from jaxslam.sensors.sensor_model import SensorModel
@@ -113,7 +113,7 @@ class FrameLocalizer:
         return state, _output_at_pose(output, T_world_cam, change, localized, weak_inliers), localized.num_matched
 
     def relocalize(self, arrays: FrameArrays, predicted: Pose | None) -> tuple[LocalizedPose | None, bool]:
-        """Localize a lost frame: against the local map at the predicted pose, else by place recognition.
+        """Localize a lost frame: near the predicted pose in the local map, then in a wider search, else by its place.
 
         Args:
             arrays: The frame.
@@ -123,9 +123,10 @@ class FrameLocalizer:
             The pose, or `None`; and whether place recognition searched the whole map and found no such place.
         """
         features = features_of(arrays, np.zeros(6, np.float32), self._sensor, self._plan)
-        near = None if predicted is None else self._in_local_map(features, predicted)
-        if near is not None:
-            return near, False
+        for radii_px in () if predicted is None else (RADII_PX, WIDE_RADII_PX):
+            near = self._in_local_map(features, predicted, radii_px)
+            if near is not None:
+                return near, False
         if np.count_nonzero(features.depth) < MIN_INLIERS:
             return None, False
         if not self._index.lock.acquire(timeout=_PATIENCE_S):
@@ -139,13 +140,22 @@ class FrameLocalizer:
         anchored = AnchoredPose(found.keyframe, found.T_keyframe_cam)
         return LocalizedPose(anchored, found.num_inliers, found.covariance), False
 
-    def _in_local_map(self, features: Features, T_world_cam: Pose) -> LocalizedPose | None:
+    def _in_local_map(
+        self, features: Features, T_world_cam: Pose, radii_px: tuple[float, ...] = RADII_PX
+    ) -> LocalizedPose | None:
         """Localize a frame against the local map from an approximate pose; `None` if too few points agree."""
         about = self._link.in_map(T_world_cam)
         if about is None:
             return None
         found = match_local_map(
-            self._link.map, about.keyframe, about.T_keyframe_cam, features, self._sensor, self._plan, self._states
+            self._link.map,
+            about.keyframe,
+            about.T_keyframe_cam,
+            features,
+            self._sensor,
+            self._plan,
+            self._states,
+            radii_px,
         )
         if found is None:
             return None

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from jaxslam.geometry.se3 import to_local
-from jaxslam.map.types import NONE, Map, observations_at, rows
+from jaxslam.map.types import Map, observations_at, rows
 from jaxslam.mapping.track_table import TrackId
 from jaxslam.runtime.padding import padded
 
@@ -36,7 +36,7 @@ class MapKeyframe(NamedTuple):
 
 
 def reload_keyframe(slam_map: Map, keyframe_id: int, num_points: int) -> MapKeyframe:
-    """A keyframe of the map for the tracker, with its points, those that were followed first.
+    """A keyframe of the map for the tracker, with its points, the most exact ones first.
 
     Raises:
         RuntimeError: If its image cannot be decoded.
@@ -46,7 +46,7 @@ def reload_keyframe(slam_map: Map, keyframe_id: int, num_points: int) -> MapKeyf
     if image is None:
         raise RuntimeError(f"the image of keyframe {keyframe_id} cannot be decoded")
     seen = observations_at(slam_map.observations, np.flatnonzero(slam_map.observations.keyframe == keyframe_id))
-    order = np.lexsort((seen.point, seen.feature != NONE))[:num_points]
+    order = np.lexsort((seen.point, seen.sigma_px))[:num_points]
     seen = observations_at(seen, order)
     X_world = slam_map.points.X_world[:, rows(slam_map.points.ids, seen.point)]
     weight = seen.weight * slam_map.points.weight[rows(slam_map.points.ids, seen.point)]

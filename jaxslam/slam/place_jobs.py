@@ -29,13 +29,27 @@ class Reload(NamedTuple):
         map: Map with the keyframes.
         T_world_cam: `(7,)` pose of the camera.
         submap: Number of the submap that the camera is in.
-        known: Ids of the keyframes that the tracker already holds.
+        latest: Ids of the keyframes in the tracker's ring, which are left out.
+        loaded: Ids of the keyframes that are loaded into the tracker: they need not be prepared again.
     """
 
     map: Map
     T_world_cam: Pose
     submap: int
-    known: frozenset[int]
+    latest: frozenset[int] = frozenset()
+    loaded: frozenset[int] = frozenset()
+
+
+class Surroundings(NamedTuple):
+    """Keyframes of the map that best cover the camera's view.
+
+    Attributes:
+        loaded: Ids of those that are loaded into the tracker, and stay.
+        keyframes: Those to load, best first.
+    """
+
+    loaded: frozenset[int]
+    keyframes: tuple[MapKeyframe, ...]
 
 
 class IndexUpdate(NamedTuple):
@@ -51,8 +65,8 @@ class IndexUpdate(NamedTuple):
 
 
 PlaceJob: TypeAlias = LoopSearch | Reload | IndexUpdate
-PlaceResult: TypeAlias = LoopClosure | tuple[MapKeyframe, ...] | None
-"""A loop, or reloaded keyframes; `None` if there are none."""
+PlaceResult: TypeAlias = LoopClosure | Surroundings | None
+"""A loop, or keyframes for the tracker; `None` if there is no loop."""
 
 
 class PlaceSearch:
@@ -75,7 +89,9 @@ class PlaceSearch:
             return self._loops.replace(job.map, job.keyframe)
         return self.reload(job)
 
-    def reload(self, job: Reload) -> tuple[MapKeyframe, ...]:
+    def reload(self, job: Reload) -> Surroundings:
         """Return the keyframes that best cover the camera's view, at most `num_reloaded` of the plan."""
-        wanted = keyframes_in_view(job.map, job.T_world_cam, job.submap, set(job.known), self._plan.num_reloaded)
-        return tuple(reload_keyframe(job.map, keyframe_id, self._plan.num_points) for keyframe_id in wanted)
+        wanted = keyframes_in_view(job.map, job.T_world_cam, job.submap, set(job.latest), self._plan.num_reloaded)
+        new = (keyframe_id for keyframe_id in wanted if keyframe_id not in job.loaded)
+        prepared = tuple(reload_keyframe(job.map, keyframe_id, self._plan.num_points) for keyframe_id in new)
+        return Surroundings(job.loaded.intersection(wanted), prepared)

@@ -1,6 +1,6 @@
 """Keyframes of the map that wait to be loaded into the tracker."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Set
 
 import numpy as np
 
@@ -26,10 +26,15 @@ class ReloadQueue:
         self._waiting: list[MapKeyframe] = []
         self._wanted: set[int] = set()
 
-    def replace(self, keyframes: Iterable[MapKeyframe]) -> None:
-        """Load these keyframes from now on, instead of those that still wait."""
+    def replace(self, keyframes: Iterable[MapKeyframe], stay: Set[int] = frozenset()) -> None:
+        """Load these keyframes from now on, instead of those that still wait.
+
+        Args:
+            keyframes: Keyframes to load, best first.
+            stay: Ids of keyframes that are loaded, and must not make room for them.
+        """
         self._waiting = list(keyframes)
-        self._wanted = {keyframe.keyframe for keyframe in self._waiting}
+        self._wanted = {keyframe.keyframe for keyframe in self._waiting} | stay
 
     def load_next(self, state: TrackState) -> TrackState:
         """Return the state of the tracker with the next keyframe loaded that is not loaded yet."""

@@ -209,7 +209,7 @@ class Slam:
         watch.ends("wait for mask")
 
         # 4. Pose: dynamic cues, RANSAC PnP and refinement; what was found moving joins the mask.
-        output = self._tracker.advance(arrays, flow, self._back.keyframe_demand)
+        output = self._tracker.advance(arrays, flow, self._back.keyframe_demand, self._back.map_views)
         arrays, mask = self._masks.exclude_moving(arrays, mask, flow, output)
         watch.ends("pose")
 

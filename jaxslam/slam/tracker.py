@@ -121,17 +121,22 @@ class Tracker:
         """Follow the points of the state into a frame by optical flow."""
         return _follow_points(self.state, frame, self.params, self.plan)
 
-    def advance(self, frame: FrameArrays, followed: FlowResult, demand: KeyframeDemand) -> TrackOutput:
+    def advance(
+        self, frame: FrameArrays, followed: FlowResult, demand: KeyframeDemand, map_views: int = 0
+    ) -> TrackOutput:
         """Estimate the pose of a frame and update the state.
 
         Args:
             frame: The frame.
             followed: Result of `follow` for it.
             demand: How much the maps want this frame to be a keyframe.
+            map_views: Number of keyframes of the map that show the view.
 
         Returns:
             Output of the tracker, in NumPy arrays.
         """
         params = self._params_for[demand]
+        if demand is not KeyframeDemand.NOW:
+            params = params._replace(map_views=np.float32(map_views))
         self.state, output = _track_followed(self.state, frame, followed, params, self.plan)
         return jax.tree.map(np.asarray, output)  # as `device_get`, in a tenth of its time

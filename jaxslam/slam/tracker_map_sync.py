@@ -205,6 +205,10 @@ class TrackerMapSync:
         """The keyframes in the tracker's ring."""
         return [id for id in self._slots[: self._plan.num_keyframes] if id != NONE]
 
+    def loaded(self) -> list[int]:
+        """The keyframes loaded from the map."""
+        return [id for id in self._slots[self._plan.num_keyframes :] if id != NONE]
+
     def slot_for(self, keyframe_id: int, keep: set[int]) -> int | None:
         """Choose a slot, not among those to keep, for a reloaded keyframe; `None` if it is loaded already or gone."""
         if keyframe_id in self._slots or not knows(self.map, keyframe_id):

@@ -117,6 +117,7 @@ def _ending(step: StepContext, estimate: FrameEstimate, motion: _Motion) -> _End
         points=kept.points,
         tracked=kept.tracked,
         overlap=estimate.matches.overlap,
+        recognized=_recognized_share(estimate.matches),
         lost=outcome.lost,
         weak=outcome.weak,
         started=motion.start,
@@ -132,6 +133,12 @@ def _ending(step: StepContext, estimate: FrameEstimate, motion: _Motion) -> _End
     keyframe = keyframe_reason(state, candidate._replace(started=started), params, plan)
     at_rest = estimate.rejection.at_rest(points.uv)
     return _Ending(points, at_rest, started, reason, keyframe, candidate.since_keyframe_s)
+
+
+def _recognized_share(matches: KeyframeMatches) -> Scalar:
+    """Return the share of the keyframe points looked for that were matched."""
+    num_matched = jnp.sum(matches.weight > 0, dtype=matches.overlap.dtype)
+    return num_matched / jnp.maximum(matches.num_sought, 1)
 
 
 def _movable_share(step: StepContext) -> Scalar:

@@ -8,12 +8,18 @@ from jaxslam_kernels.robust import weighted_median
 from jaxslam_kernels.scene_flow import flow_length
 from jaxslam_kernels.se3 import to_camera
 from jaxslam_kernels.types import Code, Flag, Mask, Scalar
+from jaxtyping import Array, Float
 
 from jaxslam.tracking.points import KeyframeRing, TrackedPoints
 from jaxslam.tracking.state import KeyframeReason, TrackParams, TrackPlan, TrackState, code
 
 _MIN_OVERLAP = 0.25
 """Smallest share of the minimum interval between keyframes that is waited when nothing overlaps the last keyframe."""
+
+
+_RECOGNIZED, _MORE_VIEWS = 0.05, 4.0
+"""Share of the keyframe points looked for that are found, below which a view is hardly recognized: in a crowd, in
+blurred images, in another light. Then so many times more keyframes may show it."""
 
 
 class KeyframeCandidate(NamedTuple):
@@ -23,7 +29,8 @@ class KeyframeCandidate(NamedTuple):
         T_world_cam: Pose of the frame.
         points: Points tracked in the frame.
         tracked: `(n,)` mask of the static points that were tracked from the previous frame.
-        overlap: Largest share of a keyframe's points that are in view.
+        overlap: `(k,)` share of each keyframe's points that are in view.
+        recognized: Share of the keyframe points looked for that were matched.
         lost: Whether tracking was lost in the frame.
         weak: Whether tracking was weak in the frame.
         started: Whether tracking starts in the frame.
@@ -34,7 +41,8 @@ class KeyframeCandidate(NamedTuple):
     T_world_cam: SE3
     points: TrackedPoints
     tracked: Mask
-    overlap: Scalar
+    overlap: Float[Array, " k"]
+    recognized: Scalar
     lost: Flag
     weak: Flag
     started: Flag
@@ -48,16 +56,19 @@ def keyframe_reason(state: TrackState, frame: KeyframeCandidate, params: TrackPa
     old = frame.tracked & (frame.points.age > state.since_keyframe)
     num_kept = jnp.sum(frame.tracked, dtype=since_s.dtype)
     share = jnp.sum(old, dtype=since_s.dtype) / jnp.maximum(num_kept, 1)
+    # Of the tracker's keyframes, some may not be in the map yet; of the map's, most are not in the tracker.
+    views_held = jnp.sum(frame.overlap >= params.keyframe_below, dtype=since_s.dtype)
+    views = jnp.maximum(views_held, params.map_views)
+    well_known = views >= params.keyframe_views * jnp.where(frame.recognized < _RECOGNIZED, _MORE_VIEWS, 1)
     tracked = ~frame.lost
     enough = params.keyframe_points_below * num_points
     few, hardly_any = tracked & (num_kept < enough), num_kept < 0.5 * enough
     weak_for_long = since_s > params.keyframe_weak_after_s
     causes = (
-        (tracked & (frame.overlap < params.keyframe_below), KeyframeReason.NEW_AREA),
-        (tracked & (share < params.keyframe_followed_below), KeyframeReason.FEW_FOLLOWED),
+        (tracked & (views_held < 1) & ~well_known, KeyframeReason.NEW_AREA),
+        (tracked & (share < params.keyframe_followed_below) & ~well_known, KeyframeReason.FEW_FOLLOWED),
         (few & (hardly_any | weak_for_long), KeyframeReason.FEW_POINTS),
         (frame.weak & weak_for_long, KeyframeReason.WEAK),
-        (tracked & (since_s > params.keyframe_after_s), KeyframeReason.TIME),
     )
     may = (
         jnp.ones((), bool)
@@ -76,7 +87,7 @@ def _adds_information(keyframes: KeyframeRing, frame: KeyframeCandidate, params:
     It must not follow the last keyframe too soon (the interval shrinks with the overlap), the camera must have moved
     relative to the points, and the image must not be largely movable, unless that lasts.
     """
-    left = frame.overlap / jnp.maximum(params.keyframe_below, 1e-3)
+    left = jnp.max(frame.overlap) / jnp.maximum(params.keyframe_below, 1e-3)
     interval_s = params.keyframe_min_s * jnp.clip(left, _MIN_OVERLAP, 1)
     due = frame.since_keyframe_s >= interval_s
     crowded = frame.movable > params.keyframe_movable_below

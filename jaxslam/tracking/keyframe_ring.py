@@ -8,7 +8,7 @@ from jaxslam_kernels.camera import Intrinsics
 from jaxslam_kernels.depth.sampling import sample_depth
 from jaxslam_kernels.flow.patch_align import align_patches
 from jaxslam_kernels.se3 import rotation_matrix, to_camera
-from jaxslam_kernels.types import Mask, Pixels, Points, Scalar, Weights
+from jaxslam_kernels.types import Mask, Pixels, Points, Weights
 from jaxtyping import Array, Bool, Float, Int, Num
 
 from jaxslam.geometry.se3 import IDENTITY
@@ -60,7 +60,7 @@ def align_keyframe_points(step: StepContext, T_world_cam: SE3, twist: Float[Arra
     inside = _visible(predicted, X_cam[2], height, width).reshape(k, n)
     visible = inside & _similar_views(keyframes, T_world_cam) & valid
     shown = jnp.sum(visible, axis=1)
-    overlap = jnp.max((shown / jnp.maximum(jnp.sum(valid, axis=1), 1)).astype(predicted.dtype))
+    overlap = (shown / jnp.maximum(jnp.sum(valid, axis=1), 1)).astype(predicted.dtype)
     if plan.num_sources == 0:
         return _no_matches(overlap, keyframes)
     # 2. Some of the keyframes that share most of them with the frame, unless something covers them.
@@ -87,7 +87,8 @@ def align_keyframe_points(step: StepContext, T_world_cam: SE3, twist: Float[Arra
     shift = jnp.sum(jnp.square(match.points - guess), axis=0)
     found = match.converged & (match.correlation > params.min_correlation) & (shift < _MAX_SHIFT_PX**2)
     weight = jnp.where(found, take(keyframes.weight.reshape(-1)), 0)
-    return KeyframeMatches(X_world, match.points, weight, take(keyframes.id.reshape(-1)), overlap)
+    num_sought = jnp.sum(real, dtype=overlap.dtype)
+    return KeyframeMatches(X_world, match.points, weight, take(keyframes.id.reshape(-1)), overlap, num_sought)
 
 
 def _chosen(visible: Bool[Array, "k n"], shown: Int[Array, " k"], plan: TrackPlan) -> tuple[Int[Array, " m"], Mask]:
@@ -101,10 +102,10 @@ def _chosen(visible: Bool[Array, "k n"], shown: Int[Array, " k"], plan: TrackPla
     return index.reshape(-1), (from_last > 0).reshape(-1)
 
 
-def _no_matches(overlap: Scalar, keyframes: KeyframeRing) -> KeyframeMatches:
+def _no_matches(overlap: Float[Array, " k"], keyframes: KeyframeRing) -> KeyframeMatches:
     none = lambda like, rows: jnp.zeros((*rows, 0), like.dtype)
     found = none(keyframes.X_world, (3,)), none(keyframes.uv, (2,)), none(keyframes.weight, ()), none(keyframes.id, ())
-    return KeyframeMatches(*found, overlap)
+    return KeyframeMatches(*found, overlap, jnp.zeros((), overlap.dtype))
 
 
 def _visible(uv: Pixels, depth: Weights, height: int, width: int) -> Mask:

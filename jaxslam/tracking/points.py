@@ -89,11 +89,13 @@ class KeyframeMatches(NamedTuple):
         uv: `(2, n)` positions in the frame, pixels.
         weight: `(n,)` weights of the matches; 0 for a point without a match.
         id: `(n,)` ids of the points.
-        overlap: Largest share of a keyframe's points that are in view.
+        overlap: `(k,)` share of each keyframe's points that are in view.
+        num_sought: Number of keyframe points that were looked for in the frame.
     """
 
     X_world: Points
     uv: Pixels
     weight: Weights
     id: Int[Array, " n"]
-    overlap: Scalar
+    overlap: Float[Array, " k"]
+    num_sought: Scalar

@@ -47,14 +47,12 @@ class KeyframeReason(enum.IntEnum):
     STARTED = 1
     """Tracking starts in this frame."""
     NEW_AREA = 2
-    """No keyframe overlaps the view enough."""
+    """No keyframe that the tracker holds shows enough of the view, and few of the map do."""
     FEW_FOLLOWED = 3
-    """Few of the tracked points were tracked at the last keyframe."""
+    """Few of the tracked points were tracked at the last keyframe, and few keyframes show the view."""
     WEAK = 4
     """Tracking is weak and needs more points."""
-    TIME = 5
-    """The last keyframe was long ago."""
-    FEW_POINTS = 6
+    FEW_POINTS = 5
     """Few points are still tracked."""
 
 
@@ -201,12 +199,16 @@ class TrackParams(NamedTuple):
         weak_inliers: Number of inliers below which the status is `WEAK`.
         min_share: Smallest share of the tracked points that are inliers of the pose.
         detect_below: Share of the capacity below which new points are detected.
-        keyframe_below: Share of a keyframe's points in view. A keyframe is made if no keyframe has more (`NEW_AREA`).
+        keyframe_below: Share of a keyframe's points in view from which on it shows the view. A keyframe is made if none
+            does that the tracker holds (`NEW_AREA`), unless `keyframe_views` keyframes of the map do.
         keyframe_followed_below: Share of the tracked points. A keyframe is made if fewer of them were tracked at the
-            last keyframe (`FEW_FOLLOWED`).
+            last keyframe (`FEW_FOLLOWED`), unless `keyframe_views` keyframes show the view.
+        keyframe_views: Number of keyframes that show a view from which on another one is no news; four times as many
+            where hardly a point of them is found.
+        map_views: Number of keyframes of a map that show the view. Those that the state itself holds are counted by the
+            tracker: this is for maps with more, and 0 without one.
         keyframe_points_below: Share of the capacity. A keyframe is made if fewer points are still tracked
             (`FEW_POINTS`); right after a keyframe, half this share.
-        keyframe_after_s: Time after which the next keyframe is made in any case (`TIME`), seconds.
         keyframe_weak_after_s: Time after which the next keyframe is made while tracking is weak (`WEAK`) or has few
             points, seconds.
         keyframe_min_s: Shortest time between keyframes with the `sparing` policy, seconds.
@@ -237,8 +239,9 @@ class TrackParams(NamedTuple):
     detect_below: Scalar
     keyframe_below: Scalar
     keyframe_followed_below: Scalar
+    keyframe_views: Scalar
+    map_views: Scalar
     keyframe_points_below: Scalar
-    keyframe_after_s: Scalar
     keyframe_weak_after_s: Scalar
     keyframe_min_s: Scalar
     keyframe_motion: Scalar

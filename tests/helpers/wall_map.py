@@ -16,7 +16,10 @@ def at(x: float = 0.0, z: float = 0.0, turn: float = 0.0) -> np.ndarray:
 
 
 def seen_from(poses: list[np.ndarray], shown: list[int], submaps: list[int] | None = None) -> Map:
-    """A wall of points two meters ahead of the origin, in keyframes that each show so many of them."""
+    """Make a map of a wall two meters ahead of the origin whose keyframes each show a number of its points.
+
+    Every second point is tracked by optical flow.
+    """
     rng = np.random.default_rng(0)
     made = empty_map(CAMERA)
     submaps = [0] * len(poses) if submaps is None else submaps
@@ -35,7 +38,9 @@ def seen_from(poses: list[np.ndarray], shown: list[int], submaps: list[int] | No
         for number in np.flatnonzero(np.array(submaps) == submap):
             some = ids[: shown[number]]
             by_feature = np.where(np.arange(len(some)) % 2, NONE, np.arange(len(some)))
-            made = with_observations(made, observations(made, np.full(len(some), number), some, by_feature, rng))
+            seen = observations(made, np.full(len(some), number), some, by_feature, rng)
+            by_flow = np.where(by_feature == NONE, np.float32(0.3), np.float32(1.0))
+            made = with_observations(made, seen._replace(sigma_px=by_flow))
     return made
 
 

@@ -2,6 +2,7 @@
 
 import functools
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,13 @@ from jaxslam.features.orb import Features, features_of
 from jaxslam.features.pose_from_matches import MIN_CELLS
 from jaxslam.geometry.se3 import IDENTITY, angle, between, compose, inverse, retract
 from jaxslam.map.types import Map, empty_map, observations_at
-from jaxslam.mapping.local_map_tracking import keyframes_in_view, local_keyframes, match_local_map
+from jaxslam.mapping.local_map_tracking import (
+    RADII_PX,
+    WIDE_RADII_PX,
+    keyframes_in_view,
+    local_keyframes,
+    match_local_map,
+)
 from jaxslam.mapping.local_mapping import mapping_plan
 from jaxslam.sensors.frame import Frame
 from jaxslam.sensors.frame_arrays import frame_arrays
@@ -54,13 +61,16 @@ def nearest_keyframe(slam_map: Map, T_world_cam: np.ndarray) -> int:
     return int(slam_map.ids[np.argmin(np.linalg.norm(slam_map.T_world_cam[:, 4:] - T_world_cam[4:], axis=1))])
 
 
-def match(slam_map: Map, index: int, error: np.ndarray, seen: Features | None = None) -> tuple[Any, np.ndarray]:
+def match(
+    slam_map: Map, index: int, error: np.ndarray, seen: Features | None = None, radii_px: tuple[float, ...] = RADII_PX
+) -> tuple[Any, np.ndarray]:
     """What comes of a frame whose pose is wrong by `error`, and its pose in the axes of the same keyframe."""
     pose = mapped()[1][index].T_world_cam
     keyframe_id = nearest_keyframe(slam_map, pose)
     true = between(slam_map.pose(keyframe_id), pose)
     seen = features(index) if seen is None else seen
-    return match_local_map(slam_map, keyframe_id, retract(true, error), seen, sensor(), PLAN), true
+    about = retract(true, error)
+    return match_local_map(slam_map, keyframe_id, about, seen, sensor(), PLAN, radii_px=radii_px), true
 
 
 class TestKeyframesInView:
@@ -92,6 +102,11 @@ class TestKeyframesInView:
 
     def test_of_an_empty_map(self) -> None:
         assert keyframes_in_view(empty_map(CAMERA), IDENTITY, 0, set(), 4) == []
+
+    def test_the_nearest_are_looked_at(self):
+        """However many there are: the cost does not grow with the map."""
+        made = seen_from([at(x=0.001 * number) for number in range(80)], [POINTS] * 80)
+        assert sorted(keyframes_in_view(made, at(), 0, set(), 99)) == list(range(64))
 
 
 class TestMatchLocalMap:
@@ -168,7 +183,7 @@ class TestPointsInView:
         """Also where the keyframe shares something with some of them."""
         with_them = match(mapped()[0], LATER, np.zeros(6))[0]
         monkeypatch.setattr("jaxslam.mapping.local_map_tracking._IN_VIEW", 0)
-        monkeypatch.setattr("jaxslam.mapping.local_map_tracking.LOCAL_KEYFRAMES", 1)
+        monkeypatch.setattr("jaxslam.mapping.local_map_tracking.LOCAL_KEYFRAMES", 0)
         without = match(mapped()[0], LATER, np.zeros(6))[0]
         assert with_them is not None
         assert without is not None
@@ -188,10 +203,10 @@ class TestNotFarFromWhereItWasThoughtToBe:
     @pytest.mark.parametrize("off_rad", [0.12, 0.2])
     def test_radians(self, off_rad: float, monkeypatch: pytest.MonkeyPatch) -> None:
         rolled = np.array([0, 0, 0, 0, 0, off_rad])
-        monkeypatch.setattr("jaxslam.mapping.local_map_tracking._RADII_PX", (40.0, 5.0))
-        assert (match(mapped()[0], LATER, rolled)[0] is not None) == (off_rad < 0.15)
+        wide = partial(match, mapped()[0], LATER, rolled, radii_px=WIDE_RADII_PX)
+        assert (wide()[0] is not None) == (off_rad < 0.15)
         monkeypatch.setattr("jaxslam.mapping.local_map_tracking._NEAR_RAD", 1.0)
-        assert match(mapped()[0], LATER, rolled)[0] is not None
+        assert wide()[0] is not None
 
 
 class TestFewFeatures:

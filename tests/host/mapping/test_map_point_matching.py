@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from exact_map import CAMERA
 
-from jaxslam.features.orb import DEFAULT_PLAN, Features
+from jaxslam.features.orb import DEFAULT_PLAN, Features, no_features
 from jaxslam.geometry.se3 import IDENTITY, retract, to_local
 from jaxslam.map.edit import with_keyframe, with_observations, with_points, without_observations
 from jaxslam.map.types import NONE, Keyframe, Map, MapPoints, empty_map, rows
@@ -13,6 +13,7 @@ from jaxslam.mapping.map_point_matching import (
     DescribedPoints,
     described_points_in,
     feature_observations,
+    features_at,
     find_points,
     fuse_duplicates,
 )
@@ -73,7 +74,7 @@ def found_in(slam_map: Map, points: DescribedPoints, features: Features, **setti
 class TestFindPoints:
     @pytest.fixture
     def points(self, three, places) -> DescribedPoints:
-        return described_points_in(made(three, 0, places, np.arange(COUNT)), np.array([0]))
+        return described_points_in(made(three, 0, places, np.arange(COUNT)), np.array([0]), DEFAULT_PLAN)
 
     def test_finds_those_in_view(self, three, places, points):
         index, feature = found_in(three, points, three.keyframes[1].features)
@@ -115,10 +116,21 @@ class TestFindPoints:
 def test_recognizable_are_those_seen_by_a_feature(three, places):
     slam_map = made(three, 0, places, np.arange(10))
     slam_map = slam_map._replace(points=slam_map.points._replace(has_descriptor=np.arange(10) > 2))
-    assert described_points_in(slam_map, np.array([0])).ids.tolist() == list(range(3, 10))
-    assert described_points_in(slam_map, np.array([1])).ids.tolist() == []
+    assert described_points_in(slam_map, np.array([0]), DEFAULT_PLAN).ids.tolist() == list(range(3, 10))
+    assert described_points_in(slam_map, np.array([1]), DEFAULT_PLAN).ids.tolist() == []
     by_flow = slam_map._replace(observations=slam_map.observations._replace(feature=np.full(10, NONE, np.int32)))
-    assert described_points_in(by_flow, np.array([0])).ids.tolist() == []
+    assert described_points_in(by_flow, np.array([0]), DEFAULT_PLAN).ids.tolist() == []
+
+
+def test_a_tracked_point_is_shown_by_the_nearest_feature(three):
+    """Within two pixels; a feature shows one point."""
+    features = three.keyframes[0].features
+    uv = features.uv_raw[:, :6] + np.array([[0.5, 0.1, 1.9, 2.1, 0.0, 0.3], [0.0] * 6], np.float32)
+    uv[:, 0] = features.uv_raw[:, 1] + np.array([0.5, 0], np.float32)  # nearer to it is the second point
+    shown = features_at(features, uv)
+    assert shown.tolist() == [NONE, 1, 2, NONE, 4, 5]
+    assert features_at(features, uv[:, :0]).tolist() == []
+    assert features_at(no_features(), uv).tolist() == [NONE] * 6
 
 
 class TestFuse:

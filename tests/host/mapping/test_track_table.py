@@ -41,6 +41,17 @@ class TestTrackTable:
         table.fuse({10: 11, 11: 12})
         assert table.points(ids(1, 2, 3)).tolist() == [12, 12, 12]
 
+    def test_a_fused_map_point_that_is_tracked(self) -> None:
+        """The tracker keeps the id that it got with a keyframe."""
+        table, tracks = TrackTable(), TrackId.of_map_points(ids(10, 11))
+        table.observed(tracks, 0)
+        table.fuse({10: 11})
+        table.fuse({11: 4})
+        assert table.points(tracks).tolist() == [4, 4]
+        assert sorted(table.tracks_of(ids(4)).tolist()) == sorted(tracks.tolist())
+        table.forget(65)
+        assert table.points(tracks).tolist() == [10, 11]
+
     def test_forgets_what_no_keyframe_observes(self) -> None:
         table = TrackTable()
         table.add(ids(1, 2), ids(10, 11))

@@ -55,7 +55,7 @@ def output(
     """What the tracker says of a keyframe at a pose where it follows points, and has found none again."""
     n, m = PLAN.num_points, PLAN.points_per_source
     none: Any = np.zeros((3, m), np.float32)
-    found = KeyframeMatches(none, none[:2], none[0], none[0].astype(np.int32), none[0, 0])
+    found = KeyframeMatches(none, none[:2], none[0], none[0].astype(np.int32), none[0], none[0, 0])
     values: dict[str, Any] = dict.fromkeys(TrackOutput._fields, np.float32(0))
     values |= {
         "T_world_cam": SE3(pose.astype(np.float32)),  # type: ignore[arg-type]

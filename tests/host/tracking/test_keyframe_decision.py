@@ -30,38 +30,71 @@ def _reason(
     moved_m=1.0,
     since_s=1.0,
     overlap=0.5,
+    new=0,
+    recognized=0.8,
+    map_views=0,
     movable=0.0,
     tracked=N,
     weak=False,
     lost=False,
     started=False,
 ) -> KeyframeReason:
-    """Why a frame is kept that shows points 2 m away, after the camera has moved since a keyframe at the origin."""
+    """Why a frame is kept that shows points 2 m away, after the camera has moved since a keyframe at the origin.
+
+    `overlap` is the share of the points of each keyframe in view, or that of the only one; `new` counts the points that
+    are younger than it.
+    """
     state = init_state(48, 64, plan)
     rng = np.random.default_rng(0)
     X_world = jnp.asarray(rng.uniform([-1, -1, 2], [1, 1, 2.1], (N, 3)).T, jnp.float32)
     state = state._replace(keyframes=state.keyframes._replace(made=jnp.ones((), jnp.int32)))
     pose = jnp.array([1, 0, 0, 0, moved_m, 0, 0], jnp.float32)
     number = lambda value: jnp.asarray(value, jnp.float32)
-    points = state.points._replace(X_world=X_world, age=jnp.full(N, 5, jnp.int32))
+    points = state.points._replace(X_world=X_world, age=jnp.where(jnp.arange(N) < new, 0, 5).astype(jnp.int32))
     candidate = KeyframeCandidate(
         T_world_cam=SE3(pose),
         points=points,
         tracked=jnp.arange(N) < tracked,
-        overlap=number(overlap),
+        overlap=jnp.atleast_1d(number(overlap)),
+        recognized=number(recognized),
         lost=jnp.asarray(lost),
         weak=jnp.asarray(weak),
         started=jnp.asarray(started),
         since_keyframe_s=number(since_s),
         movable=number(movable),
     )
-    return KeyframeReason(int(keyframe_reason(state, candidate, PARAMS, plan)))
+    params = PARAMS._replace(map_views=number(map_views))
+    return KeyframeReason(int(keyframe_reason(state, candidate, params, plan)))
 
 
 @pytest.mark.parametrize("plan", [AS_NEEDED, SPARING])
 def test_a_new_area_is_a_reason(plan) -> None:
     assert _reason(plan) == KeyframeReason.NEW_AREA
     assert _reason(plan, overlap=0.9) == KeyframeReason.NONE
+    assert _reason(plan, overlap=(0.1, 0.9, 0.3)) == KeyframeReason.NONE
+    views = CONFIG.track.keyframe_views
+    assert _reason(plan, map_views=views - 1) == KeyframeReason.NEW_AREA
+    assert _reason(plan, map_views=views) == KeyframeReason.NONE  # shown by those that the tracker does not hold
+
+
+@pytest.mark.parametrize("plan", [AS_NEEDED, SPARING])
+def test_a_turnover_of_points_is_one_until_keyframes_enough_show_the_view(plan) -> None:
+    views = CONFIG.track.keyframe_views
+    turned_over = partial(_reason, plan, new=int(0.95 * N))
+    assert turned_over(overlap=0.9) == KeyframeReason.FEW_FOLLOWED
+    assert turned_over(overlap=0.9, map_views=views - 1) == KeyframeReason.FEW_FOLLOWED
+    assert turned_over(overlap=0.9, map_views=views) == KeyframeReason.NONE
+    assert turned_over(overlap=(0.9,) * views) == KeyframeReason.NONE
+    assert _reason(plan, overlap=0.9, new=N // 2) == KeyframeReason.NONE
+
+
+@pytest.mark.parametrize("plan", [AS_NEEDED, SPARING])
+def test_more_keyframes_where_the_view_is_hardly_recognized(plan) -> None:
+    """A crowd, or another light: but not without end."""
+    views = CONFIG.track.keyframe_views
+    hardly = partial(_reason, plan, new=int(0.95 * N), overlap=0.9, recognized=0.01)
+    assert hardly(map_views=views) == KeyframeReason.FEW_FOLLOWED
+    assert hardly(map_views=4 * views) == KeyframeReason.NONE
 
 
 def test_not_soon_after_the_last_one() -> None:
@@ -75,8 +108,11 @@ def test_not_soon_after_the_last_one() -> None:
 def test_not_without_motion() -> None:
     assert _reason(AS_NEEDED, moved_m=0.01) == KeyframeReason.NEW_AREA
     assert _reason(moved_m=0.01) == KeyframeReason.NONE
-    assert _reason(moved_m=0.01, since_s=60.0, overlap=0.9) == KeyframeReason.NONE  # not for the time alone either
-    assert _reason(moved_m=0.3, since_s=60.0, overlap=0.9) == KeyframeReason.TIME
+
+
+@pytest.mark.parametrize("plan", [AS_NEEDED, SPARING])
+def test_time_alone_is_no_reason(plan) -> None:
+    assert _reason(plan, since_s=3600.0, overlap=0.9) == KeyframeReason.NONE
 
 
 def test_not_while_much_may_move_unless_that_lasts() -> None:

@@ -257,8 +257,9 @@ class TestPoseStatus:
         @quick_compile
         def status(state: TrackState, frame: FrameArrays, given: TrackParams) -> Any:
             view = PreparedFrame(frame, state.pyramid, frame.depth, state.elapsed_s)
+            nothing, overlap = jnp.zeros(0), jnp.zeros(state.keyframes.id.shape[0])
             none = KeyframeMatches(
-                jnp.zeros((3, 0)), jnp.zeros((2, 0)), jnp.zeros(0), jnp.zeros(0, jnp.int32), jnp.zeros(())
+                jnp.zeros((3, 0)), jnp.zeros((2, 0)), nothing, jnp.zeros(0, jnp.int32), overlap, jnp.zeros(())
             )
             away, trust = retract(state.T_world_cam, jnp.full(6, 0.02)), state.points.valid.astype(jnp.float32)
             X_world, twist = state.points.X_world, state.twist
@@ -333,7 +334,7 @@ def test_pairs_are_matched_by_the_plan(monkeypatch: pytest.MonkeyPatch) -> None:
 LONGER = 30
 
 
-RARE = {"keyframe_below": 0.0, "keyframe_followed_below": 0.0, "keyframe_after_s": 1e3, "keyframe_weak_after_s": 1e3}
+RARE = {"keyframe_below": 0.0, "keyframe_followed_below": 0.0, "keyframe_weak_after_s": 1e3}
 """Thresholds under which no keyframe is made for want of what it shows."""
 ALONE = PLAN._replace(num_sources=0, new_points="keyframes")
 
@@ -428,7 +429,7 @@ class TestHeldToMap:
     @pytest.mark.parametrize("which", ["weak", "keyframes", "always"])
     def test_which_frames(self, which: str) -> None:
         """Matching begins as soon as the map has a keyframe."""
-        track = replace(TRACK, match_map=which, keyframe_after_s=0.3)
+        track = replace(TRACK, match_map=which, keyframe_below=1.0)
         results = slam_results(Config(track=track, semantics=SemanticsConfig(model=None)))
         assert {result.status for result in results[1:]} == {TrackStatus.OK}
         matched = np.array([result.num_matched > 0 for result in results])
