@@ -144,6 +144,9 @@ class MappingConfig(ValidatedConfig):
     """Maximum number of iterations of local bundle adjustment."""
     latency_frames: Annotated[int, Range(at_least=0, at_most=100)] = 3
     """Number of frames after which a deterministic run has the map that includes a keyframe."""
+    max_mb: Annotated[float, Positive] | None = None
+    """Memory that the map may take, megabytes. Beyond it keyframes leave: first those whose points others show, then
+    the farthest from the camera. Without it, the map grows with the space that it shows."""
 
 
 @dataclass(frozen=True)

@@ -1,15 +1,16 @@
-"""Culling: remove map points that too few keyframes confirm, and redundant keyframes.
+"""Culling: remove map points that too few keyframes confirm, redundant keyframes, and what exceeds the memory.
 
 Source: Mur-Artal and Tardos, "ORB-SLAM2", 2017, and "ORB-SLAM", 2015, sections VI-B and VI-E, for the rules.
 """
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float64, Int
 
 from jaxslam.geometry.types import Ids
+from jaxslam.loop_closing.place_index import INDEX_BYTES
 from jaxslam.map.edit import without_points
 from jaxslam.map.keyframe_removal import without_keyframe
-from jaxslam.map.types import NONE, Map, covisible, has, rows, surviving_keyframes
+from jaxslam.map.types import NONE, Keyframe, Map, covisible, has, rows, surviving_keyframes
 from jaxslam.mapping.view_coverage import in_view, seen_alike
 
 CONFIRM_WITHIN = 3
@@ -21,6 +22,10 @@ _REDUNDANT_SHARE, _REDUNDANT_VIEWS = 0.9, 3
 """A keyframe is redundant if this share of its points is observed by this many others at least as accurately."""
 _AS_EXACT = 1.25
 """Factor on the standard deviation up to which an observation counts as accurate as another: one pyramid level."""
+_SPARE_SHARE = 0.5
+"""Share of its points that others must observe for a keyframe to leave a full map before those that are far away."""
+_MOST_AT_ONCE = 4
+"""Largest number of keyframes that leave a full map for a new one, so that the work stays bounded."""
 KEEP_LATEST = 12
 """Latest keyframes, which the tracker may still use."""
 
@@ -71,6 +76,52 @@ def without_redundant(slam_map: Map, keyframe_id: int, among: Ids) -> Map:
         if _redundant(slam_map, candidate):
             slam_map = without_keyframe(slam_map, candidate)
     return slam_map
+
+
+def within_memory(slam_map: Map, keyframe_id: int, max_bytes: int) -> Map:
+    """Drop keyframes of a map that takes too much memory, at most four: those that others show best, then the farthest.
+
+    Args:
+        slam_map: The map.
+        keyframe_id: Id of the latest keyframe. It and those shortly before it stay, and so does the last keyframe of
+            each submap.
+        max_bytes: Memory that the map may take, as `memory_bytes` counts it.
+    """
+    for _ in range(_MOST_AT_ONCE):
+        if memory_bytes(slam_map) <= max_bytes:
+            break
+        alone = np.bincount(slam_map.submap, minlength=1)[slam_map.submap] == 1
+        leaving = np.flatnonzero((slam_map.ids <= keyframe_id - KEEP_LATEST) & ~alone)
+        if not len(leaving):
+            break
+        shown = _shares_seen_by_others(slam_map)[leaving]
+        latest = slam_map.row(keyframe_id)
+        apart_m = np.linalg.norm(slam_map.T_world_cam[leaving, 4:] - slam_map.T_world_cam[latest, 4:], axis=1)
+        apart_m[slam_map.submap[leaving] != slam_map.submap[latest]] = np.inf
+        spare = shown >= _SPARE_SHARE
+        first = np.lexsort((leaving, np.where(spare, -shown, -apart_m), ~spare))[0]
+        slam_map = without_keyframe(slam_map, int(slam_map.ids[leaving[first]]))
+    return slam_map
+
+
+def memory_bytes(slam_map: Map) -> int:
+    """Return the memory that a map takes, with what the place index holds of it, bytes."""
+    arrays = [*slam_map.points, *slam_map.observations, *slam_map.loops, *slam_map.culled, slam_map.T_world_cam]
+    return sum(array.nbytes for array in arrays) + sum(map(_keyframe_bytes, slam_map.keyframes))
+
+
+def _keyframe_bytes(keyframe: Keyframe) -> int:
+    features = sum(array.nbytes for array in keyframe.features)
+    return features + len(keyframe.image_png) + INDEX_BYTES * len(keyframe.features.octave)
+
+
+def _shares_seen_by_others(slam_map: Map) -> Float64[np.ndarray, " k"]:
+    """Return the share of the points of each keyframe that enough others observe."""
+    point, keyframe = rows(slam_map.points.ids, slam_map.observations.point), slam_map.observations.keyframe
+    enough = np.bincount(point)[point] > _REDUNDANT_VIEWS
+    of = rows(slam_map.ids, keyframe)
+    counts = np.bincount(of, minlength=len(slam_map.ids))
+    return np.bincount(of, enough, minlength=len(slam_map.ids)) / np.maximum(counts, 1)
 
 
 def _redundant(slam_map: Map, keyframe_id: int) -> bool:

@@ -7,6 +7,7 @@ Source: Mur-Artal et al., "ORB-SLAM", 2015, section VI, for the steps; Mur-Artal
 III, for points with measured depth.
 """
 
+import logging
 from typing import NamedTuple
 
 import cv2
@@ -39,7 +40,7 @@ from jaxslam.map.types import (
     rows,
     surviving_keyframes,
 )
-from jaxslam.mapping.culling import CONFIRM_WITHIN, without_redundant, without_unconfirmed
+from jaxslam.mapping.culling import CONFIRM_WITHIN, within_memory, without_redundant, without_unconfirmed
 from jaxslam.mapping.local_bundle_adjustment import AdjustPlan, adjust_all, adjust_around, compile_adjustment
 from jaxslam.mapping.local_map_tracking import LOCAL_KEYFRAMES, local_keyframes
 from jaxslam.mapping.map_point_matching import (
@@ -59,10 +60,15 @@ from jaxslam.sensors.frame_arrays import FrameArrays
 from jaxslam.sensors.measurement import pixel_rays
 from jaxslam.sensors.sensor_model import SensorModel, depth_noise
 
+_log = logging.getLogger(__name__)
+
 _PART_KEYFRAMES = 30
 """Number of keyframes in the part of the map that a new keyframe may change."""
 _FUSE_KEYFRAMES = 6
 """Number of neighbors with whose features the points of a new keyframe are matched to fuse duplicates."""
+_PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE)
+"""How images of keyframes are compressed, without loss: 100 to 120 kB of 640x480 pixels in 10 ms. The default strategy
+takes as long and leaves 120 to 145 kB; WebP leaves 87 to 109 kB, but takes 160 ms."""
 _LOOP_KEYFRAMES = 96
 """Number of keyframes around a loop that are adjusted when it is closed: there, covisible keyframes still disagree."""
 
@@ -122,12 +128,14 @@ class MappingPlan(NamedTuple):
         adjust: Settings of local bundle adjustment.
         track_sigma_px: Standard deviation of the position of a point tracked by optical flow, pixels.
         search_px: Search radius around the projection of a map point at octave 0, pixels.
+        max_mb: Memory that the map may take, megabytes; `None` without a limit.
     """
 
     features: FeaturePlan = FeaturePlan()
     adjust: AdjustPlan = AdjustPlan()
     track_sigma_px: float = _SETTINGS.track_sigma_px
     search_px: float = _SETTINGS.search_px
+    max_mb: float | None = _SETTINGS.max_mb
 
 
 def mapping_plan(camera: Camera, config: Config) -> MappingPlan:
@@ -151,6 +159,7 @@ def mapping_plan(camera: Camera, config: Config) -> MappingPlan:
         ),
         track_sigma_px=mapping.track_sigma_px,
         search_px=mapping.search_px,
+        max_mb=mapping.max_mb,
     )
 
 
@@ -204,7 +213,7 @@ class LocalMapping:
         slam_map = without_redundant(slam_map, new.id, part.keyframes)
         # 10. Merge the changed part back into the map.
         self._tracks.forget(new.id)
-        self.map = merge_back(whole, part, slam_map)
+        self.map = self._within_memory(merge_back(whole, part, slam_map), new.id)
         return self.map
 
     def take_states(self, changes: StateChanges) -> Map:
@@ -246,6 +255,16 @@ class LocalMapping:
         tracks = self._tracks.tracks_of(gone)
         self._tracks.mark_removed(movers.tracks, movers.keyframe)
         return slam_map, np.append(TrackId.of_map_points(gone), tracks)
+
+    def _within_memory(self, slam_map: Map, keyframe_id: int) -> Map:
+        """Drop keyframes if the map takes too much memory, and log how many."""
+        if self._plan.max_mb is None:
+            return slam_map
+        small = within_memory(slam_map, keyframe_id, int(1e6 * self._plan.max_mb))
+        if small is not slam_map:
+            dropped = len(slam_map.ids) - len(small.ids)
+            _log.info("the map takes %g MB (mapping.max_mb), keyframes that left it: %d", self._plan.max_mb, dropped)
+        return small
 
     def _with_tracks(self, slam_map: Map, new: NewKeyframe, known: Ids, features: Features) -> Map:
         """Add the observations of tracked points; a track without a map point becomes a new point.
@@ -338,7 +357,7 @@ def with_new_keyframe(slam_map: Map, new: NewKeyframe, features: Features) -> Ma
         pose = compose(slam_map.pose(parent), pose)
         parent = int(surviving_keyframes(slam_map, np.array([parent]))[0])
         submap = int(slam_map.submap[slam_map.row(parent)])  # the submap may have been merged into another one
-    encoded, png = cv2.imencode(".png", np.asarray(new.frame.image), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    encoded, png = cv2.imencode(".png", np.asarray(new.frame.image), _PNG)
     if not encoded:
         raise RuntimeError("the image of a keyframe could not be compressed")
     keyframe = Keyframe(new.id, new.timestamp_ns, features, png.tobytes())
