@@ -1,6 +1,5 @@
 """`jaxslam bench batch`: throughput of the whole tracker on many clips at once, compared with clip by clip."""
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,13 +8,13 @@ from typing import Any
 from rich.table import Table
 
 from jaxslam.cli.console import console, make_table, plain_console, print_json, progress_bar
-from jaxslam.cli.shared_options import WithJson
+from jaxslam.cli.shared_options import WithJson, image_size
 from jaxslam.errors import BenchmarkError
 from jaxslam.io.atomic_files import make_folder
 
 _LEFT_OUT = ("loop", "worst, m")
 """Columns for which a terminal has no room."""
-_MIN_FRAMES, _MIN_PX, _MAX_PX = 3, 64, 8192
+_MIN_FRAMES = 3
 
 # Heavy modules are imported where a command runs: `--help` needs none of them.
 
@@ -76,13 +75,7 @@ class Batch(WithJson):
             )
         if self.rounds < 1:
             raise BenchmarkError(f"--rounds: expected at least 1, got {self.rounds}")
-        found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", self.size)
-        sides = tuple(map(int, found.groups())) if found else ()
-        if not sides or not all(_MIN_PX <= side <= _MAX_PX for side in sides):
-            raise BenchmarkError(
-                f"--size: expected WIDTHxHEIGHT of {_MIN_PX} to {_MAX_PX} pixels each, got '{self.size}'"
-            )
-        return sides[0], sides[1]
+        return image_size(self.size)
 
     def _measured(self, counts: Sequence[int], different: int, width: int, height: int) -> list[dict[str, Any]]:
         """Render the clips, and measure each count with a progress bar."""

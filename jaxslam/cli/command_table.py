@@ -134,6 +134,14 @@ COMMANDS = (
         "Over sizes; on a GPU too if there is one. Nothing else should run on the machine meanwhile; some minutes.",
     ),
     Command(
+        ("bench", "soak"),
+        "bench_soak:Soak",
+        "Track for hours in one place, and show what grows: keyframes, memory, time, error.",
+        "Plays a recording or a world to and fro, with a covered lens and failures of the detector now and then; in a"
+        " world, other people each time. An hour for 100,000 frames of the default; nothing else should run meanwhile"
+        " if times are to mean something.",
+    ),
+    Command(
         ("eval",),
         "eval:Eval",
         "Compare an estimated trajectory with the truth: ATE, RPE and KITTI's figures.",

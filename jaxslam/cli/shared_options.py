@@ -1,13 +1,18 @@
 """Options that several commands share."""
 
 import itertools
+import re
 from dataclasses import dataclass
 from typing import Annotated, TypeAlias
 
 import tyro
 
+from jaxslam.errors import BenchmarkError
+
 Settings: TypeAlias = Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction]
 """`key=value` texts: one tuple for each time that the option was given."""
+
+_MIN_PX, _MAX_PX = 64, 8192
 
 ALLOW_MISSING_MODEL = "semantics.missing_model=allow"
 """Setting behind `--allow-missing-model`."""
@@ -24,3 +29,16 @@ class WithJson:
 def flat(settings: Settings) -> tuple[str, ...]:
     """Return all `key=value` texts in the order in which they were given."""
     return tuple(itertools.chain(*settings))
+
+
+def image_size(text: str) -> tuple[int, int]:
+    """Return the width and height that `--size` gives, pixels.
+
+    Raises:
+        BenchmarkError: If it gives none, or one that is too small or too large.
+    """
+    found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
+    sides = tuple(map(int, found.groups())) if found else ()
+    if not sides or not all(_MIN_PX <= side <= _MAX_PX for side in sides):
+        raise BenchmarkError(f"--size: expected WIDTHxHEIGHT of {_MIN_PX} to {_MAX_PX} pixels each, got '{text}'")
+    return sides[0], sides[1]

@@ -7,14 +7,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from jaxslam.runtime.threads import threads, usable_cores
 
 _PACKAGES = ("jaxslam", "jax", "jaxlib", "jaxlie", "equinox", "optimistix", "numpy", "opencv-python-headless")
-_WINDOWS_COUNTERS = (
-    *("PeakWorkingSetSize", "WorkingSetSize", "QuotaPeakPagedPoolUsage", "QuotaPagedPoolUsage"),
-    *("QuotaPeakNonPagedPoolUsage", "QuotaNonPagedPoolUsage", "PagefileUsage", "PeakPagefileUsage"),
-)
-"""The fields of `PROCESS_MEMORY_COUNTERS` of the Windows API that follow the two counts."""
 
 
 def machine() -> dict[str, Any]:
@@ -29,10 +26,15 @@ def machine() -> dict[str, Any]:
     }
 
 
+def rss_mb() -> float:
+    """Return the resident memory of this process, megabytes."""
+    return psutil.Process().memory_info().rss / 1e6
+
+
 def peak_rss_mb() -> float:
     """Return the peak resident memory of this process, megabytes."""
     if sys.platform == "win32":
-        return _peak_working_set_mb()
+        return psutil.Process().memory_info().peak_wset / 1e6
     status = Path("/proc/self/status")
     if status.is_file():
         # Not `getrusage`: on Linux a process begins there with the peak of the one that started it.
@@ -43,27 +45,6 @@ def peak_rss_mb() -> float:
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (1e6 if sys.platform == "darwin" else 1e3)  # bytes there, kilobytes elsewhere
-
-
-def _peak_working_set_mb() -> float:
-    """Return the peak working set of this process on Windows (`GetProcessMemoryInfo`), megabytes."""
-    import ctypes  # noqa: PLC0415 - used on Windows only
-    from ctypes import wintypes  # noqa: PLC0415
-
-    class Counters(ctypes.Structure):
-        _fields_ = (
-            ("cb", wintypes.DWORD),
-            ("PageFaultCount", wintypes.DWORD),
-            *((name, ctypes.c_size_t) for name in _WINDOWS_COUNTERS),
-        )
-
-    kernel32 = getattr(ctypes, "WinDLL")("kernel32", use_last_error=True)  # noqa: B009 - not in POSIX's stubs
-    kernel32.GetCurrentProcess.restype = wintypes.HANDLE
-    kernel32.K32GetProcessMemoryInfo.argtypes = (wintypes.HANDLE, ctypes.POINTER(Counters), wintypes.DWORD)
-    counters = Counters(cb=ctypes.sizeof(Counters))
-    if not kernel32.K32GetProcessMemoryInfo(kernel32.GetCurrentProcess(), ctypes.byref(counters), counters.cb):
-        raise OSError(f"GetProcessMemoryInfo failed with error {getattr(ctypes, 'get_last_error')()}")  # noqa: B009
-    return counters.PeakWorkingSetSize / 1e6
 
 
 def cpu_model() -> str:

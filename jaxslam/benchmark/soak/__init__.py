@@ -1,0 +1,1 @@
+"""Soak tests: hours of tracking in one place, and what grows meanwhile."""

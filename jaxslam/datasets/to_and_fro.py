@@ -1,0 +1,74 @@
+"""A recording played forward and backward again and again, for runs of any length."""
+
+import numpy as np
+
+from jaxslam.datasets.protocol import Dataset
+from jaxslam.errors import DatasetError
+from jaxslam.sensors.frame import Frame
+from jaxslam.trajectory.trajectory import Trajectory
+
+_MIN_FRAMES = 2
+
+
+class ToAndFro:
+    """A recording of any length: another one played to its end, back to its beginning, and so on.
+
+    Its clock goes on at the rate of the other recording. A rolling shutter and a depth image that is taken later than
+    the color image do not fit the way back, on which they are reversed: such a recording is tracked worse than its
+    camera could be. Samples of an IMU are left out, as they would not fit the motion.
+
+    Attributes:
+        name: Name in results, such as `fr1_xyz, 12000 frames to and fro`.
+        camera: Camera of the other recording.
+        timestamps_ns: `(n,)` int64 times of the frames, nanoseconds.
+        frames_per_pass: Number of frames of one way.
+        ground_truth: True poses at the times of the frames, interpolated; `None` if they are unknown.
+    """
+
+    def __init__(self, dataset: Dataset, num_frames: int) -> None:
+        """Take a recording to play.
+
+        Args:
+            dataset: The recording.
+            num_frames: Number of frames to play.
+
+        Raises:
+            DatasetError: If the recording has fewer than two frames, or fewer than one is to be played.
+        """
+        if len(dataset) < _MIN_FRAMES:
+            raise DatasetError(f"{dataset.name}: expected at least {_MIN_FRAMES} frames, got {len(dataset)}")
+        if num_frames < 1:
+            raise DatasetError(f"num_frames: expected at least 1, got {num_frames}")
+        self._dataset = dataset
+        self.name, self.camera = f"{dataset.name}, {num_frames} frames to and fro", dataset.camera
+        self.frames_per_pass = len(dataset) - 1
+        self.timestamps_ns = dataset.timestamps_ns[0] + _period_ns(dataset) * np.arange(num_frames)
+        self.ground_truth = self._truth()
+
+    def __len__(self) -> int:
+        return len(self.timestamps_ns)
+
+    def __getitem__(self, index: int) -> Frame:
+        """Decode frame `index`; raises `IndexError` outside `-n` to `n - 1`."""
+        index = range(len(self))[index]
+        frame = self._dataset[int(self.source_of(np.array(index)))]
+        return Frame(int(self.timestamps_ns[index]), frame.image, frame.depth_m, right=frame.right)
+
+    def source_of(self, index: np.ndarray) -> np.ndarray:
+        """Return the frames of the other recording that are shown at some frames."""
+        along = index % (2 * self.frames_per_pass)
+        return np.minimum(along, 2 * self.frames_per_pass - along)
+
+    def _truth(self) -> Trajectory | None:
+        truth = self._dataset.ground_truth
+        if truth is None or not len(truth):
+            return None
+        times = self._dataset.timestamps_ns
+        known = (times >= truth.timestamps_ns[0]) & (times <= truth.timestamps_ns[-1])
+        source = self.source_of(np.arange(len(self)))
+        shown = known[source]
+        return Trajectory(self.timestamps_ns[shown], truth.at(times).T_world_cam[source[shown]])
+
+
+def _period_ns(dataset: Dataset) -> int:
+    return int(np.median(np.diff(dataset.timestamps_ns)))
