@@ -150,7 +150,7 @@ class TestRun:
         at_rest = ~under(dilated_truth(0), blind_run().observations.uv_raw[:, blind])
         assert len(seen) > 0.8 * at_rest.sum()
         views = np.bincount(np.searchsorted(slam_map.points.ids, slam_map.observations.point))
-        assert np.count_nonzero(views >= 2) > 100
+        assert np.mean(views >= 2) > 0.1
 
     def test_followed_points_on_people_are_forgotten(self) -> None:
         """Those of the first keyframe, as soon as the next frame comes."""
@@ -574,9 +574,12 @@ class TestMapping:
         assert set(TrackId.of_map_points(removed).tolist()) <= set(gone.tolist())
         assert set(movers.tracks.tolist()) <= set(gone.tolist())
         again = mapping.add(new_keyframe(3, 2 * STEP, 2 * STEP))
-        by_flow = again.observations.point[(again.observations.keyframe == 3) & (again.observations.feature == NONE)]
+        tracked = again.observations.sigma_px < 1.0  # at a feature it would be one pixel or more
+        by_flow = again.observations.point[(again.observations.keyframe == 3) & tracked]
         tracks = new_keyframe(3, 2 * STEP, None).tracks
-        assert len(by_flow) == (tracks.weight > 0).sum() - len(movers.tracks)
+        others = (tracks.weight > 0).sum() - len(movers.tracks)
+        assert 0.95 * others < len(by_flow) <= others  # a few are one with a point that is recognized there
+        assert not np.isin(mapping._tracks.points(movers.tracks), again.points.ids).any()
         assert problems(again) == []
 
     def test_a_track_that_is_no_point_yet_becomes_none(self, mask: np.ndarray) -> None:
