@@ -123,10 +123,11 @@ class FrameLocalizer:
             The pose, or `None`; and whether place recognition searched the whole map and found no such place.
         """
         features = features_of(arrays, np.zeros(6, np.float32), self._sensor, self._plan)
-        for radii_px in () if predicted is None else (RADII_PX, WIDE_RADII_PX):
-            near = self._in_local_map(features, predicted, radii_px)
-            if near is not None:
-                return near, False
+        if predicted is not None:
+            for radii_px in (RADII_PX, WIDE_RADII_PX):
+                near = self._in_local_map(features, predicted, radii_px)
+                if near is not None:
+                    return near, False
         if np.count_nonzero(features.depth) < MIN_INLIERS:
             return None, False
         if not self._index.lock.acquire(timeout=_PATIENCE_S):

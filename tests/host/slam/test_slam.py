@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from small_scene import CONFIG, Clip, clip, resident_mb, track_round_trip
 
-from jaxslam.slam.frame_result import FrameRecord
+from jaxslam.slam.frame_records import FrameRecords
 from jaxslam.slam.slam import Slam
 from jaxslam.tracking.state import TrackStatus
 from jaxslam.trajectory.evaluation import evaluate
@@ -31,7 +31,7 @@ def slam() -> Slam:
     return slam
 
 
-def run(slam: Slam, recording: Clip) -> list[FrameRecord]:
+def run(slam: Slam, recording: Clip) -> FrameRecords:
     slam.reset()
     return slam.run(recording)
 

@@ -29,7 +29,7 @@ def _reason(
     *,
     moved_m=1.0,
     since_s=1.0,
-    overlap=0.5,
+    overlap: float | tuple[float, ...] = 0.5,
     new=0,
     recognized=0.8,
     map_views=0,
