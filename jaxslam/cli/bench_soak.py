@@ -1,7 +1,7 @@
 """`jaxslam bench soak`: hours of tracking in one place, and what grows meanwhile."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from jaxslam.benchmark.soak.recordings import Covered
     from jaxslam.config.schema import Config
     from jaxslam.semantics import Detector
+    from jaxslam.worlds.passing_people import PassingPeople
 
 _CACHE_BYTES = 8 << 30
 """Size that rendered frames may take in the user's cache: some three minutes of 320x240 pixels."""
@@ -127,9 +128,8 @@ class Soak(WithJson):
             detector = FailingDetector(detector, self.detector_fails, config.run.seed)
         return Covered(played, self.covered_every), detector
 
-    def _people(self) -> Any:
-        from dataclasses import replace  # noqa: PLC0415
-
+    def _people(self) -> "PassingPeople":
+        """Open the world without its own people, for others."""
         from jaxslam.worlds.library import load_world  # noqa: PLC0415
         from jaxslam.worlds.passing_people import PassingPeople, without_people  # noqa: PLC0415
         from jaxslam.worlds.stored_world import StoredWorld  # noqa: PLC0415

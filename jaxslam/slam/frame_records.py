@@ -5,6 +5,7 @@ from typing import Any, overload
 
 import numpy as np
 
+from jaxslam.runtime.record_array import RecordArray
 from jaxslam.slam.frame_result import FrameRecord
 from jaxslam.slam.mask_pipeline import MaskSource
 from jaxslam.tracking.state import KeyframeReason, TrackStatus
@@ -30,8 +31,6 @@ _ROW = np.dtype(
     ]
 )
 """The fields of `FrameRecord`; texts by their number, `None` as NaN or -1. 79 bytes: an hour at 30 Hz takes 8.5 MB."""
-_BLOCK = 4096
-"""Number of records for which memory is taken at once."""
 _NO_SUBMAP = -1
 
 
@@ -40,8 +39,7 @@ class FrameRecords(Sequence[FrameRecord]):
 
     def __init__(self, records: Iterable[FrameRecord] = ()) -> None:
         """Start with some records."""
-        self._blocks: list[np.ndarray] = []
-        self._length = 0
+        self._rows = RecordArray(_ROW)
         self._texts: list[str] = []
         self._number_of: dict[str, int] = {}
         for record in records:
@@ -49,7 +47,7 @@ class FrameRecords(Sequence[FrameRecord]):
 
     def __len__(self) -> int:
         """Return the number of records."""
-        return self._length
+        return len(self._rows)
 
     @overload
     def __getitem__(self, index: int) -> FrameRecord: ...
@@ -62,15 +60,15 @@ class FrameRecords(Sequence[FrameRecord]):
             IndexError: If there is no such record.
         """
         if isinstance(index, slice):
-            return FrameRecords(self[at] for at in range(*index.indices(self._length)))
-        at = index + self._length if index < 0 else index
-        if not 0 <= at < self._length:
-            raise IndexError(f"expected an index within the {self._length} records, got {index}")
-        return self._record(self._blocks[at // _BLOCK][at % _BLOCK])
+            return FrameRecords(self[at] for at in range(*index.indices(len(self))))
+        at = index + len(self) if index < 0 else index
+        if not 0 <= at < len(self):
+            raise IndexError(f"expected an index within the {len(self)} records, got {index}")
+        return self._record(self._rows[at])
 
     def __iter__(self) -> Iterator[FrameRecord]:
         """Iterate over the records."""
-        return (self[at] for at in range(self._length))
+        return (self[at] for at in range(len(self)))
 
     def __eq__(self, other: object) -> bool:
         """Return whether both hold equal records."""
@@ -81,32 +79,30 @@ class FrameRecords(Sequence[FrameRecord]):
     @property
     def num_bytes(self) -> int:
         """Memory that the records take, without their texts, bytes."""
-        return sum(block.nbytes for block in self._blocks)
+        return self._rows.nbytes
 
     def append(self, record: FrameRecord) -> None:
         """Add the record of the next frame."""
-        at = self._length % _BLOCK
-        if at == 0:
-            self._blocks.append(np.zeros(_BLOCK, _ROW))
-        self._blocks[-1][at] = (
-            record.timestamp_ns,
-            record.status,
-            self._numbered(record.reason),
-            record.num_inliers,
-            record.inlier_ratio,
-            record.num_keyframe_matches,
-            record.num_matched,
-            record.residual_px,
-            record.keyframe,
-            record.dynamic_ratio,
-            record.mask_source,
-            record.mask_age,
-            self._numbered(record.detector_error),
-            np.nan if record.track_ms is None else record.track_ms,
-            np.nan if record.occluded_share is None else record.occluded_share,
-            _NO_SUBMAP if record.submap is None else record.submap,
+        self._rows.append(
+            (
+                record.timestamp_ns,
+                record.status,
+                self._numbered(record.reason),
+                record.num_inliers,
+                record.inlier_ratio,
+                record.num_keyframe_matches,
+                record.num_matched,
+                record.residual_px,
+                record.keyframe,
+                record.dynamic_ratio,
+                record.mask_source,
+                record.mask_age,
+                self._numbered(record.detector_error),
+                np.nan if record.track_ms is None else record.track_ms,
+                np.nan if record.occluded_share is None else record.occluded_share,
+                _NO_SUBMAP if record.submap is None else record.submap,
+            )
         )
-        self._length += 1
 
     def _numbered(self, text: str) -> int:
         """Return the number of a text: there are few different ones."""

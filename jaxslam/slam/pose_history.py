@@ -7,6 +7,7 @@ from jaxtyping import Float, Float64, Int64
 
 from jaxslam.geometry.se3 import IDENTITY, compose, displacement, retract
 from jaxslam.geometry.types import Pose
+from jaxslam.runtime.record_array import RecordArray
 from jaxslam.slam.tracker_map_sync import AnchoredPose
 from jaxslam.trajectory.trajectory import Trajectory
 
@@ -26,8 +27,6 @@ _RECORD = np.dtype(
 """A pose: time of its frame, the pose as it was given out, the same one relative to a keyframe with which it moves, and
 whether its world was the frame of the map. 69 bytes: an hour at 30 Hz takes 7.5 MB. The tracker itself computes in
 float32."""
-_BLOCK = 4096
-"""Number of poses for which memory is taken at once."""
 
 
 class PoseHistory:
@@ -35,17 +34,16 @@ class PoseHistory:
 
     def __init__(self) -> None:
         """Start with no poses."""
-        self._blocks: list[np.ndarray] = []
-        self._length = 0
+        self._poses = RecordArray(_RECORD)
 
     def __len__(self) -> int:
         """Return the number of poses."""
-        return self._length
+        return len(self._poses)
 
     @property
     def num_bytes(self) -> int:
         """Memory that the poses take, bytes."""
-        return sum(block.nbytes for block in self._blocks)
+        return self._poses.nbytes
 
     def add(self, timestamp_ns: int, T_world_cam: Pose, anchored: AnchoredPose, *, in_map_frame: bool) -> None:
         """Record a pose.
@@ -56,15 +54,11 @@ class PoseHistory:
             anchored: The pose relative to a keyframe.
             in_map_frame: Whether its world is the frame of the map.
         """
-        at = self._length % _BLOCK
-        if at == 0:
-            self._blocks.append(np.zeros(_BLOCK, _RECORD))
-        self._blocks[-1][at] = (timestamp_ns, T_world_cam, anchored.keyframe, anchored.T_keyframe_cam, in_map_frame)
-        self._length += 1
+        self._poses.append((timestamp_ns, T_world_cam, anchored.keyframe, anchored.T_keyframe_cam, in_map_frame))
 
     def online(self) -> Trajectory:
         """Return the poses in the map's frame as they were given out."""
-        poses = self._all()
+        poses = self._poses.array()
         poses = poses[poses["in_map_frame"]]
         return ordered_trajectory(poses["timestamp_ns"], poses["T_world_cam"].astype(np.float64))
 
@@ -75,7 +69,7 @@ class PoseHistory:
             pose_of: Function from the id of a keyframe to its current pose `(7,)`.
             submap_of: Function from the id of a keyframe to the number of its submap.
         """
-        poses = self._all()
+        poses = self._poses.array()
         keyframes, which = np.unique(poses["keyframe"], return_inverse=True)
         T_world_keyframe = np.array([pose_of(int(keyframe)) for keyframe in keyframes]).reshape(-1, 7)
         T_world_cam = compose(T_world_keyframe[which], poses["T_keyframe_cam"].astype(np.float64))
@@ -84,9 +78,6 @@ class PoseHistory:
             int(submap): ordered_trajectory(poses["timestamp_ns"][submaps == submap], T_world_cam[submaps == submap])
             for submap in np.unique(submaps)
         }
-
-    def _all(self) -> np.ndarray:
-        return np.concatenate([np.zeros(0, _RECORD), *self._blocks])[: self._length]
 
 
 def ordered_trajectory(timestamps_ns: Int64[np.ndarray, " n"], T_world_cam: Float64[np.ndarray, "n 7"]) -> Trajectory:

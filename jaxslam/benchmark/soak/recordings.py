@@ -1,7 +1,6 @@
 """What is played in a soak test: a recording to and fro, with faults, and people anew each time in a rendered world."""
 
 import threading
-from typing import Protocol
 
 import numpy as np
 from jaxtyping import Bool, UInt8
@@ -10,24 +9,14 @@ from jaxslam.datasets import Dataset
 from jaxslam.datasets.to_and_fro import ToAndFro
 from jaxslam.errors import ModelError
 from jaxslam.semantics import Detections, Detector, no_detections
-from jaxslam.sensors.camera import Camera
+from jaxslam.semantics.prompted.detector import boxes_of
 from jaxslam.sensors.frame import Frame
-from jaxslam.trajectory.trajectory import Trajectory
 from jaxslam.worlds.passing_people import PassingPeople
 
 COVERED_FRAMES = 15
 """Number of frames for which something is before the lens."""
 _NUM_REMEMBERED = 64
 """Number of frames whose people a detector can still be asked for."""
-
-
-class SoakRecording(Dataset, Protocol):
-    """A recording of a soak test."""
-
-    @property
-    def frames_per_pass(self) -> int:
-        """Number of frames of one way."""
-        ...
 
 
 class WithPeople(ToAndFro):
@@ -57,19 +46,20 @@ class WithPeople(ToAndFro):
             mask = self._masks.get(_key(image))
         if mask is None or not mask.any():
             return no_detections()
-        columns, rows = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
-        box = np.array([[columns[0], rows[0], columns[-1] + 1, rows[-1] + 1]], np.float32)
-        return Detections(box, np.ones(1, np.float32), ("person",), mask[None], None)
+        return Detections(boxes_of(mask[None]), np.ones(1, np.float32), ("person",), mask[None], None)
 
 
 class Covered:
     """A recording in which the lens is covered now and then: frames are black and have no depth.
 
     Attributes:
-        frames_per_pass: Number of frames of one way.
+        name: Name of the recording.
+        camera: Its camera.
+        timestamps_ns: `(n,)` int64 times of the frames, nanoseconds.
+        ground_truth: True poses; `None` if they are unknown.
     """
 
-    def __init__(self, recording: SoakRecording, every: int) -> None:
+    def __init__(self, recording: Dataset, every: int) -> None:
         """Cover the lens.
 
         Args:
@@ -77,39 +67,23 @@ class Covered:
             every: Number of frames after which it happens again; 0 for never.
         """
         self._recording, self._every = recording, every
-        self.frames_per_pass = recording.frames_per_pass
-
-    @property
-    def name(self) -> str:
-        """Name of the recording."""
-        return self._recording.name
-
-    @property
-    def camera(self) -> Camera:
-        """Camera of the recording."""
-        return self._recording.camera
-
-    @property
-    def timestamps_ns(self) -> np.ndarray:
-        """`(n,)` int64 times of the frames, nanoseconds."""
-        return self._recording.timestamps_ns
-
-    @property
-    def ground_truth(self) -> Trajectory | None:
-        """True poses."""
-        return self._recording.ground_truth
+        self.name, self.camera = recording.name, recording.camera
+        self.timestamps_ns, self.ground_truth = recording.timestamps_ns, recording.ground_truth
 
     def __len__(self) -> int:
         return len(self._recording)
 
     def is_covered(self, index: int) -> bool:
         """Tell whether something is before the lens at a frame."""
-        return self._every > 0 and index >= self._every and index % self._every < COVERED_FRAMES
+        return self._within(index, COVERED_FRAMES)
 
     def may_be_lost(self, index: int) -> bool:
         """Tell whether a frame may be lost: the lens is covered, or was within the last second."""
-        grace = COVERED_FRAMES + round(self.camera.fps)
-        return self._every > 0 and index >= self._every and index % self._every < grace
+        return self._within(index, COVERED_FRAMES + round(self.camera.fps))
+
+    def _within(self, index: int, num_frames: int) -> bool:
+        """Tell whether a frame is one of the first few since the lens was covered."""
+        return self._every > 0 and index >= self._every and index % self._every < num_frames
 
     def __getitem__(self, index: int) -> Frame:
         """Decode frame `index`; raises `IndexError` outside `-n` to `n - 1`."""

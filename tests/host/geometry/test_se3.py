@@ -73,7 +73,7 @@ def test_angle_is_that_of_the_shorter_way_and_exact_near_zero():
 
 
 def test_displacement():
-    """What `retract` undoes, whichever sign the quaternions have."""
+    """It undoes `retract`, whichever sign the quaternions have."""
     rng = np.random.default_rng(4)
     for first in some_poses(9, seed=5):
         tangent = rng.uniform(-1.5, 1.5, 6)  # less than half a turn

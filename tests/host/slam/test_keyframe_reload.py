@@ -23,7 +23,7 @@ from jaxslam.slam.slam import Slam
 
 class TestRecall:
     def test_points(self) -> None:
-        """As the map has them, in the keyframe's axes; the most exact first: those that were followed by flow."""
+        """They are those of the map in the keyframe's axes, the most exact first: those that flow tracked."""
         made = seen_from([at(), at(x=0.3)], [POINTS, POINTS])
         keyframe = reload_keyframe(made, 1, 120)
         assert keyframe.keyframe == 1
