@@ -56,7 +56,6 @@ class Soak(WithJson):
     def main(self) -> None:
         """Run the command."""
         self._check()
-        make_folder(self.out, BenchmarkError)
         from jaxslam.benchmark.reports.soak import markdown_report, picture, summary  # noqa: PLC0415
         from jaxslam.benchmark.soak.meter import SoakMeter  # noqa: PLC0415
         from jaxslam.cli.measurement_files import write_measurements  # noqa: PLC0415
@@ -69,6 +68,7 @@ class Soak(WithJson):
         live = ("run.deterministic=false",) if self.live else ()
         config = load_config(self.preset, None, (*live, *flat(self.set)))
         recording, detector = self._opened(config)
+        make_folder(self.out, BenchmarkError)
         with Slam(recording.camera, config, detector=detector) as slam:
             meter = SoakMeter(slam, recording.ground_truth, self.window, recording.may_be_lost, self.out / "soak.csv")
             with progress_bar("{task.description}") as progress:

@@ -134,7 +134,10 @@ def test_files_of_the_command(room: Path, tmp_path: Path, capsys: pytest.Capture
 @pytest.mark.parametrize(
     ("option", "value"), [("frames", "2"), ("window", "0"), ("people", "0"), ("detector-fails", "1.5"), ("size", "9x9")]
 )
-def test_wrong_options_are_errors(room: Path, option: str, value: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_options_are_errors_and_leave_no_folder(
+    room: Path, tmp_path: Path, option: str, value: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit):
-        main(["bench", "soak", str(room), f"--{option}", value])
+        main(["bench", "soak", str(room), f"--{option}", value, "--out", str(tmp_path / "soak")])
     assert f"--{option}: expected" in capsys.readouterr().err
+    assert not (tmp_path / "soak").exists()

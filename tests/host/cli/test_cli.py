@@ -94,8 +94,15 @@ class TestErrors:
         ],
     )
     def test_of_run(
-        self, capsys: pytest.CaptureFixture[str], recording: Path, arguments: tuple[str, ...], expected: str
+        self,
+        capsys: pytest.CaptureFixture[str],
+        monkeypatch: pytest.MonkeyPatch,
+        tmp_path: Path,
+        recording: Path,
+        arguments: tuple[str, ...],
+        expected: str,
     ) -> None:
+        monkeypatch.chdir(tmp_path)
         assert expected in fails(capsys, "run", str(recording), *arguments)
         assert not Path("results").exists()
 
