@@ -9,7 +9,8 @@ from jaxtyping import Bool, Float, Float32, UInt16
 from jaxslam.dense.depth_view import DepthView, Looks
 from jaxslam.dense.keyframe_poses import poses_of
 from jaxslam.geometry.se3 import IDENTITY, angle, between, compose
-from jaxslam.map.types import Map, has
+from jaxslam.map.point_records import has
+from jaxslam.map.types import Map
 
 Poses: TypeAlias = Mapping[int, np.ndarray | None]
 """The `(7,)` pose of the depth of each keyframe, by keyframe id. A pose is `None` if the keyframe is not in the map or

@@ -3,7 +3,8 @@
 import numpy as np
 
 from jaxslam.geometry.se3 import IDENTITY, angle, compose, inverse
-from jaxslam.map.types import Map, has, rows
+from jaxslam.map.point_records import has, rows
+from jaxslam.map.types import Map
 
 _AT_M = 2.0
 

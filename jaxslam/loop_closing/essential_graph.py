@@ -15,7 +15,8 @@ from jaxslam_kernels.pose_graph.pose_graph import PoseGraphStatus, optimize_pose
 
 from jaxslam.geometry.se3 import IDENTITY, angle, between
 from jaxslam.geometry.types import Pose
-from jaxslam.map.types import NONE, Map, has, rows, visibility
+from jaxslam.map.point_records import NONE, has, rows
+from jaxslam.map.types import Map, visibility
 from jaxslam.runtime.compiled import compiled
 from jaxslam.runtime.compiler_options import FAST_COMPILE
 from jaxslam.runtime.padding import padded

@@ -5,7 +5,8 @@ import numpy as np
 from jaxslam.geometry.se3 import IDENTITY, compose, inverse, rotate
 from jaxslam.loop_closing.loop_detector import LoopClosure
 from jaxslam.map.edit import transformed, with_loop, with_positions
-from jaxslam.map.types import NONE, Map, has, rows, surviving_keyframes
+from jaxslam.map.point_records import NONE, has, rows
+from jaxslam.map.types import Map, surviving_keyframes
 
 
 def with_loop_closed(slam_map: Map, loop: LoopClosure) -> Map:

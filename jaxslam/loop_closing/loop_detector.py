@@ -21,7 +21,8 @@ from jaxslam.loop_closing.essential_graph import poses_with_loop
 from jaxslam.loop_closing.place_index import PlaceIndex
 from jaxslam.loop_closing.place_recognition import Recognition, recognize
 from jaxslam.loop_closing.visibility_check import see_through_ratio
-from jaxslam.map.types import Map, covisible, has, rows
+from jaxslam.map.point_records import has, rows
+from jaxslam.map.types import Map, covisible
 from jaxslam.sensors.sensor_model import SensorModel
 
 _LATEST = 10

@@ -16,7 +16,8 @@ from jaxslam.features.pose_from_matches import Matches, fit_pose, matches_depth_
 from jaxslam.geometry.se3 import IDENTITY, to_local
 from jaxslam.geometry.types import Pose
 from jaxslam.loop_closing.place_index import PlaceIndex
-from jaxslam.map.types import Keyframe, Map, has
+from jaxslam.map.point_records import has
+from jaxslam.map.types import Keyframe, Map
 from jaxslam.runtime.compiled import compiled
 from jaxslam.runtime.compiler_options import FAST_COMPILE
 from jaxslam.sensors.sensor_model import SensorModel

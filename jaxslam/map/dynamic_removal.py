@@ -12,7 +12,8 @@ from jaxtyping import Bool, Int64, Num
 from jaxslam.features.orb import Features
 from jaxslam.geometry.types import Ids
 from jaxslam.map.edit import without_points
-from jaxslam.map.types import NONE, Keyframe, Map, has
+from jaxslam.map.point_records import NONE, has
+from jaxslam.map.types import Keyframe, Map
 
 
 class DynamicObservations(NamedTuple):
@@ -75,4 +76,4 @@ def _with_features(slam_map: Map, keyframe: Keyframe, stays: Bool[np.ndarray, " 
     feature, renumbered = seen.feature.copy(), (seen.keyframe == keyframe.id) & (seen.feature != NONE)
     feature[renumbered] = number[feature[renumbered]]
     keyframes = (*slam_map.keyframes[:row], keyframe._replace(features=left), *slam_map.keyframes[row + 1 :])
-    return slam_map._replace(keyframes=keyframes, observations=seen._replace(feature=feature))
+    return slam_map.with_arrays(observations=seen._replace(feature=feature))._replace(keyframes=keyframes)

@@ -10,20 +10,9 @@ from jaxtyping import Bool, Float, Float64, Int, UInt8
 from jaxslam.dynamics.occlusion import PointState
 from jaxslam.geometry.se3 import compose, transform
 from jaxslam.geometry.types import Ids, Pose, Poses
+from jaxslam.map.point_records import NONE, MapPoints, Observations, observations_at, points_at, rows
 from jaxslam.map.spanning_tree import parents_from
-from jaxslam.map.types import (
-    NONE,
-    Keyframe,
-    Loops,
-    Map,
-    MapPoints,
-    Observations,
-    observations_at,
-    point_submaps,
-    points_at,
-    rows,
-    surviving_keyframes,
-)
+from jaxslam.map.types import Keyframe, Loops, Map, point_submaps, surviving_keyframes
 from jaxslam.map.validate import Record, number_problems
 
 
@@ -73,7 +62,7 @@ def with_points(slam_map: Map, points: MapPoints) -> Map:
         name: _joined(old, getattr(points, name), axis=0 if name == "descriptor" else -1)
         for name, old in slam_map.points._asdict().items()
     }
-    return slam_map._replace(points=MapPoints(**joined), next_point=after)
+    return slam_map.with_arrays(points=MapPoints(**joined))._replace(next_point=after)
 
 
 def with_observations(slam_map: Map, observations: Observations) -> Map:
@@ -98,7 +87,7 @@ def with_observations(slam_map: Map, observations: Observations) -> Map:
     rivals = np.isin(slam_map.observations.keyframe, observations.keyframe)
     both = _joined_observations(observations_at(slam_map.observations, rivals), observations)
     new = observations_at(observations, first_of_rivals(both)[int(rivals.sum()) :])
-    return slam_map._replace(observations=_joined_observations(slam_map.observations, new))
+    return slam_map.with_arrays(observations=_joined_observations(slam_map.observations, new))
 
 
 def with_loop(
@@ -158,7 +147,7 @@ def with_positions(
         _require_finite(X_world)
         places = slam_map.points.X_world.copy()
         places[:, rows(slam_map.points.ids, point_ids)] = X_world
-        slam_map = slam_map._replace(points=slam_map.points._replace(X_world=places))
+        slam_map = slam_map.with_arrays(points=slam_map.points._replace(X_world=places))
     return slam_map
 
 
@@ -174,7 +163,8 @@ def with_descriptors(slam_map: Map, point_ids: Int[np.ndarray, " n"], descriptor
         return slam_map
     descriptor, has_descriptor = slam_map.points.descriptor.copy(), slam_map.points.has_descriptor.copy()
     descriptor[row[new]], has_descriptor[row[new]] = descriptors[new], True
-    return slam_map._replace(points=slam_map.points._replace(descriptor=descriptor, has_descriptor=has_descriptor))
+    points = slam_map.points._replace(descriptor=descriptor, has_descriptor=has_descriptor)
+    return slam_map.with_arrays(points=points)
 
 
 def with_states(slam_map: Map, point_ids: Int[np.ndarray, " n"], states: Int[np.ndarray, " n"]) -> Map:
@@ -190,7 +180,7 @@ def with_states(slam_map: Map, point_ids: Int[np.ndarray, " n"], states: Int[np.
         raise ValueError(f"states: expected {min(PointState)} to {max(PointState)}")
     state = slam_map.points.state.copy()
     state[rows(slam_map.points.ids, point_ids)] = states
-    return slam_map._replace(points=slam_map.points._replace(state=state))
+    return slam_map.with_arrays(points=slam_map.points._replace(state=state))
 
 
 def without_points(slam_map: Map, point_ids: Ids) -> Map:
@@ -198,14 +188,12 @@ def without_points(slam_map: Map, point_ids: Ids) -> Map:
     stays = np.ones(len(slam_map.points.ids), bool)
     stays[rows(slam_map.points.ids, point_ids)] = False
     seen = ~np.isin(slam_map.observations.point, point_ids)
-    return slam_map._replace(
-        points=points_at(slam_map.points, stays), observations=observations_at(slam_map.observations, seen)
-    )
+    return slam_map.with_arrays(points_at(slam_map.points, stays), observations_at(slam_map.observations, seen))
 
 
 def without_observations(slam_map: Map, mask: Bool[np.ndarray, " s"]) -> Map:
     """Remove the observations where an `(s,)` mask is true; points stay, even without any observation left."""
-    return slam_map._replace(observations=observations_at(slam_map.observations, ~mask))
+    return slam_map.with_arrays(observations=observations_at(slam_map.observations, ~mask))
 
 
 def transformed(slam_map: Map, T_new_old: Pose, submap: int, into: int, parent: int = NONE, child: int = NONE) -> Map:
@@ -240,11 +228,9 @@ def transformed(slam_map: Map, T_new_old: Pose, submap: int, into: int, parent: 
                 raise ValueError(f"child: keyframe {child} is not in submap {submap}")
             parents = parents_from(slam_map, child)
         parents[inside & (parents == NONE)] = parent
+    slam_map = slam_map.with_arrays(points=slam_map.points._replace(X_world=places))
     return slam_map._replace(
-        T_world_cam=poses,
-        parent=parents,
-        submap=np.where(inside, np.int32(into), slam_map.submap),
-        points=slam_map.points._replace(X_world=places),
+        T_world_cam=poses, parent=parents, submap=np.where(inside, np.int32(into), slam_map.submap)
     )
 
 

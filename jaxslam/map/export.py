@@ -15,7 +15,8 @@ from jaxslam.errors import MapFileError
 from jaxslam.geometry.se3 import inverse, rotate
 from jaxslam.io.atomic_files import write_atomically
 from jaxslam.io.ply_file import write_ply_points
-from jaxslam.map.types import Keyframe, Map, observations_at, point_submaps, points_at, rows
+from jaxslam.map.point_records import observations_at, points_at, rows
+from jaxslam.map.types import Keyframe, Map, point_submaps
 from jaxslam.sensors.camera import Camera
 from jaxslam.trajectory.trajectory import Trajectory, write_tum
 
@@ -69,9 +70,9 @@ def write_colmap(folder: PathLike, slam_map: Map, submap: int | None = None) -> 
         MapFileError: If a file cannot be written, there is no such submap, or an image cannot be decoded.
     """
     part = one_submap(slam_map, submap)
-    part = part._replace(points=points_at(part.points, np.isin(part.points.ids, part.observations.point)))
+    observed = np.isin(part.points.ids, part.observations.point)
     order = np.lexsort((part.observations.point, part.observations.keyframe))
-    part = part._replace(observations=observations_at(part.observations, order))
+    part = part.with_arrays(points_at(part.points, observed), observations_at(part.observations, order))
     model, images = Path(folder) / "sparse" / "0", Path(folder) / "images"
     for path in (model, images):
         try:
@@ -121,14 +122,13 @@ def one_submap(slam_map: Map, submap: int | None = None) -> Map:
         raise MapFileError(f"submap: expected one of {numbers.tolist()}, got {submap}")
     inside = slam_map.submap == submap
     seen = inside[rows(slam_map.ids, slam_map.observations.keyframe)]
-    return slam_map._replace(
+    points = points_at(slam_map.points, point_submaps(slam_map) == submap)
+    return slam_map.with_arrays(points, observations_at(slam_map.observations, seen))._replace(
         keyframes=tuple(keyframe for keyframe, own in zip(slam_map.keyframes, inside, strict=True) if own),
         ids=slam_map.ids[inside],
         T_world_cam=slam_map.T_world_cam[inside],
         parent=slam_map.parent[inside],
         submap=slam_map.submap[inside],
-        points=points_at(slam_map.points, point_submaps(slam_map) == submap),
-        observations=observations_at(slam_map.observations, seen),
     )
 
 

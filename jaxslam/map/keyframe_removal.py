@@ -6,8 +6,9 @@ from jaxtyping import Float
 from jaxslam.geometry.se3 import between, compose, inverse
 from jaxslam.geometry.so3 import matrices
 from jaxslam.geometry.types import Pose
+from jaxslam.map.point_records import observations_at, points_at
 from jaxslam.map.spanning_tree import new_anchor, parents_without
-from jaxslam.map.types import Culled, Loops, Map, observations_at, points_at
+from jaxslam.map.types import Culled, Loops, Map
 
 
 def without_keyframe(slam_map: Map, keyframe_id: int) -> Map:
@@ -31,14 +32,13 @@ def without_keyframe(slam_map: Map, keyframe_id: int) -> Map:
     )
     stays, seen = slam_map.ids != keyframe_id, slam_map.observations.keyframe != keyframe_id
     observations = observations_at(slam_map.observations, seen)
-    return slam_map._replace(
+    points = points_at(slam_map.points, np.isin(slam_map.points.ids, observations.point))
+    return slam_map.with_arrays(points, observations)._replace(
         keyframes=slam_map.keyframes[:row] + slam_map.keyframes[row + 1 :],
         ids=slam_map.ids[stays],
         T_world_cam=slam_map.T_world_cam[stays],
         parent=parents_without(slam_map, keyframe_id, anchor)[stays],
         submap=slam_map.submap[stays],
-        points=points_at(slam_map.points, np.isin(slam_map.points.ids, observations.point)),
-        observations=observations,
         loops=_loops_without(slam_map.loops, keyframe_id, anchor, T_anchor_keyframe),
         culled=culled,
     )

@@ -69,7 +69,9 @@ from jaxslam.config.validation import Range, ValidatedConfig, from_mapping
 from jaxslam.errors import JaxSlamError, MapFileError, one_line
 from jaxslam.features.orb import Features
 from jaxslam.io.atomic_files import replacing
-from jaxslam.map.types import Culled, Keyframe, Loops, Map, MapPoints, Observations
+from jaxslam.map.contents import MapContents
+from jaxslam.map.point_records import MapPoints, Observations
+from jaxslam.map.types import Culled, Keyframe, Loops, Map
 from jaxslam.map.validate import ArrayField, array_fields, problems
 from jaxslam.sensors.camera import Camera
 
@@ -348,8 +350,7 @@ def _assembled(header: _Header, arrays: dict[str, np.ndarray]) -> Map:
     made = Map(
         camera=header.camera,
         keyframes=tuple(map(Keyframe, ids, stamps, features, images)),
-        points=MapPoints(**_record(arrays, "points")),
-        observations=Observations(**_record(arrays, "observations")),
+        contents=MapContents(MapPoints(**_record(arrays, "points")), Observations(**_record(arrays, "observations"))),
         loops=Loops(**_record(arrays, "loops")),
         culled=Culled(**_record(arrays, "culled")),
         next_keyframe=header.next_keyframe,

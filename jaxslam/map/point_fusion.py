@@ -5,7 +5,8 @@ from jaxtyping import Int
 
 from jaxslam.geometry.types import Ids
 from jaxslam.map.edit import first_of_rivals
-from jaxslam.map.types import Map, MapPoints, observations_at, point_submaps, points_at, rows
+from jaxslam.map.point_records import MapPoints, observations_at, points_at, rows
+from jaxslam.map.types import Map, point_submaps
 
 
 def with_fused_points(slam_map: Map, keep: Int[np.ndarray, " f"], drop: Int[np.ndarray, " f"]) -> Map:
@@ -39,9 +40,7 @@ def with_fused_points(slam_map: Map, keep: Int[np.ndarray, " f"], drop: Int[np.n
     stays[changed] = first_of_rivals(observations_at(seen, changed))
     points = _with_best_known(_with_descriptors(slam_map.points, into), into, slam_map.observations.point)
     points = _with_highest_state(points, into)
-    return slam_map._replace(
-        points=points_at(points, into == np.arange(len(into))), observations=observations_at(seen, stays)
-    )
+    return slam_map.with_arrays(points_at(points, into == np.arange(len(into))), observations_at(seen, stays))
 
 
 def _representatives(slam_map: Map, keep: Ids, drop: Ids) -> Ids:

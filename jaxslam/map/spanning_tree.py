@@ -3,7 +3,8 @@
 import numpy as np
 
 from jaxslam.geometry.types import Ids
-from jaxslam.map.types import NONE, Map, covisible, rows
+from jaxslam.map.point_records import NONE, rows
+from jaxslam.map.types import Map, covisible
 
 
 def children(slam_map: Map, keyframe_id: int) -> Ids:

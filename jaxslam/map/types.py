@@ -3,24 +3,26 @@
 A `Map` is immutable: an edit returns a new one that shares all unchanged arrays, so any thread can read a map without
 locks. Rows are sorted by id, and an id is never assigned twice.
 
-Arrays are NumPy arrays without padding; code that calls kernels extracts and pads the rows that it needs.
+What a keyframe or a frame needs of a large map is around some keyframes: `Map.around` returns it at a cost that depends
+on what is there. `Map.points` and `Map.observations` are all of them, which takes longer the larger the map is.
 """
 
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int, Int8, Int32, Int64, UInt8
+from jaxtyping import Float64, Int, Int32, Int64
 
-from jaxslam.features.orb import DESCRIPTOR_BYTES, Features
+from jaxslam.features.orb import Features
 from jaxslam.geometry.se3 import IDENTITY, compose
 from jaxslam.geometry.types import Ids, Pose
+from jaxslam.map.contents import MapContents
+from jaxslam.map.point_records import NONE, MapPoints, Observations, empty_observations, empty_points, has, rows
 from jaxslam.sensors.camera import Camera
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-NONE = -1
-"""No keyframe, no point, no feature."""
+_NO_IDS = np.zeros(0, np.int64)
 
 
 class Keyframe(NamedTuple):
@@ -37,54 +39,6 @@ class Keyframe(NamedTuple):
     timestamp_ns: int
     features: Features
     image_png: bytes
-
-
-class MapPoints(NamedTuple):
-    """The `p` points of the map.
-
-    Attributes:
-        ids: `(p,)` ids of the points, ascending.
-        X_world: `(3, p)` positions in the world frame of their submap, meters.
-        weight: `(p,)` weights in optimization, 0 to 1.
-        descriptor: `(p, 32)` ORB descriptors; zeros for a point without one.
-        has_descriptor: `(p,)` mask of the points with a descriptor. The others are only tracked by optical flow and
-            aligned with image patches.
-        reference_keyframe: `(p,)` ids of the keyframes that created the points.
-        state: `(p,)` a `PointState` of each point: whether a moving object has passed in front of it.
-    """
-
-    ids: Int64[np.ndarray, " p"]
-    X_world: Float64[np.ndarray, "3 p"]
-    weight: Float32[np.ndarray, " p"]
-    descriptor: UInt8[np.ndarray, "p 32"]
-    has_descriptor: Bool[np.ndarray, " p"]
-    reference_keyframe: Int64[np.ndarray, " p"]
-    state: Int8[np.ndarray, " p"]
-
-
-class Observations(NamedTuple):
-    """The `s` observations of points in keyframes; a keyframe observes a point at most once.
-
-    Attributes:
-        keyframe: `(s,)` ids of the keyframes.
-        point: `(s,)` ids of the points.
-        feature: `(s,)` index among the features of the keyframe; `NONE` for a point that was tracked by optical flow to
-            where it has no feature. A tracked point with a feature nearby is measured by flow all the same.
-        uv_raw: `(2, s)` measured coordinates in the distorted image, pixels.
-        uv: `(2, s)` coordinates in an ideal pinhole image without distortion and rolling shutter, pixels.
-        depth: `(s,)` measured depth, meters; 0 where no valid depth was measured.
-        sigma_px: `(s,)` standard deviation of each coordinate of `uv`, pixels.
-        weight: `(s,)` weights in optimization, 0 to 1.
-    """
-
-    keyframe: Int64[np.ndarray, " s"]
-    point: Int64[np.ndarray, " s"]
-    feature: Int32[np.ndarray, " s"]
-    uv_raw: Float32[np.ndarray, "2 s"]
-    uv: Float32[np.ndarray, "2 s"]
-    depth: Float32[np.ndarray, " s"]
-    sigma_px: Float32[np.ndarray, " s"]
-    weight: Float32[np.ndarray, " s"]
 
 
 class Loops(NamedTuple):
@@ -127,8 +81,7 @@ class Map(NamedTuple):
         T_world_cam: `(k, 7)` poses of the keyframes, `wxyz_xyz`.
         parent: `(k,)` id of each keyframe's parent in the spanning tree; `NONE` for the first keyframe of a submap.
         submap: `(k,)` number of the submap of each keyframe; the keyframes of a submap share a world frame.
-        points: The map points.
-        observations: The observations of points in keyframes.
+        contents: The points and their observations.
         loops: The loops closed so far.
         culled: The keyframes culled so far.
         next_keyframe: Id of the next keyframe to be added.
@@ -141,12 +94,21 @@ class Map(NamedTuple):
     T_world_cam: Float64[np.ndarray, "k 7"]
     parent: Int64[np.ndarray, " k"]
     submap: Int32[np.ndarray, " k"]
-    points: MapPoints
-    observations: Observations
+    contents: MapContents
     loops: Loops
     culled: Culled
     next_keyframe: int
     next_point: int
+
+    @property
+    def points(self) -> MapPoints:
+        """All points of the map."""
+        return self.contents.points
+
+    @property
+    def observations(self) -> Observations:
+        """All observations of points in keyframes."""
+        return self.contents.observations
 
     @property
     def world_submap(self) -> int:
@@ -184,6 +146,28 @@ class Map(NamedTuple):
             keyframe_id = int(self.culled.anchor[found[0]])
         return compose(self.T_world_cam[self.row(keyframe_id)], T_anchor_keyframe)
 
+    def with_arrays(self, points: MapPoints | None = None, observations: Observations | None = None) -> "Map":
+        """Return the map with other points, other observations, or both, instead of all that it has."""
+        contents = MapContents(
+            self.points if points is None else points, self.observations if observations is None else observations
+        )
+        return self._replace(contents=contents)
+
+    def in_blocks(self) -> "Map":
+        """Return the map with its points and observations in blocks only."""
+        return self._replace(contents=self.contents.as_blocks())
+
+    def around(self, keyframe_ids: Ids, point_ids: Ids | None = None) -> "Map":
+        """Return a map of all keyframes with at least the points that some keyframes observe, and some points.
+
+        All observations of those points are in it. A map that is a part of another one is returned whole.
+
+        Args:
+            keyframe_ids: Ids of the keyframes.
+            point_ids: Ids of the points; none by default.
+        """
+        return self._replace(contents=self.contents.around(keyframe_ids, _NO_IDS if point_ids is None else point_ids))
+
 
 def empty_map(camera: Camera) -> Map:
     """Create an empty map."""
@@ -195,59 +179,12 @@ def empty_map(camera: Camera) -> Map:
         T_world_cam=np.zeros((0, 7)),
         parent=none,
         submap=np.zeros(0, np.int32),
-        points=empty_points(),
-        observations=empty_observations(),
+        contents=MapContents(empty_points(), empty_observations()),
         loops=Loops(none, none, np.zeros((0, 7)), np.zeros((0, 6, 6))),
         culled=Culled(none, none, np.zeros((0, 7))),
         next_keyframe=0,
         next_point=0,
     )
-
-
-def empty_points() -> MapPoints:
-    """Return a record of no points."""
-    return MapPoints(
-        ids=np.zeros(0, np.int64),
-        X_world=np.zeros((3, 0)),
-        weight=np.zeros(0, np.float32),
-        descriptor=np.zeros((0, DESCRIPTOR_BYTES), np.uint8),
-        has_descriptor=np.zeros(0, bool),
-        reference_keyframe=np.zeros(0, np.int64),
-        state=np.zeros(0, np.int8),
-    )
-
-
-def empty_observations() -> Observations:
-    """Return a record of no observations."""
-    return Observations(
-        keyframe=np.zeros(0, np.int64),
-        point=np.zeros(0, np.int64),
-        feature=np.zeros(0, np.int32),
-        uv_raw=np.zeros((2, 0), np.float32),
-        uv=np.zeros((2, 0), np.float32),
-        depth=np.zeros(0, np.float32),
-        sigma_px=np.zeros(0, np.float32),
-        weight=np.zeros(0, np.float32),
-    )
-
-
-def has(ids: Ids, wanted: Int[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
-    """Return which of the wanted ids are among the ascending `ids`."""
-    if not len(ids):
-        return np.zeros(len(wanted), bool)
-    return ids[np.minimum(np.searchsorted(ids, wanted), len(ids) - 1)] == wanted
-
-
-def rows(ids: Ids, wanted: Int[np.ndarray, " m"]) -> Int[np.ndarray, " m"]:
-    """Look up the index of each wanted id in the ascending `ids`.
-
-    Raises:
-        KeyError: If a wanted id is not there.
-    """
-    known = has(ids, wanted)
-    if not known.all():
-        raise KeyError(f"not in the map: {wanted[~known][:8].tolist()}")
-    return np.searchsorted(ids, wanted)
 
 
 def visibility(slam_map: Map) -> "csr_array":
@@ -271,6 +208,7 @@ def covisible(
     Returns:
         `(k,)` ids of the neighbors, the most shared points first, and `(k,)` numbers of shared points.
     """
+    slam_map = slam_map.around(np.array([keyframe_id]))
     mine = np.unique(slam_map.observations.point[slam_map.observations.keyframe == keyframe_id])
     others = slam_map.observations.keyframe[has(mine, slam_map.observations.point)]
     ids, counts = np.unique(others[others != keyframe_id], return_counts=True)
@@ -297,6 +235,7 @@ def neighborhood(slam_map: Map, keyframe_id: int, at_least: int = 15, at_most: i
     if parent != NONE and parent not in near:
         near = np.append(near[: at_most - 1], parent)
     ids = np.append(np.int64(keyframe_id), near)
+    slam_map = slam_map.around(ids)
     return ids, np.unique(slam_map.observations.point[np.isin(slam_map.observations.keyframe, ids)])
 
 
@@ -318,14 +257,3 @@ def point_submaps(slam_map: Map) -> Int32[np.ndarray, " p"]:
     """Return the `(p,)` submap of each point: the submap of its reference keyframe."""
     makers, which = np.unique(slam_map.points.reference_keyframe, return_inverse=True)
     return slam_map.submap[rows(slam_map.ids, surviving_keyframes(slam_map, makers))][which]
-
-
-def points_at(points: MapPoints, index: Ids | Bool[np.ndarray, " _n"]) -> MapPoints:
-    """Select the points in some rows, or where a mask is true."""
-    columns = {name: array[index] for name, array in points._asdict().items() if name != "X_world"}
-    return MapPoints(X_world=points.X_world[:, index], **columns)
-
-
-def observations_at(observations: Observations, index: Ids | Bool[np.ndarray, " _n"]) -> Observations:
-    """Select the observations in some rows, or where a mask is true."""
-    return Observations(*(array[..., index] for array in observations))

@@ -8,7 +8,8 @@ from jaxtyping import AbstractArray
 
 from jaxslam.dynamics.occlusion import PointState
 from jaxslam.features.orb import Features
-from jaxslam.map.types import NONE, Culled, Loops, Map, MapPoints, Observations, has, point_submaps, rows
+from jaxslam.map.point_records import NONE, MapPoints, Observations, has, rows
+from jaxslam.map.types import Culled, Loops, Map, point_submaps
 
 Record: TypeAlias = Map | MapPoints | Observations | Loops | Culled | Features
 

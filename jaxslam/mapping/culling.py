@@ -10,7 +10,10 @@ from jaxslam.geometry.types import Ids
 from jaxslam.loop_closing.place_index import INDEX_BYTES
 from jaxslam.map.edit import without_points
 from jaxslam.map.keyframe_removal import without_keyframe
-from jaxslam.map.types import NONE, Keyframe, Map, covisible, has, rows, surviving_keyframes
+from jaxslam.map.partial_map import extract_around, merge_back
+from jaxslam.map.point_records import NONE, has, rows
+from jaxslam.map.spanning_tree import children
+from jaxslam.map.types import Keyframe, Map, covisible, surviving_keyframes
 from jaxslam.mapping.view_coverage import in_view, seen_alike
 
 CONFIRM_WITHIN = 3
@@ -100,14 +103,21 @@ def within_memory(slam_map: Map, keyframe_id: int, max_bytes: int) -> Map:
         apart_m[slam_map.submap[leaving] != slam_map.submap[latest]] = np.inf
         spare = shown >= _SPARE_SHARE
         first = np.lexsort((leaving, np.where(spare, -shown, -apart_m), ~spare))[0]
-        slam_map = without_keyframe(slam_map, int(slam_map.ids[leaving[first]]))
+        slam_map = _without(slam_map, int(slam_map.ids[leaving[first]]))
     return slam_map
+
+
+def _without(slam_map: Map, keyframe_id: int) -> Map:
+    """Remove a keyframe of the whole map: an edit of the part around it and its children, which get other parents."""
+    part = extract_around(slam_map, np.append(children(slam_map, keyframe_id), keyframe_id))
+    return merge_back(slam_map, part, without_keyframe(part.map, keyframe_id))
 
 
 def memory_bytes(slam_map: Map) -> int:
     """Return the memory that a map takes, with what the place index holds of it, bytes."""
-    arrays = [*slam_map.points, *slam_map.observations, *slam_map.loops, *slam_map.culled, slam_map.T_world_cam]
-    return sum(array.nbytes for array in arrays) + sum(map(_keyframe_bytes, slam_map.keyframes))
+    arrays = [*slam_map.loops, *slam_map.culled, slam_map.T_world_cam]
+    of_arrays = sum(array.nbytes for array in arrays) + slam_map.contents.nbytes
+    return of_arrays + sum(map(_keyframe_bytes, slam_map.keyframes))
 
 
 def _keyframe_bytes(keyframe: Keyframe) -> int:

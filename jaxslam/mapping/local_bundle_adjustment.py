@@ -14,7 +14,8 @@ from jaxslam.dynamics.occlusion import state_weights
 from jaxslam.geometry.se3 import between, compose, inverse, rotate, to_local, transform
 from jaxslam.geometry.types import Ids, Points, Pose, Poses
 from jaxslam.map.edit import with_positions, without_observations
-from jaxslam.map.types import NONE, Map, Observations, covisible, has, observations_at, rows
+from jaxslam.map.point_records import NONE, Observations, has, observations_at, rows
+from jaxslam.map.types import Map, covisible
 from jaxslam.runtime.compiled import compiled
 from jaxslam.runtime.compiler_options import FAST_COMPILE
 from jaxslam.runtime.padding import padded

@@ -9,7 +9,8 @@ from jaxslam.features.orb import FeaturePlan, Features
 from jaxslam.features.pose_from_matches import FeaturePose, fit_pose, matches_of
 from jaxslam.geometry.se3 import angle, between, compose, to_local
 from jaxslam.geometry.types import Ids, Pose
-from jaxslam.map.types import Map, covisible, observations_at, rows
+from jaxslam.map.point_records import has, observations_at, rows
+from jaxslam.map.types import Map, covisible
 from jaxslam.mapping.map_point_matching import described_points_in, find_points
 from jaxslam.mapping.occlusion_states import PointStates
 from jaxslam.mapping.view_coverage import in_view, seen_alike
@@ -54,9 +55,9 @@ def keyframes_in_view(slam_map: Map, T_world_cam: Pose, submap: int, exclude: se
     others = np.flatnonzero((slam_map.submap == submap) & ~np.isin(slam_map.ids, list(exclude)))
     apart = np.linalg.norm(slam_map.T_world_cam[others, 4:] - T_world_cam[4:], axis=1)
     near = np.sort(others[np.argsort(apart, kind="stable")[:_NEAREST]])
-    of_near = np.zeros(slam_map.next_keyframe, bool)  # by id: searching all observations would take a second
-    of_near[slam_map.ids[near]] = True
-    seen = observations_at(slam_map.observations, np.flatnonzero(of_near[slam_map.observations.keyframe]))
+    slam_map = slam_map.around(slam_map.ids[near])
+    of_near = has(slam_map.ids[near], slam_map.observations.keyframe)
+    seen = observations_at(slam_map.observations, np.flatnonzero(of_near))
     X_world = slam_map.points.X_world[:, rows(slam_map.points.ids, seen.point)]
     at = rows(slam_map.ids[near], seen.keyframe)
     shown = in_view(slam_map.camera, T_world_cam, X_world)
@@ -95,7 +96,9 @@ def match_local_map(
     near, at = local_keyframes(slam_map, keyframe_id), compose(origin, T_keyframe_cam)
     submap = int(slam_map.submap[slam_map.row(keyframe_id)])
     in_view = keyframes_in_view(slam_map, at, submap, set(near.tolist()), _IN_VIEW)
-    points = described_points_in(slam_map, np.append(near, np.array(in_view, np.int64)), plan)
+    local = np.append(near, np.array(in_view, np.int64))
+    slam_map = slam_map.around(local)
+    points = described_points_in(slam_map, local, plan)
     weight = slam_map.points.weight[rows(slam_map.points.ids, points.ids)]
     for radius_px in radii_px:
         expected = compose(origin, T_keyframe_cam)

@@ -28,18 +28,8 @@ from jaxslam.map.dynamic_removal import DynamicObservations, without_dynamic, wi
 from jaxslam.map.edit import with_descriptors, with_keyframe, with_observations, with_points
 from jaxslam.map.partial_map import PartialMap, extract_around, merge_back, most_shared
 from jaxslam.map.point_fusion import with_fused_points
-from jaxslam.map.types import (
-    NONE,
-    Keyframe,
-    Map,
-    Observations,
-    covisible,
-    empty_map,
-    has,
-    point_submaps,
-    rows,
-    surviving_keyframes,
-)
+from jaxslam.map.point_records import NONE, Observations, has, rows
+from jaxslam.map.types import Keyframe, Map, covisible, empty_map, point_submaps, surviving_keyframes
 from jaxslam.mapping.culling import CONFIRM_WITHIN, within_memory, without_redundant, without_unconfirmed
 from jaxslam.mapping.local_bundle_adjustment import AdjustPlan, adjust_all, adjust_around, compile_adjustment
 from jaxslam.mapping.local_map_tracking import LOCAL_KEYFRAMES, local_keyframes
@@ -172,7 +162,7 @@ class LocalMapping:
 
     def __init__(self, camera: Camera, sensor: SensorModel, plan: MappingPlan, slam_map: Map | None = None) -> None:
         """Start with a map, empty by default."""
-        self.map = empty_map(camera) if slam_map is None else slam_map
+        self.map = (empty_map(camera) if slam_map is None else slam_map).in_blocks()
         self._sensor, self._plan = sensor, plan
         self._tracks = TrackTable()
 
@@ -193,7 +183,7 @@ class LocalMapping:
         whole = with_new_keyframe(self.map, new, features)
         # 2. Extract the part of the map that the keyframe may change.
         known = self._tracks.points(new.tracks.id)
-        part = _part(whole, new.id, known[has(whole.points.ids, known)])
+        part = _part(whole, new.id, known[whole.contents.have(known)])
         # 3. Observations of the points tracked by optical flow, which ORB-SLAM does not have, at features if there are.
         slam_map = self._with_tracks(part.map, new, known, features)
         # 4. Matching of the local map by descriptor (V-D), here with the keyframe only and not with every frame.
@@ -246,15 +236,17 @@ class LocalMapping:
         Returns:
             The new map, and the tracker ids of the removed points.
         """
-        before = slam_map = self.map
-        if has(slam_map.ids, np.array([movers.keyframe]))[0]:
-            slam_map = without_dynamic(slam_map, movers.keyframe, movers.mask)
-        slam_map = without_dynamic_points(slam_map, self._tracks.points(movers.tracks))
-        self.map = slam_map
-        gone = before.points.ids[~has(slam_map.points.ids, before.points.ids)]
+        points = self._tracks.points(movers.tracks)
+        present = np.array([movers.keyframe])
+        present = present[has(self.map.ids, present)]
+        part = extract_around(self.map, present, points[self.map.contents.have(points)])
+        slam_map = without_dynamic(part.map, movers.keyframe, movers.mask) if len(present) else part.map
+        slam_map = without_dynamic_points(slam_map, points)
+        gone = part.map.points.ids[~has(slam_map.points.ids, part.map.points.ids)]
+        self.map = merge_back(self.map, part, slam_map)
         tracks = self._tracks.tracks_of(gone)
         self._tracks.mark_removed(movers.tracks, movers.keyframe)
-        return slam_map, np.append(TrackId.of_map_points(gone), tracks)
+        return self.map, np.append(TrackId.of_map_points(gone), tracks)
 
     def _within_memory(self, slam_map: Map, keyframe_id: int) -> Map:
         """Drop keyframes if the map takes too much memory, and log how many."""

@@ -11,7 +11,8 @@ from jaxslam.geometry.se3 import to_local
 from jaxslam.geometry.types import Ids, Pose
 from jaxslam.map.edit import with_observations
 from jaxslam.map.point_fusion import with_fused_points
-from jaxslam.map.types import NONE, Map, Observations, empty_observations, observations_at, rows
+from jaxslam.map.point_records import NONE, Observations, empty_observations, observations_at, rows
+from jaxslam.map.types import Map
 
 _MARGIN_PX = 1.0
 _NEAREST_M = 0.1
@@ -45,6 +46,7 @@ class DescribedPoints(NamedTuple):
 
 def described_points_in(slam_map: Map, keyframe_ids: Ids, plan: FeaturePlan) -> DescribedPoints:
     """Return the points with a descriptor that these keyframes observe at a feature."""
+    slam_map = slam_map.around(keyframe_ids)
     seen = np.flatnonzero(
         np.isin(slam_map.observations.keyframe, keyframe_ids) & (slam_map.observations.feature != NONE)
     )
@@ -97,6 +99,7 @@ def features_at(features: Features, uv_raw: Float32[np.ndarray, "2 n"]) -> Int32
 
 def points_of_features(slam_map: Map, keyframe_id: int, num_features: int) -> Int64[np.ndarray, " f"]:
     """Return the id of the point that each feature of a keyframe shows; `NONE` for a feature that shows none."""
+    slam_map = slam_map.around(np.array([keyframe_id]))
     seen = observations_at(
         slam_map.observations,
         np.flatnonzero((slam_map.observations.keyframe == keyframe_id) & (slam_map.observations.feature != NONE)),

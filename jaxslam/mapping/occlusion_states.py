@@ -24,7 +24,9 @@ from jaxslam.dynamics.occlusion import PointState, States, next_states, occluded
 from jaxslam.geometry.se3 import IDENTITY, to_local
 from jaxslam.geometry.types import Ids, Pose
 from jaxslam.map.edit import with_states
-from jaxslam.map.types import NONE, Map, has, rows, visibility
+from jaxslam.map.partial_map import extract_around, merge_back
+from jaxslam.map.point_records import NONE, rows
+from jaxslam.map.types import Map, visibility
 from jaxslam.runtime.compiled import committed, compiled
 from jaxslam.runtime.compiler_options import SINGLE_THREAD
 from jaxslam.runtime.padding import padded
@@ -175,6 +177,7 @@ class PointStates:
     def _of(self, slam_map: Map, point_ids: Int[np.ndarray, " n"]) -> Int8[np.ndarray, " n"]:
         """Return the current states of points."""
         ahead = self._state[point_ids]
+        slam_map = slam_map.around(point_ids[:0], point_ids)
         return np.where(ahead == _AS_IN_MAP, slam_map.points.state[rows(slam_map.points.ids, point_ids)], ahead)
 
     def _points_of(self, slam_map: Map, keyframe_id: int) -> _VisiblePoints:
@@ -183,19 +186,20 @@ class PointStates:
         if shown is not None and shown.map is slam_map and shown.keyframe == keyframe_id:
             return shown
         submap = int(slam_map.submap[slam_map.row(keyframe_id)])
-        own = slam_map.observations.point[slam_map.observations.keyframe == keyframe_id]
-        blocked = self._blocked(slam_map) if shown is not None and shown.submap == submap else own[:0]
+        blocked = self._blocked(slam_map) if shown is not None and shown.submap == submap else np.zeros(0, np.int64)
+        near = slam_map.around(np.array([keyframe_id]), blocked)
+        own = near.observations.point[near.observations.keyframe == keyframe_id]
         ids = np.concatenate([own, blocked[~np.isin(blocked, own)][:_MAX_BLOCKED]])
-        X_keyframe = to_local(slam_map.pose(keyframe_id), slam_map.points.X_world[:, rows(slam_map.points.ids, ids)])
+        X_keyframe = to_local(slam_map.pose(keyframe_id), near.points.X_world[:, rows(near.points.ids, ids)])
         columns = self._columns(
-            self._of(slam_map, ids), X_keyframe.astype(np.float32), np.ones(len(ids), bool), np.ones(len(own), bool)
+            self._of(near, ids), X_keyframe.astype(np.float32), np.ones(len(ids), bool), np.ones(len(own), bool)
         )
         return _VisiblePoints(slam_map, keyframe_id, submap, ids, columns)
 
     def _blocked(self, slam_map: Map) -> Ids:
         """Return the collected points that are blocked and still in the map, the latest first."""
         ids = self._shown.ids if self._shown is not None else np.zeros(0, np.int64)
-        ids = ids[has(slam_map.points.ids, ids)]
+        ids = ids[slam_map.contents.have(ids)]
         return ids[self._of(slam_map, ids) == PointState.BLOCKED]
 
     def _columns(self, *columns: np.ndarray) -> _Columns:
@@ -213,8 +217,12 @@ class PointStates:
 
 def with_changes(slam_map: Map, changes: StateChanges) -> Map:
     """Apply state changes to those points that are still in the map."""
-    there = has(slam_map.points.ids, changes.ids)
-    return with_states(slam_map, changes.ids[there], changes.states[there])
+    there = slam_map.contents.have(changes.ids)
+    ids = changes.ids[there]
+    if not len(ids):
+        return slam_map
+    part = extract_around(slam_map, ids[:0], ids)
+    return merge_back(slam_map, part, with_states(part.map, ids, changes.states[there]))
 
 
 def occluded_shares(slam_map: Map) -> Float64[np.ndarray, " k"]:

@@ -8,7 +8,8 @@ from jaxslam.features.orb import DESCRIPTOR_BYTES, FeaturePlan, Features
 from jaxslam.geometry.se3 import between, transform
 from jaxslam.geometry.types import Ids
 from jaxslam.map.edit import with_observations, with_points
-from jaxslam.map.types import NONE, Map, MapPoints
+from jaxslam.map.point_records import NONE, MapPoints
+from jaxslam.map.types import Map
 from jaxslam.mapping.map_point_matching import feature_observations
 from jaxslam.mapping.triangulation import at_baseline, triangulate
 

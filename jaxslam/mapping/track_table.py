@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Bool, Int, Int64
 
-from jaxslam.map.types import NONE
+from jaxslam.map.point_records import NONE
 
 REMOVED = -2
 """In place of a map point: the track was on a movable object; never make a map point of it."""

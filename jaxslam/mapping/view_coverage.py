@@ -6,7 +6,8 @@ from jaxtyping import Bool, Float
 from jaxslam.geometry.se3 import to_local
 from jaxslam.geometry.so3 import matrices
 from jaxslam.geometry.types import Pose
-from jaxslam.map.types import Map, has, rows
+from jaxslam.map.point_records import has, rows
+from jaxslam.map.types import Map
 from jaxslam.sensors.camera import Camera
 
 _NUM_SAMPLES = 32
@@ -67,10 +68,11 @@ class ViewCoverage:
         X_cam, reach_m = np.zeros((len(known), 3, _NUM_SAMPLES)), np.zeros(len(known))
         X_cam[known], reach_m[known] = self._X_cam[row], self._reach_m[row]
         for new in np.flatnonzero(~known):
-            points = slam_map.observations.point[slam_map.observations.keyframe == slam_map.ids[new]]
+            near = slam_map.around(slam_map.ids[[new]])
+            points = near.observations.point[near.observations.keyframe == slam_map.ids[new]]
             if len(points):
                 some = points[np.arange(_NUM_SAMPLES) * len(points) // _NUM_SAMPLES]
-                X_world = slam_map.points.X_world[:, rows(slam_map.points.ids, some)]
+                X_world = near.points.X_world[:, rows(near.points.ids, some)]
                 X_cam[new] = to_local(slam_map.T_world_cam[new], X_world)
                 reach_m[new] = np.median(np.linalg.norm(X_cam[new], axis=0))
         self._map, self._ids, self._X_cam, self._reach_m = slam_map, slam_map.ids, X_cam, reach_m

@@ -20,7 +20,8 @@ from jaxslam.loop_closing.loop_detector import LoopClosing, LoopClosure
 from jaxslam.loop_closing.place_index import PlaceIndex
 from jaxslam.loop_closing.place_recognition import compile_recognition
 from jaxslam.map.dynamic_removal import DynamicObservations
-from jaxslam.map.types import NONE, Map, empty_map
+from jaxslam.map.point_records import NONE
+from jaxslam.map.types import Map, empty_map
 from jaxslam.mapping.local_mapping import mapping_plan
 from jaxslam.mapping.occlusion_states import PointStates
 from jaxslam.mapping.view_coverage import ViewCoverage

@@ -18,7 +18,8 @@ from jaxslam.dense.point_cloud import DenseCloud
 from jaxslam.geometry.se3 import IDENTITY, retract
 from jaxslam.geometry.types import Pose
 from jaxslam.map.dynamic_removal import DynamicObservations
-from jaxslam.map.types import NONE, Map
+from jaxslam.map.point_records import NONE
+from jaxslam.map.types import Map
 from jaxslam.mapping.local_mapping import NewKeyframe
 from jaxslam.runtime.stage_timer import StageTimes
 from jaxslam.runtime.worker import Worker, make_worker

@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 
 from jaxslam.geometry.se3 import to_local
-from jaxslam.map.types import Map, observations_at, rows
+from jaxslam.map.point_records import observations_at, rows
+from jaxslam.map.types import Map
 from jaxslam.mapping.track_table import TrackId
 from jaxslam.runtime.padding import padded
 
@@ -45,6 +46,7 @@ def reload_keyframe(slam_map: Map, keyframe_id: int, num_points: int) -> MapKeyf
     image = cv2.imdecode(np.frombuffer(keyframe.image_png, np.uint8), cv2.IMREAD_GRAYSCALE)
     if image is None:
         raise RuntimeError(f"the image of keyframe {keyframe_id} cannot be decoded")
+    slam_map = slam_map.around(np.array([keyframe_id]))
     seen = observations_at(slam_map.observations, np.flatnonzero(slam_map.observations.keyframe == keyframe_id))
     order = np.lexsort((seen.point, seen.sigma_px))[:num_points]
     seen = observations_at(seen, order)

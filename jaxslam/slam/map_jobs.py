@@ -7,7 +7,8 @@ import numpy as np
 from jaxslam.features.orb import no_features
 from jaxslam.loop_closing.loop_detector import LoopClosure
 from jaxslam.map.dynamic_removal import DynamicObservations
-from jaxslam.map.types import NONE, Map
+from jaxslam.map.point_records import NONE
+from jaxslam.map.types import Map
 from jaxslam.mapping.local_mapping import LocalMapping, MappingPlan, NewKeyframe, with_new_keyframe
 from jaxslam.mapping.occlusion_states import StateChanges
 from jaxslam.sensors.camera import Camera
@@ -78,7 +79,7 @@ class MapWriter:
                 return MapUpdate(slam_map, loops=int(slam_map is not before))
             if isinstance(job, DynamicObservations):
                 slam_map, gone = self._mapping.remove(job)
-                removed = len(before.points.ids) - len(slam_map.points.ids)
+                removed = before.contents.num_points - slam_map.contents.num_points
                 return MapUpdate(slam_map, cleaned=job.keyframe, removed=removed, gone=gone)
             if isinstance(job, StateChanges):
                 return MapUpdate(self._mapping.take_states(job), states=job.number)

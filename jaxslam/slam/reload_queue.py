@@ -4,7 +4,7 @@ from collections.abc import Iterable, Set
 
 import numpy as np
 
-from jaxslam.map.types import Map, has
+from jaxslam.map.types import Map
 from jaxslam.mapping.track_table import TrackId
 from jaxslam.slam.keyframe_reload import MapKeyframe
 from jaxslam.slam.tracker_map_sync import TrackerMapSync
@@ -56,5 +56,5 @@ class ReloadQueue:
 
 def _without_removed(keyframe: MapKeyframe, slam_map: Map) -> MapKeyframe:
     """Give weight 0 to points of a keyframe that have left the map since the keyframe was prepared."""
-    present = has(slam_map.points.ids, TrackId.map_points(keyframe.id))
+    present = slam_map.contents.have(TrackId.map_points(keyframe.id))
     return keyframe._replace(weight=np.where(present, keyframe.weight, np.float32(0)))

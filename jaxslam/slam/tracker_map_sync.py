@@ -12,7 +12,8 @@ from jaxtyping import Float
 
 from jaxslam.geometry.se3 import IDENTITY, angle, between, compose, inverse, to_local, transform
 from jaxslam.geometry.types import Pose
-from jaxslam.map.types import NONE, Map, has, surviving_keyframes
+from jaxslam.map.point_records import NONE, has
+from jaxslam.map.types import Map, surviving_keyframes
 from jaxslam.mapping.local_mapping import NewKeyframe, TrackedObservations
 from jaxslam.runtime.compiled import compiled
 from jaxslam.runtime.padding import padded

@@ -20,7 +20,8 @@ from matplotlib.figure import Figure, SubFigure
 from jaxslam.errors import TrajectoryError
 from jaxslam.geometry.so3 import matrices
 from jaxslam.io.atomic_files import write_atomically
-from jaxslam.map.types import NONE, Map, rows
+from jaxslam.map.point_records import NONE, rows
+from jaxslam.map.types import Map
 from jaxslam.trajectory.evaluation import Evaluation
 from jaxslam.trajectory.trajectory import Trajectory
 

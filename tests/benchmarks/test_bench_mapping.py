@@ -16,7 +16,8 @@ import pytest
 from jaxslam.benchmark.timing import pinned_to_one_core
 from jaxslam.config.schema import Config
 from jaxslam.datasets import open_dataset
-from jaxslam.map.types import NONE, Map
+from jaxslam.map.point_records import NONE
+from jaxslam.map.types import Map
 from jaxslam.mapping import local_mapping as module
 from jaxslam.mapping.local_mapping import LocalMapping, NewKeyframe, mapping_plan
 from jaxslam.sensors.sensor_model import sensor_model

@@ -6,7 +6,8 @@ from small_map import points
 from jaxslam.features.orb import Features
 from jaxslam.geometry.se3 import to_local
 from jaxslam.map.edit import with_keyframe, with_observations, with_points
-from jaxslam.map.types import NONE, Keyframe, Map, Observations, empty_map
+from jaxslam.map.point_records import NONE, Observations
+from jaxslam.map.types import Keyframe, Map, empty_map
 from jaxslam.sensors.camera import Camera
 
 CAMERA = Camera("exact", 640, 480, 525.0, 525.0, 319.5, 239.5)

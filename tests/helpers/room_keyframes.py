@@ -7,7 +7,8 @@ from room_views import features, picture, room, sensor
 
 from jaxslam.config.schema import Config
 from jaxslam.geometry.se3 import between, retract, to_local, transform
-from jaxslam.map.types import NONE, Map
+from jaxslam.map.point_records import NONE
+from jaxslam.map.types import Map
 from jaxslam.mapping.local_mapping import LocalMapping, MappingPlan, NewKeyframe, TrackedObservations, mapping_plan
 from jaxslam.sensors.frame_arrays import FrameArrays, frame_arrays
 

@@ -9,7 +9,8 @@ from jaxslam.config.schema import TrackConfig
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.features.orb import Features, features_of
 from jaxslam.map.edit import with_keyframe
-from jaxslam.map.types import NONE, Keyframe, Map, empty_map
+from jaxslam.map.point_records import NONE
+from jaxslam.map.types import Keyframe, Map, empty_map
 from jaxslam.sensors.frame import Frame
 from jaxslam.sensors.frame_arrays import frame_arrays
 from jaxslam.sensors.sensor_model import SensorModel, sensor_model

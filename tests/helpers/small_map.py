@@ -6,7 +6,8 @@ import numpy as np
 from jaxslam.features.orb import Features
 from jaxslam.geometry.se3 import to_local
 from jaxslam.map.edit import with_keyframe, with_loop, with_observations, with_points
-from jaxslam.map.types import NONE, Keyframe, Map, MapPoints, Observations, empty_map
+from jaxslam.map.point_records import NONE, MapPoints, Observations
+from jaxslam.map.types import Keyframe, Map, empty_map
 from jaxslam.sensors.camera import Camera
 
 CAMERA = Camera("small", 64, 48, 50.0, 51.0, 31.0, 24.5)

@@ -5,7 +5,8 @@ from small_map import CAMERA, features, observations, png
 
 from jaxslam.geometry.so3 import axis_rotation
 from jaxslam.map.edit import with_keyframe, with_observations, with_points
-from jaxslam.map.types import NONE, Keyframe, Map, MapPoints, empty_map
+from jaxslam.map.point_records import NONE, MapPoints
+from jaxslam.map.types import Keyframe, Map, empty_map
 
 POINTS = 100
 

@@ -26,7 +26,8 @@ from jaxslam.dynamics.regions import RegionMemory, RegionPlan, find_regions, mov
 from jaxslam.features.orb import DESCRIPTOR_BYTES, Features
 from jaxslam.geometry.se3 import between, to_local, transform
 from jaxslam.map.edit import with_keyframe, with_observations, with_points
-from jaxslam.map.types import NONE, Keyframe, Map, MapPoints, Observations, empty_map
+from jaxslam.map.point_records import NONE, MapPoints, Observations
+from jaxslam.map.types import Keyframe, Map, empty_map
 from jaxslam.mapping.occlusion_states import PointStates
 from jaxslam.sensors.frame_arrays import FrameMemory
 from jaxslam.sensors.sensor_model import sensor_model

@@ -19,7 +19,8 @@ from jaxslam.loop_closing.place_index import PlaceIndex
 from jaxslam.loop_closing.visibility_check import see_through_ratio
 from jaxslam.map.edit import transformed, with_keyframe
 from jaxslam.map.keyframe_removal import without_keyframe
-from jaxslam.map.types import NONE, Keyframe, Map, surviving_keyframes
+from jaxslam.map.point_records import NONE
+from jaxslam.map.types import Keyframe, Map, surviving_keyframes
 from jaxslam.map.validate import problems
 from jaxslam.sensors.frame_arrays import frame_arrays
 

@@ -21,7 +21,8 @@ from jaxslam.loop_closing.place_index import PlaceIndex
 from jaxslam.loop_closing.place_recognition import Recognition, recognize, verify
 from jaxslam.map.edit import with_keyframe
 from jaxslam.map.keyframe_removal import without_keyframe
-from jaxslam.map.types import NONE, Keyframe, Map, empty_map
+from jaxslam.map.point_records import NONE
+from jaxslam.map.types import Keyframe, Map, empty_map
 from jaxslam.sensors.frame_arrays import frame_arrays
 from jaxslam.sensors.sensor_model import sensor_model
 

@@ -23,7 +23,8 @@ from jaxslam.map.edit import (
 )
 from jaxslam.map.keyframe_removal import without_keyframe
 from jaxslam.map.point_fusion import with_fused_points
-from jaxslam.map.types import NONE, Map, Observations, point_submaps
+from jaxslam.map.point_records import NONE, Observations
+from jaxslam.map.types import Map, point_submaps
 from jaxslam.map.validate import problems
 
 RNG = np.random.Generator
@@ -270,7 +271,7 @@ class TestFused:
 
     def test_descriptor_is_carried_over(self):
         slam_map = small_map(num_points=3)
-        slam_map = slam_map._replace(points=slam_map.points._replace(has_descriptor=np.array([False, False, True])))
+        slam_map = slam_map.with_arrays(points=slam_map.points._replace(has_descriptor=np.array([False, False, True])))
         after = with_fused_points(slam_map, np.array([0, 0]), np.array([1, 2]))
         assert after.points.has_descriptor.tolist() == [True]
         np.testing.assert_array_equal(after.points.descriptor[0], slam_map.points.descriptor[2])

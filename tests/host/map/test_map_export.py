@@ -13,7 +13,8 @@ from jaxslam.geometry.se3 import to_local
 from jaxslam.map.edit import with_keyframe, with_observations, with_points, without_observations
 from jaxslam.map.export import write_colmap, write_keyframe_trajectory, write_ply
 from jaxslam.map.keyframe_removal import without_keyframe
-from jaxslam.map.types import NONE, Map, empty_map
+from jaxslam.map.point_records import NONE
+from jaxslam.map.types import Map, empty_map
 from jaxslam.sensors.camera import Camera
 from jaxslam.trajectory.trajectory import read_tum
 

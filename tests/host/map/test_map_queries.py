@@ -9,19 +9,9 @@ from small_map import CAMERA, keyframe, pose, small_map
 
 from jaxslam.map.edit import with_keyframe, without_observations
 from jaxslam.map.keyframe_removal import without_keyframe
+from jaxslam.map.point_records import NONE, has, rows
 from jaxslam.map.spanning_tree import children, subtree
-from jaxslam.map.types import (
-    NONE,
-    Map,
-    covisible,
-    empty_map,
-    has,
-    neighborhood,
-    point_submaps,
-    rows,
-    surviving_keyframes,
-    visibility,
-)
+from jaxslam.map.types import Map, covisible, empty_map, neighborhood, point_submaps, surviving_keyframes, visibility
 from jaxslam.map.validate import problems
 
 
@@ -113,7 +103,8 @@ def broken(**changes: Callable[[Any], Any]) -> Map:
         name, _, field = key.partition("__")
         record = getattr(slam_map, name)
         after = record._replace(**{field: change(getattr(record, field))}) if field else change(record)
-        slam_map = slam_map._replace(**{name: after})
+        of_arrays = name in ("points", "observations")
+        slam_map = slam_map.with_arrays(**{name: after}) if of_arrays else slam_map._replace(**{name: after})
     return slam_map
 
 
@@ -178,4 +169,6 @@ def test_problems_knows_submaps():
     slam_map, rng = small_map(num_keyframes=2), np.random.default_rng(1)
     slam_map = with_keyframe(slam_map, keyframe(slam_map, rng), pose(rng), NONE, 1)
     seen = slam_map.observations._replace(keyframe=put(0, 2)(slam_map.observations.keyframe))
-    assert problems(slam_map._replace(observations=seen)) == ["observations: a keyframe sees a point of another submap"]
+    assert problems(slam_map.with_arrays(observations=seen)) == [
+        "observations: a keyframe sees a point of another submap"
+    ]

@@ -26,7 +26,8 @@ from jaxslam.map import npz_file as map_file
 from jaxslam.map.edit import with_keyframe
 from jaxslam.map.keyframe_removal import without_keyframe
 from jaxslam.map.npz_file import load_map, save_map
-from jaxslam.map.types import NONE, Map, empty_map
+from jaxslam.map.point_records import NONE
+from jaxslam.map.types import Map, empty_map
 from jaxslam.sensors.camera import Camera
 
 HELPERS = str(Path(__file__).resolve().parents[2] / "helpers")
@@ -147,7 +148,7 @@ class TestEarlierVersions:
         save_map(path, slam_map)
         path.write_bytes(packed(of_version(unpacked(path.read_bytes()), version)))
         state = slam_map.points.state if version == 2 else np.zeros_like(slam_map.points.state)
-        assert same(load_map(path), slam_map._replace(points=slam_map.points._replace(state=state)))
+        assert same(load_map(path), slam_map.with_arrays(points=slam_map.points._replace(state=state)))
 
     def test_old_names_are_no_part_of_the_present_version(self, saved, tmp_path):
         old = of_version(unpacked(saved), 2)

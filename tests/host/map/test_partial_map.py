@@ -10,7 +10,8 @@ from jaxslam.map.edit import with_keyframe, with_observations, with_positions, w
 from jaxslam.map.keyframe_removal import without_keyframe
 from jaxslam.map.partial_map import extract_around, merge_back, most_shared
 from jaxslam.map.point_fusion import with_fused_points
-from jaxslam.map.types import NONE, Map, covisible
+from jaxslam.map.point_records import NONE
+from jaxslam.map.types import Map, covisible
 from jaxslam.map.validate import problems
 
 
@@ -26,7 +27,7 @@ def thinned(seed: int, num_keyframes: int = 6, num_points: int = 40) -> Map:
 def in_order(slam_map: Map) -> Map:
     """The observations in the order of keyframes and points: which of them came first is lost on the way."""
     order = np.lexsort((slam_map.observations.point, slam_map.observations.keyframe))
-    return slam_map._replace(
+    return slam_map.with_arrays(
         observations=type(slam_map.observations)(*(column[..., order] for column in slam_map.observations))
     )
 

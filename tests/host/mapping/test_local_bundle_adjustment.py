@@ -11,7 +11,8 @@ from small_map import same
 from jaxslam.geometry.se3 import retract as shifted
 from jaxslam.geometry.se3 import to_local
 from jaxslam.map.edit import with_positions
-from jaxslam.map.types import Map, observations_at, rows
+from jaxslam.map.point_records import observations_at, rows
+from jaxslam.map.types import Map
 from jaxslam.map.validate import problems
 from jaxslam.mapping import local_bundle_adjustment as module
 from jaxslam.mapping.local_bundle_adjustment import AdjustPlan, adjust_all, adjust_around, compile_adjustment
@@ -60,7 +61,7 @@ def test_window_comes_back_to_where_it_was_seen(truth):
 
 def test_points_that_only_one_keyframe_sees_move_along_with_it(truth):
     alone = ~np.isin(truth.observations.point, truth.points.ids[::7]) | (truth.observations.keyframe == 15)
-    slam_map = truth._replace(observations=observations_at(truth.observations, alone))
+    slam_map = truth.with_arrays(observations=observations_at(truth.observations, alone))
     lone = np.intersect1d(slam_map.points.ids[::7], slam_map.observations.point)
     assert len(lone) > 20
     before = disturbed(slam_map, np.arange(8, 16))
@@ -107,7 +108,7 @@ def test_observations_that_do_not_fit_are_dropped(truth):
     seen = truth.observations
     wrong = (rng.random(len(seen.point)) < 0.08) & (seen.keyframe >= 8)
     uv = seen.uv + np.where(wrong, rng.choice([-1, 1], seen.uv.shape) * rng.uniform(15, 60, seen.uv.shape), 0)
-    before = disturbed(truth._replace(observations=seen._replace(uv=uv.astype(np.float32))), np.arange(8, 16))
+    before = disturbed(truth.with_arrays(observations=seen._replace(uv=uv.astype(np.float32))), np.arange(8, 16))
     after = adjust_around(before, 15, PLAN)
     assert apart(after, truth, np.arange(8, 16)).max() < 1e-3
     kept = {
@@ -126,7 +127,7 @@ def test_points_count_by_their_weight(truth):
     shift = np.where(gone[rows(truth.points.ids, seen.point)] & (seen.keyframe == 15), np.float32(6), 0)
     uv = seen.uv + np.stack([shift, 0 * shift]).astype(np.float32)
     weight = np.where(gone, np.float32(0), 1).astype(np.float32)
-    weighted = truth._replace(observations=seen._replace(uv=uv), points=truth.points._replace(weight=weight))
+    weighted = truth.with_arrays(observations=seen._replace(uv=uv), points=truth.points._replace(weight=weight))
     after = adjust_around(disturbed(weighted, np.arange(8, 16)), 15, PLAN)
     assert apart(after, truth, np.arange(8, 16)).max() < 1e-4
 
@@ -158,7 +159,7 @@ def _in_common(slam_map: Map) -> Map:
     alone = np.isin(slam_map.observations.keyframe, [3]) == np.isin(
         slam_map.observations.point, slam_map.observations.point[::2]
     )
-    return slam_map._replace(observations=observations_at(slam_map.observations, alone))
+    return slam_map.with_arrays(observations=observations_at(slam_map.observations, alone))
 
 
 def _points_at(slam_map: Map, X_world: np.ndarray) -> Map:
@@ -166,12 +167,12 @@ def _points_at(slam_map: Map, X_world: np.ndarray) -> Map:
 
 
 def _observations(slam_map: Map, **columns: np.ndarray) -> Map:
-    return slam_map._replace(observations=slam_map.observations._replace(**columns))
+    return slam_map.with_arrays(observations=slam_map.observations._replace(**columns))
 
 
 SPOILT: dict[str, Callable[[Map], Map]] = {
     "nothing in common": _in_common,
-    "no observations": lambda slam_map: slam_map._replace(
+    "no observations": lambda slam_map: slam_map.with_arrays(
         observations=observations_at(slam_map.observations, np.arange(0))
     ),
     "behind the camera": lambda slam_map: _points_at(slam_map, slam_map.points.X_world * [[1], [1], [-1]]),

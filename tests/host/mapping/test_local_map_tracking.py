@@ -15,7 +15,8 @@ from jaxslam.config.schema import Config
 from jaxslam.features.orb import Features, features_of
 from jaxslam.features.pose_from_matches import MIN_CELLS
 from jaxslam.geometry.se3 import IDENTITY, angle, between, compose, inverse, retract
-from jaxslam.map.types import Map, empty_map, observations_at
+from jaxslam.map.point_records import observations_at
+from jaxslam.map.types import Map, empty_map
 from jaxslam.mapping.local_map_tracking import (
     RADII_PX,
     WIDE_RADII_PX,
@@ -142,7 +143,7 @@ class TestMatchLocalMap:
         """As those of a thing that moves: they are no part of what the frame is held to."""
         slam_map = mapped()[0]
         points = slam_map.points._replace(weight=np.zeros_like(slam_map.points.weight))
-        assert match(slam_map._replace(points=points), LATER, np.zeros(6))[0] is None
+        assert match(slam_map.with_arrays(points=points), LATER, np.zeros(6))[0] is None
 
     def test_local_keyframes_begin_with_the_one_asked_for(self) -> None:
         slam_map = mapped()[0]
@@ -160,7 +161,7 @@ class TestPointsInView:
         slam_map = mapped()[0]
         lonely = nearest_keyframe(slam_map, mapped()[1][LATER].T_world_cam)
         others = np.flatnonzero(slam_map.observations.keyframe != lonely)
-        slam_map = slam_map._replace(observations=observations_at(slam_map.observations, others))
+        slam_map = slam_map.with_arrays(observations=observations_at(slam_map.observations, others))
         assert local_keyframes(slam_map, lonely).tolist() == [lonely]
         return slam_map
 

@@ -9,7 +9,8 @@ from small_map import arrays, same
 from jaxslam.geometry.se3 import between, compose, to_local, transform
 from jaxslam.loop_closing.loop_detector import LoopClosure
 from jaxslam.map.edit import with_positions, without_observations
-from jaxslam.map.types import NONE, Map, covisible, observations_at, rows
+from jaxslam.map.point_records import NONE, observations_at, rows
+from jaxslam.map.types import Map, covisible
 from jaxslam.map.validate import problems
 from jaxslam.mapping import local_mapping
 from jaxslam.mapping.culling import CONFIRM_WITHIN, KEEP_LATEST, without_redundant, without_unconfirmed
@@ -208,7 +209,7 @@ class TestRedundant:
         seen = crowded.observations
         for factor, stays in ((1.2, False), (1.44, True)):
             sigma = np.where(seen.keyframe == 2, 1, np.float32(factor)) * seen.sigma_px
-            slam_map = crowded._replace(observations=seen._replace(sigma_px=sigma.astype(np.float32)))
+            slam_map = crowded.with_arrays(observations=seen._replace(sigma_px=sigma.astype(np.float32)))
             assert (2 in without_redundant(slam_map, CROWD - 1, np.array([2])).ids) == stays
 
     def test_those_with_enough_of_their_own_stay(self, crowded):

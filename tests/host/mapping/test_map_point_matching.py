@@ -7,7 +7,8 @@ from exact_map import CAMERA
 from jaxslam.features.orb import DEFAULT_PLAN, Features, no_features
 from jaxslam.geometry.se3 import IDENTITY, retract, to_local
 from jaxslam.map.edit import with_keyframe, with_observations, with_points, without_observations
-from jaxslam.map.types import NONE, Keyframe, Map, MapPoints, empty_map, rows
+from jaxslam.map.point_records import NONE, MapPoints, rows
+from jaxslam.map.types import Keyframe, Map, empty_map
 from jaxslam.map.validate import problems
 from jaxslam.mapping.map_point_matching import (
     DescribedPoints,
@@ -115,10 +116,10 @@ class TestFindPoints:
 
 def test_recognizable_are_those_seen_by_a_feature(three, places):
     slam_map = made(three, 0, places, np.arange(10))
-    slam_map = slam_map._replace(points=slam_map.points._replace(has_descriptor=np.arange(10) > 2))
+    slam_map = slam_map.with_arrays(points=slam_map.points._replace(has_descriptor=np.arange(10) > 2))
     assert described_points_in(slam_map, np.array([0]), DEFAULT_PLAN).ids.tolist() == list(range(3, 10))
     assert described_points_in(slam_map, np.array([1]), DEFAULT_PLAN).ids.tolist() == []
-    by_flow = slam_map._replace(observations=slam_map.observations._replace(feature=np.full(10, NONE, np.int32)))
+    by_flow = slam_map.with_arrays(observations=slam_map.observations._replace(feature=np.full(10, NONE, np.int32)))
     assert described_points_in(by_flow, np.array([0]), DEFAULT_PLAN).ids.tolist() == []
 
 

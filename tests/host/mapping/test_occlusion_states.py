@@ -32,7 +32,8 @@ from jaxslam.map.edit import with_keyframe, with_observations, with_points, with
 from jaxslam.map.npz_file import _name_in_version, load_map, save_map
 from jaxslam.map.partial_map import extract_around, merge_back
 from jaxslam.map.point_fusion import with_fused_points
-from jaxslam.map.types import NONE, Keyframe, Map, empty_map, rows
+from jaxslam.map.point_records import NONE, rows
+from jaxslam.map.types import Keyframe, Map, empty_map
 from jaxslam.map.validate import problems
 from jaxslam.mapping.local_bundle_adjustment import AdjustPlan, adjust_all, adjust_around
 from jaxslam.mapping.local_map_tracking import match_local_map
@@ -313,7 +314,7 @@ class TestMap:
 
     def test_checked(self) -> None:
         slam_map = small_map()
-        wrong = slam_map._replace(points=slam_map.points._replace(state=slam_map.points.state + np.int8(1)))
+        wrong = slam_map.with_arrays(points=slam_map.points._replace(state=slam_map.points.state + np.int8(1)))
         assert problems(wrong) == ["points.state: expected 0 to 2"]
 
     def test_file(self, tmp_path: Path) -> None:
@@ -335,7 +336,7 @@ class TestMap:
         del old["points.state.npy"], old["header.json.npy"]
         path.write_bytes(_packed(old))
         points = slam_map.points._replace(state=np.zeros(len(slam_map.points.ids), np.int8))
-        assert same(load_map(path), slam_map._replace(points=points))
+        assert same(load_map(path), slam_map.with_arrays(points=points))
         path.write_bytes(_packed(old | {"points.state.npy": members["points.state.npy"]}))
         with pytest.raises(MapFileError, match=r"unknown or missing members: points\.state\.npy"):
             load_map(path)
@@ -422,7 +423,7 @@ class TestAdjustment:
         seen = slam_map.observations
         off = (seen.keyframe == 15) & (seen.point % 2 == 0)
         uv = seen.uv + np.float32(0.6) * off * np.array([[1], [0]], np.float32)
-        slam_map = slam_map._replace(observations=seen._replace(uv=uv))
+        slam_map = slam_map.with_arrays(observations=seen._replace(uv=uv))
         odd = slam_map.points.ids[1::2]
         return with_states(slam_map, odd, np.full(len(odd), OCCLUDED))
 
@@ -451,9 +452,9 @@ class TestAdjustment:
     def test_off_to_the_bit(self) -> None:
         """Whatever states a map has that was made with the settings on."""
         slam_map = self.wrong()
-        static = slam_map._replace(points=slam_map.points._replace(state=np.zeros_like(slam_map.points.state)))
+        static = slam_map.with_arrays(points=slam_map.points._replace(state=np.zeros_like(slam_map.points.state)))
         first, second = adjust_around(slam_map, 15, AdjustPlan()), adjust_around(static, 15, AdjustPlan())
-        assert same(first._replace(points=first.points._replace(state=second.points.state)), second)
+        assert same(first.with_arrays(points=first.points._replace(state=second.points.state)), second)
 
     def test_settings(self) -> None:
         plan = lambda dynamics: mapping_plan(CAMERA, Config(dynamics=dynamics))
@@ -578,7 +579,7 @@ class TestRoomWithPeople:
         assert not off.map.points.state.any()
         assert one.occluded.sum() > 100
         np.testing.assert_array_equal(one.trajectory, off.trajectory)
-        assert same(one.map._replace(points=one.map.points._replace(state=off.map.points.state)), off.map)
+        assert same(one.map.with_arrays(points=one.map.points._replace(state=off.map.points.state)), off.map)
 
     def test_off_computes_nothing(self, monkeypatch: pytest.MonkeyPatch) -> None:
         def never(*_: object, **__: object) -> None:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxslam.map.types import NONE
+from jaxslam.map.point_records import NONE
 from jaxslam.mapping.track_table import REMOVED, TrackId, TrackTable
 
 

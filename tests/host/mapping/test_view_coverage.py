@@ -6,7 +6,8 @@ from exact_map import CAMERA, exact_map
 
 from jaxslam.geometry.se3 import IDENTITY, compose, retract
 from jaxslam.map.edit import with_positions
-from jaxslam.map.types import Map, empty_map, observations_at, rows
+from jaxslam.map.point_records import observations_at, rows
+from jaxslam.map.types import Map, empty_map
 from jaxslam.mapping.view_coverage import ViewCoverage, in_view, seen_alike
 
 SHARE = 0.8
@@ -63,5 +64,5 @@ def test_follows_the_map(slam_map: Map) -> None:
 
 def test_keyframe_without_points(slam_map: Map) -> None:
     seen = observations_at(slam_map.observations, slam_map.observations.keyframe != 5)
-    without = slam_map._replace(observations=seen)
+    without = slam_map.with_arrays(observations=seen)
     assert views(slam_map, slam_map.T_world_cam[5]) - views(without, slam_map.T_world_cam[5]) == 1

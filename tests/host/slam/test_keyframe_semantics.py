@@ -23,7 +23,8 @@ from jaxslam.loop_closing.place_index import PlaceIndex
 from jaxslam.map.dynamic_removal import DynamicObservations, under, without_dynamic
 from jaxslam.map.edit import without_points
 from jaxslam.map.keyframe_removal import without_keyframe
-from jaxslam.map.types import NONE, Map, has
+from jaxslam.map.point_records import NONE, has
+from jaxslam.map.types import Map
 from jaxslam.map.validate import problems
 from jaxslam.mapping.local_mapping import LocalMapping, NewKeyframe, TrackedObservations
 from jaxslam.mapping.track_table import TrackId

@@ -8,7 +8,7 @@ import pytest
 from small_map import CAMERA, small_map
 
 from jaxslam.map.edit import without_points
-from jaxslam.map.types import NONE
+from jaxslam.map.point_records import NONE
 from jaxslam.mapping.track_table import TrackId
 from jaxslam.slam.keyframe_reload import reload_keyframe
 from jaxslam.slam.reload_queue import ReloadQueue

@@ -12,7 +12,8 @@ from small_map import pose as random_pose
 from jaxslam.geometry.se3 import IDENTITY, between, compose, to_local, transform
 from jaxslam.map.edit import transformed, with_keyframe, with_positions
 from jaxslam.map.keyframe_removal import without_keyframe
-from jaxslam.map.types import NONE, Keyframe, Map, empty_map
+from jaxslam.map.point_records import NONE
+from jaxslam.map.types import Keyframe, Map, empty_map
 from jaxslam.mapping.local_mapping import NewKeyframe
 from jaxslam.mapping.track_table import TrackId
 from jaxslam.sensors.frame import Frame

@@ -1,0 +1,117 @@
+"""Points of a map and their observations in keyframes: records of arrays without padding."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int, Int8, Int32, Int64, UInt8
+
+from jaxslam.features.orb import DESCRIPTOR_BYTES
+from jaxslam.geometry.types import Ids
+
+NONE = -1
+"""No keyframe, no point, no feature."""
+
+
+class MapPoints(NamedTuple):
+    """The `p` points of the map.
+
+    Attributes:
+        ids: `(p,)` ids of the points, ascending.
+        X_world: `(3, p)` positions in the world frame of their submap, meters.
+        weight: `(p,)` weights in optimization, 0 to 1.
+        descriptor: `(p, 32)` ORB descriptors; zeros for a point without one.
+        has_descriptor: `(p,)` mask of the points with a descriptor. The others are only tracked by optical flow and
+            aligned with image patches.
+        reference_keyframe: `(p,)` ids of the keyframes that created the points.
+        state: `(p,)` a `PointState` of each point: whether a moving object has passed in front of it.
+    """
+
+    ids: Int64[np.ndarray, " p"]
+    X_world: Float64[np.ndarray, "3 p"]
+    weight: Float32[np.ndarray, " p"]
+    descriptor: UInt8[np.ndarray, "p 32"]
+    has_descriptor: Bool[np.ndarray, " p"]
+    reference_keyframe: Int64[np.ndarray, " p"]
+    state: Int8[np.ndarray, " p"]
+
+
+class Observations(NamedTuple):
+    """The `s` observations of points in keyframes; a keyframe observes a point at most once.
+
+    Attributes:
+        keyframe: `(s,)` ids of the keyframes.
+        point: `(s,)` ids of the points.
+        feature: `(s,)` index among the features of the keyframe; `NONE` for a point that was tracked by optical flow to
+            where it has no feature. A tracked point with a feature nearby is measured by flow all the same.
+        uv_raw: `(2, s)` measured coordinates in the distorted image, pixels.
+        uv: `(2, s)` coordinates in an ideal pinhole image without distortion and rolling shutter, pixels.
+        depth: `(s,)` measured depth, meters; 0 where no valid depth was measured.
+        sigma_px: `(s,)` standard deviation of each coordinate of `uv`, pixels.
+        weight: `(s,)` weights in optimization, 0 to 1.
+    """
+
+    keyframe: Int64[np.ndarray, " s"]
+    point: Int64[np.ndarray, " s"]
+    feature: Int32[np.ndarray, " s"]
+    uv_raw: Float32[np.ndarray, "2 s"]
+    uv: Float32[np.ndarray, "2 s"]
+    depth: Float32[np.ndarray, " s"]
+    sigma_px: Float32[np.ndarray, " s"]
+    weight: Float32[np.ndarray, " s"]
+
+
+def empty_points() -> MapPoints:
+    """Return a record of no points."""
+    return MapPoints(
+        ids=np.zeros(0, np.int64),
+        X_world=np.zeros((3, 0)),
+        weight=np.zeros(0, np.float32),
+        descriptor=np.zeros((0, DESCRIPTOR_BYTES), np.uint8),
+        has_descriptor=np.zeros(0, bool),
+        reference_keyframe=np.zeros(0, np.int64),
+        state=np.zeros(0, np.int8),
+    )
+
+
+def empty_observations() -> Observations:
+    """Return a record of no observations."""
+    return Observations(
+        keyframe=np.zeros(0, np.int64),
+        point=np.zeros(0, np.int64),
+        feature=np.zeros(0, np.int32),
+        uv_raw=np.zeros((2, 0), np.float32),
+        uv=np.zeros((2, 0), np.float32),
+        depth=np.zeros(0, np.float32),
+        sigma_px=np.zeros(0, np.float32),
+        weight=np.zeros(0, np.float32),
+    )
+
+
+def points_at(points: MapPoints, index: Ids | Bool[np.ndarray, " _n"]) -> MapPoints:
+    """Select the points in some rows, or where a mask is true."""
+    columns = {name: array[index] for name, array in points._asdict().items() if name != "X_world"}
+    return MapPoints(X_world=points.X_world[:, index], **columns)
+
+
+def observations_at(observations: Observations, index: Ids | Bool[np.ndarray, " _n"]) -> Observations:
+    """Select the observations in some rows, or where a mask is true."""
+    return Observations(*(array[..., index] for array in observations))
+
+
+def has(ids: Ids, wanted: Int[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
+    """Return which of the wanted ids are among the ascending `ids`."""
+    if not len(ids):
+        return np.zeros(len(wanted), bool)
+    return ids[np.minimum(np.searchsorted(ids, wanted), len(ids) - 1)] == wanted
+
+
+def rows(ids: Ids, wanted: Int[np.ndarray, " m"]) -> Int[np.ndarray, " m"]:
+    """Look up the index of each wanted id in the ascending `ids`.
+
+    Raises:
+        KeyError: If a wanted id is not there.
+    """
+    known = has(ids, wanted)
+    if not known.all():
+        raise KeyError(f"not in the map: {wanted[~known][:8].tolist()}")
+    return np.searchsorted(ids, wanted)
