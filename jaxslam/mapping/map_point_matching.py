@@ -83,16 +83,16 @@ def features_at(features: Features, uv_raw: Float32[np.ndarray, "2 n"]) -> Int32
         features: Features of the keyframe.
         uv_raw: Positions of the points in its distorted image, pixels.
     """
+    from scipy.spatial import KDTree  # noqa: PLC0415 - see `runtime.preload`
+
     nothing = np.full(uv_raw.shape[1], NONE, np.int32)
     if not (uv_raw.shape[1] and len(features.octave)):
         return nothing
-    apart = np.square(uv_raw[:, :, None] - features.uv_raw[:, None, :]).sum(axis=0)
-    nearest = apart.argmin(axis=1)
-    apart = apart[np.arange(len(nearest)), nearest]
+    apart, nearest = KDTree(features.uv_raw.T).query(uv_raw.T, distance_upper_bound=_SAME_PX)
     order = np.lexsort((apart, nearest))
     _, first = np.unique(nearest[order], return_index=True)
     chosen = order[first]
-    chosen = chosen[apart[chosen] < _SAME_PX**2]
+    chosen = chosen[np.isfinite(apart[chosen])]  # beyond the bound it is infinite
     nothing[chosen] = nearest[chosen]
     return nothing
 
