@@ -1,7 +1,7 @@
 """Match ORB features with those of another image, and with map points projected by a pose."""
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, Int64, Integer, UInt8, UInt16, UInt64
+from jaxtyping import Bool, Float, Float32, Float64, Int, Int64, Integer, UInt8, UInt16, UInt64
 
 from jaxslam.features.orb import DEFAULT_PLAN, FeaturePlan, Features
 
@@ -16,6 +16,10 @@ _MIN_PEAK = 0.1
 """Bins of the rotation histogram between two images, how many of the fullest are kept, and their minimum size relative
 to the fullest: `HISTO_LENGTH` and `ComputeThreeMaxima` of ORB-SLAM."""
 _OCTAVES_APART = 1
+_FARTHEST = 1e5
+"""Pixels, and bands of them, beyond which features are looked for as if they were there: no image is as large."""
+_SLACK_PX = 1e-3
+"""What numbers of some 1e11 may be off by rounding, pixels, in excess."""
 _ROWS = 32
 """Rows of a distance table computed at a time, so that they stay in the cache."""
 
@@ -143,23 +147,41 @@ def _near(
     radius_px: float,
     plan: FeaturePlan,
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
-    """Find the pairs of points and features of similar octave within the search radius of the octave."""
-    from scipy.spatial import KDTree  # noqa: PLC0415 - see `runtime.preload`
+    """Find the pairs of points and features of similar octave within the search radius of the octave.
 
-    finite = np.isfinite(predicted_uv).all(axis=0)
-    pairs = [np.zeros((2, 0), np.int64)]
-    for level in range(plan.num_levels):
-        sought = np.flatnonzero((octave == level) & finite)
-        apart = np.abs(features.octave.astype(np.int64) - level)
-        there = np.flatnonzero(apart <= _OCTAVES_APART)
-        if not len(sought) or not len(there):
-            continue
-        of_points, of_features = (KDTree(uv.T) for uv in (predicted_uv[:, sought], features.uv[:, there]))
-        radius = radius_px * plan.scale_factor**level
-        near = of_points.sparse_distance_matrix(of_features, radius, output_type="ndarray")
-        pairs.append(np.stack([sought[near["i"]], there[near["j"]]]))
-    point, feature = np.concatenate(pairs, axis=1)
-    return point, feature
+    Features are sorted by the level of the points that look for them, by bands of rows as high as a search is wide, and
+    by column: a point looks at a piece of two bands. That takes a third of the time of k-d trees of each level.
+    """
+    levels = np.arange(plan.num_levels)
+    radius = radius_px * plan.scale_factor**levels
+    feature = np.tile(np.arange(len(features.octave)), 2 * _OCTAVES_APART + 1)
+    wanted_by = features.octave.astype(np.int64) + np.arange(-_OCTAVES_APART, _OCTAVES_APART + 1)[:, None]
+    feature, wanted_by = (array[np.isin(wanted_by.ravel(), levels)] for array in (feature, wanted_by.ravel()))
+    sought = np.flatnonzero(np.isfinite(predicted_uv).all(axis=0))
+    uv, level = predicted_uv[:, sought].astype(np.float64), octave[sought].astype(np.int64)
+    reach = radius[level]
+
+    uv_there = features.uv[:, feature].astype(np.float64)
+    places = _places(wanted_by, uv_there[1] / (2 * radius[wanted_by]), uv_there[0])
+    order = np.argsort(places)
+    places, feature, uv_there = places[order], feature[order], uv_there[:, order]
+    point = np.tile(np.arange(len(sought)), 2)
+    band = np.concatenate([(uv[1] - reach) / (2 * reach), (uv[1] + reach) / (2 * reach)])
+    begin = np.searchsorted(places, _places(level[point], band, uv[0, point] - reach[point]) - _SLACK_PX)
+    end = np.searchsorted(places, _places(level[point], band, uv[0, point] + reach[point]) + _SLACK_PX)
+    count = end - begin
+    at = np.arange(count.sum()) + np.repeat(begin - (np.cumsum(count) - count), count)
+    point = np.repeat(point, count)
+    near = np.square(uv_there[:, at] - uv[:, point]).sum(axis=0) <= np.square(reach[point])
+    return sought[point[near]], feature[at[near]]
+
+
+def _places(
+    level: Int[np.ndarray, " n"], band: Float[np.ndarray, " n"], column: Float[np.ndarray, " n"]
+) -> Float64[np.ndarray, " n"]:
+    """Return numbers that sort by level, then by the whole part of the band, then by column."""
+    band = np.clip(np.floor(band), -_FARTHEST, _FARTHEST)
+    return (level * (4 * _FARTHEST) + band) * (4 * _FARTHEST) + np.clip(column, -_FARTHEST, _FARTHEST)
 
 
 def _first(groups: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:

@@ -20,8 +20,8 @@ from jaxslam.map.point_records import (
 _Record = TypeVar("_Record", MapPoints, Observations)
 
 _NO_IDS = np.zeros(0, np.int64)
-_SPAN_BITS = 8
-"""A block has the points of 256 ids in a row, which one keyframe made, or a few after one another."""
+_SPAN_BITS = 10
+"""A block has the points of 1,024 ids in a row, which a keyframe made, or some after one another."""
 
 
 class Block(NamedTuple):
