@@ -116,8 +116,9 @@ def fit_pose(
     *,
     min_inliers: int | None = None,
     min_cells: int | None = None,
+    max_sigma_m: float = MAX_SIGMA_M,
 ) -> FeaturePose | None:
-    """Fit a pose to matches; `None` if too few agree, or if the inliers cover too small a part of the image.
+    """Fit a pose to matches; `None` if too few agree, cover too small a part of the image, or leave it too uncertain.
 
     Args:
         T_origin_cam: `(7,)` approximate pose to start from.
@@ -125,6 +126,7 @@ def fit_pose(
         sensor: Camera, of which ideal pixels leave the pinhole, and the error model of its depth.
         min_inliers: Minimum number of inlier matches; `MIN_INLIERS` by default.
         min_cells: Minimum number of image cells the inliers cover; `MIN_CELLS` by default.
+        max_sigma_m: Largest standard deviation of the position in any direction, meters.
     """
     min_inliers = MIN_INLIERS if min_inliers is None else min_inliers
     min_cells = MIN_CELLS if min_cells is None else min_cells
@@ -141,7 +143,7 @@ def fit_pose(
     covariance = np.asarray(refined.covariance, np.float64) * max(float(refined.residual_scale), 1.0) ** 2
     covariance = 0.5 * (covariance + covariance.T)
     sigma_m = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
-    if _cells(np.asarray(matches.uv)[:, agree], sensor) < min_cells or sigma_m > MAX_SIGMA_M:
+    if _cells(np.asarray(matches.uv)[:, agree], sensor) < min_cells or sigma_m > max_sigma_m:
         return None
     return FeaturePose(pose, covariance, agree, share)
 

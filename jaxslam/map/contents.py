@@ -78,14 +78,14 @@ class MapContents:
         return _split(self.points, self.observations)
 
     @property
-    def in_blocks(self) -> bool:
+    def has_blocks(self) -> bool:
         """Whether the blocks are there already."""
         return "blocks" in self.__dict__
 
     @property
     def num_points(self) -> int:
         """Number of points."""
-        if not self.in_blocks:
+        if not self.has_blocks:
             return len(self.points.ids)
         return sum(len(block.points.ids) for block in self.blocks.values())
 
@@ -112,11 +112,11 @@ class MapContents:
             keyframe_ids: Ids of the keyframes.
             point_ids: Ids of the points.
         """
-        if not self.in_blocks:
+        if not self.has_blocks:
             return self
         numbers = set(np.unique(point_ids >> _SPAN_BITS).tolist()) & self.blocks.keys()
         numbers.update(*(self._of_keyframe.get(id, frozenset()) for id in keyframe_ids.tolist()))
-        return MapContents(*_joined([self.blocks[number] for number in sorted(numbers)]))
+        return MapContents(*_join([self.blocks[number] for number in sorted(numbers)]))
 
     def replaced(self, point_ids: Ids, part: "MapContents") -> "MapContents":
         """Replace points and their observations by those of an edited part.
@@ -128,11 +128,11 @@ class MapContents:
         blocks, of_keyframe = self.blocks.copy(), self._of_keyframe.copy()
         numbers = np.union1d(point_ids >> _SPAN_BITS, part.points.ids >> _SPAN_BITS).tolist()
         old = {number: blocks.pop(number) for number in numbers if number in blocks}
-        points, observations = _joined(list(old.values()))
+        points, observations = _join(list(old.values()))
         stay, seen = ~np.isin(points.ids, point_ids), ~np.isin(observations.point, point_ids)
-        points = _concatenated([points_at(points, stay), part.points])
+        points = _concatenate([points_at(points, stay), part.points])
         order = np.argsort(points.ids, kind="stable")
-        observations = _concatenated([observations_at(observations, seen), part.observations])
+        observations = _concatenate([observations_at(observations, seen), part.observations])
         new = _split(points_at(points, order), observations)
         blocks |= new
         for number in numbers:
@@ -150,7 +150,7 @@ class MapContents:
 
     @cached_property
     def _joined(self) -> tuple[MapPoints, Observations]:
-        return _joined([self.blocks[number] for number in sorted(self.blocks)])
+        return _join([self.blocks[number] for number in sorted(self.blocks)])
 
     @cached_property
     def _of_keyframe(self) -> dict[int, frozenset[int]]:
@@ -162,10 +162,10 @@ class MapContents:
         return {keyframe: frozenset(numbers) for keyframe, numbers in of_keyframe.items()}
 
 
-def _joined(blocks: list[Block]) -> tuple[MapPoints, Observations]:
+def _join(blocks: list[Block]) -> tuple[MapPoints, Observations]:
     """Join blocks, given in the order of their ids."""
-    points = _concatenated([block.points for block in blocks] or [empty_points()])
-    return points, _concatenated([block.observations for block in blocks] or [empty_observations()])
+    points = _concatenate([block.points for block in blocks] or [empty_points()])
+    return points, _concatenate([block.observations for block in blocks] or [empty_observations()])
 
 
 def _split(points: MapPoints, observations: Observations) -> dict[int, Block]:
@@ -187,7 +187,7 @@ def _split(points: MapPoints, observations: Observations) -> dict[int, Block]:
     return blocks
 
 
-def _concatenated(records: list[_Record]) -> _Record:
+def _concatenate(records: list[_Record]) -> _Record:
     """Concatenate records; descriptors along their first axis, all other arrays along their last one."""
     if len(records) == 1:
         return records[0]

@@ -88,7 +88,7 @@ class BackEnd:
         self._times = times or StageTimes()
         self._sensor, self._track_plan, self._plan = sensor, plan, mapping_plan(camera, config)
         self._config, self._localize_only = config, localize_only
-        start = empty_map(camera) if slam_map is None else slam_map
+        start = (empty_map(camera) if slam_map is None else slam_map).in_blocks()
         self._writer = MapWriter(camera, sensor, self._plan, start)
         self._index = PlaceIndex.from_map(start)
         loops = LoopClosing(self._index, sensor, self._plan.features)

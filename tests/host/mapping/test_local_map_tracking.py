@@ -233,7 +233,7 @@ class TestFewFeatures:
         monkeypatch.setattr("jaxslam.mapping.local_map_tracking._MIN_CELLS", MIN_CELLS)
         assert match(mapped()[0], LATER, np.zeros(6), self.within(78, 60, 1000))[0] is None
 
-    @pytest.mark.parametrize(("width", "height", "at_most"), [(50, 30, 1000), (320, 240, 14)])
+    @pytest.mark.parametrize(("width", "height", "at_most"), [(40, 24, 1000), (320, 240, 14)])
     def test_too_few(self, width: int, height: int, at_most: int) -> None:
         assert match(mapped()[0], LATER, np.zeros(6), self.within(width, height, at_most))[0] is None
 

@@ -38,6 +38,31 @@ def test_every_map_is_whole_and_stays_as_it_was():
             np.testing.assert_array_equal(array, before[name])
 
 
+def test_a_keyframe_costs_what_is_around_it_and_not_the_map():
+    """What nobody asked for was not joined: the map before and after it, and the blocks of another room."""
+    there = mapped(2)[1][-1]
+    points, seen = there.points, there.observations
+    apart = 1 << 20  # of ids, as of a room that was mapped later
+    far = points._replace(ids=points.ids + apart, X_world=points.X_world + 100.0)
+    both = there.with_arrays(
+        type(points)(
+            *(
+                np.concatenate([one, other], axis=0 if name == "descriptor" else -1)
+                for name, one, other in zip(points._fields, points, far, strict=True)
+            )
+        ),
+        seen,
+    )._replace(next_point=2 * apart)
+    mapping = LocalMapping(room().camera, sensor(), PLAN, both)
+    before = mapping.map.contents
+    mapping.add(new_keyframe(2, 2 * STEP, STEP))
+    after = mapping.map.contents
+    for contents in (before, after):
+        assert not {"points", "observations"} & set(vars(contents))
+    shared = [number for number, block in after.blocks.items() if block is before.blocks.get(number)]
+    assert len(shared) >= len(np.unique(far.ids >> 10))
+
+
 def test_points_the_tracker_saw_get_a_observation_in_every_keyframe(maps):
     """Every track is one point all along, seen where the tracker saw it."""
     slam_map = maps[2]
