@@ -359,7 +359,7 @@ def _assembled(header: _Header, arrays: dict[str, np.ndarray]) -> Map:
     )
     if wrong := problems(made):
         raise MapFileError(f"the map is not whole: {_first(wrong)}")
-    return made
+    return made.in_blocks()
 
 
 def _record(arrays: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:

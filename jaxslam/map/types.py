@@ -154,8 +154,8 @@ class Map(NamedTuple):
         return self._replace(contents=contents)
 
     def in_blocks(self) -> "Map":
-        """Return the map with its points and observations in blocks only."""
-        return self._replace(contents=self.contents.as_blocks())
+        """Return the map with its points and observations in blocks; itself if they are."""
+        return self if self.contents.has_blocks else self._replace(contents=self.contents.as_blocks())
 
     def around(self, keyframe_ids: Ids, point_ids: Ids | None = None) -> "Map":
         """Return a map of all keyframes with at least the points that some keyframes observe, and some points.

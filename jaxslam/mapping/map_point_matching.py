@@ -88,7 +88,8 @@ def features_at(features: Features, uv_raw: Float32[np.ndarray, "2 n"]) -> Int32
     nothing = np.full(uv_raw.shape[1], NONE, np.int32)
     if not (uv_raw.shape[1] and len(features.octave)):
         return nothing
-    apart, nearest = KDTree(features.uv_raw.T).query(uv_raw.T, distance_upper_bound=_SAME_PX)
+    found = KDTree(features.uv_raw.T).query(uv_raw.T, distance_upper_bound=_SAME_PX)
+    apart, nearest = map(np.asarray, found)
     order = np.lexsort((apart, nearest))
     _, first = np.unique(nearest[order], return_index=True)
     chosen = order[first]

@@ -130,3 +130,10 @@ def same(first: Map, second: Map) -> bool:
             for name in one
         )
     )
+
+
+def in_order(slam_map: Map) -> Map:
+    """The observations in the order of keyframes and points: an edit of a part moves those of the part to the end."""
+    order = np.lexsort((slam_map.observations.point, slam_map.observations.keyframe))
+    columns = (column[..., order] for column in slam_map.observations)
+    return slam_map.with_arrays(observations=Observations(*columns))

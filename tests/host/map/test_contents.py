@@ -3,7 +3,7 @@
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from small_map import arrays, same, small_map
+from small_map import arrays, in_order, same, small_map
 
 from jaxslam.map.edit import with_positions, without_observations, without_points
 from jaxslam.map.partial_map import extract_around, merge_back
@@ -20,13 +20,6 @@ def spread(seed: int, apart: int, num_keyframes: int = 6, num_points: int = 40) 
     )._replace(next_point=num_points * apart)
     slam_map = without_observations(slam_map, np.random.default_rng(seed).random(len(seen.point)) < 0.65)
     return without_points(slam_map, np.setdiff1d(slam_map.points.ids, slam_map.observations.point))
-
-
-def in_order(slam_map: Map) -> Map:
-    """The observations in the order of keyframes and points."""
-    order = np.lexsort((slam_map.observations.point, slam_map.observations.keyframe))
-    columns = (column[..., order] for column in slam_map.observations)
-    return slam_map.with_arrays(observations=type(slam_map.observations)(*columns))
 
 
 @settings(max_examples=40, deadline=None)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from small_map import arrays, keyframe, observations, pose, same, small_map
+from small_map import arrays, in_order, keyframe, observations, pose, same, small_map
 
 from jaxslam.map.edit import with_keyframe, with_observations, with_positions, without_observations, without_points
 from jaxslam.map.keyframe_removal import without_keyframe
@@ -22,14 +22,6 @@ def thinned(seed: int, num_keyframes: int = 6, num_points: int = 40) -> Map:
         slam_map, np.random.default_rng(seed).random(len(slam_map.observations.point)) < 0.65
     )
     return without_points(slam_map, np.setdiff1d(slam_map.points.ids, slam_map.observations.point))
-
-
-def in_order(slam_map: Map) -> Map:
-    """The observations in the order of keyframes and points: which of them came first is lost on the way."""
-    order = np.lexsort((slam_map.observations.point, slam_map.observations.keyframe))
-    return slam_map.with_arrays(
-        observations=type(slam_map.observations)(*(column[..., order] for column in slam_map.observations))
-    )
 
 
 @settings(max_examples=30, deadline=None)
