@@ -10,12 +10,13 @@ from .dynamics.cue import CueResult as CueResult
 from .dynamics.object_motion import MotionState as MotionState
 from .dynamics.regions import Regions as Regions
 from .errors import JaxSlamError as JaxSlamError
+from .map.contents import MapContents as MapContents
+from .map.point_records import MapPoints as MapPoints
+from .map.point_records import Observations as Observations
 from .map.types import Culled as Culled
 from .map.types import Keyframe as Keyframe
 from .map.types import Loops as Loops
 from .map.types import Map as Map
-from .map.types import MapPoints as MapPoints
-from .map.types import Observations as Observations
 from .runtime.compile_cache import enable_compile_cache as enable_compile_cache
 from .runtime.compiler_options import FAST_COMPILE as FAST_COMPILE
 from .runtime.threads import prefer_one_thread as prefer_one_thread

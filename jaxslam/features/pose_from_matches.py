@@ -116,7 +116,7 @@ def fit_pose(
     *,
     min_inliers: int | None = None,
     min_cells: int | None = None,
-    max_sigma_m: float = MAX_SIGMA_M,
+    max_sigma_m: float | None = None,
 ) -> FeaturePose | None:
     """Fit a pose to matches; `None` if too few agree, cover too small a part of the image, or leave it too uncertain.
 
@@ -126,10 +126,11 @@ def fit_pose(
         sensor: Camera, of which ideal pixels leave the pinhole, and the error model of its depth.
         min_inliers: Minimum number of inlier matches; `MIN_INLIERS` by default.
         min_cells: Minimum number of image cells the inliers cover; `MIN_CELLS` by default.
-        max_sigma_m: Largest standard deviation of the position in any direction, meters.
+        max_sigma_m: Largest standard deviation of the position in any direction, meters; `MAX_SIGMA_M` by default.
     """
     min_inliers = MIN_INLIERS if min_inliers is None else min_inliers
     min_cells = MIN_CELLS if min_cells is None else min_cells
+    max_sigma_m = MAX_SIGMA_M if max_sigma_m is None else max_sigma_m
     refined: PoseRefinement = jax.device_get(_refined(SE3(jnp.asarray(T_origin_cam, jnp.float32)), matches, sensor))
     used = np.asarray(matches.weight) > 0
     gate = np.where(np.asarray(matches.depth) > 0, _CHI2_GATES[1], _CHI2_GATES[0])

@@ -51,7 +51,7 @@ class MapContents:
         self.points, self.observations = points, observations
 
     @classmethod
-    def of_blocks(cls, blocks: dict[int, Block], of_keyframe: dict[int, frozenset[int]]) -> "MapContents":
+    def _of_blocks(cls, blocks: dict[int, Block], of_keyframe: dict[int, frozenset[int]]) -> "MapContents":
         """Hold blocks.
 
         Args:
@@ -97,7 +97,7 @@ class MapContents:
 
     def as_blocks(self) -> "MapContents":
         """Return the same in blocks only, without whole arrays."""
-        return MapContents.of_blocks(self.blocks, self._of_keyframe)
+        return MapContents._of_blocks(self.blocks, self._of_keyframe)
 
     def have(self, point_ids: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
         """Return which of some ids are of points that are here."""
@@ -146,7 +146,7 @@ class MapContents:
                     del of_keyframe[keyframe]
             for keyframe in now - before:
                 of_keyframe[keyframe] = of_keyframe.get(keyframe, frozenset()) | {number}
-        return MapContents.of_blocks(blocks, of_keyframe)
+        return MapContents._of_blocks(blocks, of_keyframe)
 
     @cached_property
     def _joined(self) -> tuple[MapPoints, Observations]:
