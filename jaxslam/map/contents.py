@@ -1,7 +1,7 @@
 """Points and observations of a map: as whole arrays, or in blocks that edits of other blocks share."""
 
 from functools import cached_property
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Int
@@ -13,11 +13,10 @@ from jaxslam.map.point_records import (
     empty_observations,
     empty_points,
     has,
+    joined,
     observations_at,
     points_at,
 )
-
-_Record = TypeVar("_Record", MapPoints, Observations)
 
 _NO_IDS = np.zeros(0, np.int64)
 _SPAN_BITS = 10
@@ -79,7 +78,7 @@ class MapContents:
 
     @property
     def has_blocks(self) -> bool:
-        """Whether the blocks are there already."""
+        """True once the points are held in blocks."""
         return "blocks" in self.__dict__
 
     @property
@@ -130,9 +129,9 @@ class MapContents:
         old = {number: blocks.pop(number) for number in numbers if number in blocks}
         points, observations = _join(list(old.values()))
         stay, seen = ~np.isin(points.ids, point_ids), ~np.isin(observations.point, point_ids)
-        points = _concatenate([points_at(points, stay), part.points])
+        points = joined([points_at(points, stay), part.points])
         order = np.argsort(points.ids, kind="stable")
-        observations = _concatenate([observations_at(observations, seen), part.observations])
+        observations = joined([observations_at(observations, seen), part.observations])
         new = _split(points_at(points, order), observations)
         blocks |= new
         for number in numbers:
@@ -164,8 +163,8 @@ class MapContents:
 
 def _join(blocks: list[Block]) -> tuple[MapPoints, Observations]:
     """Join blocks, given in the order of their ids."""
-    points = _concatenate([block.points for block in blocks] or [empty_points()])
-    return points, _concatenate([block.observations for block in blocks] or [empty_observations()])
+    points = joined([block.points for block in blocks] or [empty_points()])
+    return points, joined([block.observations for block in blocks] or [empty_observations()])
 
 
 def _split(points: MapPoints, observations: Observations) -> dict[int, Block]:
@@ -185,15 +184,3 @@ def _split(points: MapPoints, observations: Observations) -> dict[int, Block]:
         seen = observations_at(observations, order[first[row] : last[row]])
         blocks[number] = Block(own, seen, frozenset(np.unique(seen.keyframe).tolist()))
     return blocks
-
-
-def _concatenate(records: list[_Record]) -> _Record:
-    """Concatenate records; descriptors along their first axis, all other arrays along their last one."""
-    if len(records) == 1:
-        return records[0]
-    return type(records[0])(
-        *(
-            np.concatenate([getattr(record, name) for record in records], axis=0 if name == "descriptor" else -1)
-            for name in records[0]._fields
-        )
-    )

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Float64, Int, UInt8
 from jaxslam.dynamics.occlusion import PointState
 from jaxslam.geometry.se3 import compose, transform
 from jaxslam.geometry.types import Ids, Pose, Poses
-from jaxslam.map.point_records import NONE, MapPoints, Observations, observations_at, points_at, rows
+from jaxslam.map.point_records import NONE, MapPoints, Observations, joined, observations_at, points_at, rows
 from jaxslam.map.spanning_tree import parents_from
 from jaxslam.map.types import Keyframe, Loops, Map, point_submaps, surviving_keyframes
 from jaxslam.map.validate import Record, number_problems
@@ -58,11 +58,7 @@ def with_points(slam_map: Map, points: MapPoints) -> Map:
         raise ValueError(f"points.ids: expected {slam_map.next_point} to {after - 1} in order")
     surviving_keyframes(slam_map, points.reference_keyframe)
     _require_sound(points)
-    joined = {
-        name: _joined(old, getattr(points, name), axis=0 if name == "descriptor" else -1)
-        for name, old in slam_map.points._asdict().items()
-    }
-    return slam_map.with_arrays(points=MapPoints(**joined))._replace(next_point=after)
+    return slam_map.with_arrays(points=joined([slam_map.points, points]))._replace(next_point=after)
 
 
 def with_observations(slam_map: Map, observations: Observations) -> Map:
@@ -85,9 +81,9 @@ def with_observations(slam_map: Map, observations: Observations) -> Map:
     if wrong.any():
         raise ValueError(f"keyframe {observations.keyframe[wrong][0]} has no feature {observations.feature[wrong][0]}")
     rivals = np.isin(slam_map.observations.keyframe, observations.keyframe)
-    both = _joined_observations(observations_at(slam_map.observations, rivals), observations)
+    both = joined([observations_at(slam_map.observations, rivals), observations])
     new = observations_at(observations, first_of_rivals(both)[int(rivals.sum()) :])
-    return slam_map.with_arrays(observations=_joined_observations(slam_map.observations, new))
+    return slam_map.with_arrays(observations=joined([slam_map.observations, new]))
 
 
 def with_loop(
@@ -250,14 +246,6 @@ def _poses(T: Pose | Poses) -> Poses:
     _require_finite(poses)
     poses[:, :4] /= np.linalg.norm(poses[:, :4], axis=1, keepdims=True)
     return poses
-
-
-def _joined(old: np.ndarray, new: np.ndarray, axis: int = -1) -> np.ndarray:
-    return np.concatenate([old, new], axis=axis, dtype=old.dtype, casting="same_kind")
-
-
-def _joined_observations(old: Observations, new: Observations) -> Observations:
-    return Observations(*map(_joined, old, new))
 
 
 def first_of_rivals(observations: Observations) -> Bool[np.ndarray, " s"]:

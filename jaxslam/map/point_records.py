@@ -1,6 +1,7 @@
 """Points of a map and their observations in keyframes: records of arrays without padding."""
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int, Int8, Int32, Int64, UInt8
@@ -84,6 +85,25 @@ def empty_observations() -> Observations:
         depth=np.zeros(0, np.float32),
         sigma_px=np.zeros(0, np.float32),
         weight=np.zeros(0, np.float32),
+    )
+
+
+_Record = TypeVar("_Record", MapPoints, Observations)
+
+
+def joined(records: Sequence[_Record]) -> _Record:
+    """Concatenate records; the types of the first one stay."""
+    first = records[0]
+    return type(first)(
+        *(
+            np.concatenate(
+                [getattr(record, name) for record in records],
+                axis=0 if name == "descriptor" else -1,
+                dtype=array.dtype,
+                casting="same_kind",
+            )
+            for name, array in first._asdict().items()
+        )
     )
 
 

@@ -11,7 +11,7 @@ from jaxslam.geometry.se3 import to_local
 from jaxslam.geometry.types import Ids, Pose
 from jaxslam.map.edit import with_observations
 from jaxslam.map.point_fusion import with_fused_points
-from jaxslam.map.point_records import NONE, Observations, empty_observations, observations_at, rows
+from jaxslam.map.point_records import NONE, Observations, empty_observations, joined, observations_at, rows
 from jaxslam.map.types import Map
 
 _MARGIN_PX = 1.0
@@ -205,9 +205,7 @@ def fuse_duplicates(
         new.append(feature_observations(neighbor, features, mine[free], feature[free], plan))
         kept.append(np.minimum(there, mine)[~free])
         dropped.append(np.maximum(there, mine)[~free])
-    slam_map = with_observations(
-        slam_map, Observations(*(np.concatenate(columns, axis=-1) for columns in zip(*new, strict=True)))
-    )
+    slam_map = with_observations(slam_map, joined(new))
     drop, first = np.unique(np.concatenate(dropped), return_index=True)
     keep = np.concatenate(kept)[first]
     return with_fused_points(slam_map, keep, drop), keep, drop

@@ -5,7 +5,14 @@ import numpy as np
 
 from jaxslam.features.orb import Features
 from jaxslam.geometry.se3 import to_local
-from jaxslam.map.edit import with_keyframe, with_loop, with_observations, with_points
+from jaxslam.map.edit import (
+    with_keyframe,
+    with_loop,
+    with_observations,
+    with_points,
+    without_observations,
+    without_points,
+)
 from jaxslam.map.point_records import NONE, MapPoints, Observations
 from jaxslam.map.types import Keyframe, Map, empty_map
 from jaxslam.sensors.camera import Camera
@@ -130,6 +137,15 @@ def same(first: Map, second: Map) -> bool:
             for name in one
         )
     )
+
+
+def thinned(seed: int, num_keyframes: int = 6, num_points: int = 40) -> Map:
+    """Every keyframe sees about a third of the points."""
+    slam_map = small_map(num_keyframes, num_points, seed)
+    slam_map = without_observations(
+        slam_map, np.random.default_rng(seed).random(len(slam_map.observations.point)) < 0.65
+    )
+    return without_points(slam_map, np.setdiff1d(slam_map.points.ids, slam_map.observations.point))
 
 
 def in_order(slam_map: Map) -> Map:

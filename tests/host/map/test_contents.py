@@ -3,23 +3,20 @@
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from small_map import arrays, in_order, same, small_map
+from small_map import arrays, in_order, same, small_map, thinned
 
-from jaxslam.map.edit import with_positions, without_observations, without_points
+from jaxslam.map.edit import with_positions, without_points
 from jaxslam.map.partial_map import extract_around, merge_back
 from jaxslam.map.types import Map, empty_map
 from jaxslam.map.validate import problems
 
 
-def spread(seed: int, apart: int, num_keyframes: int = 6, num_points: int = 40) -> Map:
-    """A map whose point ids are so far apart that many blocks have some; every keyframe sees a third of the points."""
-    slam_map = small_map(num_keyframes, num_points, seed)
+def spread(seed: int, apart: int) -> Map:
+    """A map whose point ids are so far apart that many blocks have some."""
+    slam_map = thinned(seed)
     points, seen = slam_map.points, slam_map.observations
-    slam_map = slam_map.with_arrays(
-        points._replace(ids=points.ids * apart), seen._replace(point=seen.point * apart)
-    )._replace(next_point=num_points * apart)
-    slam_map = without_observations(slam_map, np.random.default_rng(seed).random(len(seen.point)) < 0.65)
-    return without_points(slam_map, np.setdiff1d(slam_map.points.ids, slam_map.observations.point))
+    slam_map = slam_map.with_arrays(points._replace(ids=points.ids * apart), seen._replace(point=seen.point * apart))
+    return slam_map._replace(next_point=slam_map.next_point * apart)
 
 
 @settings(max_examples=40, deadline=None)

@@ -4,24 +4,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from small_map import arrays, in_order, keyframe, observations, pose, same, small_map
+from small_map import arrays, in_order, keyframe, observations, pose, same, small_map, thinned
 
-from jaxslam.map.edit import with_keyframe, with_observations, with_positions, without_observations, without_points
+from jaxslam.map.edit import with_keyframe, with_observations, with_positions, without_points
 from jaxslam.map.keyframe_removal import without_keyframe
 from jaxslam.map.partial_map import extract_around, merge_back, most_shared
 from jaxslam.map.point_fusion import with_fused_points
 from jaxslam.map.point_records import NONE
 from jaxslam.map.types import Map, covisible
 from jaxslam.map.validate import problems
-
-
-def thinned(seed: int, num_keyframes: int = 6, num_points: int = 40) -> Map:
-    """Every keyframe sees about a third of the points."""
-    slam_map = small_map(num_keyframes, num_points, seed)
-    slam_map = without_observations(
-        slam_map, np.random.default_rng(seed).random(len(slam_map.observations.point)) < 0.65
-    )
-    return without_points(slam_map, np.setdiff1d(slam_map.points.ids, slam_map.observations.point))
 
 
 @settings(max_examples=30, deadline=None)

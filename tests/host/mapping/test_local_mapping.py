@@ -9,7 +9,7 @@ from small_map import arrays, same
 from jaxslam.geometry.se3 import between, compose, to_local, transform
 from jaxslam.loop_closing.loop_detector import LoopClosure
 from jaxslam.map.edit import with_positions, without_observations
-from jaxslam.map.point_records import NONE, observations_at, rows
+from jaxslam.map.point_records import NONE, joined, observations_at, rows
 from jaxslam.map.types import Map, covisible
 from jaxslam.map.validate import problems
 from jaxslam.mapping import local_mapping
@@ -39,20 +39,12 @@ def test_every_map_is_whole_and_stays_as_it_was():
 
 
 def test_a_keyframe_costs_what_is_around_it_and_not_the_map():
-    """What nobody asked for was not joined: the map before and after it, and the blocks of another room."""
+    """It joins neither the map before it nor the one after, and shares the blocks of another room."""
     there = mapped(2)[1][-1]
     points, seen = there.points, there.observations
     apart = 1 << 20  # of ids, as of a room that was mapped later
     far = points._replace(ids=points.ids + apart, X_world=points.X_world + 100.0)
-    both = there.with_arrays(
-        type(points)(
-            *(
-                np.concatenate([one, other], axis=0 if name == "descriptor" else -1)
-                for name, one, other in zip(points._fields, points, far, strict=True)
-            )
-        ),
-        seen,
-    )._replace(next_point=2 * apart)
+    both = there.with_arrays(joined([points, far]), seen)._replace(next_point=2 * apart)
     mapping = LocalMapping(room().camera, sensor(), PLAN, both)
     before = mapping.map.contents
     mapping.add(new_keyframe(2, 2 * STEP, STEP))
