@@ -39,12 +39,14 @@ class Command(NamedTuple):
             the commands whose words begin with its own.
         about: Summary of the command in one line.
         more: More about it, for its own help.
+        takes_gpu: Whether it computes on a GPU if JAX finds one; the tracker is made for the CPU.
     """
 
     words: tuple[str, ...]
     place: str | None
     about: str
     more: str = ""
+    takes_gpu: bool = False
 
     @property
     def name(self) -> str:
@@ -113,6 +115,7 @@ COMMANDS = (
         "Track 1 to 64 clips at once with `vmap`, beside a loop.",
         "Frames a second, on the GPU where JAX has one. Nothing else should run on the machine meanwhile; some minutes."
         " `NPROC=1` before the command holds XLA to one thread.",
+        takes_gpu=True,
     ),
     Command(
         ("bench", "compile"),
@@ -132,6 +135,7 @@ COMMANDS = (
         "bench_kernels:Kernels",
         "Measure each kernel beside OpenCV, SciPy, Ceres, gtsam or scikit-learn.",
         "Over sizes; on a GPU too if there is one. Nothing else should run on the machine meanwhile; some minutes.",
+        takes_gpu=True,
     ),
     Command(
         ("bench", "soak"),

@@ -9,6 +9,7 @@ from typing import Any, NoReturn
 
 from jaxslam.cli.command_table import COMMANDS, Command, ExitCode, below, find_command
 from jaxslam.errors import JaxSlamError, MissingModelError, nearest
+from jaxslam.runtime.platform_choice import prefer_cpu
 
 _ABOUT = "Real-time visual SLAM for dynamic scenes. Start with: jaxslam demo"
 _HELP = ("-h", "--help")
@@ -40,6 +41,8 @@ def _run(words: list[str]) -> None:
     command = find_command(words)
     if command is None or command.place is None:
         _list_commands(command, words)
+    if not command.takes_gpu:
+        prefer_cpu()
     import tyro  # noqa: PLC0415 - not needed to list commands, and neither is rich
 
     from jaxslam.cli.console import messages_for  # noqa: PLC0415

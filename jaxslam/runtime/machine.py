@@ -9,15 +9,20 @@ from typing import Any
 
 import psutil
 
+from jaxslam import __version__
 from jaxslam.runtime.threads import threads, usable_cores
 
-_PACKAGES = ("jaxslam", "jax", "jaxlib", "jaxlie", "equinox", "optimistix", "numpy", "opencv-python-headless")
+_PACKAGES = ("jax", "jaxlib", "jaxlie", "equinox", "optimistix", "numpy", "opencv-python-headless")
 
 
 def machine() -> dict[str, Any]:
     """Return the package versions, the processor, the cores and threads of this process, and the jaxslam commit."""
     return {
-        "versions": {"python": platform.python_version(), **{name: version(name) for name in _PACKAGES}},
+        "versions": {
+            "python": platform.python_version(),
+            "jaxslam": __version__,  # a checkout that is not installed has no metadata
+            **{name: version(name) for name in _PACKAGES},
+        },
         "cpu": cpu_model(),
         "vectors": _vectors(),
         "cores": usable_cores(),

@@ -14,6 +14,7 @@ from jaxslam.map.npz_file import load_map, save_map
 from jaxslam.map.types import Map
 from jaxslam.masks.depth_instances import InstanceFinder
 from jaxslam.runtime.compile_cache import enable_compile_cache
+from jaxslam.runtime.platform_choice import warn_unless_cpu
 from jaxslam.runtime.stage_timer import StageTimes
 from jaxslam.runtime.threads import bound_threads
 from jaxslam.semantics import Detector
@@ -109,6 +110,7 @@ class Slam:
             localize_only,
         )
         bound_threads(self.config.run.threads)
+        warn_unless_cpu()
         enable_compile_cache()
         self._tracker = Tracker(camera, self.config)
         self._detector = _watched(detector or detector_of(self.config.semantics, self.config.run.threads))
