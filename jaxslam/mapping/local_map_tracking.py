@@ -3,6 +3,8 @@
 Source: Mur-Artal and Tardos, "ORB-SLAM2", 2017, section III, "tracking against the local map".
 """
 
+from collections.abc import Set
+
 import numpy as np
 
 from jaxslam.features.orb import FeaturePlan, Features
@@ -45,7 +47,21 @@ def local_keyframes(slam_map: Map, keyframe_id: int) -> Ids:
     return np.append(np.int64(keyframe_id), near[:LOCAL_KEYFRAMES])
 
 
-def keyframes_in_view(slam_map: Map, T_world_cam: Pose, submap: int, exclude: set[int], at_most: int) -> list[int]:
+def nearest_keyframes(slam_map: Map, T_world_cam: Pose, submap: int, exclude: Set[int] = frozenset()) -> Ids:
+    """Return the ids of the keyframes nearest to a camera, at most 64, in order.
+
+    Args:
+        slam_map: The map.
+        T_world_cam: `(7,)` pose of the camera.
+        submap: Number of the submap the camera is in.
+        exclude: Ids of keyframes to leave out.
+    """
+    others = np.flatnonzero((slam_map.submap == submap) & ~np.isin(slam_map.ids, list(exclude)))
+    apart = np.linalg.norm(slam_map.T_world_cam[others, 4:] - T_world_cam[4:], axis=1)
+    return slam_map.ids[np.sort(others[np.argsort(apart, kind="stable")[:_NEAREST]])]
+
+
+def keyframes_in_view(slam_map: Map, T_world_cam: Pose, submap: int, exclude: Set[int], at_most: int) -> list[int]:
     """Return the keyframes that observe the most points in view, best first.
 
     Args:
@@ -55,9 +71,7 @@ def keyframes_in_view(slam_map: Map, T_world_cam: Pose, submap: int, exclude: se
         exclude: Ids of keyframes to leave out.
         at_most: Maximum number of keyframes.
     """
-    others = np.flatnonzero((slam_map.submap == submap) & ~np.isin(slam_map.ids, list(exclude)))
-    apart = np.linalg.norm(slam_map.T_world_cam[others, 4:] - T_world_cam[4:], axis=1)
-    near = np.sort(others[np.argsort(apart, kind="stable")[:_NEAREST]])
+    near = rows(slam_map.ids, nearest_keyframes(slam_map, T_world_cam, submap, exclude))
     slam_map = slam_map.around(slam_map.ids[near])
     of_near = has(slam_map.ids[near], slam_map.observations.keyframe)
     seen = observations_at(slam_map.observations, np.flatnonzero(of_near))

@@ -211,6 +211,12 @@ class LocalMapping:
         self.map = with_changes(self.map, changes)
         return self.map
 
+    def remove_points(self, point_ids: Ids) -> Map:
+        """Remove points that are gone, those of them that are in the map; return the new map."""
+        part = extract_around(self.map, point_ids[:0], point_ids[self.map.contents.have(point_ids)])
+        self.map = merge_back(self.map, part, without_dynamic_points(part.map, point_ids))
+        return self.map
+
     def close_loop(self, loop: LoopClosure) -> Map:
         """Close a loop, or merge two submaps; return the new map. Section numbers are of ORB-SLAM (2015)."""
         if not has(self.map.ids, np.array([loop.source, loop.target])).all():

@@ -24,6 +24,7 @@ from jaxslam.map.point_records import NONE
 from jaxslam.map.types import Map, empty_map
 from jaxslam.mapping.local_mapping import mapping_plan
 from jaxslam.mapping.occlusion_states import PointStates
+from jaxslam.mapping.vanished_points import FrameDepth
 from jaxslam.mapping.view_coverage import ViewCoverage
 from jaxslam.runtime.preload import import_scipy
 from jaxslam.runtime.stage_timer import StageTimes
@@ -35,8 +36,10 @@ from jaxslam.sensors.frame_arrays import FrameArrays, own_copy
 from jaxslam.sensors.sensor_model import SensorModel
 from jaxslam.slam.dense_thread import dense_mapping_of
 from jaxslam.slam.frame_localizer import FrameLocalizer, LocalizedPose
+from jaxslam.slam.frame_result import FrameResult
 from jaxslam.slam.keyframe_semantics import KeyframeSemantics
-from jaxslam.slam.map_jobs import MapJob, MapUpdate, MapWriter
+from jaxslam.slam.map_changes import MapChanges
+from jaxslam.slam.map_jobs import MapJob, MapUpdate, MapWriter, PointRemoval
 from jaxslam.slam.place_jobs import IndexUpdate, LoopSearch, PlaceJob, PlaceResult, PlaceSearch, Reload
 from jaxslam.slam.reload_queue import ReloadQueue
 from jaxslam.slam.tracker import KeyframeDemand
@@ -106,6 +109,7 @@ class BackEnd:
         self._localizer = FrameLocalizer(sensor, self._plan.features, self._link, self._index, self._states)
         self._arrived: Map | None = None
         self._coverage, self.map_views = ViewCoverage(with_dense_keyframes(config).keyframe_below), 0
+        self._changes = MapChanges()
         self._reloads = ReloadQueue(self._link, points_may_leave=self._semantics is not None)
         self._correction = IDENTITY
         self._gone: list[np.ndarray] = []  # track ids of points that the tracker must drop
@@ -118,6 +122,11 @@ class BackEnd:
     def map(self) -> Map:
         """The current map."""
         return self._link.map
+
+    @property
+    def map_changed(self) -> bool:
+        """Whether many points of the map are gone, and no keyframe was made since."""
+        return self._changes.pending
 
     @property
     def loops_closed(self) -> int:
@@ -158,6 +167,8 @@ class BackEnd:
             partial(self._link.compile, state, drops_points=self._semantics is not None),
             partial(compile_recognition, self._sensor, self._plan.features),
         ]
+        if not self._localize_only and frame.right is None:
+            steps.append(FrameDepth(np.zeros(6, np.float32), frame, self._sensor).compile)
         if self._states is not None:
             steps.append(partial(self._states.compile, frame))
         last: list[_Step] = [partial(self._graphs.compile_now, len(self.map.ids))]
@@ -222,6 +233,7 @@ class BackEnd:
             recognized: Pose of the frame in the map if it was relocalized.
         """
         if output.keyframe:
+            self._changes.keyframe_made()
             self._insert_keyframe(frame, arrays, output, number, recognized)
         if self.dense is not None and int(output.status) != TrackStatus.LOST:
             self.dense.frame_tracked(number, frame.image, arrays, output)
@@ -275,17 +287,21 @@ class BackEnd:
         self._reloads.replace(())
         return self._link.reset_at_pose(state, T_world_cam, np.zeros(6))
 
-    def frame_tracked(self, T_world_cam: Pose, frame: int) -> None:
+    def frame_tracked(self, tracked: FrameResult, arrays: FrameArrays, frame: int) -> None:
         """Count the keyframes that show the view, and request those around at intervals.
 
         Args:
-            T_world_cam: `(7,)` pose of the frame.
+            tracked: Result of the frame.
+            arrays: The frame; copied where it is needed.
             frame: Number of the frame.
         """
+        T_world_cam = tracked.T_world_cam
         if not self._localize_only:
             self.map_views = self._coverage.num_views(self.map, T_world_cam, self._link.submap_now())
         if frame % _RELOAD_EVERY == 0:
-            self._request_reload(T_world_cam, frame)
+            looks = not self._localize_only and arrays.right is None and tracked.status == TrackStatus.OK
+            seen = FrameDepth(tracked.twist, own_copy(arrays), self._sensor) if looks else None
+            self._request_reload(T_world_cam, frame, seen)
 
     def anchor(self, T_world_cam: Pose) -> AnchoredPose:
         """Express a pose `(7,)` of the tracker relative to the reference keyframe."""
@@ -416,8 +432,12 @@ class BackEnd:
                     self._to_mapping.submit(result, frame)
             elif result is not None:
                 self._reloads.replace(result.keyframes, result.loaded)
+                if result.vanished is not None:
+                    gone = self._changes.gone(result.vanished)
+                    if len(gone) and not self._closed:
+                        self._to_mapping.submit(PointRemoval(gone), frame)
 
-    def _request_reload(self, T_world_cam: Pose, frame: int) -> None:
+    def _request_reload(self, T_world_cam: Pose, frame: int, seen: FrameDepth | None = None) -> None:
         if self._track_plan.num_reloaded and self._link.reference != NONE:
             held = frozenset(self._link.latest()), frozenset(self._link.loaded())
-            self._to_places.submit(Reload(self.map, T_world_cam, self._link.submap_now(), *held), frame)
+            self._to_places.submit(Reload(self.map, T_world_cam, self._link.submap_now(), *held, seen), frame)

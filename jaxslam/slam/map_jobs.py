@@ -5,6 +5,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from jaxslam.features.orb import no_features
+from jaxslam.geometry.types import Ids
 from jaxslam.loop_closing.loop_detector import LoopClosure
 from jaxslam.map.dynamic_removal import DynamicObservations
 from jaxslam.map.point_records import NONE
@@ -15,8 +16,19 @@ from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame_arrays import FrameArrays
 from jaxslam.sensors.sensor_model import SensorModel
 
-MapJob: TypeAlias = NewKeyframe | LoopClosure | DynamicObservations | StateChanges
-"""A keyframe to insert, a loop to close, observations to remove, or occlusion states to store."""
+
+class PointRemoval(NamedTuple):
+    """A job: remove points that are gone.
+
+    Attributes:
+        ids: `(n,)` ids of the points, some of which may have left the map.
+    """
+
+    ids: Ids
+
+
+MapJob: TypeAlias = NewKeyframe | LoopClosure | DynamicObservations | StateChanges | PointRemoval
+"""A keyframe to insert, a loop to close, observations or points to remove, or occlusion states to store."""
 
 
 class MapUpdate(NamedTuple):
@@ -81,6 +93,8 @@ class MapWriter:
                 slam_map, gone = self._mapping.remove(job)
                 removed = before.contents.num_points - slam_map.contents.num_points
                 return MapUpdate(slam_map, cleaned=job.keyframe, removed=removed, gone=gone)
+            if isinstance(job, PointRemoval):
+                return MapUpdate(self._mapping.remove_points(job.ids))
             if isinstance(job, StateChanges):
                 return MapUpdate(self._mapping.take_states(job), states=job.number)
             return MapUpdate(self._mapping.add(job), job.id, states=0 if job.states is None else job.states.number)

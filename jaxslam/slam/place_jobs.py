@@ -5,7 +5,8 @@ from typing import NamedTuple, TypeAlias
 from jaxslam.geometry.types import Pose
 from jaxslam.loop_closing.loop_detector import LoopClosing, LoopClosure
 from jaxslam.map.types import Map
-from jaxslam.mapping.local_map_tracking import keyframes_in_view
+from jaxslam.mapping.local_map_tracking import keyframes_in_view, nearest_keyframes
+from jaxslam.mapping.vanished_points import FrameDepth, VanishedPoints, vanished_points
 from jaxslam.slam.keyframe_reload import MapKeyframe, reload_keyframe
 from jaxslam.tracking.state import TrackPlan
 
@@ -31,6 +32,7 @@ class Reload(NamedTuple):
         submap: Number of the submap that the camera is in.
         latest: Ids of the keyframes in the tracker's ring, which are left out.
         loaded: Ids of the keyframes that are loaded into the tracker: they need not be prepared again.
+        seen: Depth of the frame, to find the points that are gone; `None` not to look for them.
     """
 
     map: Map
@@ -38,6 +40,7 @@ class Reload(NamedTuple):
     submap: int
     latest: frozenset[int] = frozenset()
     loaded: frozenset[int] = frozenset()
+    seen: FrameDepth | None = None
 
 
 class Surroundings(NamedTuple):
@@ -46,10 +49,12 @@ class Surroundings(NamedTuple):
     Attributes:
         loaded: Ids of those that are loaded into the tracker, and stay.
         keyframes: Those to load, best first.
+        vanished: Points in view that the frame sees through; `None` if they were not looked for.
     """
 
     loaded: frozenset[int]
     keyframes: tuple[MapKeyframe, ...]
+    vanished: VanishedPoints | None = None
 
 
 class IndexUpdate(NamedTuple):
@@ -94,4 +99,12 @@ class PlaceSearch:
         wanted = keyframes_in_view(job.map, job.T_world_cam, job.submap, set(job.latest), self._plan.num_reloaded)
         new = (keyframe_id for keyframe_id in wanted if keyframe_id not in job.loaded)
         prepared = tuple(reload_keyframe(job.map, keyframe_id, self._plan.num_points) for keyframe_id in new)
-        return Surroundings(job.loaded.intersection(wanted), prepared)
+        return Surroundings(job.loaded.intersection(wanted), prepared, self._vanished(job))
+
+    @staticmethod
+    def _vanished(job: Reload) -> VanishedPoints | None:
+        if job.seen is None:
+            return None
+        # Not only those that show the view: what was moved had been seen from anywhere.
+        around = nearest_keyframes(job.map, job.T_world_cam, job.submap)
+        return vanished_points(job.map, around, job.T_world_cam, job.seen)

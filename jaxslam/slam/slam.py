@@ -22,7 +22,7 @@ from jaxslam.semantics.checked_detector import CheckedDetector
 from jaxslam.semantics.from_config import detector_of, key_detector_of, why_no_network
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame, check_frame
-from jaxslam.sensors.frame_arrays import FrameMemory
+from jaxslam.sensors.frame_arrays import FrameArrays, FrameMemory
 from jaxslam.slam.argument_checks import check_arguments, warn_of_other_camera
 from jaxslam.slam.back_end import BackEnd
 from jaxslam.slam.background_consistency import BackgroundConsistency
@@ -211,7 +211,8 @@ class Slam:
         watch.ends("wait for mask")
 
         # 4. Pose: dynamic cues, RANSAC PnP and refinement; what was found moving joins the mask.
-        output = self._tracker.advance(arrays, flow, self._back.keyframe_demand, self._back.map_views)
+        back = self._back
+        output = self._tracker.advance(arrays, flow, back.keyframe_demand, back.map_views, map_changed=back.map_changed)
         arrays, mask = self._masks.exclude_moving(arrays, mask, flow, output)
         watch.ends("pose")
 
@@ -229,7 +230,7 @@ class Slam:
         if self._background is not None:
             result = self._background.check(result, arrays)
         self._clock.advance(frame.timestamp_ns)
-        result = self._recorded(result, dt_s, float(arrays.depth_delay_s))
+        result = self._recorded(result, dt_s, arrays)
         self._masks.submit_for_detection(self._frame, frame.image)
         self._frame += 1
         watch.ends("hand over")
@@ -391,7 +392,7 @@ class Slam:
         self._status_log.look(self._frame, tracked, self._localization.lost_s)
         return tracked
 
-    def _recorded(self, tracked: FrameResult, dt_s: float, depth_delay_s: float) -> FrameResult:
+    def _recorded(self, tracked: FrameResult, dt_s: float, arrays: FrameArrays) -> FrameResult:
         """Record the result, and return it as `track` does."""
         if tracked.status == TrackStatus.LOST:
             self._localization.frame_lost(dt_s, tracked.correction)
@@ -399,9 +400,10 @@ class Slam:
             predicts = self.config.run.on_loss == "predict"
             return replace(tracked, T_world_cam=self._localization.predicted()) if predicts else tracked
         time_s = self._clock.continuous_ns(tracked.timestamp_ns) * 1e-9
+        depth_delay_s = float(arrays.depth_delay_s)
         self._masks.frame_tracked(self._frame, time_s, tracked.T_world_cam, tracked.twist, depth_delay_s)
         self._localization.frame_tracked(tracked.T_world_cam, tracked.twist)
-        self._back.frame_tracked(tracked.T_world_cam, self._frame)
+        self._back.frame_tracked(tracked, arrays, self._frame)
         anchored = self._back.anchor(tracked.T_world_cam)
         self._history.add(tracked.timestamp_ns, tracked.T_world_cam, anchored, in_map_frame=tracked.in_map_frame)
         return tracked

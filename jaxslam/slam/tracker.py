@@ -122,7 +122,13 @@ class Tracker:
         return _follow_points(self.state, frame, self.params, self.plan)
 
     def advance(
-        self, frame: FrameArrays, followed: FlowResult, demand: KeyframeDemand, map_views: int = 0
+        self,
+        frame: FrameArrays,
+        followed: FlowResult,
+        demand: KeyframeDemand,
+        map_views: int = 0,
+        *,
+        map_changed: bool = False,
     ) -> TrackOutput:
         """Estimate the pose of a frame and update the state.
 
@@ -131,12 +137,13 @@ class Tracker:
             followed: Result of `follow` for it.
             demand: How much the maps want this frame to be a keyframe.
             map_views: Number of keyframes of the map that show the view.
+            map_changed: Whether many points of the map are gone, and no keyframe was made since.
 
         Returns:
             Output of the tracker, in NumPy arrays.
         """
         params = self._params_for[demand]
         if demand is not KeyframeDemand.NOW:
-            params = params._replace(map_views=np.float32(map_views))
+            params = params._replace(map_views=np.float32(map_views), map_changed=np.float32(map_changed))
         self.state, output = _track_followed(self.state, frame, followed, params, self.plan)
         return jax.tree.map(np.asarray, output)  # as `device_get`, in a tenth of its time

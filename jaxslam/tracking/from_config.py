@@ -68,6 +68,7 @@ def track_params(camera: Camera, config: TrackConfig, dtype: DTypeLike = jnp.flo
         keyframe_followed_below=of(config.keyframe_followed_below),
         keyframe_views=of(config.keyframe_views),
         map_views=of(0),
+        map_changed=of(0),
         keyframe_points_below=of(config.keyframe_points_below),
         keyframe_weak_after_s=of(config.keyframe_weak_after_s),
         keyframe_min_s=of(config.keyframe_min_s),

@@ -69,6 +69,7 @@ def keyframe_reason(state: TrackState, frame: KeyframeCandidate, params: TrackPa
         (tracked & (share < params.keyframe_followed_below) & ~well_known, KeyframeReason.FEW_FOLLOWED),
         (few & (hardly_any | weak_for_long), KeyframeReason.FEW_POINTS),
         (frame.weak & weak_for_long, KeyframeReason.WEAK),
+        (tracked & weak_for_long & (params.map_changed > 0), KeyframeReason.CHANGED),
     )
     may = (
         jnp.ones((), bool)

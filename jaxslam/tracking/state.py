@@ -54,6 +54,8 @@ class KeyframeReason(enum.IntEnum):
     """Tracking is weak and needs more points."""
     FEW_POINTS = 5
     """Few points are still tracked."""
+    CHANGED = 6
+    """Many points of the map are gone: something was moved."""
 
 
 class TrackPhase(enum.IntEnum):
@@ -207,6 +209,7 @@ class TrackParams(NamedTuple):
             where hardly a point of them is found.
         map_views: Number of keyframes of a map that show the view. Those that the state itself holds are counted by the
             tracker: this is for maps with more, and 0 without one.
+        map_changed: 1 if many points of a map are gone, and no keyframe was made since (`CHANGED`), else 0.
         keyframe_points_below: Share of the capacity. A keyframe is made if fewer points are still tracked
             (`FEW_POINTS`); right after a keyframe, half this share.
         keyframe_weak_after_s: Time after which the next keyframe is made while tracking is weak (`WEAK`) or has few
@@ -241,6 +244,7 @@ class TrackParams(NamedTuple):
     keyframe_followed_below: Scalar
     keyframe_views: Scalar
     map_views: Scalar
+    map_changed: Scalar
     keyframe_points_below: Scalar
     keyframe_weak_after_s: Scalar
     keyframe_min_s: Scalar

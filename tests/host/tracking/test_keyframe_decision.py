@@ -33,6 +33,7 @@ def _reason(
     new=0,
     recognized=0.8,
     map_views=0,
+    map_changed=False,
     movable=0.0,
     tracked=N,
     weak=False,
@@ -63,7 +64,7 @@ def _reason(
         since_keyframe_s=number(since_s),
         movable=number(movable),
     )
-    params = PARAMS._replace(map_views=number(map_views))
+    params = PARAMS._replace(map_views=number(map_views), map_changed=number(map_changed))
     return KeyframeReason(int(keyframe_reason(state, candidate, params, plan)))
 
 
@@ -95,6 +96,15 @@ def test_more_keyframes_where_the_view_is_hardly_recognized(plan) -> None:
     hardly = partial(_reason, plan, new=int(0.95 * N), overlap=0.9, recognized=0.01)
     assert hardly(map_views=views) == KeyframeReason.FEW_FOLLOWED
     assert hardly(map_views=4 * views) == KeyframeReason.NONE
+
+
+@pytest.mark.parametrize("plan", [AS_NEEDED, SPARING])
+def test_a_change_of_the_map_is_one(plan) -> None:
+    changed = partial(_reason, plan, overlap=0.9, map_changed=True)
+    assert changed() == KeyframeReason.CHANGED
+    assert changed(map_views=100) == KeyframeReason.CHANGED  # as well known as it was
+    assert changed(since_s=0.1) == KeyframeReason.NONE
+    assert changed(lost=True) == KeyframeReason.NONE
 
 
 def test_not_soon_after_the_last_one() -> None:

@@ -1,0 +1,134 @@
+"""Find map points that are gone: the depth image of a frame shows another surface behind them.
+
+Without it, the points of a chair that was moved between two visits would stay: no keyframe contradicts them, as each
+observed them when the chair was there.
+
+Source of the case: Ji, Wang and Xie, "Towards Real-time Semantic RGB-D SLAM in Dynamic Environments" (TRS-SLAM), 2021,
+section III-B.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxslam_kernels.types import DepthImage, Points, Scalar
+from jaxtyping import Array, Bool, Float
+
+from jaxslam.geometry.se3 import to_local
+from jaxslam.geometry.types import Ids, Pose
+from jaxslam.map.point_records import rows
+from jaxslam.map.types import Map
+from jaxslam.mapping.view_coverage import in_view
+from jaxslam.runtime.compiled import compiled
+from jaxslam.runtime.compiler_options import SINGLE_THREAD
+from jaxslam.runtime.padding import padded
+from jaxslam.sensors.frame_arrays import FrameArrays
+from jaxslam.sensors.measurement import depth_sigma, pixel_rays, predict_pixels
+from jaxslam.sensors.sensor_model import SensorModel
+
+_DEPTH_SIGMAS, _DEPTH_SHARE = 4.2, 0.05
+"""Distance of a surface behind a point from which the point is gone: three standard deviations of the difference of two
+measurements, and a share of the depth for errors of the pose and of the map."""
+_REACH_PX = 2
+"""Radius around a point in which all depth must be of one surface: at an edge, a pose error of pixels would become an
+error of depth."""
+_BATCH = 4096
+"""Number of points that are compared at once."""
+_MIN_VIEWS = 3
+"""Number of keyframes that must observe a point for it to be confirmed."""
+
+
+class FrameDepth:
+    """The depth image of a frame, with which map points are compared.
+
+    Attributes:
+        twist: `(6,)` velocity of the camera in its own axes, m/s, then rad/s.
+        frame: The frame.
+        sensor: Camera, and the error model of its depth.
+    """
+
+    def __init__(self, twist: Float[np.ndarray, "6"], frame: FrameArrays, sensor: SensorModel) -> None:
+        """Keep a frame, whose arrays must not change."""
+        self.twist, self.frame, self.sensor = twist.astype(np.float32), frame, sensor
+
+    def compare(self, X_cam: Float[np.ndarray, "3 n"]) -> Bool[np.ndarray, "2 n"]:
+        """Compare points, given in the camera frame in meters, with the depth.
+
+        Returns:
+            Masks of the points behind which the frame sees a surface, and of those that it sees where they are.
+        """
+        seen = np.zeros((2, X_cam.shape[1]), bool)
+        of_frame = self.frame.ignore, self.frame.depth, self.frame.depth_delay_s
+        for start in range(0, X_cam.shape[1], _BATCH):
+            some = X_cam[:, start : start + _BATCH].astype(np.float32)
+            filled = padded(some, _BATCH, axis=-1)
+            compared = _compared(filled, self.twist, *of_frame, self.sensor)
+            seen[:, start : start + _BATCH] = np.asarray(compared)[:, : some.shape[1]]
+        return seen
+
+    def compile(self) -> None:
+        """Compile what a frame of this size needs."""
+        self.compare(np.zeros((3, 1)))
+
+
+class VanishedPoints(NamedTuple):
+    """Map points in view that a frame sees through.
+
+    Attributes:
+        ids: `(n,)` ids of the points behind which the frame sees another surface, in order.
+        confirmed: `(n,)` whether at least three keyframes observe the point. Points on someone who walked by are gone
+            from one keyframe to the next.
+        there: `(m,)` ids of the points that it sees where they are, in order.
+        num_shown: Number of confirmed points that are in view.
+    """
+
+    ids: Ids
+    confirmed: Bool[np.ndarray, " n"]
+    there: Ids
+    num_shown: int
+
+
+def vanished_points(slam_map: Map, keyframe_ids: Ids, T_world_cam: Pose, seen: FrameDepth) -> VanishedPoints:
+    """Find the map points that a frame sees through.
+
+    Args:
+        slam_map: The map.
+        keyframe_ids: Ids of the keyframes around; only their points are looked at.
+        T_world_cam: `(7,)` pose of the frame.
+        seen: Depth of the frame.
+    """
+    near = slam_map.around(keyframe_ids)
+    row = rows(near.points.ids, near.observations.point)
+    views = np.bincount(row, minlength=len(near.points.ids))
+    theirs = np.zeros(len(near.points.ids), bool)
+    theirs[row[np.isin(near.observations.keyframe, keyframe_ids)]] = True
+    shown = np.flatnonzero(theirs & in_view(near.camera, T_world_cam, near.points.X_world))
+    confirmed = views[shown] >= _MIN_VIEWS
+    gone, there = seen.compare(to_local(T_world_cam, near.points.X_world[:, shown]))
+    ids = near.points.ids[shown]
+    return VanishedPoints(ids[gone], confirmed[gone], ids[there], int(confirmed.sum()))
+
+
+@compiled(when="warm-up", options=SINGLE_THREAD)
+def _compared(
+    X_cam: Points,
+    twist: Float[Array, "6"],
+    ignore: Bool[Array, "h w"],
+    depth: DepthImage,
+    depth_delay_s: Scalar,
+    sensor: SensorModel,
+) -> Bool[Array, "2 n"]:
+    """Return masks of the points behind which the frame sees a surface, and of those that it sees where they are."""
+    height, width = ignore.shape
+    front = X_cam[2] > sensor.min_depth_m / 2
+    X_cam = jnp.where(front, X_cam, jnp.array([[0.0], [0.0], [1.0]], X_cam.dtype))
+    uv = predict_pixels(X_cam, twist, height, sensor)
+    size = jnp.array([[width], [height]], uv.dtype)
+    pixel = jnp.round(uv)
+    inside = front & ((pixel >= 0) & (pixel < size)).all(axis=0)
+    column, row = jnp.clip(pixel, 0, size - 1).astype(jnp.int32)
+    expected = X_cam[2]
+    measured = pixel_rays(uv, sensor).measured(expected, twist, depth, depth_delay_s, sensor, reach=_REACH_PX).depth
+    known = inside & ~ignore[row, column] & (measured > sensor.min_depth_m) & (measured < sensor.max_depth_m)
+    farther, tolerance = measured - expected, _DEPTH_SIGMAS * depth_sigma(measured, sensor) + _DEPTH_SHARE * expected
+    return jnp.stack([known & (farther > tolerance), known & (jnp.abs(farther) <= tolerance)])

@@ -1,0 +1,40 @@
+"""Judge by several frames which points of the map are gone, and whether the map has changed."""
+
+import numpy as np
+
+from jaxslam.geometry.types import Ids
+from jaxslam.mapping.vanished_points import VanishedPoints
+
+_MIN_VANISHED, _MIN_SHARE = 15, 0.005
+"""Smallest number of confirmed points that are gone, and smallest share of those in view, for a change of the map."""
+
+_MAX_DOUBTED = 4096
+"""Number of points that one frame saw through that are remembered, the newest ones."""
+
+
+class MapChanges:
+    """What frames say of the map: a point is gone when two of them see through it, and none in between sees it there.
+
+    A single frame may have a wrong pose, or be blurred.
+
+    Attributes:
+        pending: Whether the map has changed, and no keyframe was made since.
+    """
+
+    def __init__(self) -> None:
+        """Start without frames."""
+        self.pending = False
+        self._doubted = np.zeros(0, np.int64)
+
+    def gone(self, vanished: VanishedPoints) -> Ids:
+        """Return the ids of the points that are gone, given those that a frame sees through."""
+        again = np.isin(vanished.ids, self._doubted)
+        num_gone = np.count_nonzero(again & vanished.confirmed)
+        self.pending |= bool(num_gone >= max(_MIN_VANISHED, _MIN_SHARE * vanished.num_shown))
+        doubted = np.setdiff1d(np.union1d(self._doubted, vanished.ids), vanished.there)
+        self._doubted = np.setdiff1d(doubted, vanished.ids[again])[-_MAX_DOUBTED:]
+        return vanished.ids[again]
+
+    def keyframe_made(self) -> None:
+        """Note that a keyframe shows the change."""
+        self.pending = False
