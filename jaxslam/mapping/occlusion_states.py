@@ -31,15 +31,12 @@ from jaxslam.runtime.compiled import committed, compiled
 from jaxslam.runtime.compiler_options import SINGLE_THREAD
 from jaxslam.runtime.padding import padded
 from jaxslam.sensors.frame_arrays import FrameArrays
-from jaxslam.sensors.measurement import depth_sigma, pixel_rays, predict_pixels
+from jaxslam.sensors.measurement import depth_sigma, predict_pixels, surface_depth
 from jaxslam.sensors.sensor_model import SensorModel
 
 _DEPTH_SIGMAS, _DEPTH_SHARE = 4.2, 0.02
 """Difference of measured and expected depth from which a point is displaced: three standard deviations of the
 difference of two measurements, and a share of the depth for errors of pose and calibration."""
-_REACH_PX = 2
-"""Radius around a point in which all depth must be of one surface: at an edge, a pose error of pixels would become an
-error of depth."""
 _MAX_BENT = 0.5
 """Largest shift of a point by the lens, as a share of the image: farther out, its polynomial may fold back inside."""
 _MAX_BLOCKED = 512
@@ -288,7 +285,6 @@ def _displaced(
         depth_delay_s: Time from the image to its depth, in seconds.
         sensor: Camera and the error model of its depth.
     """
-    measured = pixel_rays(uv, sensor).measured(expected, twist, depth, depth_delay_s, sensor, reach=_REACH_PX).depth
-    known = (measured > sensor.min_depth_m) & (measured < sensor.max_depth_m)
+    measured, known = surface_depth(expected, uv, twist, depth, depth_delay_s, sensor)
     tolerance = _DEPTH_SIGMAS * depth_sigma(expected, sensor) + _DEPTH_SHARE * expected
     return known & (jnp.abs(measured - expected) > tolerance)

@@ -23,15 +23,12 @@ from jaxslam.runtime.compiled import compiled
 from jaxslam.runtime.compiler_options import SINGLE_THREAD
 from jaxslam.runtime.padding import padded
 from jaxslam.sensors.frame_arrays import FrameArrays
-from jaxslam.sensors.measurement import depth_sigma, pixel_rays, predict_pixels
+from jaxslam.sensors.measurement import depth_sigma, predict_pixels, surface_depth
 from jaxslam.sensors.sensor_model import SensorModel
 
 _DEPTH_SIGMAS, _DEPTH_SHARE = 4.2, 0.05
 """Distance of a surface behind a point from which the point is gone: three standard deviations of the difference of two
 measurements, and a share of the depth for errors of the pose and of the map."""
-_REACH_PX = 2
-"""Radius around a point in which all depth must be of one surface: at an edge, a pose error of pixels would become an
-error of depth."""
 _BATCH = 4096
 """Number of points that are compared at once."""
 _MIN_VIEWS = 3
@@ -121,14 +118,13 @@ def _compared(
     """Return masks of the points behind which the frame sees a surface, and of those that it sees where they are."""
     height, width = ignore.shape
     front = X_cam[2] > sensor.min_depth_m / 2
-    X_cam = jnp.where(front, X_cam, jnp.array([[0.0], [0.0], [1.0]], X_cam.dtype))
     uv = predict_pixels(X_cam, twist, height, sensor)
     size = jnp.array([[width], [height]], uv.dtype)
     pixel = jnp.round(uv)
     inside = front & ((pixel >= 0) & (pixel < size)).all(axis=0)
     column, row = jnp.clip(pixel, 0, size - 1).astype(jnp.int32)
     expected = X_cam[2]
-    measured = pixel_rays(uv, sensor).measured(expected, twist, depth, depth_delay_s, sensor, reach=_REACH_PX).depth
-    known = inside & ~ignore[row, column] & (measured > sensor.min_depth_m) & (measured < sensor.max_depth_m)
+    measured, known = surface_depth(expected, uv, twist, depth, depth_delay_s, sensor)
+    known &= inside & ~ignore[row, column]
     farther, tolerance = measured - expected, _DEPTH_SIGMAS * depth_sigma(measured, sensor) + _DEPTH_SHARE * expected
     return jnp.stack([known & (farther > tolerance), known & (jnp.abs(farther) <= tolerance)])

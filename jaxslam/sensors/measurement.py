@@ -21,6 +21,9 @@ RIGHT_LEVELS = 2
 """Of the pyramid of the right image: where matching begins is known to a few pixels."""
 _EXPECTED_PX = 1.0
 """A match so close to where the map has a point is that point."""
+_SURFACE_PX = 2
+"""Radius around a pixel in which `surface_depth` needs all depth to be of one surface: at an edge, a pose error of
+pixels would become an error of depth."""
 
 
 class PreparedFrame(NamedTuple):
@@ -184,6 +187,32 @@ def predict_pixels(X_cam: Points, twist: Float[Array, "6"], height: int, sensor:
     v = to_pixels(sensor.intrinsics, distort(sensor.intrinsics, xy))[1]
     late = xy + image_velocity(xy, depth, twist) * row_time(v, height, sensor.readout_s)[None, :]
     return to_pixels(sensor.intrinsics, distort(sensor.intrinsics, late))
+
+
+def surface_depth(
+    expected_depth: Weights,
+    uv: Pixels,
+    twist: Float[Array, "6"],
+    depth: DepthImage,
+    depth_delay_s: Scalar,
+    sensor: SensorModel,
+) -> tuple[Weights, Mask]:
+    """Measure the depth of the surface at each pixel, to compare it with that of a point expected there.
+
+    Args:
+        expected_depth: `(n,)` expected depths, meters.
+        uv: `(2, n)` expected pixels.
+        twist: Velocity of the camera in its own axes.
+        depth: Raw depth image, meters.
+        depth_delay_s: Time from the image to its depth, seconds.
+        sensor: Camera and the error model of its depth.
+
+    Returns:
+        Depths `(n,)` in meters, and a mask of the pixels around which all depth is of one surface within range.
+    """
+    rays = pixel_rays(uv, sensor)
+    measured = rays.measured(expected_depth, twist, depth, depth_delay_s, sensor, reach=_SURFACE_PX).depth
+    return measured, (measured > sensor.min_depth_m) & (measured < sensor.max_depth_m)
 
 
 def depth_sigma(depth: Weights, sensor: SensorModel) -> Weights:

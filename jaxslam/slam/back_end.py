@@ -125,7 +125,7 @@ class BackEnd:
 
     @property
     def map_changed(self) -> bool:
-        """Whether many points of the map are gone, and no keyframe was made since."""
+        """True if many points of the map are gone, and no keyframe was made since."""
         return self._changes.pending
 
     @property

@@ -13,7 +13,7 @@ _MAX_DOUBTED = 4096
 
 
 class MapChanges:
-    """What frames say of the map: a point is gone when two of them see through it, and none in between sees it there.
+    """Collects what frames see through: a point is gone if two of them do, and none in between sees it there.
 
     A single frame may have a wrong pose, or be blurred.
 
