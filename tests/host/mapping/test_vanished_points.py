@@ -105,7 +105,7 @@ def test_a_point_is_gone_that_two_frames_see_through() -> None:
 
 
 def test_many_points_that_are_gone_are_a_change_until_a_keyframe() -> None:
-    changes, many = MapChanges(), seen_through(*range(15))
+    changes, many = MapChanges(), seen_through(*range(20))
     changes.gone(many)
     assert not changes.pending
     changes.gone(many)
@@ -116,11 +116,29 @@ def test_many_points_that_are_gone_are_a_change_until_a_keyframe() -> None:
     assert not changes.pending
 
 
+def test_points_that_are_gone_add_up_over_a_few_frames() -> None:
+    few, more, nothing = seen_through(*range(11)), seen_through(*range(20, 31)), seen_through()
+    assert pending_after(few, few, nothing, more, more)
+    assert not pending_after(few, few, nothing, nothing, nothing, more, more), "long before"
+    assert not pending_after(few, few, None, more, more), "a keyframe shows the first ones"
+
+
+def pending_after(*looks: VanishedPoints | None) -> bool:
+    """Tell whether a change is pending after frames, of which `None` is a keyframe."""
+    changes = MapChanges()
+    for vanished in looks:
+        if vanished is None:
+            changes.keyframe_made()
+        else:
+            changes.gone(vanished)
+    return changes.pending
+
+
 @pytest.mark.parametrize(
     ("vanished", "what"),
     [
-        (seen_through(*range(14)), "too few"),
-        (seen_through(*range(15), num_shown=3001), "less than 0.5 % of those in view"),
+        (seen_through(*range(19)), "too few"),
+        (seen_through(*range(20), num_shown=4001), "less than 0.5 % of those in view"),
         (seen_through(*range(100), confirmed=False), "of someone who walked by"),
     ],
 )
