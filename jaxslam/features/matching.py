@@ -152,11 +152,10 @@ def _near(
     Features are sorted by the level of the points that look for them, by bands of rows as high as a search is wide, and
     by column: a point looks at a piece of two bands. That takes a third of the time of k-d trees of each level.
     """
-    levels = np.arange(plan.num_levels)
-    radius = radius_px * plan.scale_factor**levels
-    feature = np.tile(np.arange(len(features.octave)), 2 * _OCTAVES_APART + 1)
+    radius = radius_px * plan.scale_factor ** np.arange(plan.num_levels)
     wanted_by = features.octave.astype(np.int64) + np.arange(-_OCTAVES_APART, _OCTAVES_APART + 1)[:, None]
-    feature, wanted_by = (array[np.isin(wanted_by.ravel(), levels)] for array in (feature, wanted_by.ravel()))
+    apart, feature = np.nonzero((wanted_by >= 0) & (wanted_by < plan.num_levels))
+    wanted_by = wanted_by[apart, feature]
     sought = np.flatnonzero(np.isfinite(predicted_uv).all(axis=0))
     uv, level = predicted_uv[:, sought].astype(np.float64), octave[sought].astype(np.int64)
     reach = radius[level]

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Float64, Int, UInt8
 from jaxslam.dynamics.occlusion import PointState
 from jaxslam.geometry.se3 import compose, transform
 from jaxslam.geometry.types import Ids, Pose, Poses
-from jaxslam.map.point_records import NONE, MapPoints, Observations, joined, observations_at, points_at, rows
+from jaxslam.map.point_records import NONE, MapPoints, Observations, has, joined, observations_at, points_at, rows
 from jaxslam.map.spanning_tree import parents_from
 from jaxslam.map.types import Keyframe, Loops, Map, point_submaps, surviving_keyframes
 from jaxslam.map.validate import Record, number_problems
@@ -80,10 +80,21 @@ def with_observations(slam_map: Map, observations: Observations) -> Map:
     wrong = (observations.feature < NONE) | (observations.feature >= num_features[which])
     if wrong.any():
         raise ValueError(f"keyframe {observations.keyframe[wrong][0]} has no feature {observations.feature[wrong][0]}")
-    rivals = np.isin(slam_map.observations.keyframe, observations.keyframe)
-    both = joined([observations_at(slam_map.observations, rivals), observations])
-    new = observations_at(observations, first_of_rivals(both)[int(rivals.sum()) :])
+    new = observations_at(observations, ~_conflicts(slam_map, observations))
+    new = observations_at(new, first_of_rivals(new))
     return slam_map.with_arrays(observations=joined([slam_map.observations, new]))
+
+
+def _conflicts(slam_map: Map, new: Observations) -> Bool[np.ndarray, " n"]:
+    """Return which new observations conflict with one of the map."""
+    seen = slam_map.observations
+    near = np.flatnonzero(has(np.unique(new.keyframe), seen.keyframe))
+    shown = near[seen.feature[near] != NONE]
+    points = _group(seen.keyframe[near], seen.point[near])
+    features = _group(seen.keyframe[shown], seen.feature[shown])
+    return has(np.sort(points), _group(new.keyframe, new.point)) | has(
+        np.sort(features), _group(new.keyframe, new.feature)
+    )
 
 
 def with_loop(
@@ -258,14 +269,15 @@ def first_of_rivals(observations: Observations) -> Bool[np.ndarray, " s"]:
         feature = _group(observations.keyframe[undecided], by_feature[undecided])
         first = _is_first(pair) & _is_first(feature)
         stays[undecided[first]] = True
-        undecided = undecided[~(np.isin(pair, pair[first]) | np.isin(feature, feature[first]))]
+        rest = np.flatnonzero(~first)
+        beaten = has(np.sort(pair[first]), pair[rest]) | has(np.sort(feature[first]), feature[rest])
+        undecided = undecided[rest[~beaten]]
     return stays
 
 
 def _group(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Number the distinct pairs: equal numbers where both values are equal."""
-    first, second = (np.unique(values, return_inverse=True)[1] for values in (first, second))
-    return first * (second.max() + 1) + second
+    """Number pairs: equal numbers where both values are equal. Ids of keyframes and points are far below 2^31."""
+    return (first.astype(np.int64) << np.int64(32)) + second
 
 
 def _is_first(groups: np.ndarray) -> np.ndarray:

@@ -120,9 +120,7 @@ def observations_at(observations: Observations, index: Ids | Bool[np.ndarray, " 
 
 def has(ids: Ids, wanted: Int[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
     """Return which of the wanted ids are among the ascending `ids`."""
-    if not len(ids):
-        return np.zeros(len(wanted), bool)
-    return ids[np.minimum(np.searchsorted(ids, wanted), len(ids) - 1)] == wanted
+    return _is_at(ids, np.searchsorted(ids, wanted), wanted)
 
 
 def rows(ids: Ids, wanted: Int[np.ndarray, " m"]) -> Int[np.ndarray, " m"]:
@@ -131,7 +129,15 @@ def rows(ids: Ids, wanted: Int[np.ndarray, " m"]) -> Int[np.ndarray, " m"]:
     Raises:
         KeyError: If a wanted id is not there.
     """
-    known = has(ids, wanted)
+    at = np.searchsorted(ids, wanted)
+    known = _is_at(ids, at, wanted)
     if not known.all():
         raise KeyError(f"not in the map: {wanted[~known][:8].tolist()}")
-    return np.searchsorted(ids, wanted)
+    return at
+
+
+def _is_at(ids: Ids, at: Int[np.ndarray, " m"], wanted: Int[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
+    """Return which of the wanted ids are where they would be in the ascending `ids`."""
+    if not len(ids):
+        return np.zeros(len(wanted), bool)
+    return ids[np.minimum(at, len(ids) - 1)] == wanted

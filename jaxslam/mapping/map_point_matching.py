@@ -11,7 +11,7 @@ from jaxslam.geometry.se3 import to_local
 from jaxslam.geometry.types import Ids, Pose
 from jaxslam.map.edit import with_observations
 from jaxslam.map.point_fusion import with_fused_points
-from jaxslam.map.point_records import NONE, Observations, empty_observations, joined, observations_at, rows
+from jaxslam.map.point_records import NONE, Observations, empty_observations, has, joined, observations_at, rows
 from jaxslam.map.types import Map
 
 _MARGIN_PX = 1.0
@@ -40,7 +40,7 @@ class DescribedPoints(NamedTuple):
 
     def without(self, point_ids: Ids) -> "DescribedPoints":
         """Return the points but for those with these ids."""
-        stays = ~np.isin(self.ids, point_ids)
+        stays = ~has(np.sort(point_ids), self.ids)
         return DescribedPoints(self.ids[stays], self.X_world[:, stays], self.descriptor[stays], self.size[stays])
 
 
