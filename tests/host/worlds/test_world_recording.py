@@ -251,7 +251,7 @@ def test_is_written_as_tum_with_numbers_and_labels(tmp_path):
     assert "4 1 person" in (tmp_path / "room" / "labels.txt").read_text()
 
 
-SLOW = {"flat", "house", "open", "road", "road_loop"}
+SLOW = {"flat", "flat_visits", "house", "open", "road", "road_loop"}
 """Worlds that are rendered in 7 to 34 s; all others take less than 3."""
 
 
