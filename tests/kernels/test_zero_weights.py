@@ -117,6 +117,7 @@ def test_ransac_pnp():
     assert jacobian[0, 1] == 0
 
 
+@pytest.mark.slow
 def test_bundle_adjust_points():
     """A point that has no weight counts where it would go, not where it started."""
     inputs = bundle_inputs()
@@ -145,6 +146,7 @@ def test_bundle_adjust_observations():
     np.testing.assert_allclose(jacobian[:, unseen], 0.0, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_pose_graph():
     """An edge to a node without others has none: it is fitted exactly."""
     start, edges = graph_inputs()
@@ -158,6 +160,7 @@ def test_pose_graph():
     np.testing.assert_array_equal(jacobian[:2, 5], 0.0)
 
 
+@pytest.mark.slow
 def test_ransac_fundamental():
     inputs = match_inputs()
 

@@ -78,6 +78,7 @@ def changed(params: TrackParams, **changes: float) -> TrackParams:
 
 
 class TestTrackClips:
+    @pytest.mark.slow
     @pytest.mark.parametrize("threads", [1, 2])
     def test_vmap_equals_loop(self, task: Task, alone: TrackedClips, threads: int) -> None:
         """Three clips in two programs: the last one is filled up."""

@@ -26,6 +26,7 @@ SIZES = ProgramBudget(1000, 100, {"pose.p3p": 600, "se3.retract": 400})
 SMALL = Budget("a CPU (avx2)", "jaxlib 1.0", {"track_followed": SIZES})
 
 
+@pytest.mark.slow
 def test_step_is_within_its_budget() -> None:
     """Compiles both programs of a frame. Counts are equal with SSE4.2, AVX2 and AVX-512, with one thread and two."""
     budget = load_budget(BUDGET)

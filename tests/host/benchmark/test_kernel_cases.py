@@ -53,6 +53,7 @@ def content(out: Path) -> dict[str, Any]:
     return json.loads((out / "kernels.json").read_text())
 
 
+@pytest.mark.slow
 class TestResults:
     def test_are_printed_alone(self, out: Path, content: dict[str, Any]) -> None:
         assert json.loads((out.parent / PRINTED).read_text()) == content
@@ -93,6 +94,7 @@ class TestResults:
             assert len(np.unique(np.asarray(image).reshape(-1, 4), axis=0)) > 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SMALL)
 def test_results_agree(name: str) -> None:
     """And would not, were ours another."""

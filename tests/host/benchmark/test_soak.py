@@ -119,6 +119,7 @@ def test_a_world_without_room_for_people_is_an_error() -> None:
         PassingPeople(WorldRecording(without_people(load_world("open"))), 1)
 
 
+@pytest.mark.slow
 def test_files_of_the_command(room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     wanted = ["--frames", "50", "--window", "20", "--covered-every", "25", "--size", "160x120", "--people", "2"]
     main(["bench", "soak", str(room), *wanted, "--out", str(tmp_path), "--json"])

@@ -65,6 +65,7 @@ class TestSuite:
         assert suite.sequences[1] == Sequence("start", "rgbd_bonn_crowd", stop=20)
         assert [clip.whole for clip in suite.sequences] == [True, False]
 
+    @pytest.mark.slow
     def test_room_as_pairs(self, tmp_path: Path) -> None:
         text = "sequences: [{name: room, sensor: stereo, room: {frames: 1, people: 0, baseline_m: 0.1}}]"
         (job,) = plan(load_suite(suite_file(tmp_path, text)))

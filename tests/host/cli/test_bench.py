@@ -90,6 +90,7 @@ def times_of(files: list[Path]) -> dict[Path, int]:
     return {path: path.stat().st_mtime_ns for path in files}
 
 
+@pytest.mark.slow
 class TestResults:
     def test_of_every_run(self, out: Path) -> None:
         assert {path.name for path in out.iterdir()} == {"results.json", "report.md", "report.html", "room"}

@@ -288,6 +288,7 @@ def test_key_objects_are_dense() -> None:
 
 
 class TestRun:
+    @pytest.mark.slow
     def test_what_a_run_leaves(self, tmp_path: Path) -> None:
         recording = clip(frames=40)
         dense = DenseConfig(enabled=True, max_points=20_000, keyframe_points=4096, pixel_step=1)

@@ -99,6 +99,7 @@ class TestTrajectory:
         assert (np.asarray(found.weight)[:50] == 1).all()
         assert np.isfinite(np.asarray(found.evidence)).all()
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("as_published", [False, True])
     @pytest.mark.parametrize("motion", ["none", "all"])
     def test_gradient(self, as_published: bool, motion: str) -> None:

@@ -57,6 +57,7 @@ def tracked(plan: TrackPlan, cue_params: tuple[Any, ...], people: int = 0) -> tu
 
 
 class TestOwnCue:
+    @pytest.mark.slow
     def test_has_a_veto(self) -> None:
         plan = PLAN._replace(cues=(left_of,))
         _, output = tracked(plan, (jnp.asarray(WIDTH / 2),))
@@ -74,6 +75,7 @@ class TestOwnCue:
         np.testing.assert_allclose(output.T_world_cam.wxyz_xyz, without.T_world_cam.wxyz_xyz, atol=1e-6)
         assert not np.asarray(output.cue_results[0].weight)[np.asarray(output.cue_results[0].known)].any()
 
+    @pytest.mark.slow
     def test_that_lets_all_pass_changes_nothing(self) -> None:
         _, without = tracked(PLAN, ())
         _, passed = tracked(PLAN._replace(cues=(left_of,)), (jnp.asarray(0.0),))

@@ -91,6 +91,7 @@ class TestKidnap:
         found = played.first(TrackStatus.RELOCALIZED)
         assert played.results[found + 1].num_keyframe_matches > 60
 
+    @pytest.mark.slow
     def test_real(self, data_dir: Path) -> None:
         """The first frame has a rolling shutter and no motion yet to correct it by: 14 to 38 mm in 24 runs."""
         dataset = open_dataset(data_dir / "tum/rgbd_dataset_freiburg1_rpy_excerpt")
@@ -257,6 +258,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class TestCommandLine:
+    @pytest.mark.slow
     def test_run_localize_export(self, written: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         map_file, settings = tmp_path / "m.npz", ["--set", *SETTINGS]
         main(["run", str(written), "--save-map", str(map_file), "--out", str(tmp_path / "one"), *settings])

@@ -48,6 +48,7 @@ def windows_of(dataset: Dataset, config: Config, window: int, tmp_path) -> tuple
     return meter.windows, statuses
 
 
+@pytest.mark.slow
 def test_no_keyframes_where_the_camera_has_been(tmp_path) -> None:
     whole = clip()
     windows, statuses = windows_of(ToAndFro(whole, 16 * (len(whole) - 1)), CONFIG, 2 * (len(whole) - 1), tmp_path)
@@ -56,6 +57,7 @@ def test_no_keyframes_where_the_camera_has_been(tmp_path) -> None:
     assert windows[-1].keyframes == windows[4].keyframes
 
 
+@pytest.mark.slow
 def test_a_camera_at_rest_makes_no_keyframes(tmp_path) -> None:
     """For twenty seconds here."""
     still = SyntheticDataset(SyntheticConfig(width=320, height=240, frames=8, people=0, path="static"))

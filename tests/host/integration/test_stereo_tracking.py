@@ -171,6 +171,7 @@ class TestRoom:
             statuses = [slam.track(dataset[index]).status for index in range(len(dataset))]
         assert statuses[1:] == [TrackStatus.OK] * 5
 
+    @pytest.mark.slow
     def test_black_pairs_in_between(self) -> None:
         dataset = _room(0.1, frames=16)
         black = np.zeros((480, 640, 3), np.uint8)
@@ -271,6 +272,7 @@ class TestKitti:
         with pytest.raises(CameraError, match="baseline_m: expected meters for a stereo pair"):
             open_dataset(_kitti_folder(tmp_path), camera=dataclasses.replace(DEPTH, width=64, height=48, cx=30, cy=20))
 
+    @pytest.mark.slow
     def test_real(self, data_dir: Path) -> None:
         """51 pairs from a car: every one tracked, and the length of the path right."""
         dataset = open_dataset(data_dir / "kitti" / "sequences" / "06")

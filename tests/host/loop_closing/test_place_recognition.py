@@ -264,6 +264,7 @@ def recorded_map(dataset: Dataset, found: list[Features], poses: list[np.ndarray
     return slam_map
 
 
+@pytest.mark.slow
 def test_real_places(data_dir: Path):
     """TUM fr1_rpy: revisits are recognized where they are; Bonn's lecture hall is not, nor the other way round."""
     desk = open_dataset(data_dir / "tum" / "rgbd_dataset_freiburg1_rpy_excerpt")

@@ -57,6 +57,7 @@ def test_of_views_that_nothing_else_shows_the_farther_leaves() -> None:
     assert slam_map.culled.ids.tolist() == [0]
 
 
+@pytest.mark.slow
 def test_a_tracker_whose_map_is_full_goes_on(caplog: pytest.LogCaptureFixture) -> None:
     many = replace(TRACK, keyframe_below=1.0, keyframe_views=1000)
     counts, poses = [], []

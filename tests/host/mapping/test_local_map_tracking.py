@@ -307,6 +307,7 @@ class TestLostFrames:
             assert np.linalg.norm((slam._back.pose(placed.anchored) - mapped()[1][40].T_world_cam)[4:]) < 0.015
             assert slam._back.relocalize(arrays, None) == (None, True)
 
+    @pytest.mark.slow
     def test_go_on_from_there(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """A camera turned too fast for flow, while no place is recognized."""
         monkeypatch.setattr("jaxslam.slam.frame_localizer.recognize", lambda *_, **__: None)

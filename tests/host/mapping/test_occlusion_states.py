@@ -541,6 +541,7 @@ class TestRoomWithPeople:
         assert max(shares) > 0.05
         assert occluded_shares(run.map).max() > 0.2
 
+    @pytest.mark.slow
     def test_are_of_the_room(self) -> None:
         """They are where the empty room has a surface."""
         run, source = as_published(), _scene()[0].source

@@ -357,6 +357,7 @@ class TestRoomWithNobodyInIt:
         assert [result.dynamic_mask.sum() for result in results] == [0] * len(results)
         assert all(result.status is not TrackStatus.LOST for result in results)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("size", [(321, 243), (32, 24)])
     def test_other_sizes(self, size: tuple[int, int]) -> None:
         source = SyntheticDataset(SyntheticConfig(width=size[0], height=size[1], frames=30, people=0, path="rpy"))
@@ -395,6 +396,7 @@ class TestPeople:
         assert masked > 0
         assert wrong <= 0.01 * masked
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(("size", "least_overlap"), [((321, 243), 0.7), ((65, 49), 0.15), ((33, 25), 0.0)])
     def test_in_other_sizes(self, size: tuple[int, int], least_overlap: float) -> None:
         """In small pictures people are soon too small to be found, but no mask is wrong."""

@@ -357,6 +357,7 @@ with Slam(room.camera, load_config(overrides=["semantics.model=null", "run.deter
 """
 
 
+@pytest.mark.slow
 def test_next_process_of_the_tracker_finds_all() -> None:
     """It traces nothing again, and gives the same digits."""
     shared = Path(os.environ["JAX_COMPILATION_CACHE_DIR"]) / "traces"

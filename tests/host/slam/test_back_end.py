@@ -92,6 +92,7 @@ class TestDeterminism:
             assert (tmp_path / "two" / file).read_bytes() == first, file
             assert (tmp_path / "other" / file).read_bytes() == first, file
 
+    @pytest.mark.slow
     def test_threads_give_much_the_same(self) -> None:
         """Not the same bytes, but the same places."""
         tracks = []

@@ -85,6 +85,7 @@ class TestTracking:
         assert keyframe_matches[4] > 1.1 * keyframe_matches[0]
         assert errors[4] < 1.1 * errors[0]
 
+    @pytest.mark.slow
     def test_a_way_that_is_known_makes_hardly_a_keyframe(self) -> None:
         """To and fro three times: the map grows with what it shows, and the pose is as right as the first time."""
         frames, truth = _there_and_back()

@@ -235,6 +235,7 @@ class TestRun:
         assert results[0].status is TrackStatus.RELOCALIZED
         assert looks.frames == keyframes(results)
 
+    @pytest.mark.slow
     def test_nothing_is_compiled_while_frames_come(self, compiled: list[str]) -> None:
         jax.clear_caches()
         with Slam(source().camera, config(), detector=Looks()) as slam:
@@ -427,7 +428,7 @@ class TestFailure:
             assert len(messages) == slam.map.next_keyframe >= 2
             assert problems(slam.map) == []
 
-    @pytest.mark.parametrize("new_points", ["always", "keyframes"])
+    @pytest.mark.parametrize("new_points", ["always", pytest.param("keyframes", marks=pytest.mark.slow)])
     def test_all_of_a_keyframe_is_masked(self, new_points: Any) -> None:
         """Its points leave: points that came after hold the pose, or it is found again by the keyframe before."""
         looks_so_far = itertools.count()

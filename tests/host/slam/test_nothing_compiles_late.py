@@ -67,6 +67,7 @@ def script(slam: Slam, frames: list[Frame], compiled: list[str]) -> list[TrackSt
     return statuses
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("live", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_losses_and_submaps(compiled: list[str], *, live: bool) -> None:
     """Then a reset, and another tracker with the same settings."""

@@ -195,6 +195,7 @@ class TestClose:
 
 
 class TestInTurn:
+    @pytest.mark.slow
     @pytest.mark.parametrize("dense", [False, pytest.param(True, marks=pytest.mark.slow)])
     def test_cold_as_warm(self, tmp_path: Path, *, dense: bool) -> None:
         """A loss among the first frames too: to the byte."""

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import jax
+import pytest
 from small_scene import CONFIG, clip
 
 from jaxslam.config.schema import DenseConfig
@@ -11,6 +12,7 @@ from jaxslam.runtime.compiled import programs
 from jaxslam.slam.slam import Slam
 
 
+@pytest.mark.slow
 def test_no_program_is_forgotten() -> None:
     """Everything at once, in threads: occlusion, a dense map, and a detector for every frame or for keyframes."""
     recording, compiled = clip(people=1, frames=2), set()

@@ -43,6 +43,7 @@ def with_focal(scale: float) -> TrackParams:
     return given._replace(sensor=given.sensor._replace(intrinsics=longer))
 
 
+@pytest.mark.slow
 def test_equals_its_steps(frames: FrameArrays) -> None:
     end, outputs = quick_compile(partial(rollout, plan=PLAN))(new_state(), frames, params())
     step, state = quick_compile(partial(track_step, plan=PLAN)), new_state()

@@ -164,6 +164,7 @@ class TestCompiled:
             else:
                 np.testing.assert_array_equal(one, other, err_msg=name)
 
+    @pytest.mark.slow
     def test_scan_equals_loop(self, counted: Counted, frames: FrameArrays) -> None:
         _, outputs = track(counted.step, frames)
         scan = quick_compile(
@@ -173,6 +174,7 @@ class TestCompiled:
         assert described(state) == described(new_state())
         np.testing.assert_allclose(scanned.T_world_cam.wxyz_xyz, poses(outputs), atol=1e-4)
 
+    @pytest.mark.slow
     def test_vmap_equals_loop(self, counted: Counted, frames: FrameArrays) -> None:
         """Two recordings side by side, one of them a frame ahead."""
         batched = quick_compile(jax.vmap(lambda s, f, p: track_step(s, f, p, PLAN), in_axes=(0, 0, None)))
@@ -280,6 +282,7 @@ class TestPoseStatus:
         pairs = [(fine, fine), (stopped, fine), (fine, stopped), (few, fine), (stopped, few)]
         assert [int(worse_status(*pair)) for pair in pairs] == [fine, stopped, stopped, fine, few]
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("plan", [PLAN, PLAN.exact()], ids=["default", "exact"])
     def test_both_refinements_have_the_steps_of_the_plan(
         self, plan: TrackPlan, monkeypatch: pytest.MonkeyPatch
@@ -299,6 +302,7 @@ class TestPoseStatus:
         assert plan.pose_steps == (25 if plan is PLAN else 1000)
 
 
+@pytest.mark.slow
 def test_a_start_at_a_recognized_place_keeps_the_velocity(counted: Counted, frames: FrameArrays) -> None:
     """The second frame is predicted by it; one that is lost has none."""
     place, twist = jnp.array([1.0, 0, 0, 0, 0.2, 0, 0]), jnp.array([0.3, 0, 0, 0, 0.1, 0])
@@ -367,6 +371,7 @@ class TestFollowingAlone:
             seen |= now
         return np.array(new)
 
+    @pytest.mark.slow
     def test_nothing_is_looked_up(self, step: Step) -> None:
         outputs = self.outputs(step, keyframe_points_below=0.5, keyframe_weak_after_s=0.0)
         assert [int(output.status) for output in outputs] == [TrackStatus.STARTED] + [TrackStatus.OK] * (LONGER - 1)
@@ -451,8 +456,8 @@ class TestPresets:
     @pytest.mark.parametrize(
         ("name", "match_map", "looks_every"),
         [
-            ("static", "always", None),
-            ("ngd-detector", "always", 1),
+            pytest.param("static", "always", None, marks=pytest.mark.slow),
+            pytest.param("ngd-detector", "always", 1, marks=pytest.mark.slow),
             ("ngd-propagation", "always", 2),
             ("ngd", "keyframes", 2),
         ],

@@ -109,7 +109,9 @@ def _problem(recording: Clip) -> Problem:
 
 
 class TestGradient:
-    @pytest.mark.parametrize("name", Inputs._fields)
+    @pytest.mark.parametrize(
+        "name", [pytest.param(name, marks=pytest.mark.slow if name == "camera" else ()) for name in Inputs._fields]
+    )
     def test_equals_finite_differences(self, problem: Problem, name: str) -> None:
         along = getattr(problem.direction(seed=2), name)
         h = float(getattr(DIFFERENCE, name))
@@ -120,6 +122,7 @@ class TestGradient:
         assert abs(expected) > 0
         assert derivative == pytest.approx(expected, rel=1e-3)
 
+    @pytest.mark.slow
     def test_forward_equals_reverse(self, problem: Problem) -> None:
         """Along a random change of everything, scaled so that every input contributes as much as any other."""
         shares = jax.tree.map(jnp.vdot, problem.gradient, problem.direction(seed=1))

@@ -219,6 +219,7 @@ def test_there_are_ten_rooms_that_differ():
         assert all(values.count(value) == 1 for value in values)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CROWDS)
 def test_people_are_in_view_most_of_the_time(name, folder, data_dir, monkeypatch):
     monkeypatch.setenv("JAXSLAM_MODELS", str(real_network(CUTTER).parent))

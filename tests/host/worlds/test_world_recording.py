@@ -251,13 +251,8 @@ def test_is_written_as_tum_with_numbers_and_labels(tmp_path):
     assert "4 1 person" in (tmp_path / "room" / "labels.txt").read_text()
 
 
-SLOW = {"flat", "flat_visits", "house", "open", "road", "road_loop"}
-"""Worlds that are rendered in 7 to 34 s; all others take less than 3."""
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in worlds()]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", worlds())
 def test_the_camera_of_every_world_keeps_clear_of_everything(name, request):
     """Real people and hands are left out: people stay where they were recorded, and a hand is to cover the lens."""
     world = dataclasses.replace(load_world(name), real_people=None, hands=())

@@ -166,6 +166,7 @@ class TestReference:
         np.testing.assert_allclose(result.lenses, lenses, rtol=1e-4, atol=1e-5)
         np.testing.assert_array_equal(result.lenses[3], inputs.lenses[3])
 
+    @pytest.mark.slow
     def test_truth_without_noise(self):
         scene = make_scene(2, noise=0.0)
         with jax.enable_x64(True):
@@ -174,6 +175,7 @@ class TestReference:
         assert _pose_errors(result.poses, scene.truth) < 1e-8
         np.testing.assert_allclose(result.lenses, scene.true_lenses, rtol=1e-6)
 
+    @pytest.mark.slow
     def test_float32_is_within_a_hundredth(self):
         inputs = make_scene(3).inputs
         single, gradient, _ = _run(inputs)

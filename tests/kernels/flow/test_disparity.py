@@ -132,6 +132,7 @@ class TestMatchesReference:
 
 
 class TestGradient:
+    @pytest.mark.slow
     def test_gradient(self):
         """Forward, reverse and central differences agree; the guess has no part in it."""
         with jax.enable_x64(True):

@@ -151,6 +151,7 @@ class TestMatchesReference:
         np.testing.assert_allclose(single.cost, double.cost, rtol=1e-4)
         assert _largest_difference(single.T_world_cam.wxyz_xyz, double.T_world_cam.wxyz_xyz) < 1e-3
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("sim3", [False, True])
     def test_jacobians(self, sim3):
         """The written-out derivatives are those of the errors."""
@@ -165,6 +166,7 @@ class TestMatchesReference:
             np.testing.assert_allclose(by_source, whole[m, :, problem.source], atol=1e-12)
             np.testing.assert_allclose(by_target, whole[m, :, problem.target], atol=1e-12)
 
+    @pytest.mark.slow
     def test_published_optima(self, data_dir: Path, posegraph_case):
         """`χ²` as Ceres or gtsam reports it, or as the sparse Gauss-Newton in this folder finds it."""
         name, simplified, published, tolerance = posegraph_case
@@ -210,7 +212,9 @@ _compiled_gradient = quick_compile(jax.grad(_value), static_argnames="loss")
 
 
 class TestGradient:
-    @pytest.mark.parametrize(("sim3", "loss"), [(False, "squared"), (True, "cauchy")])
+    @pytest.mark.parametrize(
+        ("sim3", "loss"), [(False, "squared"), pytest.param(True, "cauchy", marks=pytest.mark.slow)]
+    )
     def test_gradient(self, sim3, loss):
         """Forward, reverse and central differences agree, for measured poses, scales, weights and information."""
         self._check(loop_graph(4, 9, sim3=sim3), sim3, loss)
@@ -242,6 +246,7 @@ class TestGradient:
         assert abs(difference) > 1e-3
 
 
+@pytest.mark.slow
 def test_vmap_equals_loop():
     several = [_inputs(loop_graph(seed, 10)) for seed in range(3)]
     batch = jax.tree.map(lambda *x: jnp.stack(x), *several)
@@ -393,6 +398,7 @@ def test_wrong_loop_is_rejected_by_a_robust_loss():
 class TestHostElimination:
     """The steps are solved elsewhere; the answer and its derivatives are the same."""
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("sim3", [False, True])
     def test_matches_reference(self, sim3):
         with jax.enable_x64(True):
@@ -403,6 +409,7 @@ class TestHostElimination:
         assert _largest_difference(host.T_world_cam.wxyz_xyz, band.T_world_cam.wxyz_xyz) < 1e-6
         assert int(host.num_iterations) == int(host.num_steps) <= int(band.num_iterations)
 
+    @pytest.mark.slow
     def test_gradient(self):
         with jax.enable_x64(True):
             inputs = _inputs(loop_graph(4, 9), jnp.float64)

@@ -131,6 +131,7 @@ class TestRepeatability:
         with pytest.raises(IndexError):
             stored.render(4)
 
+    @pytest.mark.slow
     def test_stored_pairs(self, tmp_path):
         config = dataclasses.replace(SMALL, frames=1, baseline_m=0.1)
         rendered, stored = (StoredRoom(config, tmp_path / "room").render(0) for _ in range(2))

@@ -86,6 +86,7 @@ class TestExactDepth:
         assert np.mean(error[unoccluded] < 1e-3) > 0.99
         assert np.median(error[unoccluded]) < 2e-5
 
+    @pytest.mark.slow
     def test_any_size_and_camera_sees_the_same(self):
         """A crop of a shifted, wider image, whose tiles lie differently, has the same depth."""
         dataset = dataset_with(people=2)

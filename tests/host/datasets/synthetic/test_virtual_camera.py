@@ -18,6 +18,7 @@ STREET = World(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("index", [0, 20, 45])
 def test_what_is_left_out_is_out_of_sight_or_tiny(monkeypatch, index):
     chosen = WorldRecording(STREET)
