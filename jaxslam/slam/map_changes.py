@@ -36,7 +36,7 @@ class MapChanges:
     def gone(self, vanished: VanishedPoints) -> Ids:
         """Return the ids of the points that are gone, given those that a frame sees through."""
         again = np.isin(vanished.ids, self._doubted)
-        self._nums_gone.append(np.count_nonzero(again & vanished.confirmed))
+        self._nums_gone.append(int(np.count_nonzero(again & vanished.confirmed)))
         self.pending |= bool(sum(self._nums_gone) >= max(_MIN_VANISHED, _MIN_SHARE * vanished.num_shown))
         doubted = np.setdiff1d(np.union1d(self._doubted, vanished.ids), vanished.there)
         self._doubted = np.setdiff1d(doubted, vanished.ids[again])[-_MAX_DOUBTED:]
