@@ -70,10 +70,13 @@ _LONGEST = (
     "test_notebooks",
     "test_back_end",
     "test_keyframe_semantics",
-    "test_cues_in_tracker",
-    "test_dask_executor",
     "test_step_gradient",
-    "test_zero_weights",
+    "test_epipolar",
+    "test_relocalization",
+    "test_lens",
+    "test_pnp",
+    "test_bundle_adjust",
+    "test_occlusion_states",
 )
 """Files that take a minute or more. The first two compile the trackers of 640x480 and of small scenes, one each, which
 most of the others then load."""

@@ -71,17 +71,17 @@ def keyframes_in_view(slam_map: Map, T_world_cam: Pose, submap: int, exclude: Se
         exclude: Ids of keyframes to leave out.
         at_most: Maximum number of keyframes.
     """
-    near = rows(slam_map.ids, nearest_keyframes(slam_map, T_world_cam, submap, exclude))
-    slam_map = slam_map.around(slam_map.ids[near])
-    of_near = has(slam_map.ids[near], slam_map.observations.keyframe)
+    near = nearest_keyframes(slam_map, T_world_cam, submap, exclude)
+    slam_map = slam_map.around(near)
+    of_near = has(near, slam_map.observations.keyframe)
     seen = observations_at(slam_map.observations, np.flatnonzero(of_near))
     X_world = slam_map.points.X_world[:, rows(slam_map.points.ids, seen.point)]
-    at = rows(slam_map.ids[near], seen.keyframe)
+    at, positions = rows(near, seen.keyframe), slam_map.T_world_cam[rows(slam_map.ids, near), 4:].T
     shown = in_view(slam_map.camera, T_world_cam, X_world)
-    shown &= seen_alike(X_world, slam_map.T_world_cam[near[at], 4:].T, T_world_cam[4:, None])
+    shown &= seen_alike(X_world, positions[:, at], T_world_cam[4:, None])
     counts = np.bincount(at[shown], minlength=len(near))
     order = np.lexsort((near, -counts))[:at_most]
-    return [int(slam_map.ids[near[index]]) for index in order if counts[index] >= _MIN_POINTS]
+    return [int(near[index]) for index in order if counts[index] >= _MIN_POINTS]
 
 
 def match_local_map(

@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxlie import SE3
-from jaxslam_kernels.camera import to_pixels
 from jaxslam_kernels.se3 import to_camera
 from jaxslam_kernels.types import DepthImage, Mask, Pixels, Points, Scalar, Weights
 from jaxtyping import Array, Bool, Float, Float32, Float64, Int, Int8, Int64
@@ -31,14 +30,12 @@ from jaxslam.runtime.compiled import committed, compiled
 from jaxslam.runtime.compiler_options import SINGLE_THREAD
 from jaxslam.runtime.padding import padded
 from jaxslam.sensors.frame_arrays import FrameArrays
-from jaxslam.sensors.measurement import depth_sigma, predict_pixels, surface_depth
+from jaxslam.sensors.measurement import depth_sigma, expected_pixels, surface_depth
 from jaxslam.sensors.sensor_model import SensorModel
 
 _DEPTH_SIGMAS, _DEPTH_SHARE = 4.2, 0.02
 """Difference of measured and expected depth from which a point is displaced: three standard deviations of the
 difference of two measurements, and a share of the depth for errors of pose and calibration."""
-_MAX_BENT = 0.5
-"""Largest shift of a point by the lens, as a share of the image: farther out, its polynomial may fold back inside."""
 _MAX_BLOCKED = 512
 """Maximum number of blocked points of earlier keyframes that are kept; if there are more, the latest ones."""
 _AS_IN_MAP = -1
@@ -241,27 +238,15 @@ def _after_frame(
     guard: bool,
 ) -> tuple[States, Float[Array, "2"]]:
     """Return the states after a frame, the number of changes, and the OCCLUDED share of the keyframe's points."""
-    height, width = ignore.shape
     X_cam = to_camera(SE3(T_keyframe_cam), columns.X_keyframe)
-    uv = predict_pixels(X_cam, twist, height, sensor)
-    size = jnp.array([[width], [height]], uv.dtype)
-    pixel = jnp.round(uv)
-    inside = columns.there & _before_the_lens(X_cam, size, sensor) & ((pixel >= 0) & (pixel < size)).all(axis=0)
-    column, row = jnp.clip(pixel, 0, size - 1).astype(jnp.int32)
+    expected = expected_pixels(X_cam, twist, ignore, sensor)
+    inside = columns.there & expected.inside
     displaced = jnp.zeros_like(inside)
     if guard:
-        displaced = _displaced(X_cam[2], uv, twist, depth, depth_delay_s, sensor)
-    states = next_states(columns.states, inside, ignore[row, column], displaced)
+        displaced = _displaced(X_cam[2], expected.uv, twist, depth, depth_delay_s, sensor)
+    states = next_states(columns.states, inside, expected.ignored, displaced)
     num_changed = jnp.sum(states != columns.states, dtype=jnp.float32)
     return states, jnp.stack([num_changed, occluded_share(states, columns.own)])
-
-
-def _before_the_lens(X_cam: Points, size: Float[Array, "2 1"], sensor: SensorModel) -> Mask:
-    """Return which points are in front of the camera, and not so far aside that only distortion folds them inside."""
-    nearest = sensor.min_depth_m / 2
-    straight = to_pixels(sensor.intrinsics, X_cam[:2] / jnp.maximum(X_cam[2:], nearest))
-    near = (straight > -_MAX_BENT * size) & (straight < (1 + _MAX_BENT) * size)
-    return (X_cam[2] > nearest) & near.all(axis=0)
 
 
 def _displaced(

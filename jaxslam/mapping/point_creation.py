@@ -54,7 +54,7 @@ def with_triangulated(slam_map: Map, keyframe_id: int, neighbors: Ids, plan: Fea
         plan: Settings of feature extraction.
     """
     features, pose = slam_map.keyframe(keyframe_id).features, slam_map.pose(keyframe_id)
-    free, found_with = _free(slam_map, keyframe_id), []
+    free, seen = _free(slam_map, keyframe_id), []
     for neighbor in neighbors[:_TRIANGULATE_KEYFRAMES].tolist():
         if not at_baseline(pose, slam_map.pose(neighbor), features.depth):
             continue
@@ -62,19 +62,12 @@ def with_triangulated(slam_map: Map, keyframe_id: int, neighbors: Ids, plan: Fea
         relative = between(pose, slam_map.pose(neighbor))
         found = triangulate(slam_map.camera, _at(features, free), _at(theirs, free_there), relative, plan)
         mine, other = free[found.first], free_there[found.second]
-        found_with.append((found.X_first, mine, (neighbor, theirs, other)))
+        points = new_points(slam_map, keyframe_id, transform(pose, found.X_first), features.descriptor[mine])
+        slam_map = with_points(slam_map, points)
+        for number, which, index in ((keyframe_id, features, mine), (neighbor, theirs, other)):
+            seen.append(feature_observations(number, which, points.ids, index, plan))
         free = np.setdiff1d(free, mine)
-    if not found_with:
-        return slam_map
-    X_first, mine, at_neighbors = zip(*found_with, strict=True)
-    places, index = transform(pose, np.concatenate(X_first, axis=1)), np.concatenate(mine)
-    points = new_points(slam_map, keyframe_id, places, features.descriptor[index])
-    seen, end = [], 0
-    for at_keyframe, (neighbor, theirs, other) in zip(mine, at_neighbors, strict=True):
-        ids, end = points.ids[end : end + len(other)], end + len(other)
-        seen.append(feature_observations(keyframe_id, features, ids, at_keyframe, plan))
-        seen.append(feature_observations(neighbor, theirs, ids, other, plan))
-    return with_observations(with_points(slam_map, points), joined(seen))
+    return with_observations(slam_map, joined(seen)) if seen else slam_map
 
 
 def _free(slam_map: Map, keyframe_id: int) -> Ids:

@@ -23,7 +23,7 @@ from jaxslam.runtime.compiled import compiled
 from jaxslam.runtime.compiler_options import SINGLE_THREAD
 from jaxslam.runtime.padding import padded
 from jaxslam.sensors.frame_arrays import FrameArrays
-from jaxslam.sensors.measurement import depth_sigma, predict_pixels, surface_depth
+from jaxslam.sensors.measurement import depth_sigma, expected_pixels, surface_depth
 from jaxslam.sensors.sensor_model import SensorModel
 
 _DEPTH_SIGMAS, _DEPTH_SHARE = 4.2, 0.05
@@ -116,15 +116,8 @@ def _compared(
     sensor: SensorModel,
 ) -> Bool[Array, "2 n"]:
     """Return masks of the points behind which the frame sees a surface, and of those that it sees where they are."""
-    height, width = ignore.shape
-    front = X_cam[2] > sensor.min_depth_m / 2
-    uv = predict_pixels(X_cam, twist, height, sensor)
-    size = jnp.array([[width], [height]], uv.dtype)
-    pixel = jnp.round(uv)
-    inside = front & ((pixel >= 0) & (pixel < size)).all(axis=0)
-    column, row = jnp.clip(pixel, 0, size - 1).astype(jnp.int32)
-    expected = X_cam[2]
-    measured, known = surface_depth(expected, uv, twist, depth, depth_delay_s, sensor)
-    known &= inside & ~ignore[row, column]
+    pixels, expected = expected_pixels(X_cam, twist, ignore, sensor), X_cam[2]
+    measured, known = surface_depth(expected, pixels.uv, twist, depth, depth_delay_s, sensor)
+    known &= pixels.inside & ~pixels.ignored
     farther, tolerance = measured - expected, _DEPTH_SIGMAS * depth_sigma(measured, sensor) + _DEPTH_SHARE * expected
     return jnp.stack([known & (farther > tolerance), known & (jnp.abs(farther) <= tolerance)])

@@ -24,6 +24,8 @@ _EXPECTED_PX = 1.0
 _SURFACE_PX = 2
 """Radius around a pixel in which `surface_depth` needs all depth to be of one surface: at an edge, a pose error of
 pixels would become an error of depth."""
+_MAX_BENT = 0.5
+"""Largest shift of a point by the lens, as a share of the image: farther out, its polynomial may fold back inside."""
 
 
 class PreparedFrame(NamedTuple):
@@ -187,6 +189,48 @@ def predict_pixels(X_cam: Points, twist: Float[Array, "6"], height: int, sensor:
     v = to_pixels(sensor.intrinsics, distort(sensor.intrinsics, xy))[1]
     late = xy + image_velocity(xy, depth, twist) * row_time(v, height, sensor.readout_s)[None, :]
     return to_pixels(sensor.intrinsics, distort(sensor.intrinsics, late))
+
+
+class ExpectedPixels(NamedTuple):
+    """Where points are expected in a frame.
+
+    Attributes:
+        uv: `(2, n)` pixels of the distorted image, whether or not they are inside.
+        inside: `(n,)` mask of the points that are in the image.
+        ignored: `(n,)` whether the frame ignores the pixel; of any pixel where a point is not inside.
+    """
+
+    uv: Pixels
+    inside: Mask
+    ignored: Mask
+
+
+def expected_pixels(
+    X_cam: Points, twist: Float[Array, "6"], ignore: Bool[Array, "h w"], sensor: SensorModel
+) -> ExpectedPixels:
+    """Look up where points are expected in a frame.
+
+    Args:
+        X_cam: `(3, n)` positions in the camera frame, meters.
+        twist: Velocity of the camera in its own axes.
+        ignore: Mask of the pixels that the frame ignores.
+        sensor: Camera and its readout time.
+    """
+    height, width = ignore.shape
+    uv = predict_pixels(X_cam, twist, height, sensor)
+    size = jnp.array([[width], [height]], uv.dtype)
+    pixel = jnp.round(uv)
+    inside = _before_the_lens(X_cam, size, sensor) & ((pixel >= 0) & (pixel < size)).all(axis=0)
+    column, row = jnp.clip(pixel, 0, size - 1).astype(jnp.int32)
+    return ExpectedPixels(uv, inside, ignore[row, column])
+
+
+def _before_the_lens(X_cam: Points, size: Float[Array, "2 1"], sensor: SensorModel) -> Mask:
+    """Return which points are in front of the camera, and not so far aside that only distortion folds them inside."""
+    nearest = sensor.min_depth_m / 2
+    straight = to_pixels(sensor.intrinsics, X_cam[:2] / jnp.maximum(X_cam[2:], nearest))
+    near = (straight > -_MAX_BENT * size) & (straight < (1 + _MAX_BENT) * size)
+    return (X_cam[2] > nearest) & near.all(axis=0)
 
 
 def surface_depth(
