@@ -15,6 +15,7 @@ from jaxslam_kernels.pose_graph.pose_graph import PoseGraphStatus, optimize_pose
 
 from jaxslam.geometry.se3 import IDENTITY, angle, between
 from jaxslam.geometry.types import Pose
+from jaxslam.map.graph_edges import padded_edges
 from jaxslam.map.point_records import NONE, has, rows
 from jaxslam.map.types import Map, visibility
 from jaxslam.runtime.compiled import compiled
@@ -152,29 +153,18 @@ def _graph(slam_map: Map, inside: np.ndarray) -> _Graph:
 
 
 def _solved(graph: _Graph, poses: np.ndarray, fixed: np.ndarray) -> Any:
-    num, num_edges = len(poses), len(graph.source)
+    num = len(poses)
     size = next(size for size in _SIZES if size >= num)
-    room = size * _EDGES_A_NODE
-    columns: Any = (
-        padded(graph.source, room, fill=0).astype(np.int32),
-        padded(graph.target, room, fill=0).astype(np.int32),
-        _pose_array(padded(graph.T_source_target, room, fill=IDENTITY)),
-        padded(graph.information, room, fill=np.eye(6)).astype(np.float32),
-        padded(np.ones(num_edges, np.float32), room, fill=0),
-        np.arange(room) < num_edges,
-    )
-    edges, start = PoseGraphEdges(*columns), _pose_array(padded(poses, size, fill=IDENTITY))
+    edges = padded_edges(*graph, size * _EDGES_A_NODE)
+    initial: Any = padded(poses, size, fill=IDENTITY).astype(np.float32)
     rank = band_rank(graph.source, graph.target, size)
     with _ONE_AT_A_TIME[size]:
-        solved = jax.device_get(_optimize(start, edges, padded(fixed, size, fill=False), np.arange(size) < num, rank))
-    return solved._replace(chi2=solved.chi2[:num_edges])
+        solved = jax.device_get(
+            _optimize(SE3(initial), edges, padded(fixed, size, fill=False), np.arange(size) < num, rank)
+        )
+    return solved._replace(chi2=solved.chi2[: len(graph.source)])
 
 
 @compiled(when="warm-up", options=FAST_COMPILE)
 def _optimize(T_world_cam: SE3, edges: PoseGraphEdges, fixed: Any, mask: Any, rank: Any) -> Any:
     return optimize_pose_graph(T_world_cam, edges, fixed, mask=mask, rank=rank, loss="squared", max_steps=30)
-
-
-def _pose_array(T: np.ndarray) -> SE3:
-    wxyz_xyz: Any = T.astype(np.float32)
-    return SE3(wxyz_xyz)

@@ -12,6 +12,13 @@ def children(slam_map: Map, keyframe_id: int) -> Ids:
     return slam_map.ids[slam_map.parent == keyframe_id]
 
 
+def ancestor_outside(slam_map: Map, keyframe_id: int, inside: Ids) -> int:
+    """Return the nearest of a keyframe and its ancestors in the spanning tree not among some; `NONE` without any."""
+    while keyframe_id != NONE and keyframe_id in inside:
+        keyframe_id = int(slam_map.parent[slam_map.row(keyframe_id)])
+    return keyframe_id
+
+
 def subtree(slam_map: Map, keyframe_id: int) -> Ids:
     """Return the ascending ids of a keyframe and all its descendants in the spanning tree."""
     from scipy.sparse import csr_array  # noqa: PLC0415 - see `runtime.preload`

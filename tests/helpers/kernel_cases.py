@@ -92,6 +92,7 @@ def cases(n: int = 11) -> dict[str, Case]:
             "fixed_poses": b(3),
             "fixed_points": b(n),
             "point_weights": f(n),
+            "edges": edges,
             "scale": f(),
             "tolerance": f(),
         },

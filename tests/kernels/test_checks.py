@@ -28,8 +28,15 @@ CASES = cases(N)
 EMPTY = cases(0)
 ANY_SHAPE = {"absolute_orientation", "adjugate", "valid_depth", "loss_value", "loss_weight", "compose", "between"}
 INSIDE = {  # parts of kernels: called by kernels only, with what those have checked
-    *("bundle.lens", "bundle.schur", "bundle.zero_weight_points", "checks", "first_order", "flow.lk_row_search"),
-    *("flow.lk_search", "image.patches", "implicit_positions", "levenberg_marquardt", "pose.pose_cost"),
+    *("bundle.edges", "bundle.lens", "bundle.schur", "bundle.zero_weight_points", "checks", "first_order"),
+    *(
+        "flow.lk_row_search",
+        "flow.lk_search",
+        "image.patches",
+        "implicit_positions",
+        "levenberg_marquardt",
+        "pose.pose_cost",
+    ),
     *("pose_graph.block_tridiagonal_cg", "pose_graph.cost", "pose_graph.sparse_solve", "two_view.fundamental_refine"),
     *("positive_definite", "program_parts", "two_view.homography"),
 }

@@ -34,6 +34,7 @@ from jaxslam_kernels.bundle.cost import (
     clean_weights,
     free_cameras,
 )
+from jaxslam_kernels.bundle.edges import edge_cost, edge_gradient, edge_hessian, exact_edge_hessian
 from jaxslam_kernels.bundle.equations import BundleEquations, exact_blocks, normal_equations
 from jaxslam_kernels.bundle.lens import Cameras, Lenses, move_cameras, shift_cameras, usable_lenses
 from jaxslam_kernels.bundle.schur import Reduced, eliminate, is_determined, points_determined, solve_reduced
@@ -42,6 +43,7 @@ from jaxslam_kernels.checks import checked
 from jaxslam_kernels.first_order import first_order
 from jaxslam_kernels.pose.pose_cost import UNKNOWN_CHI2
 from jaxslam_kernels.pose.pose_refine import usable_pose
+from jaxslam_kernels.pose_graph.cost import PoseGraphEdges, graph_problem
 from jaxslam_kernels.robust import Loss
 from jaxslam_kernels.types import Code, Flag, Mask, Points, Scalar, Weights
 
@@ -104,6 +106,7 @@ def bundle_adjust(
     point_weights: Weights | None = None,
     lenses: Lenses | None = None,
     fixed_lenses: Bool[Array, " k"] | None = None,
+    edges: PoseGraphEdges | None = None,
     two_sided: bool = False,
     loss: Loss = "cauchy",
     scale: Scalar | float = 2.0,
@@ -127,6 +130,8 @@ def bundle_adjust(
         lenses: Initial lens of each camera (focal length, k1, k2), estimated with the poses; the observations are then
             pixels from the principal point, see `Observations`. `None` for ideal cameras.
         fixed_lenses: Lenses that do not change; `None` for none.
+        edges: Measured relative poses of the cameras, with squared loss whatever `loss` is; `None` for none. They
+            count as `optimize_pose_graph` says; one of weight 0 has neither influence nor derivative.
         two_sided: Whether a point behind a camera is seen too, where its line of sight meets the image, static. Data
             sets whose residuals ignore the side need it, as Bundle Adjustment in the Large.
         loss: The robust loss, static.
@@ -141,12 +146,15 @@ def bundle_adjust(
     dtype, n = X_world.dtype, X_world.shape[1]
     fixed_points = jnp.zeros(n, bool) if fixed_points is None else fixed_points
     point_weights = jnp.ones(n, dtype) if point_weights is None else point_weights
-    cameras, X_world, observations = _usable(Cameras(poses, lenses), X_world, observations)
+    cameras, X_world, observations, usable = _usable(Cameras(poses, lenses), X_world, observations)
     problem, slot = bundle_problem(observations, point_weights, jnp.asarray(scale, dtype), ~fixed_poses, ~fixed_points)
     if lenses is not None:
         free_lens = jnp.ones_like(fixed_poses) if fixed_lenses is None else ~fixed_lenses
         problem = problem._replace(free_lens=free_lens)
-    problem = problem._replace(two_sided=jnp.array(True) if two_sided else None)
+    problem = problem._replace(
+        two_sided=jnp.array(True) if two_sided else None,
+        edges=None if edges is None else graph_problem(edges, usable, 1.0, 6),
+    )
     solution = solve_bundle(cameras, X_world, problem, loss, jnp.asarray(tolerance, dtype), max_steps)
     # What is fixed keeps its derivative, what is free gets that of the optimum.
     start = _where_free(problem, solution.cameras, cameras)
@@ -154,7 +162,7 @@ def bundle_adjust(
     relative = _on_grid(clean_weights(observations.weights), slot, problem)
     tangents, shifts, more_cost = _optimum_shift(start, start_points, problem, relative, loss)
     optimum = shift_cameras(start, tangents)
-    initial_cost = bundle_cost(bundle_views(cameras, X_world, problem, loss), problem, loss)
+    initial_cost = _cost(cameras, X_world, problem, loss)
     result = _report(optimum, start_points + shifts, problem, slot, loss, initial_cost, solution)
     return result._replace(cost=result.cost + more_cost)
 
@@ -185,17 +193,14 @@ def solve_bundle(
     cameras, X_world, problem, tolerance = lax.stop_gradient((cameras, X_world, problem, tolerance))
     epsilon = float(jnp.finfo(X_world.dtype).eps)
 
-    def evaluate(cameras: Cameras, X_world: Points) -> Scalar:
-        return bundle_cost(bundle_views(cameras, X_world, problem, loss), problem, loss)
-
     def step(state: _State) -> _State:
-        equations = normal_equations(bundle_views(state.cameras, state.X_world, problem, loss))
+        equations = _equations(state.cameras, state.X_world, problem, loss)
         reduced = eliminate(equations, problem, state.damping)
         tangents, shifts = solve_reduced(reduced, equations.camera_gradient, equations.point_gradient)
         predicted = _predicted_decrease(equations, tangents, shifts, state.damping)
         cameras = _where_free(problem, move_cameras(state.cameras, tangents), state.cameras)
         X_world = state.X_world + shifts
-        cost = evaluate(cameras, X_world)
+        cost = _cost(cameras, X_world, problem, loss)
         finite = jnp.isfinite(cost) & jnp.isfinite(X_world).all()
         finite = finite & jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(cameras)]).all()
         accept = finite & (cost <= (1.0 + 32.0 * epsilon) * state.cost)  # a sum is no better than its rounding
@@ -217,11 +222,26 @@ def solve_bundle(
             num_steps=state.num_steps + 1,
         )
 
-    cost, no = evaluate(cameras, X_world), jnp.zeros((), bool)
+    cost, no = _cost(cameras, X_world, problem, loss), jnp.zeros((), bool)
     damping = jnp.full_like(cost, _INITIAL_DAMPING)
     start = _State(cameras, X_world, cost, damping, no, no, jnp.zeros((), jnp.int32))
     end = lax.while_loop(lambda s: ~s.converged & ~s.stuck & (s.num_steps < max_steps), step, start)
     return Solution(end.cameras, end.X_world, end.converged, end.num_steps)
+
+
+def _cost(cameras: Cameras, X_world: Points, problem: BundleProblem, loss: Loss) -> Scalar:
+    """The cost of the observations and of the edges."""
+    cost = bundle_cost(bundle_views(cameras, X_world, problem, loss), problem, loss)
+    return cost if problem.edges is None else cost + edge_cost(cameras, problem.edges)
+
+
+def _equations(cameras: Cameras, X_world: Points, problem: BundleProblem, loss: Loss) -> BundleEquations:
+    """The exact gradient of the cost, and the Hessian of iteratively reweighted least squares."""
+    equations = normal_equations(bundle_views(cameras, X_world, problem, loss))
+    if problem.edges is None:
+        return equations
+    gradient = equations.camera_gradient + edge_gradient(cameras, problem.edges)
+    return equations._replace(camera_gradient=gradient, edges=edge_hessian(cameras, problem.edges))
 
 
 def _where_free(problem: BundleProblem, new: Cameras, old: Cameras) -> Cameras:
@@ -261,7 +281,7 @@ def _optimum_shift_jvp(loss: Loss, primals: tuple, tangents: tuple) -> tuple[tup
     heard = change._replace(weights=jnp.where(silent[None, :], 0.0, change.weights))
 
     def gradients(cameras: Cameras, X_world: Points, problem: BundleProblem) -> tuple[Array, Array]:
-        equations = normal_equations(bundle_views(cameras, X_world, problem, loss))
+        equations = _equations(cameras, X_world, problem, loss)
         return equations.camera_gradient, equations.point_gradient
 
     _, changes = jax.jvp(gradients, (cameras, idle.X_world, problem), (*tangents[:2], heard))
@@ -283,7 +303,7 @@ def _at_optimum(cameras: Cameras, X_world: Points, problem: BundleProblem, loss:
     At a strict minimum it is positive definite. A point where it is not (the solver stopped short of one, or a
     direction is free) gets its reweighted Hessian; all of them do if the cameras are undetermined still.
     """
-    reweighted = normal_equations(bundle_views(cameras, X_world, problem, loss))
+    reweighted = _equations(cameras, X_world, problem, loss)
     blocks = exact_blocks(cameras, X_world, problem, loss)
     convex = points_determined(blocks.point.sum(axis=2), problem.free_point) | ~problem.free_point
     rest = problem._replace(weights=jnp.where(convex[None, :], 0.0, problem.weights))
@@ -294,6 +314,7 @@ def _at_optimum(cameras: Cameras, X_world: Points, problem: BundleProblem, loss:
         point_gradient=reweighted.point_gradient,
         point_hessian=others.point_hessian + jnp.where(convex, blocks.point.sum(axis=2), 0.0),
         cross=others.cross + jnp.where(convex, blocks.cross, 0.0),
+        edges=None if problem.edges is None else exact_edge_hessian(cameras, problem.edges),
     )
     first, second = (eliminate(equations, problem, jnp.zeros_like(problem.scale)) for equations in (mixed, reweighted))
     reduced = jax.tree.map(lambda a, b: jnp.where(is_determined(first), a, b), first, second)
@@ -313,12 +334,16 @@ def _report(
 ) -> BundleAdjustment:
     """Everything that is said of the final values, evaluated there."""
     views = bundle_views(cameras, X_world, problem, loss)
-    equations = lax.stop_gradient(normal_equations(views))
+    equations = lax.stop_gradient(_equations(cameras, X_world, problem, loss))
     counts = (problem.weights > 0) & (views.robust_weights > 0)
-    free = counts & (free_cameras(problem).any(axis=1)[:, None] | problem.free_point[None, :])
+    free_camera = free_cameras(problem).any(axis=1)
+    adjusts = (counts & (free_camera[:, None] | problem.free_point[None, :])).any()
+    if problem.edges is not None:
+        ends = free_camera[problem.edges.source] | free_camera[problem.edges.target]
+        adjusts = adjusts | (ends & (problem.edges.weights > 0)).any()
     determined = is_determined(eliminate(equations, problem, jnp.zeros_like(problem.scale)))
     status = jnp.select(
-        [~free.any(), ~determined, ~solution.converged],
+        [~adjusts, ~determined, ~solution.converged],
         [BundleStatus.NOTHING_TO_ADJUST, BundleStatus.DEGENERATE, BundleStatus.NOT_CONVERGED],
         BundleStatus.OK,
     )
@@ -327,7 +352,7 @@ def _report(
         poses=cameras.poses,
         X_world=X_world,
         initial_cost=initial_cost,
-        cost=bundle_cost(views, problem, loss),
+        cost=_cost(cameras, X_world, problem, loss),
         status=status.astype(jnp.int32),
         num_steps=solution.num_steps,
         determined=points_determined(equations.point_hessian, jnp.ones_like(problem.free_point)),
@@ -338,8 +363,13 @@ def _report(
     )
 
 
-def _usable(cameras: Cameras, X_world: Points, observations: Observations) -> tuple[Cameras, Points, Observations]:
-    """Finite poses with unit quaternions and finite points; what observes others is no longer valid."""
+def _usable(
+    cameras: Cameras, X_world: Points, observations: Observations
+) -> tuple[Cameras, Points, Observations, Bool[Array, " k"]]:
+    """Finite poses with unit quaternions and finite points; what observes others is no longer valid.
+
+    Also which cameras were usable.
+    """
     clean, usable = jax.vmap(usable_pose)(SE3(cameras.poses))
     lenses = cameras.lenses
     if lenses is not None:
@@ -350,7 +380,7 @@ def _usable(cameras: Cameras, X_world: Points, observations: Observations) -> tu
     point = jnp.clip(observations.point, 0, X_world.shape[1] - 1)
     valid = observations.valid & usable[camera] & finite[point]
     X_world = jnp.where(finite[None, :], X_world, 0.0)
-    return Cameras(clean.wxyz_xyz, lenses), X_world, observations._replace(valid=valid)
+    return Cameras(clean.wxyz_xyz, lenses), X_world, observations._replace(valid=valid), usable
 
 
 def _predicted_decrease(
@@ -358,7 +388,7 @@ def _predicted_decrease(
 ) -> Scalar:
     """Decrease of the cost that the quadratic model predicts for a damped step."""
     slope = jnp.sum(equations.camera_gradient * tangents) + jnp.sum(equations.point_gradient * shifts)
-    camera_diagonal = jnp.diagonal(equations.camera_hessian, axis1=1, axis2=2)
+    camera_diagonal = equations.camera_diagonal()
     point_diagonal = jnp.diagonal(equations.point_hessian).T
     raised = jnp.sum(camera_diagonal * jnp.square(tangents)) + jnp.sum(point_diagonal * jnp.square(shifts))
     return 0.5 * (damping * raised - slope)

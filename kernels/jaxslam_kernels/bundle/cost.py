@@ -22,6 +22,7 @@ from jaxslam_kernels.bundle.lens import Bend, Cameras, LensPart, bend
 from jaxslam_kernels.camera import MIN_DEPTH, Intrinsics, normalize
 from jaxslam_kernels.checks import checked
 from jaxslam_kernels.pose.pose_cost import UNKNOWN_CHI2, positive
+from jaxslam_kernels.pose_graph.cost import GraphProblem
 from jaxslam_kernels.robust import Loss, loss_value, loss_weight
 from jaxslam_kernels.types import Flag, Mask, Pixels, Points, Scalar, Weights
 
@@ -103,6 +104,7 @@ class BundleProblem(NamedTuple):
         free_point: True for points that may move.
         free_lens: True for lenses that may change; `None` without lenses.
         two_sided: Whether points behind a camera count; `None` if not.
+        edges: Measured relative poses of the cameras; `None` without.
     """
 
     xy: Float[Array, "2 k n"]
@@ -115,6 +117,7 @@ class BundleProblem(NamedTuple):
     free_point: Mask
     free_lens: Bool[Array, " k"] | None = None
     two_sided: Flag | None = None
+    edges: GraphProblem | None = None
 
 
 def free_cameras(problem: BundleProblem) -> Bool[Array, "k c"]:

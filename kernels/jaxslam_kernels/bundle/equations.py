@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxslam_kernels.bundle.cost import BundleProblem, Plane, Views, bundle_views
+from jaxslam_kernels.bundle.edges import EdgeHessian
 from jaxslam_kernels.bundle.lens import Cameras, LensPart, lens_gradient, lens_hessian, shift_cameras
 from jaxslam_kernels.robust import Loss
 from jaxslam_kernels.types import Points
@@ -22,6 +23,7 @@ class BundleEquations(NamedTuple):
         point_gradient: Gradient by the points.
         point_hessian: Hessian block of each point.
         cross: Second derivatives by camera and point.
+        edges: Second derivatives of the edges' cost by every two cameras; `None` without edges.
     """
 
     camera_gradient: Float[Array, "k c"]
@@ -29,6 +31,14 @@ class BundleEquations(NamedTuple):
     point_gradient: Points
     point_hessian: Float[Array, "3 3 n"]
     cross: Float[Array, "k c 3 n"]
+    edges: EdgeHessian | None = None
+
+    def camera_diagonal(self) -> Float[Array, "k c"]:
+        """Return the second derivative of the cost by each parameter of the cameras."""
+        diagonal = jnp.diagonal(self.camera_hessian, axis1=1, axis2=2)
+        if self.edges is None:
+            return diagonal
+        return diagonal + jnp.einsum("kckc->kc", self.edges)
 
 
 def normal_equations(views: Views) -> BundleEquations:

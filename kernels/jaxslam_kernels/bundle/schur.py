@@ -37,7 +37,7 @@ class Reduced(NamedTuple):
 def eliminate(equations: BundleEquations, problem: BundleProblem, damping: Scalar) -> Reduced:
     """Eliminates the points from equations whose diagonal is raised by the fraction `damping`."""
     (k, c, _), n = equations.camera_hessian.shape, equations.point_hessian.shape[2]
-    units = _units(jnp.diagonal(equations.camera_hessian, axis1=1, axis2=2), free_cameras(problem))
+    units = _units(equations.camera_diagonal(), free_cameras(problem))
     root = inverse_root(equations.point_hessian, problem.free_point, damping)
     cross = equations.cross * units[:, :, None, None]
     first, second, third = (cross[:, :, j, None, :] * root[:, j][None, None] for j in range(3))
@@ -46,6 +46,8 @@ def eliminate(equations: BundleEquations, problem: BundleProblem, damping: Scala
     diagonal = jnp.where(units > 0, damping, 1.0)  # and 1 for what does not move
     cameras = cameras + jnp.eye(c, dtype=units.dtype)[None] * diagonal[:, :, None]
     blocks = jnp.eye(k, dtype=units.dtype)[:, None, :, None] * cameras[:, :, None, :]
+    if equations.edges is not None:
+        blocks = blocks + equations.edges * units[:, :, None, None] * units[None, None]
     return Reduced(
         units, root, coupling, cho_factor(blocks.reshape(c * k, c * k) - coupling @ coupling.T, lower=True)[0]
     )

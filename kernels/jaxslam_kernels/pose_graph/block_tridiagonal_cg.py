@@ -28,15 +28,15 @@ class GraphMatrix(NamedTuple):
 
     Attributes:
         diagonal: `(k, d, d)` blocks of the nodes.
-        coupling: `(m, d, d)` blocks in the row of an edge's source and the column of its target.
-        source: `(m,)` index of the source.
-        target: `(m,)` index of the target.
+        coupling: `(e, d, d)` blocks in the row of an edge's source and the column of its target.
+        source: `(e,)` index of the source.
+        target: `(e,)` index of the target.
     """
 
     diagonal: Float[Array, "k d d"]
-    coupling: Float[Array, "m d d"]
-    source: Int[Array, " m"]
-    target: Int[Array, " m"]
+    coupling: Float[Array, "e d d"]
+    source: Int[Array, " e"]
+    target: Int[Array, " e"]
 
 
 class BandFactor(NamedTuple):

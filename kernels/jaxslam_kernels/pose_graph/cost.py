@@ -29,32 +29,32 @@ Nodes = Float[Array, "k 8"]
 """`wxyz_xyz` of each `T_world_cam`, and the logarithm of its scale, 0 in SE(3)."""
 Steps = Float[Array, "k d"]
 """A tangent a node, d = 6 or 7: translation in the camera's axes (world's unit), rotation, log scale."""
-Blocks = Float[Array, "m d d"]
+Blocks = Float[Array, "e d d"]
 
 _SMALLEST_PIVOT = 1e-6  # of an information matrix scaled to unit diagonal; below it a direction is unmeasured
 
 
 class PoseGraphEdges(NamedTuple):
-    """Relative measurements between nodes, in arrays of fixed length m.
+    """Relative measurements between nodes, in arrays of fixed length e.
 
     Attributes:
-        source: `(m,)` indices of the nodes in whose frame is measured.
-        target: `(m,)` indices of the nodes that are measured.
-        T_source_target: m measured poses, `wxyz_xyz` `(m, 7)`, translation in the unit of the source's camera.
-        information: `(m, 6, 6)` inverse covariances of the error, or `(m, 7, 7)` with scales. The symmetric part
+        source: `(e,)` indices of the nodes in whose frame is measured.
+        target: `(e,)` indices of the nodes that are measured.
+        T_source_target: e measured poses, `wxyz_xyz` `(e, 7)`, translation in the unit of the source's camera.
+        information: `(e, 6, 6)` inverse covariances of the error, or `(e, 7, 7)` with scales. The symmetric part
             counts.
-        weights: `(m,)` non-negative factors of each edge's cost.
-        mask: `(m,)` which slots hold an edge.
-        scales: `(m,)` measured scale of the target over that of the source, all positive; `None` in SE(3).
+        weights: `(e,)` non-negative factors of each edge's cost.
+        mask: `(e,)` which slots hold an edge.
+        scales: `(e,)` measured scale of the target over that of the source, all positive; `None` in SE(3).
     """
 
-    source: Int[Array, " m"]
-    target: Int[Array, " m"]
-    T_source_target: Annotated[SE3, "m"]
+    source: Int[Array, " e"]
+    target: Int[Array, " e"]
+    T_source_target: Annotated[SE3, "e"]
     information: Blocks
-    weights: Float[Array, " m"]
-    mask: Bool[Array, " m"]
-    scales: Float[Array, " m"] | None = None
+    weights: Float[Array, " e"]
+    mask: Bool[Array, " e"]
+    scales: Float[Array, " e"] | None = None
 
 
 class GraphProblem(NamedTuple):
@@ -69,11 +69,11 @@ class GraphProblem(NamedTuple):
         loss_scale: Scale of the robust loss, in standard deviations.
     """
 
-    source: Int[Array, " m"]
-    target: Int[Array, " m"]
-    measured: Float[Array, "m 8"]
+    source: Int[Array, " e"]
+    target: Int[Array, " e"]
+    measured: Float[Array, "e 8"]
     information: Blocks
-    weights: Float[Array, " m"]
+    weights: Float[Array, " e"]
     loss_scale: Scalar
 
 
@@ -83,7 +83,7 @@ class GraphEquations(NamedTuple):
     Attributes:
         gradient: Gradient of the cost, one tangent per node.
         diagonal: `(k, d, d)`, the block of each node.
-        coupling: `(m, d, d)`, rows of the source and columns of the target.
+        coupling: `(e, d, d)`, rows of the source and columns of the target.
     """
 
     gradient: Steps
@@ -123,7 +123,7 @@ def graph_problem_and_idle(
     finite = used & jnp.isfinite(edges.weights)
     identity = jnp.zeros(8, dtype).at[0].set(1.0)
 
-    def problem_of(used: Bool[Array, " m"]) -> GraphProblem:
+    def problem_of(used: Bool[Array, " e"]) -> GraphProblem:
         return GraphProblem(
             source=jnp.where(used, source, 0),
             target=jnp.where(used, target, 0),
@@ -138,7 +138,7 @@ def graph_problem_and_idle(
     return problem_of(used), problem_of(idle)
 
 
-def edge_errors(nodes: Nodes, problem: GraphProblem) -> Float[Array, "m d"]:
+def edge_errors(nodes: Nodes, problem: GraphProblem) -> Float[Array, "e d"]:
     """The error of every edge, the first d of (translation, rotation, log scale)."""
     errors = jax.vmap(_error)(nodes[problem.source], nodes[problem.target], problem.measured)
     return errors[:, : problem.information.shape[1]]
@@ -153,7 +153,7 @@ def edge_jacobians(nodes: Nodes, problem: GraphProblem) -> tuple[Blocks, Blocks]
 
 def graph_cost(
     nodes: Nodes, problem: GraphProblem, loss: Loss
-) -> tuple[Scalar, Float[Array, " m"], Float[Array, " m"]]:
+) -> tuple[Scalar, Float[Array, " e"], Float[Array, " e"]]:
     """The cost, and of every edge the squared norm of its error and `ρ'` of that; 0 and 0 where there is no edge."""
     errors = edge_errors(nodes, problem)
     used = problem.weights > 0
@@ -169,7 +169,7 @@ def graph_gradient(nodes: Nodes, problem: GraphProblem, loss: Loss) -> Steps:
     return _gather_gradient(nodes, problem, by_source, by_target, pull)
 
 
-def idle_gradient(nodes: Nodes, idle: GraphProblem, change: Float[Array, " m"], loss: Loss) -> Steps:
+def idle_gradient(nodes: Nodes, idle: GraphProblem, change: Float[Array, " e"], loss: Loss) -> Steps:
     """The gradient of the idle edges for the weights `change`, linear in those."""
     heard = _heard(nodes, idle, loss)
     of_weights = lambda weights: graph_gradient(nodes, idle._replace(weights=weights), loss)
@@ -192,7 +192,7 @@ def _idle_cost_jvp(loss: Loss, primals: tuple, tangents: tuple) -> tuple[Scalar,
     return idle_cost(nodes, idle, loss), 0.5 * jnp.sum(change * loss_value(chi2, idle.loss_scale, loss))
 
 
-def _heard(nodes: Nodes, idle: GraphProblem, loss: Loss) -> Float[Array, " m"]:
+def _heard(nodes: Nodes, idle: GraphProblem, loss: Loss) -> Float[Array, " e"]:
     """1 for each edge whose error the loss can tell from an overflow, 0 for others."""
     _, chi2, _ = graph_cost(nodes, idle._replace(weights=jnp.ones_like(idle.weights)), loss)
     return lax.stop_gradient(jnp.where(chi2 < LARGEST_SQUARED, 1.0, 0.0).astype(chi2.dtype))
@@ -290,7 +290,7 @@ def _similarities(T: SE3, scales: Array | None) -> tuple[Float[Array, "n 8"], Bo
     return jnp.concatenate([q, safe[:, 4:], log_scale[:, None]], axis=1), usable
 
 
-def _measures_all(information: Blocks) -> Bool[Array, " m"]:
+def _measures_all(information: Blocks) -> Bool[Array, " e"]:
     """Whether no direction of an edge is free: finite and positive definite, clear of rounding."""
     information = lax.stop_gradient(information)
     diagonal = jnp.diagonal(information, axis1=1, axis2=2)

@@ -12,8 +12,8 @@ def band_rank(source: np.ndarray, target: np.ndarray, num_nodes: int) -> np.ndar
     For the host: the graph's structure decides, once for each change of it. A millisecond for thousands of nodes.
 
     Args:
-        source: `(m,)` indices of nodes, those of edges in use only.
-        target: `(m,)` indices of nodes.
+        source: `(e,)` indices of nodes, those of edges in use only.
+        target: `(e,)` indices of nodes.
         num_nodes: Capacity k, slots without edges included.
 
     Returns:
@@ -35,8 +35,8 @@ def suitable_group_size(source: np.ndarray, target: np.ndarray, rank: np.ndarray
     For the host, like `band_rank`. The sizes are few so that a graph that grows seldom compiles anew.
 
     Args:
-        source: `(m,)` indices of nodes, those of edges in use only.
-        target: `(m,)` indices of nodes.
+        source: `(e,)` indices of nodes, those of edges in use only.
+        target: `(e,)` indices of nodes.
         rank: `(k,)` each node's place, from `band_rank`.
 
     Returns:

@@ -86,8 +86,8 @@ class PoseGraph(NamedTuple):
         scales: `(k,)` scales, all ones in SE(3).
         cost_before: `½ Σ w ρ(s)` at the initial poses.
         cost: The same at the result.
-        chi2: `(m,)` squared whitened error s of every edge; 0 where there is none.
-        robust_weights: `(m,)` the loss's weight `ρ'(s)` in [0, 1]; 0 where there is no edge.
+        chi2: `(e,)` squared whitened error s of every edge; 0 where there is none.
+        robust_weights: `(e,)` the loss's weight `ρ'(s)` in [0, 1]; 0 where there is no edge.
         anchored: `(k,)` which nodes are fixed, or have a path of edges to a fixed one.
         status: A `PoseGraphStatus`.
         num_steps: Steps of Levenberg-Marquardt tried.
@@ -98,8 +98,8 @@ class PoseGraph(NamedTuple):
     scales: Float[Array, " k"]
     cost_before: Scalar
     cost: Scalar
-    chi2: Float[Array, " m"]
-    robust_weights: Float[Array, " m"]
+    chi2: Float[Array, " e"]
+    robust_weights: Float[Array, " e"]
     anchored: Bool[Array, " k"]
     status: Code
     num_steps: Int[Array, ""]
@@ -158,7 +158,7 @@ def optimize_pose_graph(
 
     Args:
         T_world_cam: k initial poses, `wxyz_xyz` `(k, 7)`.
-        edges: m measured relative poses; with scales and 7 x 7 information for Sim(3).
+        edges: e measured relative poses; with scales and 7 x 7 information for Sim(3).
         fixed: `(k,)` nodes that stay. At least one in every connected part, or the part stays as a whole.
         scales: `(k,)` positive initial scales: Sim(3). `None`: SE(3).
         mask: `(k,)` which slots hold a node; all by default.
