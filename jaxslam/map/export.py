@@ -138,7 +138,7 @@ def _counts(ids: np.ndarray, mentioned: np.ndarray) -> np.ndarray:
 
 
 def _decoded(keyframe: Keyframe) -> np.ndarray:
-    data = np.frombuffer(keyframe.image_png, np.uint8)
+    data = np.frombuffer(keyframe.image_file, np.uint8)
     image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
     if image is None:
         raise MapFileError(f"keyframe {keyframe.id}: its image cannot be decoded")
@@ -162,10 +162,10 @@ def _grays(slam_map: Map) -> np.ndarray:
 
 def _undistorted(keyframe: Keyframe, camera: Camera) -> bytes:
     """Return the undistorted image as PNG; black where the distorted image has no data."""
-    if not any(camera.distortion):
-        return keyframe.image_png
-    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-    image = cv2.undistort(_decoded(keyframe), K, np.array(camera.distortion))
+    image = _decoded(keyframe)
+    if any(camera.distortion):
+        K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+        image = cv2.undistort(image, K, np.array(camera.distortion))
     return cv2.imencode(".png", image)[1].tobytes()
 
 

@@ -25,7 +25,7 @@ The others are arrays, each `NAME.npy`, little-endian, in C order:
     features.octave                uint8    (n)        level of the scale pyramid
     features.angle                 float32  (n)        radians, from u towards v
     features.descriptor            uint8    (n, 32)    ORB
-    images.png                     uint8    (b)        one gray PNG a keyframe
+    images.files                   uint8    (b)        one gray image a keyframe, JPEG or PNG
     points.ids                     int64    (p)        ascending
     points.X_world                 float64  (3, p)     meters
     points.weight                  float32  (p)        0 to 1
@@ -76,8 +76,8 @@ from jaxslam.map.validate import ArrayField, array_fields, problems
 from jaxslam.sensors.camera import Camera
 
 FORMAT = "jaxslam map"
-VERSION = 3
-READABLE = (1, 2, 3)
+VERSION = 4
+READABLE = (1, 2, 3, 4)
 """Versions that `load_map` reads."""
 
 _SINCE = {"points.state": 2}
@@ -191,7 +191,7 @@ def _layout() -> dict[str, ArrayField]:
     layout["keyframes.feature_offsets"] = layout["keyframes.image_offsets"] = ArrayField(np.dtype(np.int64), ("k+1",))
     for prefix, record in _RECORDS.items():
         layout |= {f"{prefix}.{name}": field for name, field in array_fields(record).items()}
-    return layout | {"images.png": ArrayField(np.dtype(np.uint8), ("b",))}
+    return layout | {"images.files": ArrayField(np.dtype(np.uint8), ("b",))}
 
 
 def _header(slam_map: Map, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
@@ -202,7 +202,7 @@ def _header(slam_map: Map, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
         "l": len(slam_map.loops.source),
         "c": len(slam_map.culled.ids),
         "n": len(arrays["features.octave"]),
-        "b": len(arrays["images.png"]),
+        "b": len(arrays["images.files"]),
     }
     return {
         "format": FORMAT,
@@ -217,7 +217,7 @@ def _header(slam_map: Map, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
 def _arrays(slam_map: Map) -> dict[str, np.ndarray]:
     """Return the arrays of a file by name, in the order of the file."""
     features = [keyframe.features for keyframe in slam_map.keyframes]
-    images = [keyframe.image_png for keyframe in slam_map.keyframes]
+    images = [keyframe.image_file for keyframe in slam_map.keyframes]
     keyframes = {
         **slam_map._asdict(),
         "timestamp_ns": np.array([keyframe.timestamp_ns for keyframe in slam_map.keyframes], np.int64),
@@ -227,7 +227,7 @@ def _arrays(slam_map: Map) -> dict[str, np.ndarray]:
     records = {
         "keyframes": keyframes,
         "features": _joined(features),
-        "images": {"png": np.frombuffer(b"".join(images), np.uint8)},
+        "images": {"files": np.frombuffer(b"".join(images), np.uint8)},
         "points": slam_map.points._asdict(),
         "observations": slam_map.observations._asdict(),
         "loops": slam_map.loops._asdict(),
@@ -286,6 +286,8 @@ def _with_present_names(header: dict[str, Any], version: int) -> dict[str, Any]:
 
 def _name_in_version(name: str, version: int) -> str:
     """Return the name of an array or a count in files of a version."""
+    if name == "images.files":
+        return name if version >= 4 else "images.png"
     if version >= 3:
         return name
     return _BEFORE_VERSION_3.get(name, name.replace("observations", "sightings").replace("uv_raw", "seen_uv"))
@@ -345,7 +347,7 @@ def _assembled(header: _Header, arrays: dict[str, np.ndarray]) -> Map:
         Features(*columns)
         for columns in zip(*(_features(arrays, name) for name in array_fields(Features)), strict=True)
     ]
-    images = [part.tobytes() for part in _split(arrays, "images.png", "keyframes.image_offsets")]
+    images = [part.tobytes() for part in _split(arrays, "images.files", "keyframes.image_offsets")]
     ids, stamps = arrays["keyframes.ids"].tolist(), arrays["keyframes.timestamp_ns"].tolist()
     made = Map(
         camera=header.camera,

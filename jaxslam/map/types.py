@@ -32,13 +32,13 @@ class Keyframe(NamedTuple):
         id: Id of the keyframe.
         timestamp_ns: Time of the image, nanoseconds.
         features: ORB features of the image.
-        image_png: Gray image, compressed as PNG.
+        image_file: Gray image, compressed: JPEG, or PNG in a map of an earlier version.
     """
 
     id: int
     timestamp_ns: int
     features: Features
-    image_png: bytes
+    image_file: bytes
 
 
 class Loops(NamedTuple):

@@ -122,7 +122,7 @@ def memory_bytes(slam_map: Map) -> int:
 
 def _keyframe_bytes(keyframe: Keyframe) -> int:
     features = sum(array.nbytes for array in keyframe.features)
-    return features + len(keyframe.image_png) + INDEX_BYTES * len(keyframe.features.octave)
+    return features + len(keyframe.image_file) + INDEX_BYTES * len(keyframe.features.octave)
 
 
 def _shares_seen_by_others(slam_map: Map) -> Float64[np.ndarray, " k"]:

@@ -43,7 +43,7 @@ def reload_keyframe(slam_map: Map, keyframe_id: int, num_points: int) -> MapKeyf
         RuntimeError: If its image cannot be decoded.
     """
     keyframe = slam_map.keyframe(keyframe_id)
-    image = cv2.imdecode(np.frombuffer(keyframe.image_png, np.uint8), cv2.IMREAD_GRAYSCALE)
+    image = cv2.imdecode(np.frombuffer(keyframe.image_file, np.uint8), cv2.IMREAD_GRAYSCALE)
     if image is None:
         raise RuntimeError(f"the image of keyframe {keyframe_id} cannot be decoded")
     slam_map = slam_map.around(np.array([keyframe_id]))

@@ -134,6 +134,6 @@ def test_growth(recorded):
         f"kB a keyframe: points {size(slam_map.points):.0f}, observations {size(slam_map.observations):.0f}, ", end=""
     )
     print(f"features {np.mean([1e3 * size(frame.features) for frame in slam_map.keyframes]):.0f}, ", end="")
-    print(f"image {np.mean([len(frame.image_png) / 1e3 for frame in slam_map.keyframes]):.0f}")
+    print(f"image {np.mean([len(frame.image_file) / 1e3 for frame in slam_map.keyframes]):.0f}")
     assert late < 2 * early
     assert a_keyframe < 1.0

@@ -124,7 +124,7 @@ def same(first: Map, second: Map) -> bool:
     """Whether two maps are equal to the bit, types included."""
     one, two = arrays(first), arrays(second)
     plain = [
-        (m.camera, m.next_keyframe, m.next_point, [(f.id, f.timestamp_ns, f.image_png) for f in m.keyframes])
+        (m.camera, m.next_keyframe, m.next_point, [(f.id, f.timestamp_ns, f.image_file) for f in m.keyframes])
         for m in (first, second)
     ]
     return (

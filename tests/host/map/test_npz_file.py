@@ -101,7 +101,7 @@ class TestForeign:
     def test_other_files(self, tmp_path):
         path = tmp_path / "a.map"
         assert refused(path, b"") == "is empty"
-        assert refused(path, full_map().keyframes[0].image_png) == "not a jaxslam map"
+        assert refused(path, full_map().keyframes[0].image_file) == "not a jaxslam map"
         assert refused(path, b"keyframes: 3\n" * 100) == "not a jaxslam map"
         assert refused(path, npy(np.zeros(3))) == "not a jaxslam map"
 
@@ -123,6 +123,7 @@ BEFORE_VERSION_3 = {
     "points.has_descriptor": "points.recognisable",
     "points.reference_keyframe": "points.made_by",
 }
+BEFORE_VERSION_4 = {"images.files": "images.png"}
 
 
 def of_version(members: Members, version: int) -> Members:
@@ -130,24 +131,25 @@ def of_version(members: Members, version: int) -> Members:
     old = {}
     for name, data in members.items():
         old_name = name
-        for new, before in BEFORE_VERSION_3.items():
+        for new, before in (BEFORE_VERSION_4 | (BEFORE_VERSION_3 if version < 3 else {})).items():
             old_name = old_name.replace(new, before)
         old[old_name] = data
     header = json.loads(members["header.json"])
     header["version"], counts = version, header["counts"]
-    counts["sightings"] = counts.pop("observations")
+    if version < 3:
+        counts["sightings"] = counts.pop("observations")
     if version == 1:
         del old["points.state.npy"]
     return old | {"header.json": json.dumps(header).encode()}
 
 
 class TestEarlierVersions:
-    @pytest.mark.parametrize("version", [1, 2])
+    @pytest.mark.parametrize("version", [1, 2, 3])
     def test_load(self, version, tmp_path):
         path, slam_map = tmp_path / "a.map", small_map()
         save_map(path, slam_map)
         path.write_bytes(packed(of_version(unpacked(path.read_bytes()), version)))
-        state = slam_map.points.state if version == 2 else np.zeros_like(slam_map.points.state)
+        state = slam_map.points.state if version > 1 else np.zeros_like(slam_map.points.state)
         assert same(load_map(path), slam_map.with_arrays(points=slam_map.points._replace(state=state)))
 
     def test_old_names_are_no_part_of_the_present_version(self, saved, tmp_path):
@@ -203,9 +205,9 @@ class TestHeader:
     @pytest.mark.parametrize(
         ("path", "value", "message"),
         [
-            (["version"], 4, "expected a map file of version 1, 2, 3, got version 4"),
-            (["version"], None, "expected a map file of version 1, 2, 3, got version None"),
-            (["version"], True, "expected a map file of version 1, 2, 3, got version True"),
+            (["version"], 5, "expected a map file of version 1, 2, 3, 4, got version 5"),
+            (["version"], None, "expected a map file of version 1, 2, 3, 4, got version None"),
+            (["version"], True, "expected a map file of version 1, 2, 3, 4, got version True"),
             (["counts"], 3, "header: counts: expected `key: value` lines, got 3"),
             (["counts", "points"], -1, "header: counts: points: expected an integer >= 0 and <= 4e+18, got -1"),
             (["counts", "points"], 1.5, "header: counts: points: expected an integer >= 0 and <= 4e+18, got 1.5"),
@@ -230,7 +232,7 @@ class TestHeader:
         assert most < 2_000_000
 
     def test_refuses_compression(self, saved, tmp_path):
-        zeros = {**unpacked(saved), "images.png.npy": npy(np.zeros(50_000_000, np.uint8))}
+        zeros = {**unpacked(saved), "images.files.npy": npy(np.zeros(50_000_000, np.uint8))}
         assert (
             refused(tmp_path / "a.map", packed(zeros, zipfile.ZIP_DEFLATED)) == "header.json: expected no compression"
         )

@@ -46,7 +46,7 @@ class TestRecall:
 
     def test_damaged_image(self) -> None:
         made = seen_from([at()], [POINTS])
-        damaged = made._replace(keyframes=(made.keyframes[0]._replace(image_png=b"no picture"),))
+        damaged = made._replace(keyframes=(made.keyframes[0]._replace(image_file=b"no picture"),))
         with pytest.raises(RuntimeError, match="image of keyframe 0 cannot be decoded"):
             reload_keyframe(damaged, 0, 30)
 
