@@ -30,7 +30,13 @@ from jaxslam.map.partial_map import PartialMap, extract_around, merge_back, most
 from jaxslam.map.point_fusion import with_fused_points
 from jaxslam.map.point_records import NONE, Observations, has, rows
 from jaxslam.map.types import Keyframe, Map, covisible, empty_map, point_submaps, surviving_keyframes
-from jaxslam.mapping.culling import CONFIRM_WITHIN, within_memory, without_redundant, without_unconfirmed
+from jaxslam.mapping.culling import (
+    CONFIRM_WITHIN,
+    within_memory,
+    without_isolated,
+    without_redundant,
+    without_unconfirmed,
+)
 from jaxslam.mapping.local_bundle_adjustment import AdjustPlan, adjust_all, adjust_around, compile_adjustment
 from jaxslam.mapping.local_map_tracking import LOCAL_KEYFRAMES, local_keyframes
 from jaxslam.mapping.map_point_matching import (
@@ -203,7 +209,8 @@ class LocalMapping:
         slam_map = without_redundant(slam_map, new.id, part.keyframes)
         # 10. Merge the changed part back into the map.
         self._tracks.forget(new.id)
-        self.map = self._within_memory(merge_back(whole, part, slam_map), new.id)
+        slam_map = without_isolated(merge_back(whole, part, slam_map), new.id)
+        self.map = self._within_memory(slam_map, new.id)
         return self.map
 
     def take_states(self, changes: StateChanges) -> Map:

@@ -167,7 +167,7 @@ class BackEnd:
             partial(self._link.compile, state, drops_points=self._semantics is not None),
             partial(compile_recognition, self._sensor, self._plan.features),
         ]
-        if not self._localize_only and frame.right is None:
+        if frame.right is None:
             steps.append(FrameDepth(np.zeros(6, np.float32), frame, self._sensor).compile)
         if self._states is not None:
             steps.append(partial(self._states.compile, frame))

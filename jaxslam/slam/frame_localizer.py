@@ -11,8 +11,9 @@ from jaxslam.geometry.se3 import compose, inverse, transform
 from jaxslam.geometry.types import Pose
 from jaxslam.loop_closing.place_index import PlaceIndex
 from jaxslam.loop_closing.place_recognition import recognize
-from jaxslam.mapping.local_map_tracking import RADII_PX, WIDE_RADII_PX, match_local_map
+from jaxslam.mapping.local_map_tracking import RADII_PX, WIDE_RADII_PX, match_local_map, nearest_keyframes
 from jaxslam.mapping.occlusion_states import PointStates
+from jaxslam.mapping.vanished_points import FrameDepth, vanished_points
 from jaxslam.sensors.frame_arrays import FrameArrays
 from jaxslam.sensors.sensor_model import SensorModel
 from jaxslam.slam.tracker_map_sync import AnchoredPose, TrackerMapSync, pose_of
@@ -115,6 +116,9 @@ class FrameLocalizer:
     def relocalize(self, arrays: FrameArrays, predicted: Pose | None) -> tuple[LocalizedPose | None, bool]:
         """Localize a lost frame: near the predicted pose in the local map, then in a wider search, else by its place.
 
+        A pose at which the frame would see through much of the map is none: of a lost frame, the points that agree may
+        all be on someone who walks before the camera, and are in the map since they were seen at first.
+
         Args:
             arrays: The frame.
             predicted: `(7,)` predicted pose; `None` if the camera has been lost for too long to predict one.
@@ -126,7 +130,7 @@ class FrameLocalizer:
         if predicted is not None:
             for radii_px in (RADII_PX, WIDE_RADII_PX):
                 near = self._in_local_map(features, predicted, radii_px)
-                if near is not None:
+                if near is not None and self._fits_map(arrays, near):
                     return near, False
         if np.count_nonzero(features.depth) < MIN_INLIERS:
             return None, False
@@ -139,7 +143,17 @@ class FrameLocalizer:
         if found is None:
             return None, True
         anchored = AnchoredPose(found.keyframe, found.T_keyframe_cam)
-        return LocalizedPose(anchored, found.num_inliers, found.covariance), False
+        there = LocalizedPose(anchored, found.num_inliers, found.covariance)
+        return (there, False) if self._fits_map(arrays, there) else (None, True)
+
+    def _fits_map(self, arrays: FrameArrays, found: LocalizedPose) -> bool:
+        """Return whether the frame does not see through the map at a pose; without a depth image nothing tells."""
+        if arrays.right is not None:
+            return True
+        T_world_cam = self._link.pose(found.anchored)
+        around = nearest_keyframes(self._link.map, T_world_cam, self._link.submap_of(found.anchored.keyframe))
+        depth = FrameDepth(np.zeros(6, np.float32), arrays, self._sensor)
+        return not vanished_points(self._link.map, around, T_world_cam, depth).contradict_pose
 
     def _in_local_map(
         self, features: Features, T_world_cam: Pose, radii_px: tuple[float, ...] = RADII_PX

@@ -21,7 +21,7 @@ _MAX_DOUBTED = 4096
 class MapChanges:
     """Collects what frames see through: a point is gone if two of them do, and none in between sees it there.
 
-    A single frame may have a wrong pose, or be blurred.
+    A single frame may have a wrong pose, or be blurred. One that sees through much of the map has a wrong pose.
 
     Attributes:
         pending: Whether the map has changed, and no keyframe was made since.
@@ -35,6 +35,8 @@ class MapChanges:
 
     def gone(self, vanished: VanishedPoints) -> Ids:
         """Return the ids of the points that are gone, given those that a frame sees through."""
+        if vanished.contradict_pose:
+            return vanished.ids[:0]
         again = np.isin(vanished.ids, self._doubted)
         self._nums_gone.append(int(np.count_nonzero(again & vanished.confirmed)))
         self.pending |= bool(sum(self._nums_gone) >= max(_MIN_VANISHED, _MIN_SHARE * vanished.num_shown))

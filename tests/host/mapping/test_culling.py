@@ -1,4 +1,4 @@
-"""What leaves a map that takes too much memory, and in which order."""
+"""Which keyframes leave: isolated ones, and those of a map that takes too much memory."""
 
 import logging
 from dataclasses import replace
@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from room_round import TRACK, room
-from wall_map import POINTS, at, seen_from
+from wall_map import BEHIND, POINTS, at, seen_from
 
 from jaxslam.config.schema import Config, MappingConfig
 from jaxslam.map.types import Map
 from jaxslam.map.validate import problems
-from jaxslam.mapping.culling import KEEP_LATEST, memory_bytes, within_memory
+from jaxslam.mapping.culling import KEEP_LATEST, memory_bytes, within_memory, without_isolated
 from jaxslam.slam.slam import Slam
 from jaxslam.tracking.state import TrackStatus
 
@@ -55,6 +55,33 @@ def test_of_views_that_nothing_else_shows_the_farther_leaves() -> None:
     slam_map = seen_from(poses, [POINTS, POINTS, POINTS, *([1] * KEEP_LATEST)])
     slam_map = within_memory(slam_map, len(poses) - 1, memory_bytes(slam_map) - 1)
     assert slam_map.culled.ids.tolist() == [0]
+
+
+def isolated(pose: np.ndarray, num_shown: int) -> Map:
+    """A wall that all keyframes but the second show, which is no longer one of the latest."""
+    return seen_from([at(), pose, *[at()] * KEEP_LATEST], [POINTS, num_shown, *[POINTS] * KEEP_LATEST])
+
+
+@pytest.mark.parametrize("num_shown", [0, 14])
+def test_a_keyframe_that_shares_few_points_leaves_where_others_show_its_view(num_shown: int) -> None:
+    slam_map = isolated(at(x=0.05), num_shown)
+    smaller = without_isolated(slam_map, 1 + KEEP_LATEST)
+    assert smaller.culled.ids.tolist() == [1]
+    assert not problems(smaller)
+
+
+@pytest.mark.parametrize(
+    ("slam_map", "latest", "what"),
+    [
+        (isolated(at(), 15), 1 + KEEP_LATEST, "it shares enough points"),
+        (isolated(BEHIND, 0), 1 + KEEP_LATEST, "nothing else shows its view"),
+        (isolated(at(), 0), KEEP_LATEST, "the root of the submap"),
+        (isolated(at(), 0), KEEP_LATEST - 5, "a young one"),
+        (without_isolated(isolated(at(), 0), 1 + KEEP_LATEST), 1 + KEEP_LATEST, "it has left"),
+    ],
+)
+def test_a_keyframe_stays(slam_map: Map, latest: int, what: str) -> None:
+    assert without_isolated(slam_map, latest) is slam_map, what
 
 
 @pytest.mark.slow

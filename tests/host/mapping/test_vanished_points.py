@@ -48,10 +48,21 @@ def test_points_before_a_surface_are_gone(slam_map: Map) -> None:
     assert vanished.confirmed.all()
     assert vanished.num_shown == len(vanished.ids)
     assert not len(vanished.there)
+    assert vanished.num_there == 0
 
 
 def test_points_are_there_where_a_surface_is(slam_map: Map) -> None:
-    assert len(look(slam_map, depth_of(Z_M)).there) > NUM_POINTS // 2
+    vanished = look(slam_map, depth_of(Z_M))
+    assert len(vanished.there) == vanished.num_there > NUM_POINTS // 2
+    assert not vanished.contradict_pose
+
+
+@pytest.mark.parametrize(
+    ("num_gone", "num_there", "contradict"), [(8, 42, True), (8, 41, False), (60, 340, False), (61, 339, True)]
+)
+def test_a_pose_is_wrong_from_which_much_of_the_map_is_gone(num_gone: int, num_there: int, contradict: bool) -> None:
+    assert seen_through(*range(num_gone), num_there=num_there).contradict_pose == contradict
+    assert not seen_through(*range(num_gone), num_there=num_there, confirmed=False).contradict_pose
 
 
 def test_only_points_of_the_given_keyframes_are_looked_at(slam_map: Map) -> None:
@@ -91,8 +102,12 @@ def test_an_edge_tells_nothing(slam_map: Map) -> None:
     assert not len(look(slam_map, depth_of(columns)).ids)
 
 
-def seen_through(*ids: int, there: int = 999, confirmed: bool = True, num_shown: int = 300) -> VanishedPoints:
-    return VanishedPoints(np.array(ids, np.int64), np.full(len(ids), confirmed), np.array([there]), num_shown)
+def seen_through(
+    *ids: int, there: int = 999, confirmed: bool = True, num_shown: int = 300, num_there: int = 300
+) -> VanishedPoints:
+    return VanishedPoints(
+        np.array(ids, np.int64), np.full(len(ids), confirmed), np.array([there]), num_shown, num_there
+    )
 
 
 def test_a_point_is_gone_that_two_frames_see_through() -> None:
@@ -102,6 +117,13 @@ def test_a_point_is_gone_that_two_frames_see_through() -> None:
     assert not len(changes.gone(seen_through()))
     assert changes.gone(seen_through(1, 4)).tolist() == [4], "1 was seen there in between"
     assert not changes.pending, "a few points"
+
+
+def test_what_a_frame_of_a_wrong_pose_sees_is_no_change() -> None:
+    changes, everything = MapChanges(), seen_through(*range(200))
+    for _ in range(3):
+        assert not len(changes.gone(everything))
+    assert not changes.pending
 
 
 def test_many_points_that_are_gone_are_a_change_until_a_keyframe() -> None:
