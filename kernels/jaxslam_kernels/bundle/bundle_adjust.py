@@ -59,7 +59,7 @@ class BundleStatus(IntEnum):
     NOT_CONVERGED = 1
     """The steps ran out, or none lowered the cost; the values are the best ones found."""
     NOTHING_TO_ADJUST = 2
-    """No observation counts, or everything seen is fixed; the values are the initial ones."""
+    """Nothing free has an observation or an edge that counts; the values are the initial ones."""
     DEGENERATE = 3
     """The poses can move together at no cost, as a whole or in scale. The values lower the cost; which of the equal
     ones they are depends on the start, and nothing has a derivative."""
@@ -71,7 +71,7 @@ class BundleAdjustment(NamedTuple):
     Attributes:
         poses: `wxyz_xyz` of T_world_cam; the identity where the initial one was not finite.
         X_world: Points in meters; the origin where the initial one was not finite.
-        initial_cost: Cost `½ Σ w ρ(s)` before the adjustment.
+        initial_cost: Cost `½ Σ w ρ(s)` before the adjustment, that of the edges included.
         cost: The same cost after it.
         status: A `BundleStatus`.
         num_steps: Number of steps tried.
