@@ -140,7 +140,7 @@ class MappingConfig(ValidatedConfig):
     level."""
     window: Annotated[int, Range(at_least=2, at_most=32)] = 8
     """Number of keyframes whose poses local bundle adjustment optimizes."""
-    max_steps: Annotated[int, Range(at_least=1, at_most=100)] = 5
+    max_steps: Annotated[int, Range(at_least=1, at_most=100)] = 10
     """Maximum number of iterations of local bundle adjustment."""
     latency_frames: Annotated[int, Range(at_least=0, at_most=100)] = 3
     """Number of frames after which a deterministic run has the map that includes a keyframe."""

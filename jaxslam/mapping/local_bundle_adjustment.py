@@ -35,6 +35,10 @@ _STRONG = 100
 """Number of common points from which they alone tell the relative pose of a keyframe and its parent."""
 _EDGE_PX = 1.0
 """Standard deviation of that relative pose where there are fewer: how far it moves the points in view, pixels."""
+_TOLERANCE = 1e-3
+"""Share of the cost: a step that changes it by less is the last one. With 1e-3 a window of fr1_rpy takes five to nine
+steps; with 1e-4 it takes all ten, for the same error. Always five make the rendered road, where a car drives off, 5 %
+worse."""
 _OUTLIER_CHI2 = 11.3
 """Squared whitened error above which an observation is dropped: 1 % of the good ones with three residuals."""
 
@@ -257,7 +261,7 @@ def _adjust(
         fixed_poses=fixed,
         edges=edges,
         scale=loss_scale,
-        tolerance=1e-4,
+        tolerance=_TOLERANCE,
         max_steps=max_steps,
     )
 
