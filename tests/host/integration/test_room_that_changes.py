@@ -43,11 +43,11 @@ def recording(tmp_path, changes: bool) -> StoredWorld:
 class Visits:
     """Tracks the recording, and keeps which points were where the chair was, at the change and at the end."""
 
-    def __init__(self, dataset: StoredWorld) -> None:
+    def __init__(self, dataset: StoredWorld, seed: int) -> None:
         truth, start_ns = dataset.ground_truth, dataset.timestamps_ns[0]
         assert truth is not None
         self.before: set[int] = set()
-        with Slam(dataset.camera, load_config()) as slam:
+        with Slam(dataset.camera, load_config(overrides=[f"run.seed={seed}"])) as slam:
             first = None
 
             def on_frame(frame: object, result: FrameResult | Rejected) -> None:
@@ -73,12 +73,17 @@ def of_chair(slam_map: Map, T_true_map: Pose) -> set[int]:
 
 @pytest.mark.slow
 def test_points_of_a_chair_that_was_moved_leave_the_map(tmp_path) -> None:
-    same, moved = (Visits(recording(tmp_path, changes)) for changes in (False, True))
-    assert min(len(same.before), len(moved.before)) >= NUM_OF_CHAIR
-    assert len(same.before & same.after) >= 0.95 * len(same.before), "points of a chair that stands there stay"
-    assert len(moved.before & moved.after) <= 0.05 * len(moved.before)
-    assert KeyframeReason.CHANGED not in same.reasons
-    assert KeyframeReason.CHANGED in moved.reasons
-    assert not same.num_lost
-    assert not moved.num_lost
-    assert moved.ate_m <= 1.1 * same.ate_m
+    """Errors are compared over seeds: their ratio of one seed is 0.89 to 1.16."""
+    errors = []
+    for seed in range(3):
+        same, moved = (Visits(recording(tmp_path, changes), seed) for changes in (False, True))
+        assert min(len(same.before), len(moved.before)) >= NUM_OF_CHAIR
+        assert len(same.before & same.after) >= 0.95 * len(same.before), "points of a chair that stands there stay"
+        assert len(moved.before & moved.after) <= 0.05 * len(moved.before)
+        assert KeyframeReason.CHANGED not in same.reasons
+        assert KeyframeReason.CHANGED in moved.reasons
+        assert not same.num_lost
+        assert not moved.num_lost
+        errors.append((same.ate_m, moved.ate_m))
+    of_same, of_moved = np.median(errors, axis=0)
+    assert of_moved <= 1.1 * of_same
