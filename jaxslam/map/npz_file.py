@@ -83,6 +83,9 @@ READABLE = (1, 2, 3, 4)
 _SINCE = {"points.state": 2}
 """The first version with an array, if not version 1; in older files the array is missing and read as zeros."""
 
+_BEFORE_VERSION_4 = {"images.files": "images.png"}
+"""Names of arrays before version 4."""
+
 _BEFORE_VERSION_3 = {
     "features.uv_raw": "features.seen_uv",
     "points.has_descriptor": "points.recognisable",
@@ -286,8 +289,8 @@ def _with_present_names(header: dict[str, Any], version: int) -> dict[str, Any]:
 
 def _name_in_version(name: str, version: int) -> str:
     """Return the name of an array or a count in files of a version."""
-    if name == "images.files":
-        return name if version >= 4 else "images.png"
+    if version < 4:
+        name = _BEFORE_VERSION_4.get(name, name)
     if version >= 3:
         return name
     return _BEFORE_VERSION_3.get(name, name.replace("observations", "sightings").replace("uv_raw", "seen_uv"))

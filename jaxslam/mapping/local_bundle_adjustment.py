@@ -195,8 +195,7 @@ def _solve_input(
 def _observations(slam_map: Map, window: _Window, size: int, plan: AdjustPlan) -> BundleObservations:
     camera, seen = slam_map.camera, window.observations
     room = size * _OBSERVATIONS_A_POINT
-    slots = np.argsort(window.keyframes)
-    row = slots[np.searchsorted(window.keyframes[slots], seen.keyframe)]
+    row = _places(window.keyframes, seen.keyframe)
     sigma_depth = plan.depth_sigma_m + plan.depth_sigma_per_m2 * np.square(seen.depth)
     focal = np.array([[camera.fx], [camera.fy]])
     center = np.array([[camera.cx], [camera.cy]])
@@ -226,13 +225,12 @@ def _tree_edges(slam_map: Map, window: _Window, room: int) -> PoseGraphEdges:
     What the tracker knows of the motion between two keyframes is in their common points, if there are many. Of a
     keyframe after a fast turn, all of 27 observations were wrong matches with another place, and moved it by 0.19 m.
     """
-    slots = np.argsort(window.keyframes)
-    row_of = lambda keyframe_ids: slots[np.searchsorted(window.keyframes[slots], keyframe_ids)]
     parents = slam_map.parent[rows(slam_map.ids, window.keyframes)]
     child = np.flatnonzero(np.isin(parents, window.keyframes))
-    parent = row_of(parents[child])
+    parent = _places(window.keyframes, parents[child])
     seen = np.zeros((len(window.keyframes), len(window.points)), np.float32)
-    seen[row_of(window.observations.keyframe), np.searchsorted(window.points, window.observations.point)] = 1
+    of_keyframe, of_point = window.observations.keyframe, window.observations.point
+    seen[_places(window.keyframes, of_keyframe), rows(window.points, of_point)] = 1
     few = np.sum(seen[parent] * seen[child], axis=1) < _STRONG
     parent, child = parent[few], child[few]
     poses = slam_map.T_world_cam[rows(slam_map.ids, window.keyframes)]
@@ -283,12 +281,17 @@ def _moved_along(slam_map: Map, keyframe_ids: Ids, poses: Poses) -> tuple[Ids, P
     """Return the points that only one of these keyframes observes, and their positions after it has moved."""
     row = rows(slam_map.points.ids, slam_map.observations.point)
     once = np.bincount(row, minlength=len(slam_map.points.ids))[row] == 1
-    order = np.argsort(keyframe_ids)
-    lone = np.flatnonzero(once & has(keyframe_ids[order], slam_map.observations.keyframe))
-    which = order[rows(keyframe_ids[order], slam_map.observations.keyframe[lone])]
+    lone = np.flatnonzero(once & has(np.sort(keyframe_ids), slam_map.observations.keyframe))
+    which = _places(keyframe_ids, slam_map.observations.keyframe[lone])
     change = compose(poses, inverse(slam_map.T_world_cam[rows(slam_map.ids, keyframe_ids)]))[which]
     X_world = rotate(change, slam_map.points.X_world[:, row[lone]].T) + change[:, 4:]
     return slam_map.observations.point[lone], X_world.T
+
+
+def _places(ids: Ids, wanted: Ids) -> Int[np.ndarray, " n"]:
+    """Return the place of each wanted id among ids in any order."""
+    order = np.argsort(ids)
+    return order[rows(ids[order], wanted)]
 
 
 def _identity_row() -> Float32[np.ndarray, "7"]:

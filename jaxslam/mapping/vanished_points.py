@@ -91,7 +91,7 @@ class VanishedPoints(NamedTuple):
 
     @property
     def contradict_pose(self) -> bool:
-        """Whether so many points are gone that the pose of the frame must be wrong."""
+        """True if so many points are gone that the pose of the frame must be wrong."""
         num_gone = np.count_nonzero(self.confirmed)
         compared = num_gone + self.num_there
         return bool(compared >= _MIN_COMPARED and num_gone > _MAX_SHARE * compared)

@@ -192,7 +192,7 @@ def predict_pixels(X_cam: Points, twist: Float[Array, "6"], height: int, sensor:
 
 
 class ExpectedPixels(NamedTuple):
-    """Where points are expected in a frame.
+    """Pixels at which points are expected in a frame.
 
     Attributes:
         uv: `(2, n)` pixels of the distorted image, whether or not they are inside.

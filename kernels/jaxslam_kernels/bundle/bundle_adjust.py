@@ -28,6 +28,7 @@ from jaxslam_kernels.bundle.cost import (
     Observations,
     Plane,
     Poses,
+    Views,
     bundle_cost,
     bundle_problem,
     bundle_views,
@@ -162,7 +163,7 @@ def bundle_adjust(
     relative = _on_grid(clean_weights(observations.weights), slot, problem)
     tangents, shifts, more_cost = _optimum_shift(start, start_points, problem, relative, loss)
     optimum = shift_cameras(start, tangents)
-    initial_cost = _cost(cameras, X_world, problem, loss)
+    initial_cost = _cost(cameras, bundle_views(cameras, X_world, problem, loss), problem, loss)
     result = _report(optimum, start_points + shifts, problem, slot, loss, initial_cost, solution)
     return result._replace(cost=result.cost + more_cost)
 
@@ -194,13 +195,14 @@ def solve_bundle(
     epsilon = float(jnp.finfo(X_world.dtype).eps)
 
     def step(state: _State) -> _State:
-        equations = _equations(state.cameras, state.X_world, problem, loss)
+        views = bundle_views(state.cameras, state.X_world, problem, loss)
+        equations = _equations(state.cameras, views, problem)
         reduced = eliminate(equations, problem, state.damping)
         tangents, shifts = solve_reduced(reduced, equations.camera_gradient, equations.point_gradient)
         predicted = _predicted_decrease(equations, tangents, shifts, state.damping)
         cameras = _where_free(problem, move_cameras(state.cameras, tangents), state.cameras)
         X_world = state.X_world + shifts
-        cost = _cost(cameras, X_world, problem, loss)
+        cost = _cost(cameras, bundle_views(cameras, X_world, problem, loss), problem, loss)
         finite = jnp.isfinite(cost) & jnp.isfinite(X_world).all()
         finite = finite & jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(cameras)]).all()
         accept = finite & (cost <= (1.0 + 32.0 * epsilon) * state.cost)  # a sum is no better than its rounding
@@ -222,22 +224,23 @@ def solve_bundle(
             num_steps=state.num_steps + 1,
         )
 
-    cost, no = _cost(cameras, X_world, problem, loss), jnp.zeros((), bool)
+    cost = _cost(cameras, bundle_views(cameras, X_world, problem, loss), problem, loss)
+    no = jnp.zeros((), bool)
     damping = jnp.full_like(cost, _INITIAL_DAMPING)
     start = _State(cameras, X_world, cost, damping, no, no, jnp.zeros((), jnp.int32))
     end = lax.while_loop(lambda s: ~s.converged & ~s.stuck & (s.num_steps < max_steps), step, start)
     return Solution(end.cameras, end.X_world, end.converged, end.num_steps)
 
 
-def _cost(cameras: Cameras, X_world: Points, problem: BundleProblem, loss: Loss) -> Scalar:
+def _cost(cameras: Cameras, views: Views, problem: BundleProblem, loss: Loss) -> Scalar:
     """The cost of the observations and of the edges."""
-    cost = bundle_cost(bundle_views(cameras, X_world, problem, loss), problem, loss)
+    cost = bundle_cost(views, problem, loss)
     return cost if problem.edges is None else cost + edge_cost(cameras, problem.edges)
 
 
-def _equations(cameras: Cameras, X_world: Points, problem: BundleProblem, loss: Loss) -> BundleEquations:
+def _equations(cameras: Cameras, views: Views, problem: BundleProblem) -> BundleEquations:
     """The exact gradient of the cost, and the Hessian of iteratively reweighted least squares."""
-    equations = normal_equations(bundle_views(cameras, X_world, problem, loss))
+    equations = normal_equations(views)
     if problem.edges is None:
         return equations
     gradient = equations.camera_gradient + edge_gradient(cameras, problem.edges)
@@ -281,7 +284,7 @@ def _optimum_shift_jvp(loss: Loss, primals: tuple, tangents: tuple) -> tuple[tup
     heard = change._replace(weights=jnp.where(silent[None, :], 0.0, change.weights))
 
     def gradients(cameras: Cameras, X_world: Points, problem: BundleProblem) -> tuple[Array, Array]:
-        equations = _equations(cameras, X_world, problem, loss)
+        equations = _equations(cameras, bundle_views(cameras, X_world, problem, loss), problem)
         return equations.camera_gradient, equations.point_gradient
 
     _, changes = jax.jvp(gradients, (cameras, idle.X_world, problem), (*tangents[:2], heard))
@@ -303,7 +306,7 @@ def _at_optimum(cameras: Cameras, X_world: Points, problem: BundleProblem, loss:
     At a strict minimum it is positive definite. A point where it is not (the solver stopped short of one, or a
     direction is free) gets its reweighted Hessian; all of them do if the cameras are undetermined still.
     """
-    reweighted = _equations(cameras, X_world, problem, loss)
+    reweighted = _equations(cameras, bundle_views(cameras, X_world, problem, loss), problem)
     blocks = exact_blocks(cameras, X_world, problem, loss)
     convex = points_determined(blocks.point.sum(axis=2), problem.free_point) | ~problem.free_point
     rest = problem._replace(weights=jnp.where(convex[None, :], 0.0, problem.weights))
@@ -334,7 +337,7 @@ def _report(
 ) -> BundleAdjustment:
     """Everything that is said of the final values, evaluated there."""
     views = bundle_views(cameras, X_world, problem, loss)
-    equations = lax.stop_gradient(_equations(cameras, X_world, problem, loss))
+    equations = lax.stop_gradient(_equations(cameras, views, problem))
     counts = (problem.weights > 0) & (views.robust_weights > 0)
     free_camera = free_cameras(problem).any(axis=1)
     adjusts = (counts & (free_camera[:, None] | problem.free_point[None, :])).any()
@@ -352,7 +355,7 @@ def _report(
         poses=cameras.poses,
         X_world=X_world,
         initial_cost=initial_cost,
-        cost=_cost(cameras, X_world, problem, loss),
+        cost=_cost(cameras, views, problem, loss),
         status=status.astype(jnp.int32),
         num_steps=solution.num_steps,
         determined=points_determined(equations.point_hessian, jnp.ones_like(problem.free_point)),
