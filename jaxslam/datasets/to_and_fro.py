@@ -1,5 +1,7 @@
 """A recording played forward and backward again and again, for runs of any length."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from jaxslam.datasets.protocol import Dataset
@@ -13,9 +15,9 @@ _MIN_FRAMES = 2
 class ToAndFro:
     """A recording of any length: another one played to its end, back to its beginning, and so on.
 
-    Its clock goes on at the rate of the other recording. A rolling shutter and a depth image that is taken later than
-    the color image do not fit the way back, on which they are reversed: such a recording is tracked worse than its
-    camera could be. Samples of an IMU are left out, as they would not fit the motion.
+    Its clock goes on at the rate of the other recording. On the way back, depth that was taken after its image comes
+    before it, and a rolling shutter reads the last row first. Samples of an IMU are left out, as they would not fit the
+    motion.
 
     Attributes:
         name: Name in results, such as `fr1_xyz, 12000 frames to and fro`.
@@ -51,13 +53,25 @@ class ToAndFro:
     def __getitem__(self, index: int) -> Frame:
         """Decode frame `index`; raises `IndexError` outside `-n` to `n - 1`."""
         index = range(len(self))[index]
-        frame = self._dataset[int(self.source_of(np.array(index)))]
-        return Frame(int(self.timestamps_ns[index]), frame.image, frame.depth_m, right=frame.right)
+        return self._played(index, self._dataset[int(self.source_of(np.array(index)))])
 
     def source_of(self, index: np.ndarray) -> np.ndarray:
         """Return the frames of the other recording that are shown at some frames."""
         along = index % (2 * self.frames_per_pass)
         return np.minimum(along, 2 * self.frames_per_pass - along)
+
+    def _played(self, index: int, source: Frame) -> Frame:
+        """Return a frame of the other recording as frame `index`."""
+        timestamp_ns, delay_ns = int(self.timestamps_ns[index]), _depth_delay_ns(source)
+        # The frame at a turn comes at the end of the way to it.
+        backward = max(index - 1, 0) // self.frames_per_pass % 2 == 1
+        return replace(
+            source,
+            timestamp_ns=timestamp_ns,
+            depth_timestamp_ns=timestamp_ns + (-delay_ns if backward else delay_ns),
+            imu=None,
+            played_backward=backward,
+        )
 
     def _truth(self) -> Trajectory | None:
         truth = self._dataset.ground_truth
@@ -68,6 +82,10 @@ class ToAndFro:
         source = self.source_of(np.arange(len(self)))
         shown = known[source]
         return Trajectory(self.timestamps_ns[shown], truth.at(times).T_world_cam[source[shown]])
+
+
+def _depth_delay_ns(frame: Frame) -> int:
+    return 0 if frame.depth_timestamp_ns is None else frame.depth_timestamp_ns - frame.timestamp_ns
 
 
 def _period_ns(dataset: Dataset) -> int:

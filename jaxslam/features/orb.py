@@ -241,6 +241,7 @@ def _no_patches() -> Patches:
 @compiled(when="warm-up")
 def _ideal(uv_raw: Pixels, twist: Float[Array, "6"], frame: FrameArrays, sensor: SensorModel) -> tuple[Pixels, Weights]:
     """Convert pixels to those of the ideal camera and read depth; of a stereo pair by matching."""
+    sensor = sensor.for_readout(frame.readout_sign)
     believed = valid_depth(frame.depth, sensor.min_depth_m, sensor.max_depth_m)
     rough, matched = sample_depth(believed, uv_raw), None
     if frame.right is not None:

@@ -374,6 +374,7 @@ def _ideal(
     uv_raw: Pixels, expected_depth: Weights, twist: Float[Array, "6"], frame: FrameArrays, sensor: SensorModel
 ) -> tuple[Pixels, Weights]:
     """Convert pixels of the distorted image to pixels of the ideal camera, and measure their depth."""
+    sensor = sensor.for_readout(frame.readout_sign)
     believed = valid_depth(frame.depth, sensor.min_depth_m, sensor.max_depth_m)
     seen = pixel_rays(uv_raw, sensor).measured(expected_depth, twist, believed, frame.depth_delay_s, sensor)
     return to_pixels(sensor.intrinsics, seen.xy), seen.depth

@@ -205,7 +205,7 @@ class PointStates:
         self, columns: _Columns, T_keyframe_cam: Pose, twist: Float[np.ndarray, "6"], arrays: FrameArrays
     ) -> tuple[States, Float[Array, "2"]]:
         motion = T_keyframe_cam.astype(np.float32), twist
-        seen = arrays.ignore, arrays.depth, arrays.depth_delay_s
+        seen = arrays.ignore, arrays.depth, arrays.depth_delay_s, arrays.readout_sign
         return _after_frame(columns, *motion, *seen, self._sensor, guard=self._config.guard)
 
 
@@ -233,12 +233,14 @@ def _after_frame(
     ignore: Bool[Array, "h w"],
     depth: DepthImage,
     depth_delay_s: Scalar,
+    readout_sign: Scalar | None,
     sensor: SensorModel,
     *,
     guard: bool,
 ) -> tuple[States, Float[Array, "2"]]:
     """Return the states after a frame, the number of changes, and the OCCLUDED share of the keyframe's points."""
     X_cam = to_camera(SE3(T_keyframe_cam), columns.X_keyframe)
+    sensor = sensor.for_readout(readout_sign)
     expected = expected_pixels(X_cam, twist, ignore, sensor)
     inside = columns.there & expected.inside
     displaced = jnp.zeros_like(inside)

@@ -58,7 +58,7 @@ class FrameDepth:
             Masks of the points behind which the frame sees a surface, and of those that it sees where they are.
         """
         seen = np.zeros((2, X_cam.shape[1]), bool)
-        of_frame = self.frame.ignore, self.frame.depth, self.frame.depth_delay_s
+        of_frame = self.frame.ignore, self.frame.depth, self.frame.depth_delay_s, self.frame.readout_sign
         for start in range(0, X_cam.shape[1], _BATCH):
             some = X_cam[:, start : start + _BATCH].astype(np.float32)
             filled = padded(some, _BATCH, axis=-1)
@@ -126,9 +126,11 @@ def _compared(
     ignore: Bool[Array, "h w"],
     depth: DepthImage,
     depth_delay_s: Scalar,
+    readout_sign: Scalar | None,
     sensor: SensorModel,
 ) -> Bool[Array, "2 n"]:
     """Return masks of the points behind which the frame sees a surface, and of those that it sees where they are."""
+    sensor = sensor.for_readout(readout_sign)
     pixels, expected = expected_pixels(X_cam, twist, ignore, sensor), X_cam[2]
     measured, known = surface_depth(expected, pixels.uv, twist, depth, depth_delay_s, sensor)
     known &= pixels.inside & ~pixels.ignored

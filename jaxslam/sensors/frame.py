@@ -33,6 +33,8 @@ class Frame:
             for a camera that measures depth. With a right image, `depth_m` is only the start value of stereo matching.
         imu: Samples of an IMU after the frame before, up to this frame's time, on the same clock; `None` without an
             IMU. jaxslam does not use them yet.
+        played_backward: Whether the frame is part of a recording that is played backward. A rolling shutter then reads
+            the last row first.
 
     Raises:
         FrameError: If a field has the wrong type or shape, the images differ in size, there is neither depth nor a
@@ -46,6 +48,7 @@ class Frame:
     depth_timestamp_ns: int | None = None
     right: np.ndarray | None = None
     imu: ImuSamples | None = None
+    played_backward: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "timestamp_ns", _timestamp("timestamp_ns", self.timestamp_ns))

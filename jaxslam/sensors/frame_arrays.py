@@ -25,6 +25,8 @@ class FrameArrays(NamedTuple):
             right image, `depth` is only the start value of stereo matching.
         movable: `(h, w)` number of the movable object at each pixel, from 1; 0 where there is none. Needed by a plan
             with `motion`, which finds out which objects do move; `None` without.
+        readout_sign: 1, or -1 where a rolling shutter reads the last row first, as in a recording that is played
+            backward; `None` for 1.
     """
 
     image: Num[Array, "*time h w"]
@@ -34,6 +36,7 @@ class FrameArrays(NamedTuple):
     depth_delay_s: Float[Array, "*time"]
     right: Num[Array, "*time h w"] | None = None
     movable: UInt8[Array, "*time h w"] | None = None
+    readout_sign: Float[Array, "*time"] | None = None
 
 
 def frame_arrays(frame: Frame, dt_s: float, dtype: DTypeLike = np.float32) -> FrameArrays:
@@ -49,7 +52,8 @@ def frame_arrays(frame: Frame, dt_s: float, dtype: DTypeLike = np.float32) -> Fr
     ignore = np.zeros(frame.size[::-1], bool) if frame.dynamic_mask is None else frame.dynamic_mask
     depth = _depth(frame).astype(dtype, copy=False)
     right = None if frame.right is None else to_gray(frame.right)
-    arrays: Any = (to_gray(frame.image), depth, ignore, *_times(frame, dt_s, dtype), right)
+    times, sign = _times(frame, dt_s, dtype), _readout_sign(frame, dtype)
+    arrays: Any = (to_gray(frame.image), depth, ignore, *times, right, None, sign)
     return FrameArrays(*arrays)
 
 
@@ -116,7 +120,8 @@ class FrameMemory:
             np.copyto(ignore, frame.dynamic_mask)
         if self._movable is not None:
             self._movable[:] = 0
-        arrays: Any = (self._image, self._depth, ignore, *_times(frame, dt_s, np.float32), right, self._movable)
+        times, sign = _times(frame, dt_s, np.float32), _readout_sign(frame, np.float32)
+        arrays: Any = (self._image, self._depth, ignore, *times, right, self._movable, sign)
         return FrameArrays(*arrays)
 
     def with_movable(self, arrays: FrameArrays, labels: np.ndarray) -> FrameArrays:
@@ -171,3 +176,7 @@ def _depth(frame: Frame) -> np.ndarray:
 def _times(frame: Frame, dt_s: float, dtype: DTypeLike) -> tuple[np.ndarray, np.ndarray]:
     delay_ns = 0 if frame.depth_timestamp_ns is None else frame.depth_timestamp_ns - frame.timestamp_ns
     return np.asarray(dt_s, dtype), np.asarray(delay_ns * 1e-9, dtype)
+
+
+def _readout_sign(frame: Frame, dtype: DTypeLike) -> np.ndarray:
+    return np.asarray(-1 if frame.played_backward else 1, dtype)

@@ -36,6 +36,14 @@ class SensorModel(NamedTuple):
     max_depth_m: Scalar
     baseline_m: Scalar
 
+    def for_readout(self, sign: Scalar | None) -> "SensorModel":
+        """Return the model with the direction in which a frame's rolling shutter reads the rows.
+
+        Args:
+            sign: 1 for the first row first, -1 for the last row first; `None` for 1. See `FrameArrays`.
+        """
+        return self if sign is None else self._replace(readout_s=self.readout_s * sign)
+
 
 class DepthNoise(NamedTuple):
     """Standard deviation of measured depth: `sigma_m + sigma_per_m2 z^2` at depth `z`.

@@ -107,6 +107,7 @@ def follow_points(
         TypeError: In the same cases as `track_step`.
     """
     _check(state, frame, params, plan)
+    params = _for_readout(params, frame)
     height, width = frame.image.shape
     elapsed_s = state.elapsed_s + frame.dt_s
     pyramid = build_pyramid(frame.image, num_levels=plan.num_levels, dtype=state.twist.dtype)
@@ -146,6 +147,7 @@ def track_followed(
         TypeError: In the same cases as `track_step`.
     """
     _check_followed(state, frame, followed_points, params, plan)
+    params = _for_readout(params, frame)
     pyramid, predicted, uv, found = followed_points
     # 1. Prepare the frame: depth that can be believed, and the right image of a stereo pair.
     step, X_world = _prepared(state, frame, pyramid, params, plan), state.points.X_world
@@ -207,6 +209,11 @@ def _check_followed(
     check_cues(state, frame, params, plan)
     points = expected.points
     check_followed(followed_points, FlowResult(expected.pyramid, expected.T_world_cam, points.uv, points.valid))
+
+
+def _for_readout(params: TrackParams, frame: FrameArrays) -> TrackParams:
+    """Return the settings with the direction in which the frame's rolling shutter reads the rows."""
+    return params._replace(sensor=params.sensor.for_readout(frame.readout_sign))
 
 
 def _prepared(

@@ -158,7 +158,8 @@ def _check_frame(frame: FrameArrays, dtype: jnp.dtype) -> None:
     for name, of in (("depth", dtype), ("ignore", np.bool_)):
         check_array(f"frame.{name}", getattr(frame, name), image.shape, None, " as frame.image")
         check_array(f"frame.{name}", getattr(frame, name), image.shape, of, _STATE_DTYPE if name == "depth" else "")
-    for name in ("dt_s", "depth_delay_s"):
+    scalars = ("dt_s", "depth_delay_s", *(() if frame.readout_sign is None else ("readout_sign",)))
+    for name in scalars:
         check_array(f"frame.{name}", getattr(frame, name), (), dtype, _STATE_DTYPE)
     if frame.right is not None:
         check_array("frame.right", frame.right, image.shape, image.dtype, " as frame.image")

@@ -1,6 +1,7 @@
 """What is played in a soak test: a recording to and fro, with faults, and people anew each time in a rendered world."""
 
 import threading
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, UInt8
@@ -38,7 +39,7 @@ class WithPeople(ToAndFro):
             self._masks[_key(frame.image)] = mask
             while len(self._masks) > _NUM_REMEMBERED:
                 del self._masks[next(iter(self._masks))]
-        return Frame(int(self.timestamps_ns[index]), frame.image, frame.depth_m, right=frame.right)
+        return self._played(index, frame)
 
     def detect(self, image: UInt8[np.ndarray, "h w 3"], /) -> Detections:
         """Find all people in a frame that was rendered lately; nobody in any other image."""
@@ -93,7 +94,7 @@ class Covered:
             return frame
         black, right = np.zeros_like(frame.image), None if frame.right is None else np.zeros_like(frame.right)
         depth_m = None if frame.depth_m is None else np.zeros_like(frame.depth_m)
-        return Frame(frame.timestamp_ns, black, depth_m, right=right)
+        return replace(frame, image=black, depth_m=depth_m, right=right)
 
 
 class FailingDetector:

@@ -1,6 +1,7 @@
 """A soak test of a small world: what is played, what is counted, and the files that it leaves."""
 
 import csv
+import dataclasses
 import json
 from pathlib import Path
 
@@ -15,10 +16,12 @@ from jaxslam.datasets import Subset
 from jaxslam.datasets.to_and_fro import ToAndFro
 from jaxslam.errors import ConfigError, DatasetError, ModelError
 from jaxslam.semantics import Detections, no_detections
+from jaxslam.sensors.frame import Frame
 from jaxslam.worlds.library import load_world
 from jaxslam.worlds.passing_people import PassingPeople, without_people
 from jaxslam.worlds.recording import WorldRecording
 
+DELAY_NS = 7_000_000
 ROOM = """
 about: A room in which somebody walks about.
 seconds: 0.4
@@ -30,6 +33,22 @@ people: [{at_m: [1, 0]}]
 camera: {width: 160, height: 120}
 way: {points_m: [[-2, -0.3, 1.4], [-1.7, 0.3, 1.4]], look: [2, 0, 1.2], speed_m_per_s: 0.5}
 """
+
+
+class LateDepth:
+    """A recording whose depth is taken 7 ms after the image."""
+
+    def __init__(self) -> None:
+        self._frames = clip().frames[:4]
+        self.name, self.camera, self.ground_truth = "late", clip().camera, None
+        self.timestamps_ns = clip().timestamps_ns[:4]
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __getitem__(self, index: int) -> Frame:
+        frame = self._frames[index]
+        return dataclasses.replace(frame, depth_timestamp_ns=frame.timestamp_ns + DELAY_NS)
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +74,16 @@ def test_a_recording_goes_to_and_fro() -> None:
     assert np.array_equal(truth.T_world_cam, expected)
     with pytest.raises(IndexError):
         played[12]
+
+
+def test_times_within_a_frame_are_reversed_on_the_way_back() -> None:
+    played = ToAndFro(LateDepth(), 12)
+    assert [played[index].played_backward for index in range(12)] == [False] * 4 + [True] * 3 + [False] * 3 + [True] * 2
+    shown = [played[index] for index in (1, 5, 8)]
+    assert [(frame.depth_timestamp_ns or 0) - frame.timestamp_ns for frame in shown] == [DELAY_NS, -DELAY_NS, DELAY_NS]
+    covered = Covered(played, 5)
+    assert covered.is_covered(5)
+    assert covered[5].played_backward
 
 
 @pytest.mark.parametrize(("frames", "played"), [(1, 5), (4, 0)])

@@ -165,6 +165,9 @@ def test_rolling_shutter_is_removed():
     expected = features.uv_raw + 525 * late_s * np.stack([1 + x * x, x * y])
     assert np.abs(expected - features.uv_raw).max() > 4
     np.testing.assert_allclose(features.uv, expected, atol=1e-2)
+    backward = with_depth(depth)._replace(readout_sign=np.float32(-1))
+    features = features_of(backward, turn, sensor_model(camera, TrackConfig()))
+    np.testing.assert_allclose(features.uv, 2 * features.uv_raw - expected, atol=1e-2)
 
 
 def test_compiles_once_however_many_features_there_are(monkeypatch):

@@ -32,6 +32,10 @@ class TestFrameArrays:
         np.testing.assert_array_equal(arrays.ignore, mask)
         assert float(arrays.depth_delay_s) == pytest.approx(-0.008)
 
+    def test_sign_of_the_readout(self) -> None:
+        signs = [frame_arrays(frame(100, played_backward=way), 0.1).readout_sign for way in (False, True)]
+        assert [float(sign) for sign in signs if sign is not None] == [1, -1]
+
     def test_depth_is_not_copied(self) -> None:
         given = frame(100)
         assert frame_arrays(given, 0.1).depth is given.depth_m

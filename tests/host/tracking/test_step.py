@@ -136,6 +136,17 @@ class TestCompiled:
         track(counted.step, frames, seed=7, loss_scale=jnp.float32(2.0), sensor=rolling)
         assert counted.traces == 1
 
+    def test_rows_read_in_reverse(self, counted: Counted, frames: FrameArrays) -> None:
+        """As with a negative readout time, and not as before."""
+        rolling, reversed_ = (params().sensor._replace(readout_s=jnp.float32(s)) for s in (0.02, -0.02))
+        backward = frames._replace(readout_sign=-np.ones(COUNT, np.float32))
+        forward, there, expected = (
+            poses(track(counted.step, given, sensor=sensor)[1])
+            for given, sensor in ((frames, rolling), (backward, rolling), (frames, reversed_))
+        )
+        np.testing.assert_array_equal(there, expected)
+        assert np.abs(forward - there).max() > 1e-4
+
     def test_same_bytes_again(self, counted: Counted, frames: FrameArrays) -> None:
         first, second = (track(counted.step, frames) for _ in range(2))
         np.testing.assert_array_equal(poses(first[1]), poses(second[1]))
