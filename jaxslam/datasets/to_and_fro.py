@@ -15,9 +15,9 @@ _MIN_FRAMES = 2
 class ToAndFro:
     """A recording of any length: another one played to its end, back to its beginning, and so on.
 
-    Its clock goes on at the rate of the other recording. On the way back, depth that was taken after its image comes
-    before it, and a rolling shutter reads the last row first. Samples of an IMU are left out, as they would not fit the
-    motion.
+    Frames follow each other at the intervals of the other recording. On the way back, depth that was taken after its
+    image comes before it, and a rolling shutter reads the last row first. Samples of an IMU are left out, as they would
+    not fit the motion.
 
     Attributes:
         name: Name in results, such as `fr1_xyz, 12000 frames to and fro`.
@@ -44,7 +44,8 @@ class ToAndFro:
         self._dataset = dataset
         self.name, self.camera = f"{dataset.name}, {num_frames} frames to and fro", dataset.camera
         self.frames_per_pass = len(dataset) - 1
-        self.timestamps_ns = dataset.timestamps_ns[0] + _period_ns(dataset) * np.arange(num_frames)
+        shown = dataset.timestamps_ns[self.source_of(np.arange(num_frames))]
+        self.timestamps_ns = shown[0] + np.cumsum(np.abs(np.diff(shown, prepend=shown[0])))
         self.ground_truth = self._truth()
 
     def __len__(self) -> int:
@@ -86,7 +87,3 @@ class ToAndFro:
 
 def _depth_delay_ns(frame: Frame) -> int:
     return 0 if frame.depth_timestamp_ns is None else frame.depth_timestamp_ns - frame.timestamp_ns
-
-
-def _period_ns(dataset: Dataset) -> int:
-    return int(np.median(np.diff(dataset.timestamps_ns)))
