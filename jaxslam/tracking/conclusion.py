@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from jaxslam.tracking.dynamic_rejection import DynamicRejection
 from jaxslam.tracking.keyframe_decision import KeyframeCandidate, keyframe_reason
 from jaxslam.tracking.keyframe_ring import with_keyframe
+from jaxslam.tracking.motion_prediction import updated_statistics
 from jaxslam.tracking.outcome import Outcome
 from jaxslam.tracking.point_detection import detect_new_points
 from jaxslam.tracking.point_update import KeptPoints, probation_weights
@@ -104,7 +105,8 @@ def _motion(step: StepContext, estimate: FrameEstimate) -> _Motion:
     start = lost & ((state.phase == TrackPhase.START) | waited)
     pose = _choose(lost, state.T_world_cam, estimate.refined.T_world_cam)
     # A start at a recognized place keeps the velocity of the reset: without it, a fast camera is lost again at once.
-    twist = jnp.where(lost, jnp.where(start, state.twist, 0), step.twist_to(estimate.refined.T_world_cam))
+    at_reset = start & (state.phase == TrackPhase.START)
+    twist = jnp.where(lost, jnp.where(at_reset, state.twist, 0), step.twist_to(estimate.refined.T_world_cam))
     return _Motion(pose, twist, start, lost_frames)
 
 
@@ -183,13 +185,15 @@ def _new_state(step: StepContext, estimate: FrameEstimate, motion: _Motion, endi
     held, make = lost & ~ending.started, ending.keyframe > 0
     trust = jnp.where(ending.at_rest, probation_weights(points, params), 0)
     image, pose = view.frame.image, motion.T_world_cam
+    velocity = updated_statistics(state.velocity, state.twist, motion.twist, view.elapsed_s)
     still_to_start = held & (state.phase == TrackPhase.START)
     return TrackState(
         pyramid=_choose(held, state.pyramid, view.pyramid),
         points=points,
         keyframes=with_keyframe(state.keyframes, make, image, pose, points, trust, plan),
         T_world_cam=pose,
-        twist=motion.twist,
+        twist=jnp.where(held, state.twist, motion.twist),
+        velocity=_choose(lost, state.velocity, velocity),
         elapsed_s=jnp.where(held, jnp.maximum(view.elapsed_s, 0), 0),
         since_keyframe_s=jnp.where(make, 0, ending.since_keyframe_s),
         since_keyframe=jnp.where(make, 0, state.since_keyframe + (~lost).astype(jnp.int32)),

@@ -16,6 +16,7 @@ from jaxslam.geometry.se3 import IDENTITY
 from jaxslam.runtime.filled_arrays import filled
 from jaxslam.runtime.floating_dtype import floating_dtype
 from jaxslam.tracking.keyframe_ring import empty_keyframes
+from jaxslam.tracking.motion_prediction import VelocityStatistics
 from jaxslam.tracking.points import empty_points
 from jaxslam.tracking.state import TrackPhase, TrackPlan, TrackState
 from jaxslam.tracking.step_checks import check_plan, check_pose
@@ -63,6 +64,7 @@ def init_state(
         keyframes=empty_keyframes(height, width, plan, jnp.dtype(image_dtype), dtype),
         T_world_cam=SE3(pose.wxyz_xyz.astype(dtype)),
         twist=filled(6, dtype),
+        velocity=VelocityStatistics(filled(2, dtype), filled(2, dtype)),
         elapsed_s=filled((), dtype),
         since_keyframe_s=filled((), dtype),
         since_keyframe=filled((), jnp.int32),

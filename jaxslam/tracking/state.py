@@ -18,6 +18,7 @@ from jaxslam.dynamics.cue import Cue, CueResult
 from jaxslam.dynamics.object_motion import MotionMemory, MotionParams, MotionPlan, MotionState
 from jaxslam.dynamics.regions import RegionMemory, RegionPlan, Regions
 from jaxslam.sensors.sensor_model import SensorModel
+from jaxslam.tracking.motion_prediction import VelocityStatistics
 from jaxslam.tracking.points import KeyframeMatches, KeyframeRing, TrackedPoints
 
 
@@ -274,6 +275,7 @@ class TrackState(NamedTuple):
         keyframes: Keyframes whose points are matched again.
         T_world_cam: Pose of the camera.
         twist: `(6,)` velocity of the camera in its own axes, m/s, then rad/s.
+        velocity: Statistics of the velocity, which tell for how long it can be believed.
         elapsed_s: Time since the last good frame, seconds.
         since_keyframe_s: Time since the last keyframe, seconds.
         since_keyframe: Number of good frames since the last keyframe.
@@ -291,6 +293,7 @@ class TrackState(NamedTuple):
     keyframes: KeyframeRing
     T_world_cam: SE3
     twist: Float[Array, "6"]
+    velocity: VelocityStatistics
     elapsed_s: Scalar
     since_keyframe_s: Scalar
     since_keyframe: Code

@@ -17,8 +17,8 @@ from jaxslam_kernels.depth.sampling import valid_depth
 from jaxslam_kernels.flow.lk_flow import lk_flow
 from jaxslam_kernels.image.pyramid import Pyramid, build_pyramid
 from jaxslam_kernels.robust import weighted_median
-from jaxslam_kernels.se3 import retract, to_camera
-from jaxslam_kernels.types import Mask, Pixels, Weights
+from jaxslam_kernels.se3 import to_camera
+from jaxslam_kernels.types import Mask, Pixels, Scalar, Weights
 from jaxtyping import Array, Int
 
 from jaxslam.dynamics.object_motion import labels_at
@@ -36,15 +36,13 @@ from jaxslam.tracking.conclusion import FrameEstimate, conclude
 from jaxslam.tracking.dynamic_rejection import FramePoints, reject_dynamic_points
 from jaxslam.tracking.initial_state import DEFAULT_PLAN, state_shapes
 from jaxslam.tracking.keyframe_ring import align_keyframe_points
+from jaxslam.tracking.motion_prediction import predict_pose
 from jaxslam.tracking.outcome import judge_frame
 from jaxslam.tracking.point_update import probation_weights, update_points
 from jaxslam.tracking.pose_estimation import coarse_pose, fits, measure_matches, refined_pose, worse_status
 from jaxslam.tracking.state import TrackOutput, TrackParams, TrackPlan, TrackState
-from jaxslam.tracking.step_checks import check_cues, check_followed, check_state, check_step
+from jaxslam.tracking.step_checks import check_cues, check_followed, check_pose, check_state, check_step
 from jaxslam.tracking.step_context import StepContext
-
-_MAX_PREDICTION_S = 0.1
-"""A constant velocity says nothing about longer gaps."""
 
 
 class FlowResult(NamedTuple):
@@ -52,7 +50,7 @@ class FlowResult(NamedTuple):
 
     Attributes:
         pyramid: Image pyramid of the frame.
-        predicted: Pose of the camera predicted by constant velocity.
+        predicted: Predicted pose of the camera.
         uv: `(2, n)` positions of the points in the frame, pixels.
         ok: `(n,)` mask of the points that were found.
     """
@@ -64,7 +62,12 @@ class FlowResult(NamedTuple):
 
 
 def track_step(
-    state: TrackState, frame: FrameArrays, params: TrackParams, plan: TrackPlan = DEFAULT_PLAN
+    state: TrackState,
+    frame: FrameArrays,
+    params: TrackParams,
+    plan: TrackPlan = DEFAULT_PLAN,
+    *,
+    predicted: SE3 | None = None,
 ) -> tuple[TrackState, TrackOutput]:
     """Track one frame.
 
@@ -73,6 +76,8 @@ def track_step(
         frame: Image, depth and time of the frame.
         params: Camera and thresholds, traced.
         plan: Array sizes and search settings, static; the plan with which the state was made.
+        predicted: Pose of the camera from which points are tracked, such as that of wheel odometry; by default it is
+            predicted from the velocity.
 
     Returns:
         The new state and the output for the frame. A frame that cannot be used is not an error: points and pose stay,
@@ -86,11 +91,22 @@ def track_step(
     """
     _check(state, frame, params, plan)
     check_cues(state, frame, params, plan)  # here too: before anything is computed where nothing is traced
-    return track_followed(state, frame, follow_points(state, frame, params, plan), params, plan)
+    flow = follow_points(state, frame, params, plan, predicted=predicted)
+    return track_followed(state, frame, flow, params, plan)
+
+
+def predicted_pose(state: TrackState, dt_s: Scalar) -> SE3:
+    """Predict the pose of the camera a time after the frame before, in seconds, from its velocity."""
+    return predict_pose(state.T_world_cam, state.twist, state.velocity, state.elapsed_s + dt_s)
 
 
 def follow_points(
-    state: TrackState, frame: FrameArrays, params: TrackParams, plan: TrackPlan = DEFAULT_PLAN
+    state: TrackState,
+    frame: FrameArrays,
+    params: TrackParams,
+    plan: TrackPlan = DEFAULT_PLAN,
+    *,
+    predicted: SE3 | None = None,
 ) -> FlowResult:
     """Track the points of the state into a frame by optical flow: the first part of `track_step`.
 
@@ -101,6 +117,7 @@ def follow_points(
         frame: Image and time of the frame; the values of depth, `ignore` and `movable` may still change afterward.
         params: Camera and thresholds, traced; the parameters of cues may be missing.
         plan: Array sizes and search settings, static.
+        predicted: Pose of the camera from which points are tracked; by default it is predicted from the velocity.
 
     Raises:
         ValueError: In the same cases as `track_step`.
@@ -109,10 +126,10 @@ def follow_points(
     _check(state, frame, params, plan)
     params = _for_readout(params, frame)
     height, width = frame.image.shape
-    elapsed_s = state.elapsed_s + frame.dt_s
     pyramid = build_pyramid(frame.image, num_levels=plan.num_levels, dtype=state.twist.dtype)
-    # Constant velocity.
-    predicted = retract(state.T_world_cam, state.twist * jnp.clip(elapsed_s, 0, _MAX_PREDICTION_S))
+    if predicted is None:
+        predicted = predicted_pose(state, frame.dt_s)
+    check_pose("predicted", predicted)
     points = state.points
     before = predict_pixels(to_camera(state.T_world_cam, points.X_world), state.twist, height, params.sensor)
     after = predict_pixels(to_camera(predicted, points.X_world), state.twist, height, params.sensor)
