@@ -12,6 +12,7 @@ from jaxslam_kernels.types import Pixels, Points, Weights
 from jaxtyping import Float, Float32, Float64, Int, Int64
 
 from jaxslam.features.orb import FeaturePlan, Features
+from jaxslam.geometry.se3 import to_local
 from jaxslam.geometry.types import Pose
 from jaxslam.runtime.compiled import compiled
 from jaxslam.runtime.compiler_options import FAST_COMPILE
@@ -19,17 +20,10 @@ from jaxslam.runtime.padding import padded
 from jaxslam.sensors.measurement import depth_sigma
 from jaxslam.sensors.sensor_model import SensorModel
 
-MIN_INLIERS = 30
-"""Minimum number of features that agree with the final pose."""
-MIN_SHARE = 0.5
-"""Their minimum share of the features matched at the predicted positions."""
-MIN_CELLS = 12
-"""Minimum number of image cells they must cover. With 8, one of 900 pairs of images of one room came out 0.5 m wrong: a
-small part of the image may show an object that exists twice."""
+_MIN_SHARE = 0.5
+"""Minimum share of the matches that agree with the final pose."""
 _CELL = 0.15
 """Side of such a cell in focal lengths, 9 degrees: 48 cells in an image of 640 x 480 pixels and focal length 525."""
-MAX_SIGMA_M = 0.03
-"""Largest standard deviation of the position in any direction, in meters."""
 _SIGMA_PX = 1.0
 """Standard deviation of each coordinate of a feature of octave 0."""
 _MAX_STEPS = 100
@@ -58,6 +52,26 @@ class Matches(NamedTuple):
     weight: Weights
 
 
+class PoseGates(NamedTuple):
+    """What a pose must meet to be believed.
+
+    Attributes:
+        min_inliers: Minimum number of matches that agree with it.
+        min_cells: Minimum number of image cells that these cover.
+        max_sigma: Largest standard deviation of the position in any direction, as a share of the median depth of the
+            matches that agree.
+    """
+
+    min_inliers: int
+    min_cells: int
+    max_sigma: float
+
+
+PLACE_GATES = PoseGates(min_inliers=30, min_cells=12, max_sigma=0.0075)
+"""Those of a place that may be anywhere. With 8 cells, one of 900 pairs of images of one room came out 0.5 m wrong: a
+small part of the image may show an object that exists twice. The deviation is 3 cm where points are 4 m away."""
+
+
 class FeaturePose(NamedTuple):
     """Pose that enough matches agree with.
 
@@ -67,12 +81,22 @@ class FeaturePose(NamedTuple):
             does not include errors that the features have in common.
         agree: Indices of the inlier matches.
         share: Share of the matches that are inliers.
+        num_cells: Number of image cells that the inliers cover.
+        sigma: Largest standard deviation of the position in any direction, as a share of the median depth of the
+            inliers.
     """
 
     T_origin_cam: Pose
     covariance: Float64[np.ndarray, "6 6"]
     agree: Int64[np.ndarray, " k"]
     share: float
+    num_cells: int
+    sigma: float
+
+    def meets(self, gates: PoseGates) -> bool:
+        """Tell whether the pose can be believed."""
+        enough = len(self.agree) >= gates.min_inliers and self.num_cells >= gates.min_cells
+        return enough and self.share >= _MIN_SHARE and self.sigma <= gates.max_sigma
 
 
 def matches_of(
@@ -113,10 +137,7 @@ def fit_pose(
     T_origin_cam: Pose,
     matches: Matches,
     sensor: SensorModel,
-    *,
-    min_inliers: int | None = None,
-    min_cells: int | None = None,
-    max_sigma_m: float | None = None,
+    gates: PoseGates = PLACE_GATES,
 ) -> FeaturePose | None:
     """Fit a pose to matches; `None` if too few agree, cover too small a part of the image, or leave it too uncertain.
 
@@ -124,19 +145,14 @@ def fit_pose(
         T_origin_cam: `(7,)` approximate pose to start from.
         matches: Points matched with features.
         sensor: Camera, of which ideal pixels leave the pinhole, and the error model of its depth.
-        min_inliers: Minimum number of inlier matches; `MIN_INLIERS` by default.
-        min_cells: Minimum number of image cells the inliers cover; `MIN_CELLS` by default.
-        max_sigma_m: Largest standard deviation of the position in any direction, meters; `MAX_SIGMA_M` by default.
+        gates: What the pose must meet.
     """
-    min_inliers = MIN_INLIERS if min_inliers is None else min_inliers
-    min_cells = MIN_CELLS if min_cells is None else min_cells
-    max_sigma_m = MAX_SIGMA_M if max_sigma_m is None else max_sigma_m
     refined: PoseRefinement = jax.device_get(_refined(SE3(jnp.asarray(T_origin_cam, jnp.float32)), matches, sensor))
     used = np.asarray(matches.weight) > 0
     gate = np.where(np.asarray(matches.depth) > 0, _CHI2_GATES[1], _CHI2_GATES[0])
     agree = np.flatnonzero(used & (np.asarray(refined.chi2) < gate))
     share = len(agree) / max(np.count_nonzero(used), 1)
-    if refined.status != PoseStatus.OK or len(agree) < min_inliers or share < MIN_SHARE:
+    if refined.status != PoseStatus.OK or not len(agree):
         return None
     pose = np.asarray(refined.T_world_cam.wxyz_xyz, np.float64)
     pose[:4] /= np.linalg.norm(pose[:4])
@@ -144,9 +160,10 @@ def fit_pose(
     covariance = np.asarray(refined.covariance, np.float64) * max(float(refined.residual_scale), 1.0) ** 2
     covariance = 0.5 * (covariance + covariance.T)
     sigma_m = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
-    if _cells(np.asarray(matches.uv)[:, agree], sensor) < min_cells or sigma_m > max_sigma_m:
-        return None
-    return FeaturePose(pose, covariance, agree, share)
+    depth_m = np.median(to_local(pose, np.asarray(matches.X, np.float64)[:, agree])[2])
+    num_cells = _cells(np.asarray(matches.uv)[:, agree], sensor)
+    found = FeaturePose(pose, covariance, agree, share, num_cells, float(sigma_m / depth_m))
+    return found if found.meets(gates) else None
 
 
 def matches_depth_sigma(matches: Matches, sensor: SensorModel) -> Weights:

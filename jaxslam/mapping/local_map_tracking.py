@@ -8,7 +8,7 @@ from collections.abc import Set
 import numpy as np
 
 from jaxslam.features.orb import FeaturePlan, Features
-from jaxslam.features.pose_from_matches import FeaturePose, fit_pose, matches_of
+from jaxslam.features.pose_from_matches import FeaturePose, PoseGates, fit_pose, matches_of
 from jaxslam.geometry.se3 import angle, between, compose, displacement, retract, to_local
 from jaxslam.geometry.types import Ids, Pose
 from jaxslam.map.point_records import has, observations_at, rows
@@ -24,10 +24,10 @@ _IN_VIEW = 5
 """Number of further keyframes that show most of what is in view, whatever their age."""
 _NEAR_M, _NEAR_RAD = 0.15, 0.15
 """Maximum distance of the result from the approximate pose, in meters and radians."""
-_MIN_INLIERS, _MIN_CELLS = 15, 2
-"""Minimum number of inliers, and of image cells they cover. Place recognition needs more, because an object may exist
-twice; here the camera pose is known approximately, and a person may leave little of the view. In Bonn's `crowd`, 15 of
-15 points agree in two cells beside someone: alone they tell a position to 0.28 m."""
+_GATES = PoseGates(min_inliers=15, min_cells=2, max_sigma=np.inf)
+"""Place recognition needs more, because an object may exist twice; here the camera pose is known approximately, and a
+person may leave little of the view. In Bonn's `crowd`, 15 of 15 points agree in two cells beside someone: alone they
+tell a position to 0.28 m."""
 _PRIOR_INFORMATION = np.diag(np.repeat([_NEAR_M / 3, _NEAR_RAD / 3], 3) ** -2.0)
 """Inverse covariance of the approximate pose: three standard deviations are the farthest that the result may be off."""
 RADII_PX = (15.0, 5.0)
@@ -125,14 +125,7 @@ def match_local_map(
         if states is not None:
             counts = counts * states.weights(slam_map, points.ids[index])
         matches = matches_of(X, better_known, features, feature, plan, weight=counts)
-        found = fit_pose(
-            T_keyframe_cam,
-            matches,
-            sensor,
-            min_inliers=_MIN_INLIERS,
-            min_cells=_MIN_CELLS,
-            max_sigma_m=np.inf,
-        )
+        found = fit_pose(T_keyframe_cam, matches, sensor, _GATES)
         if found is None:
             return None
         found = _with_prior(found, T_first)

@@ -81,8 +81,19 @@ def own_copy(arrays: FrameArrays) -> FrameArrays:
     return FrameArrays(*copies)
 
 
+class _Buffers(NamedTuple):
+    """Memory of the arrays of one frame."""
+
+    image: np.ndarray
+    depth: np.ndarray
+    ignore: np.ndarray
+    right: np.ndarray | None
+    movable: np.ndarray | None
+    matched: np.ndarray | None
+
+
 class FrameMemory:
-    """Reusable buffers for the arrays of one frame, overwritten by each frame.
+    """Reusable buffers for the arrays of the current frame, and of the last one that was kept.
 
     XLA computes on them without a copy: see `aligned_array`.
     """
@@ -96,45 +107,66 @@ class FrameMemory:
             pairs: Whether to hold right images.
             movable: Whether to hold the numbers of movable objects.
         """
-        self._movable = aligned_array((height, width), np.uint8) if movable else None
-        self._right = aligned_array((height, width), np.uint8) if pairs else None
-        self._image, self._depth = aligned_array((height, width), np.uint8), aligned_array((height, width), np.float32)
-        self._ignore, self._nothing = (aligned_array((height, width), np.bool_) for _ in range(2))
+        size = (height, width)
+        self._now, self._kept = (
+            _Buffers(
+                aligned_array(size, np.uint8),
+                aligned_array(size, np.float32),
+                aligned_array(size, np.bool_),
+                aligned_array(size, np.uint8) if pairs else None,
+                aligned_array(size, np.uint8) if movable else None,
+                aligned_array(size, np.float32) if pairs else None,
+            )
+            for _ in range(2)
+        )
+        self._nothing = aligned_array(size, np.bool_)
         self._nothing[:] = False
 
     def hold(self, frame: Frame, dt_s: float, *, depth_follows: bool = False) -> FrameArrays:
-        """Return the arrays of a frame as `frame_arrays` does; they are valid until the next call.
+        """Return the arrays of a frame as `frame_arrays` does.
+
+        They are valid until the next call, or after `keep` until the next call after the next `keep`.
 
         Args:
             frame: The frame.
             dt_s: Time since the previous frame in seconds.
             depth_follows: Whether the frame has no depth yet; that of the arrays must be replaced before it is read.
         """
-        to_gray(frame.image, out=self._image)
+        now = self._now
+        to_gray(frame.image, out=now.image)
         if not depth_follows:
-            np.copyto(self._depth, _depth(frame))
-        right = None if self._right is None or frame.right is None else to_gray(frame.right, out=self._right)
+            np.copyto(now.depth, _depth(frame))
+        right = None if now.right is None or frame.right is None else to_gray(frame.right, out=now.right)
         ignore = self._nothing
         if frame.dynamic_mask is not None:
-            ignore = self._ignore
+            ignore = now.ignore
             np.copyto(ignore, frame.dynamic_mask)
-        if self._movable is not None:
-            self._movable[:] = 0
+        if now.movable is not None:
+            now.movable[:] = 0
         times, sign = _times(frame, dt_s, np.float32), _readout_sign(frame, np.float32)
-        arrays: Any = (self._image, self._depth, ignore, *times, right, self._movable, sign)
+        arrays: Any = (now.image, now.depth, ignore, *times, right, now.movable, sign)
         return FrameArrays(*arrays)
+
+    def keep(self) -> None:
+        """Keep the arrays of the current frame valid until another frame is kept."""
+        self._now, self._kept = self._kept, self._now
+
+    @property
+    def matched_depth(self) -> np.ndarray | None:
+        """`(h, w)` buffer for the depth of the current pair, which no array of `hold` shares; `None` without pairs."""
+        return self._now.matched
 
     def with_movable(self, arrays: FrameArrays, labels: np.ndarray) -> FrameArrays:
         """Return the current arrays with the numbers `(h, w)` of movable objects."""
-        assert self._movable is not None
-        np.copyto(self._movable, labels)
-        movable: Any = self._movable
+        movable: Any = self._now.movable
+        assert movable is not None
+        np.copyto(movable, labels)
         return arrays._replace(movable=movable)
 
     def ignoring(self, arrays: FrameArrays, mask: np.ndarray) -> FrameArrays:
         """Return the current arrays with pixels ignored where `mask` `(h, w)` is true."""
-        np.copyto(self._ignore, mask)
-        ignore: Any = self._ignore
+        ignore: Any = self._now.ignore
+        np.copyto(ignore, mask)
         return arrays._replace(ignore=ignore)
 
 

@@ -13,12 +13,12 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam.config.schema import Config
+from jaxslam.features.view_matching import ViewPose, compile_view_matching
 from jaxslam.geometry.se3 import IDENTITY, compose
 from jaxslam.geometry.types import Pose
 from jaxslam.loop_closing.essential_graph import GraphCompiler
 from jaxslam.loop_closing.loop_detector import LoopClosing, LoopClosure
 from jaxslam.loop_closing.place_index import PlaceIndex
-from jaxslam.loop_closing.place_recognition import compile_recognition
 from jaxslam.map.dynamic_removal import DynamicObservations
 from jaxslam.map.point_records import NONE
 from jaxslam.map.types import Map, empty_map
@@ -165,7 +165,7 @@ class BackEnd:
             import_scipy,
             partial(self._writer.compile, frame, self._num_tracks),
             partial(self._link.compile, state, drops_points=self._semantics is not None),
-            partial(compile_recognition, self._sensor, self._plan.features),
+            partial(compile_view_matching, self._sensor, self._plan.features),
         ]
         if frame.right is None:
             steps.append(FrameDepth(np.zeros(6, np.float32), frame, self._sensor).compile)
@@ -264,6 +264,10 @@ class BackEnd:
             return None
         return self._states.see(self.map, anchored.keyframe, anchored.T_keyframe_cam, np.asarray(output.twist), arrays)
 
+    def motion_to(self, arrays: FrameArrays, T_last_cam: Pose) -> ViewPose | None:
+        """Return the pose of a lost frame in the axes of the last tracked one; see `FrameLocalizer.motion_to`."""
+        return self._localizer.motion_to(arrays, T_last_cam)
+
     def relocalize(self, arrays: FrameArrays, predicted: Pose | None) -> tuple[LocalizedPose | None, bool]:
         """Localize a lost frame in the map; see `FrameLocalizer.relocalize`."""
         return self._localizer.relocalize(arrays, predicted)
@@ -277,9 +281,18 @@ class BackEnd:
             twist: `(6,)` velocity of the camera in its own axes, m/s, then rad/s; 0 if it is not known.
         """
         self._link.set_reference_keyframe(recognized.keyframe)
-        pose = self._link.pose(recognized)
-        state = self._link.reset_at_pose(state, pose, twist)
-        self._reloads.replace(self._searches.reload(Reload(self.map, pose, self._link.submap_now())).keyframes)
+        return self.reset_after_motion(state, self._link.pose(recognized), twist)
+
+    def reset_after_motion(self, state: TrackState, T_world_cam: Pose, twist: Float[np.ndarray, "6"]) -> TrackState:
+        """Return the tracker's state reset to a pose relative to the reference keyframe, with keyframes around loaded.
+
+        Args:
+            state: State of the tracker.
+            T_world_cam: `(7,)` pose of the camera.
+            twist: `(6,)` velocity of the camera in its own axes, m/s, then rad/s.
+        """
+        state = self._link.reset_at_pose(state, T_world_cam, twist)
+        self._reloads.replace(self._searches.reload(Reload(self.map, T_world_cam, self._link.submap_now())).keyframes)
         return self._reloads.load_all(state)
 
     def start_submap(self, state: TrackState, T_world_cam: Pose) -> TrackState:
@@ -292,10 +305,11 @@ class BackEnd:
 
         Args:
             tracked: Result of the frame.
-            arrays: The frame; copied where it is needed.
+            arrays: The frame, which must not change until another one is tracked.
             frame: Number of the frame.
         """
         T_world_cam = tracked.T_world_cam
+        self._localizer.frame_tracked(arrays, tracked.twist)
         if not self._localize_only:
             self.map_views = self._coverage.num_views(self.map, T_world_cam, self._link.submap_now())
         if frame % _RELOAD_EVERY == 0:

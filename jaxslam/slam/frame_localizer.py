@@ -2,11 +2,14 @@
 
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jaxlie import SE3
+from jaxtyping import Float
 
 from jaxslam.features.orb import FeaturePlan, Features, features_of
-from jaxslam.features.pose_from_matches import MIN_INLIERS
+from jaxslam.features.pose_from_matches import PLACE_GATES, PoseGates
+from jaxslam.features.view_matching import ViewPose, match_views, match_views_near
 from jaxslam.geometry.se3 import compose, inverse, transform
 from jaxslam.geometry.types import Pose
 from jaxslam.loop_closing.place_index import PlaceIndex
@@ -21,6 +24,8 @@ from jaxslam.tracking.state import TrackOutput, TrackReason, TrackState, TrackSt
 
 _PATIENCE_S = 0.02
 """Longest wait for the lock of the place index while lost; the next frame tries again."""
+_MOTION_GATES = PoseGates(min_inliers=20, min_cells=8, max_sigma=0.0125)
+"""Fewer than of a place: optical flow goes on from there, and finds out whether it is right."""
 
 
 class LocalizedPose(NamedTuple):
@@ -62,7 +67,7 @@ def _output_at_pose(
 
 
 class FrameLocalizer:
-    """Localizes frames in the map as the tracker knows it.
+    """Localizes frames in the map as the tracker knows it, and relative to the last frame that was tracked.
 
     Attributes:
         features: Features of the current frame; `None` until `match_tracked` has extracted them.
@@ -88,10 +93,41 @@ class FrameLocalizer:
         self._sensor, self._plan, self._link = sensor, plan, link
         self._index, self._states = index, states
         self.features: Features | None = None
+        self._of_lost: Features | None = None
+        self._last: tuple[FrameArrays, Float[np.ndarray, 6]] | None = None
+        self._of_last: Features | None = None
 
     def begin_frame(self) -> None:
         """Forget the features of the frame before."""
-        self.features = None
+        self.features = self._of_lost = None
+
+    def frame_tracked(self, arrays: FrameArrays, twist: Float[np.ndarray, "6"]) -> None:
+        """Keep a frame that was tracked.
+
+        Args:
+            arrays: The frame; it must not change until another one is tracked.
+            twist: `(6,)` velocity of the camera in its own axes, m/s, then rad/s.
+        """
+        self._last, self._of_last = (arrays, twist), None
+
+    def motion_to(self, arrays: FrameArrays, T_last_cam: Pose) -> ViewPose | None:
+        """Return the pose of a lost frame in the axes of the last tracked one; `None` if features do not tell.
+
+        Features are matched around where the predicted motion takes them, else wherever they are: for motion that is
+        too large for optical flow.
+
+        Args:
+            arrays: The frame.
+            T_last_cam: `(7,)` predicted pose of the frame in the axes of the last tracked one.
+        """
+        if self._last is None:
+            return None
+        if self._of_last is None:
+            self._of_last = features_of(*self._last, self._sensor, self._plan)
+        features = self._features_of_lost(arrays)
+        both, how = (self._of_last, features), {"plan": self._plan, "gates": _MOTION_GATES}
+        near = match_views_near(*both, T_last_cam, self._sensor, WIDE_RADII_PX, **how)
+        return near or match_views(*both, self._sensor, jax.random.key(0), **how)
 
     def match_tracked(
         self, state: TrackState, arrays: FrameArrays, output: TrackOutput, weak_inliers: float
@@ -126,13 +162,13 @@ class FrameLocalizer:
         Returns:
             The pose, or `None`; and whether place recognition searched the whole map and found no such place.
         """
-        features = features_of(arrays, np.zeros(6, np.float32), self._sensor, self._plan)
+        features = self._features_of_lost(arrays)
         if predicted is not None:
             for radii_px in (RADII_PX, WIDE_RADII_PX):
                 near = self._in_local_map(features, predicted, radii_px)
                 if near is not None and self._fits_map(arrays, near):
                     return near, False
-        if np.count_nonzero(features.depth) < MIN_INLIERS:
+        if np.count_nonzero(features.depth) < PLACE_GATES.min_inliers:
             return None, False
         if not self._index.lock.acquire(timeout=_PATIENCE_S):
             return None, False
@@ -145,6 +181,12 @@ class FrameLocalizer:
         anchored = AnchoredPose(found.keyframe, found.T_keyframe_cam)
         there = LocalizedPose(anchored, found.num_inliers, found.covariance)
         return (there, False) if self._fits_map(arrays, there) else (None, True)
+
+    def _features_of_lost(self, arrays: FrameArrays) -> Features:
+        """Extract the features of the current frame, once, as of a camera at rest."""
+        if self._of_lost is None:
+            self._of_lost = features_of(arrays, np.zeros(6, np.float32), self._sensor, self._plan)
+        return self._of_lost
 
     def _fits_map(self, arrays: FrameArrays, found: LocalizedPose) -> bool:
         """Return whether the frame does not see through the map at a pose; without a depth image nothing tells."""

@@ -6,6 +6,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam.config.schema import Config
+from jaxslam.features.view_matching import ViewPose
+from jaxslam.geometry.se3 import IDENTITY, between, compose, displacement
 from jaxslam.sensors.frame_arrays import FrameArrays
 from jaxslam.slam.back_end import BackEnd
 from jaxslam.slam.frame_localizer import LocalizedPose
@@ -14,6 +16,7 @@ from jaxslam.slam.program_compiler import ProgramCompiler
 from jaxslam.slam.tracker import Tracker
 from jaxslam.slam.tracker_map_sync import AnchoredPose
 from jaxslam.tracking.state import TrackOutput, TrackReason, TrackStatus
+from jaxslam.tracking.step import FlowResult
 
 
 class LocalizedOutput(NamedTuple):
@@ -30,10 +33,23 @@ class LocalizedOutput(NamedTuple):
     recognized: AnchoredPose | None = None
 
 
+class TrackedAgain(NamedTuple):
+    """A lost frame that was tracked after all.
+
+    Attributes:
+        flow: Points followed into the frame.
+        output: Output of the tracker.
+    """
+
+    flow: FlowResult
+    output: TrackOutput
+
+
 class LocalizationStage:
     """Relocalizes frames that are lost, and matches frames that are weak with the local map.
 
-    The order of calls for a frame is `localize`, then `frame_tracked` or `frame_lost`.
+    The order of calls for a frame is `track_by_features` if it is lost, `localize`, then `frame_tracked` or
+    `frame_lost`.
     """
 
     def __init__(
@@ -53,6 +69,7 @@ class LocalizationStage:
         self._begins_submaps = config.run.on_loss == "submap" and not localize_only
         # Not as arrays of JAX: to compare with one would be compiled in the middle of a run.
         self._fastest = float(tracker.params.max_speed_m_per_s), float(tracker.params.max_turn_rad_per_s)
+        self._weak_inliers = config.track.weak_inliers
         self._motion = ConstantVelocity()
         self._any_tracked = self._was_lost = False
         self._unrecognized = 0
@@ -66,6 +83,37 @@ class LocalizationStage:
     def predicted(self) -> Float[np.ndarray, "7"]:
         """Predict the pose of the latest frame, from at most one second of constant velocity."""
         return self._motion.now()
+
+    def track_by_features(self, arrays: FrameArrays, flow: FlowResult) -> TrackedAgain | None:
+        """Track a lost frame again, from the motion since the last tracked frame that its features tell.
+
+        Args:
+            arrays: The frame.
+            flow: Points followed into the frame before, with the predicted pose.
+
+        Returns:
+            The points and the output; `None` if the frame stays lost.
+        """
+        if not self._any_tracked or not self._programs.can_map():
+            return None
+        last, back = self._tracker.last_pose(), self._back
+        found = back.motion_to(arrays, between(last, np.asarray(flow.predicted.wxyz_xyz, np.float64)))
+        if found is None:
+            return None
+        self._tracker.before(arrays)
+        elapsed_s = self._tracker.elapsed_s() + float(arrays.dt_s)
+        flow = self._tracker.follow(arrays, found.T_source_cam)
+        output = self._tracker.advance(arrays, flow, back.keyframe_demand, back.map_views, map_changed=back.map_changed)
+        if int(output.status) != TrackStatus.LOST:
+            return TrackedAgain(flow, output)
+        # Nearer points look too different for optical flow: a car at 5 m a frame has 15 of 150 that agree.
+        twist = displacement(IDENTITY, found.T_source_cam) / elapsed_s
+        if not self._is_plausible(twist):
+            return None
+        T_world_cam = compose(last, found.T_source_cam)
+        self._tracker.state = back.reset_after_motion(self._tracker.state, T_world_cam, twist)
+        flow = self._tracker.follow(arrays)
+        return TrackedAgain(flow, self._at_matched_pose(self._restarted(arrays, flow), found))
 
     def localize(self, arrays: FrameArrays, output: TrackOutput, dt_s: float) -> LocalizedOutput:
         """Relocalize a frame that is lost, or match one that is weak with the local map, if that is compiled yet.
@@ -131,15 +179,32 @@ class LocalizationStage:
         """Return the mean velocity since the last tracked frame; 0 if that is too long ago, or the place is another."""
         twist = self._motion.velocity_to(self._back.pose(recognized), dt_s)
         same_world = self._any_tracked and self._back.keyframe_submap(recognized.keyframe) == self._back.submap_now
-        plausible = (np.linalg.norm(twist.reshape(2, 3), axis=1) < self._fastest).all()
-        return twist if same_world and plausible else np.zeros(6)
+        return twist if same_world and self._is_plausible(twist) else np.zeros(6)
+
+    def _is_plausible(self, twist: Float[np.ndarray, "6"]) -> bool:
+        """Whether the camera may move at a velocity."""
+        return bool((np.linalg.norm(twist.reshape(2, 3), axis=1) < self._fastest).all())
 
     def _track_again(self, arrays: FrameArrays) -> TrackOutput:
         """Track the frame from the state that was just reset."""
-        output = self._tracker.advance(arrays, self._tracker.follow(arrays), self._back.keyframe_demand)
+        return self._restarted(arrays, self._tracker.follow(arrays))
+
+    def _restarted(self, arrays: FrameArrays, flow: FlowResult) -> TrackOutput:
+        output = self._tracker.advance(arrays, flow, self._back.keyframe_demand)
         if int(output.status) != TrackStatus.STARTED:
             self._tracker.await_relocalization()  # not to start by itself
         return output
+
+    def _at_matched_pose(self, output: TrackOutput, found: ViewPose) -> TrackOutput:
+        """Return the output of a frame whose pose is that of its features relative to the last frame."""
+        num_inliers = found.pairs.shape[1]
+        enough = num_inliers >= self._weak_inliers
+        return output._replace(
+            status=np.int32(TrackStatus.OK if enough else TrackStatus.WEAK),
+            reason=np.int32(TrackReason.NONE if enough else TrackReason.FEW_INLIERS),
+            covariance=found.covariance.astype(np.float32),
+            num_inliers=np.int32(num_inliers),
+        )
 
     @staticmethod
     def _relocalized(output: TrackOutput, found: LocalizedPose, lost: TrackOutput) -> LocalizedOutput:

@@ -12,7 +12,6 @@ from jaxslam.dynamics.point_mask import mask_around, moving_points
 from jaxslam.geometry.se3 import IDENTITY, retract
 from jaxslam.geometry.types import Pose
 from jaxslam.masks.depth_instances import InstanceFinder
-from jaxslam.runtime.aligned_memory import aligned_array
 from jaxslam.runtime.stage_timer import StageTimes
 from jaxslam.runtime.worker import Worker, make_worker
 from jaxslam.semantics import Detector
@@ -59,7 +58,6 @@ class MaskStage:
         self._memory, self._instances, self._times = memory, instances, times
         self._reach_px = config.dynamics.reach_px
         self._rough_depth = RoughDepth(camera) if camera.is_stereo else None
-        self._depth = aligned_array((camera.height, camera.width), np.float32) if camera.is_stereo else None
         self._pipeline = _mask_pipeline(camera, config, detector, max_depth_m, times)
         self._found: FrameMask | None = None
         idle = self._pipeline is None and self._rough_depth is None
@@ -83,8 +81,8 @@ class MaskStage:
         """
         depth = np.asarray(arrays.depth)
         if frame.depth_m is None:
-            assert self._depth is not None
-            depth = self._depth
+            assert self._memory.matched_depth is not None
+            depth = self._memory.matched_depth
             self._worker.submit(("match pair", partial(self._match_pair, frame, depth)), number)
         self._worker.submit(("masks", partial(self._find_mask, number, frame, arrays, depth, correction)), number)
 
@@ -103,7 +101,7 @@ class MaskStage:
         self._worker.flush()
         assert self._found is not None
         if frame.depth_m is None:
-            depth: Any = self._depth
+            depth: Any = self._memory.matched_depth
             arrays = arrays._replace(depth=depth)
         return self._with_ignored(arrays, self._found.mask, frame.dynamic_mask), self._found
 

@@ -210,13 +210,17 @@ class Slam:
         arrays, mask = self._masks.result(frame, arrays)
         watch.ends("wait for mask")
 
-        # 4. Pose: dynamic cues, RANSAC PnP and refinement; what was found moving joins the mask.
+        # 4. Pose: dynamic cues, RANSAC PnP and refinement.
         back = self._back
         output = self._tracker.advance(arrays, flow, back.keyframe_demand, back.map_views, map_changed=back.map_changed)
-        arrays, mask = self._masks.exclude_moving(arrays, mask, flow, output)
         watch.ends("pose")
 
-        # 5. Relocalize a lost frame, or match a weak one with the local map.
+        # 5. Match features of a lost frame with the last one, or relocalize it; match a weak one with the local map.
+        again = self._localization.track_by_features(arrays, flow) if int(output.status) == TrackStatus.LOST else None
+        if again is not None:
+            flow, output = again
+        if int(output.status) != TrackStatus.LOST:  # cues go by a wrong motion while the pose is not known
+            arrays, mask = self._masks.exclude_moving(arrays, mask, flow, output)
         output, num_matched, recognized = self._localization.localize(arrays, output, dt_s)
         lost = int(output.status) == TrackStatus.LOST
         share = None if lost else self._back.update_occlusion(arrays, output)
@@ -403,6 +407,7 @@ class Slam:
         depth_delay_s = float(arrays.depth_delay_s)
         self._masks.frame_tracked(self._frame, time_s, tracked.T_world_cam, tracked.twist, depth_delay_s)
         self._localization.frame_tracked(tracked.T_world_cam, tracked.twist)
+        self._memory.keep()
         self._back.frame_tracked(tracked, arrays, self._frame)
         anchored = self._back.anchor(tracked.T_world_cam)
         self._history.add(tracked.timestamp_ns, tracked.T_world_cam, anchored, in_map_frame=tracked.in_map_frame)

@@ -7,8 +7,14 @@ from enum import Enum
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxlie import SE3
+from jaxslam_kernels.se3 import compose
+from jaxslam_kernels.types import Flag
+from jaxtyping import Array, Float
 
 from jaxslam.config.schema import Config
+from jaxslam.geometry.se3 import IDENTITY
+from jaxslam.geometry.types import Pose
 from jaxslam.runtime.compiled import committed, compiled, lower
 from jaxslam.runtime.compiler_options import FAST_COMPILE, SINGLE_THREAD
 from jaxslam.runtime.garbage import collector_paused
@@ -18,7 +24,7 @@ from jaxslam.tracking.cue_registry import with_cue_params, with_cues
 from jaxslam.tracking.from_config import track_params, track_plan, with_dense_keyframes
 from jaxslam.tracking.initial_state import init_state
 from jaxslam.tracking.state import TrackOutput, TrackParams, TrackPhase, TrackPlan, TrackState
-from jaxslam.tracking.step import FlowResult, follow_points, track_followed
+from jaxslam.tracking.step import FlowResult, follow_points, predicted_pose, track_followed
 
 _PATIENT_S = 0.5
 """Seconds from one keyframe to the next for want of points, while mapping is behind. With the preset `ngd` at the rate
@@ -26,7 +32,20 @@ of the camera there was one every tenth of a second, and the threads held each o
 _ALL_IS_NEW = 2.0
 """More than the whole of a keyframe's points: a frame that shows them all is kept too."""
 
-_follow_points = compiled(when="warm-up", static="plan", options=FAST_COMPILE | SINGLE_THREAD)(follow_points)
+
+@compiled(when="warm-up", static="plan", options=FAST_COMPILE | SINGLE_THREAD)
+def _follow_points(
+    state: TrackState,
+    frame: FrameArrays,
+    T_last_cam: Float[Array, "7"],
+    known: Flag,
+    params: TrackParams,
+    plan: TrackPlan,
+) -> FlowResult:
+    """Follow points from a motion since the last frame, or where that is not known, from the velocity."""
+    own, given = predicted_pose(state, frame.dt_s), compose(state.T_world_cam, SE3(T_last_cam))
+    predicted = SE3(jnp.where(known, given.wxyz_xyz, own.wxyz_xyz))
+    return follow_points(state, frame, params, plan, predicted=predicted)
 
 
 @compiled(when="warm-up", static="plan", donate="state", options=FAST_COMPILE)
@@ -112,14 +131,37 @@ class Tracker:
         # takes longer: it is lowered before, as Python traces one program at a time.
         with collector_paused(), ThreadPoolExecutor(1, thread_name_prefix="jaxslam-compile-flow") as beside:
             lower(_track_followed, state, frame, followed, self.params, self.plan)
-            flow = beside.submit(_follow_points, other, frame, self.params, self.plan)
+            motion = IDENTITY.astype(np.float32), np.bool_(False)
+            flow = beside.submit(_follow_points, other, frame, *motion, self.params, self.plan)
             beside.submit(gc.collect)  # while XLA compiles the step; the second frame would wait for it, 0.2 s
             jax.block_until_ready(_track_followed(state, frame, followed, self.params, self.plan))
             jax.block_until_ready(flow.result())
 
-    def follow(self, frame: FrameArrays) -> FlowResult:
-        """Follow the points of the state into a frame by optical flow."""
-        return _follow_points(self.state, frame, self.params, self.plan)
+    def follow(self, frame: FrameArrays, T_last_cam: Pose | None = None) -> FlowResult:
+        """Follow the points of the state into a frame by optical flow.
+
+        Args:
+            frame: The frame.
+            T_last_cam: `(7,)` pose of the camera in the axes of the last tracked frame, from which points are followed;
+                predicted from the velocity if it is not known.
+        """
+        motion = (IDENTITY if T_last_cam is None else T_last_cam).astype(np.float32)
+        return _follow_points(self.state, frame, motion, np.bool_(T_last_cam is not None), self.params, self.plan)
+
+    def last_pose(self) -> Pose:
+        """Return the pose `(7,)` of the last tracked frame."""
+        return np.asarray(self.state.T_world_cam.wxyz_xyz, np.float64)
+
+    def elapsed_s(self) -> float:
+        """Return the time since the last tracked frame, in seconds."""
+        return float(np.asarray(self.state.elapsed_s))
+
+    def before(self, frame: FrameArrays) -> None:
+        """Go back in time to before a frame that was lost, so that it can be tracked again."""
+        dt_s, devices = np.float32(frame.dt_s), self.state.twist.devices()
+        times = (self.state.elapsed_s, self.state.since_keyframe_s)
+        elapsed_s, since_keyframe_s = (jax.device_put(np.asarray(time) - dt_s, *devices) for time in times)
+        self.state = self.state._replace(elapsed_s=elapsed_s, since_keyframe_s=since_keyframe_s)
 
     def advance(
         self,

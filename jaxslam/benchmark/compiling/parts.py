@@ -12,8 +12,8 @@ from jaxslam.config.loading import load_config
 from jaxslam.config.schema import Config
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.dense.dense_map import DenseMap
+from jaxslam.features.view_matching import compile_view_matching
 from jaxslam.loop_closing.essential_graph import compile_graph
-from jaxslam.loop_closing.place_recognition import compile_recognition
 from jaxslam.mapping.local_mapping import LocalMapping, mapping_plan
 from jaxslam.runtime.compiler_options import FAST_COMPILE
 from jaxslam.sensors.camera import Camera
@@ -98,7 +98,7 @@ def _loop_closing(scene: Scene) -> Compile:
 
     def compile_both() -> None:
         compile_graph()
-        compile_recognition(sensor, plan.features)
+        compile_view_matching(sensor, plan.features)
 
     return compile_both
 

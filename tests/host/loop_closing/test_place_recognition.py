@@ -13,10 +13,11 @@ from scipy.spatial.transform import Rotation, Slerp
 from jaxslam.config.schema import TrackConfig
 from jaxslam.datasets import Dataset, open_dataset
 from jaxslam.features import pose_from_matches as feature_pose
+from jaxslam.features import view_matching
 from jaxslam.features.orb import Features, features_of
-from jaxslam.features.pose_from_matches import MAX_SIGMA_M, MIN_INLIERS
+from jaxslam.features.pose_from_matches import PLACE_GATES
+from jaxslam.features.view_matching import match_views
 from jaxslam.geometry.se3 import angle, between
-from jaxslam.loop_closing import place_recognition
 from jaxslam.loop_closing.place_index import PlaceIndex
 from jaxslam.loop_closing.place_recognition import Recognition, recognize, verify
 from jaxslam.map.edit import with_keyframe
@@ -26,6 +27,8 @@ from jaxslam.map.types import Keyframe, Map, empty_map
 from jaxslam.sensors.frame_arrays import frame_arrays
 from jaxslam.sensors.sensor_model import sensor_model
 
+ROOM_DEPTH_M = 4.0
+"""At most, of the median point of a view."""
 ROUND = range(0, FRAMES, 120)
 
 
@@ -163,9 +166,9 @@ def test_recognizes_places_of_the_room(round_map, round_index):
         meters, radians = error(round_map, found, room().T_world_cam[index])
         assert meters < 0.01
         assert radians < np.radians(0.4)
-        assert found.num_inliers == found.pairs.shape[1] >= MIN_INLIERS
+        assert found.num_inliers == found.pairs.shape[1] >= PLACE_GATES.min_inliers
         np.testing.assert_array_equal(found.covariance, found.covariance.T)
-        assert 0 < np.linalg.eigvalsh(found.covariance[:3, :3])[-1] <= MAX_SIGMA_M**2
+        assert 0 < np.linalg.eigvalsh(found.covariance[:3, :3])[-1] <= (PLACE_GATES.max_sigma * ROOM_DEPTH_M) ** 2
         assert meters**2 < 25 * found.covariance[:3, :3].trace()
     near = [recognize(round_map, round_index, features(index + 10), sensor()) for index in ROUND]
     assert [found.keyframe for found in near if found is not None] == round_map.ids.tolist()
@@ -197,7 +200,7 @@ def test_another_room_is_not_recognized(round_map, round_index):
             assert recognize(round_map, round_index, features(index, seed), sensor()) is None
 
 
-def test_too_little_to_be_certain(round_map, monkeypatch):
+def test_too_little_to_be_certain(round_map):
     """The same picture, but only what lies in a corner of it, or only a few features, or none with depth."""
     keyframe, whole = round_map.keyframes[0], features(0)
     assert verify(keyframe, whole, sensor()) is not None
@@ -205,19 +208,23 @@ def test_too_little_to_be_certain(round_map, monkeypatch):
         *(array[..., index] if array.ndim < 2 or len(array) == 2 else array[index] for array in whole)
     )
     corner = np.flatnonzero((whole.uv[0] < 240) & (whole.uv[1] < 200))
-    assert len(corner) > 2 * MIN_INLIERS
+    assert len(corner) > 2 * PLACE_GATES.min_inliers
     for index in (corner, np.arange(0, 1000, 40), np.arange(0)):
         assert verify(keyframe, take(index), sensor()) is None
     flat = keyframe._replace(features=keyframe.features._replace(depth=np.zeros_like(whole.depth)))
     assert verify(flat, whole, sensor()) is None
-    for gates, certain in (((12, 1.0), False), ((1, 0.03), False), ((1, 1.0), True)):  # each alone refuses the corner
-        monkeypatch.setattr(feature_pose, "MIN_CELLS", gates[0])
-        monkeypatch.setattr(feature_pose, "MAX_SIGMA_M", gates[1])
-        assert (verify(keyframe, take(corner), sensor()) is not None) == certain
+    few, anywhere = PLACE_GATES._replace(min_cells=1), PLACE_GATES._replace(max_sigma=1.0)
+    for gates, certain in (
+        (anywhere, False),
+        (few, False),
+        (few._replace(max_sigma=1.0), True),
+    ):  # each alone refuses it
+        matched = match_views(keyframe.features, take(corner), sensor(), jax.random.key(0), gates=gates)
+        assert (matched is not None) == certain
 
 
 def test_compiles_once(round_map, monkeypatch):
-    for module, name in ((place_recognition, "_agreed"), (feature_pose, "_refined")):
+    for module, name in ((view_matching, "_agreed"), (feature_pose, "_refined")):
         monkeypatch.setattr(
             module, name, jax.jit(eqx.debug.assert_max_traces(getattr(module, name).__wrapped__, max_traces=1))
         )

@@ -13,10 +13,11 @@ from wall_map import BEHIND, POINTS, at, seen_from
 
 from jaxslam.config.schema import Config
 from jaxslam.features.orb import Features, features_of
-from jaxslam.features.pose_from_matches import MIN_CELLS
+from jaxslam.features.pose_from_matches import PLACE_GATES
 from jaxslam.geometry.se3 import IDENTITY, angle, between, compose, inverse, retract
 from jaxslam.map.point_records import observations_at
 from jaxslam.map.types import Map, empty_map
+from jaxslam.mapping import local_map_tracking
 from jaxslam.mapping.local_map_tracking import (
     RADII_PX,
     WIDE_RADII_PX,
@@ -245,7 +246,8 @@ class TestFewFeatures:
         assert off_m < 3 * sigma_m
 
     def test_fewer_are_not_enough_to_recognize_a_place(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("jaxslam.mapping.local_map_tracking._MIN_CELLS", MIN_CELLS)
+        gates = local_map_tracking._GATES._replace(min_cells=PLACE_GATES.min_cells)
+        monkeypatch.setattr(local_map_tracking, "_GATES", gates)
         assert match(mapped()[0], LATER, np.zeros(6), self.within(78, 60, 1000))[0] is None
 
     @pytest.mark.parametrize(("width", "height", "at_most"), [(24, 16, 1000), (320, 240, 14)])

@@ -456,7 +456,7 @@ class TestFailure:
 
     @pytest.mark.parametrize("new_points", ["always", "keyframes"])
     def test_all_is_always_masked(self, new_points: Any) -> None:
-        """Nothing is left of the map; tracking goes on by what has just come, or is lost again and again."""
+        """Nothing is left of the map; tracking goes on by what has just come, or by the features of the last frame."""
         with Slam(source().camera, with_points_in(new_points), detector=everything) as slam:
             results = track(slam)
             slam.finish()
@@ -465,8 +465,7 @@ class TestFailure:
             assert problems(slam.map) == []
             assert np.isfinite(slam.trajectory.T_world_cam).all()
         statuses = [result.status for result in results]
-        assert (TrackStatus.LOST in statuses) == (new_points == "keyframes")
-        assert np.mean([status is TrackStatus.LOST for status in statuses]) < 0.5
+        assert TrackStatus.LOST not in statuses
 
 
 def with_points_in(new_points: Any) -> Config:

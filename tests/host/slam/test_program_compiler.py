@@ -45,16 +45,16 @@ class Gate:
 
     def __init__(self, patch: pytest.MonkeyPatch) -> None:
         self.reached, self.open, self.error = threading.Event(), threading.Event(), False
-        compile_recognition = back_end.compile_recognition
+        compile_view_matching = back_end.compile_view_matching
 
         def held(*arguments: object) -> None:
             self.reached.set()
             assert self.open.wait(120)
             if self.error:
                 raise WrongError
-            compile_recognition(*arguments)  # pyright: ignore[reportArgumentType]
+            compile_view_matching(*arguments)  # pyright: ignore[reportArgumentType]
 
-        patch.setattr(back_end, "compile_recognition", held)
+        patch.setattr(back_end, "compile_view_matching", held)
 
 
 @pytest.fixture
