@@ -45,7 +45,7 @@ def _follow_points(
     """Follow points from a motion since the last frame, or where that is not known, from the velocity."""
     own, given = predicted_pose(state, frame.dt_s), compose(state.T_world_cam, SE3(T_last_cam))
     predicted = SE3(jnp.where(known, given.wxyz_xyz, own.wxyz_xyz))
-    return follow_points(state, frame, params, plan, predicted=predicted)
+    return follow_points(state, frame, params, plan, predicted=predicted, is_known=known)
 
 
 @compiled(when="warm-up", static="plan", donate="state", options=FAST_COMPILE)

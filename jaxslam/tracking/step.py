@@ -18,7 +18,7 @@ from jaxslam_kernels.flow.lk_flow import lk_flow
 from jaxslam_kernels.image.pyramid import Pyramid, build_pyramid
 from jaxslam_kernels.robust import weighted_median
 from jaxslam_kernels.se3 import to_camera
-from jaxslam_kernels.types import Mask, Pixels, Scalar, Weights
+from jaxslam_kernels.types import Flag, Mask, Pixels, Scalar, Weights
 from jaxtyping import Array, Int
 
 from jaxslam.dynamics.object_motion import labels_at
@@ -107,6 +107,7 @@ def follow_points(
     plan: TrackPlan = DEFAULT_PLAN,
     *,
     predicted: SE3 | None = None,
+    is_known: Flag | bool = True,
 ) -> FlowResult:
     """Track the points of the state into a frame by optical flow: the first part of `track_step`.
 
@@ -118,6 +119,8 @@ def follow_points(
         params: Camera and thresholds, traced; the parameters of cues may be missing.
         plan: Array sizes and search settings, static.
         predicted: Pose of the camera from which points are tracked; by default it is predicted from the velocity.
+        is_known: Whether `predicted` comes from a measurement, so that points it takes out of the image are gone. If it
+            is only predicted from the velocity, they are sought where they were.
 
     Raises:
         ValueError: In the same cases as `track_step`.
@@ -128,7 +131,7 @@ def follow_points(
     height, width = frame.image.shape
     pyramid = build_pyramid(frame.image, num_levels=plan.num_levels, dtype=state.twist.dtype)
     if predicted is None:
-        predicted = predicted_pose(state, frame.dt_s)
+        predicted, is_known = predicted_pose(state, frame.dt_s), False
     check_pose("predicted", predicted)
     points = state.points
     before = predict_pixels(to_camera(state.T_world_cam, points.X_world), state.twist, height, params.sensor)
@@ -137,7 +140,8 @@ def follow_points(
     inside = jnp.all((guess > 0) & (guess < jnp.array([[width - 1], [height - 1]], guess.dtype)), axis=0)
     guess = jnp.where(inside[None, :], guess, points.uv)
     flow = lk_flow(state.pyramid, pyramid, points.uv, guess, points.valid, plan=plan.flow)
-    return FlowResult(pyramid, predicted, flow.points, flow.ok & (points.weight > 0))
+    gone = is_known & ~inside
+    return FlowResult(pyramid, predicted, flow.points, flow.ok & (points.weight > 0) & ~gone)
 
 
 def track_followed(

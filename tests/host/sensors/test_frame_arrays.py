@@ -7,6 +7,7 @@ import pytest
 
 from jaxslam import Frame, frame_arrays, stack_frames
 from jaxslam.errors import FrameError
+from jaxslam.sensors.frame_arrays import FrameMemory
 
 MS = 1_000_000
 
@@ -43,6 +44,21 @@ class TestFrameArrays:
     def test_double_precision(self) -> None:
         arrays = frame_arrays(frame(100), 0.1, np.float64)
         assert {array.dtype for array in arrays[:5]} == {np.dtype("uint8"), np.dtype("bool"), np.dtype("float64")}
+
+
+class TestFrameMemory:
+    def test_the_kept_frame_stays(self) -> None:
+        memory = FrameMemory(4, 6)
+        first = memory.hold(frame(100), 0.1)
+        memory.keep()
+        for time_ms in (130, 160):  # lost: not kept
+            memory.hold(frame(time_ms), 0.1)
+            np.testing.assert_array_equal(first.image, np.full((4, 6), 100))
+        second = memory.hold(frame(190), 0.1)
+        memory.keep()
+        memory.hold(frame(220), 0.1)
+        np.testing.assert_array_equal(second.image, np.full((4, 6), 190))
+        assert not np.array_equal(first.image, np.full((4, 6), 100))
 
 
 class TestStackFrames:

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
+from jaxlie import SE3
 from jaxslam_kernels.flow.disparity import row_disparities
 from jaxslam_kernels.pose.pose_refine import PoseStatus
 from jaxslam_kernels.se3 import retract
@@ -24,6 +25,8 @@ from small_scene import HEIGHT, PLAN, TRACK, WIDTH, at, clip, new_state, params,
 from jaxslam import FlowPlan
 from jaxslam.config.loading import load_config
 from jaxslam.config.schema import Config, SemanticsConfig
+from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
+from jaxslam.geometry.se3 import between
 from jaxslam.semantics import Detections, no_detections
 from jaxslam.sensors import measurement
 from jaxslam.sensors.frame_arrays import FrameArrays
@@ -146,6 +149,22 @@ class TestCompiled:
         )
         np.testing.assert_array_equal(there, expected)
         assert np.abs(forward - there).max() > 1e-4
+
+    def test_a_motion_from_outside(self, counted: Counted) -> None:
+        """A frame that turns by a third of the picture is tracked from a prediction, and lost without."""
+        turning = SyntheticDataset(SyntheticConfig(width=WIDTH, height=HEIGHT, frames=120, people=0, path="rpy"))
+        pair = stacked([turning[60], turning[78]])
+        first, second = at(pair, 0), at(pair, 1)
+        start, _ = counted.step(new_state(), first, params())
+        moved = jnp.asarray(between(*turning.T_world_cam[[60, 78]]), jnp.float32)
+        _, lost = counted.step(start, second, params())
+        step = quick_compile(lambda *given: track_step(*given[:3], PLAN, predicted=SE3(given[3])))
+        _, tracked = step(start, second, params(), moved)
+        assert int(lost.status) == TrackStatus.LOST
+        assert int(tracked.status) != TrackStatus.LOST
+        np.testing.assert_allclose(tracked.T_world_cam.wxyz_xyz, moved, atol=0.02)
+        with pytest.raises(TypeError, match="predicted"):
+            jax.eval_shape(lambda: track_step(start, second, params(), PLAN, predicted=moved))  # pyright: ignore[reportArgumentType]
 
     def test_same_bytes_again(self, counted: Counted, frames: FrameArrays) -> None:
         first, second = (track(counted.step, frames) for _ in range(2))

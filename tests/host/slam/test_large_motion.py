@@ -1,0 +1,42 @@
+"""Frames that move too far for optical flow are tracked by their features."""
+
+import dataclasses
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from small_scene import CONFIG, HEIGHT, WIDTH
+
+from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
+from jaxslam.geometry.se3 import angle, between
+from jaxslam.slam.slam import Slam
+from jaxslam.tracking.state import TrackStatus
+
+SOURCE = SyntheticDataset(SyntheticConfig(width=WIDTH, height=HEIGHT, frames=120, people=0, path="rpy"))
+
+
+@pytest.fixture(scope="module")
+def slam() -> Iterator[Slam]:
+    with Slam(SOURCE.camera, CONFIG) as slam:
+        yield slam
+
+
+@pytest.mark.parametrize(("first", "second"), [(20, 32), (40, 56), (60, 78)])
+def test_the_second_frame_of_a_camera_that_turns_fast(slam: Slam, first: int, second: int) -> None:
+    """By 0.25 to 0.3 rad, a third of the picture, from rest: nothing predicts it, and optical flow finds nothing."""
+    slam.reset()
+    start, result = slam.track(SOURCE[first]), slam.track(SOURCE[second])
+    assert result.status in (TrackStatus.OK, TrackStatus.WEAK)
+    moved = between(*SOURCE.T_world_cam[[first, second]])
+    assert angle(moved) > 0.25
+    wrong = between(moved, between(start.T_world_cam, result.T_world_cam))
+    assert np.linalg.norm(wrong[4:]) < 0.03
+    assert angle(wrong) < 0.015
+
+
+def test_a_frame_of_another_place_is_lost(slam: Slam) -> None:
+    slam.reset()
+    first = slam.track(SOURCE[20])
+    other = SyntheticDataset(SyntheticConfig(width=WIDTH, height=HEIGHT, frames=2, people=0, seed=5))[1]
+    later = dataclasses.replace(other, timestamp_ns=first.timestamp_ns + 100_000_000)
+    assert slam.track(later).status == TrackStatus.LOST
