@@ -17,7 +17,7 @@ NONE = VelocityStatistics(jnp.zeros(2), jnp.zeros(2))
 @jax.jit
 def _after(twists: jax.Array, dt_s: jax.Array) -> VelocityStatistics:
     before = jnp.concatenate([jnp.zeros((1, 6)), twists[:-1]])
-    take = lambda statistics, pair: (updated_statistics(statistics, *pair, dt_s), None)
+    take = lambda statistics, pair: (updated_statistics(statistics, pair[0], pair[1], dt_s), None)
     return lax.scan(take, NONE, (before, twists))[0]
 
 
@@ -29,7 +29,7 @@ def after(twists: np.ndarray, dt_s: float = DT_S) -> VelocityStatistics:
 def share_predicted(twists: np.ndarray, elapsed_s: float, dt_s: float = DT_S) -> np.ndarray:
     """Shares `(2,)` of constant velocity that are predicted, of translation and rotation."""
     twist = np.asarray(twists[-1], np.float32)
-    pose = predict_pose(SE3.identity(), twist, after(twists, dt_s), jnp.float32(elapsed_s))
+    pose = predict_pose(SE3.identity(), jnp.asarray(twist), after(twists, dt_s), jnp.float32(elapsed_s))
     moved = np.asarray(displacement(SE3.identity(), pose)).reshape(2, 3)
     full = twist.reshape(2, 3) * elapsed_s
     return np.sum(moved * full, axis=1) / np.sum(full * full, axis=1)

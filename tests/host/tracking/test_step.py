@@ -158,7 +158,9 @@ class TestCompiled:
         start, _ = counted.step(new_state(), first, params())
         moved = jnp.asarray(between(*turning.T_world_cam[[60, 78]]), jnp.float32)
         _, lost = counted.step(start, second, params())
-        step = quick_compile(lambda *given: track_step(*given[:3], PLAN, predicted=SE3(given[3])))
+        step = quick_compile(
+            lambda state, frame, params, pose: track_step(state, frame, params, PLAN, predicted=SE3(pose))
+        )
         _, tracked = step(start, second, params(), moved)
         assert int(lost.status) == TrackStatus.LOST
         assert int(tracked.status) != TrackStatus.LOST
