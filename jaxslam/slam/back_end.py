@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam.config.schema import Config
-from jaxslam.features.view_matching import ViewPose, compile_view_matching
+from jaxslam.features.view_matching import compile_view_matching
 from jaxslam.geometry.se3 import IDENTITY, compose
 from jaxslam.geometry.types import Pose
 from jaxslam.loop_closing.essential_graph import GraphCompiler
@@ -35,7 +35,7 @@ from jaxslam.sensors.frame import Frame
 from jaxslam.sensors.frame_arrays import FrameArrays, own_copy
 from jaxslam.sensors.sensor_model import SensorModel
 from jaxslam.slam.dense_thread import dense_mapping_of
-from jaxslam.slam.frame_localizer import FrameLocalizer, LocalizedPose
+from jaxslam.slam.frame_localizer import FeatureMotion, FrameLocalizer, LocalizedPose
 from jaxslam.slam.frame_result import FrameResult
 from jaxslam.slam.keyframe_semantics import KeyframeSemantics
 from jaxslam.slam.map_changes import MapChanges
@@ -264,8 +264,8 @@ class BackEnd:
             return None
         return self._states.see(self.map, anchored.keyframe, anchored.T_keyframe_cam, np.asarray(output.twist), arrays)
 
-    def motion_to(self, arrays: FrameArrays, T_last_cam: Pose) -> ViewPose | None:
-        """Return the pose of a lost frame in the axes of the last tracked one; see `FrameLocalizer.motion_to`."""
+    def motion_to(self, arrays: FrameArrays, T_last_cam: Pose) -> FeatureMotion | None:
+        """Estimate the motion from the last tracked frame to a lost one; see `FrameLocalizer.motion_to`."""
         return self._localizer.motion_to(arrays, T_last_cam)
 
     def relocalize(self, arrays: FrameArrays, predicted: Pose | None) -> tuple[LocalizedPose | None, bool]:

@@ -6,11 +6,10 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam.config.schema import Config
-from jaxslam.features.view_matching import ViewPose
 from jaxslam.geometry.se3 import IDENTITY, between, compose, displacement
 from jaxslam.sensors.frame_arrays import FrameArrays
 from jaxslam.slam.back_end import BackEnd
-from jaxslam.slam.frame_localizer import LocalizedPose
+from jaxslam.slam.frame_localizer import FeatureMotion, LocalizedPose
 from jaxslam.slam.pose_history import ConstantVelocity
 from jaxslam.slam.program_compiler import ProgramCompiler
 from jaxslam.slam.tracker import Tracker
@@ -102,15 +101,15 @@ class LocalizationStage:
             return None
         self._tracker.before(arrays)
         elapsed_s = self._tracker.elapsed_s() + float(arrays.dt_s)
-        flow = self._tracker.follow(arrays, found.T_source_cam)
+        flow = self._tracker.follow(arrays, found.T_last_cam)
         output = self._tracker.advance(arrays, flow, back.keyframe_demand, back.map_views, map_changed=back.map_changed)
         if int(output.status) != TrackStatus.LOST:
             return TrackedAgain(flow, output)
         # Nearer points look too different for optical flow: a car at 5 m a frame has 15 of 150 that agree.
-        twist = displacement(IDENTITY, found.T_source_cam) / elapsed_s
-        if not self._is_plausible(twist):
+        twist = displacement(IDENTITY, found.T_last_cam) / elapsed_s
+        if not (found.is_certain and self._is_plausible(twist)):
             return None
-        T_world_cam = compose(last, found.T_source_cam)
+        T_world_cam = compose(last, found.T_last_cam)
         self._tracker.state = back.reset_after_motion(self._tracker.state, T_world_cam, twist)
         flow = self._tracker.follow(arrays)
         return TrackedAgain(flow, self._at_matched_pose(self._restarted(arrays, flow), found))
@@ -195,15 +194,14 @@ class LocalizationStage:
             self._tracker.await_relocalization()  # not to start by itself
         return output
 
-    def _at_matched_pose(self, output: TrackOutput, found: ViewPose) -> TrackOutput:
+    def _at_matched_pose(self, output: TrackOutput, found: FeatureMotion) -> TrackOutput:
         """Return the output of a frame whose pose is that of its features relative to the last frame."""
-        num_inliers = found.pairs.shape[1]
-        enough = num_inliers >= self._weak_inliers
+        enough = found.num_matched >= self._weak_inliers
         return output._replace(
             status=np.int32(TrackStatus.OK if enough else TrackStatus.WEAK),
             reason=np.int32(TrackReason.NONE if enough else TrackReason.FEW_INLIERS),
             covariance=found.covariance.astype(np.float32),
-            num_inliers=np.int32(num_inliers),
+            num_inliers=np.int32(found.num_matched),
         )
 
     @staticmethod
