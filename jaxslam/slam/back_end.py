@@ -309,7 +309,7 @@ class BackEnd:
             frame: Number of the frame.
         """
         T_world_cam = tracked.T_world_cam
-        self._localizer.frame_tracked(arrays, tracked.twist)
+        self._localizer.frame_tracked(arrays, T_world_cam, tracked.twist)
         if not self._localize_only:
             self.map_views = self._coverage.num_views(self.map, T_world_cam, self._link.submap_now())
         if frame % _RELOAD_EVERY == 0:

@@ -48,6 +48,7 @@ class FeatureMotion(NamedTuple):
 
     Attributes:
         T_last_cam: `(7,)` pose of the lost frame in the axes of the last tracked one.
+        T_world_cam: `(7,)` pose of the lost frame, from that of the last tracked one as the map has it now.
         covariance: `(6, 6)` in the tangent space at the camera: translation (m), then rotation (rad).
         num_matched: Number of features that agree with it.
         is_certain: Whether it can be believed by itself: it is near the predicted motion, or enough features agree for
@@ -55,16 +56,18 @@ class FeatureMotion(NamedTuple):
     """
 
     T_last_cam: Pose
+    T_world_cam: Pose
     covariance: np.ndarray
     num_matched: int
     is_certain: bool
 
 
 class _TrackedFrame(NamedTuple):
-    """A frame that was tracked, with its `(6,)` velocity in m/s, then rad/s."""
+    """A frame that was tracked, with its `(6,)` velocity in m/s, then rad/s, and its pose."""
 
     arrays: FrameArrays
     twist: Float[np.ndarray, "6"]
+    anchored: AnchoredPose
 
 
 def _output_at_pose(
@@ -126,14 +129,15 @@ class FrameLocalizer:
         """Forget the features of the frame before."""
         self.features = self._of_lost = None
 
-    def frame_tracked(self, arrays: FrameArrays, twist: Float[np.ndarray, "6"]) -> None:
+    def frame_tracked(self, arrays: FrameArrays, T_world_cam: Pose, twist: Float[np.ndarray, "6"]) -> None:
         """Keep a frame that was tracked.
 
         Args:
             arrays: The frame; it must not change until another one is tracked.
+            T_world_cam: `(7,)` pose of the camera.
             twist: `(6,)` velocity of the camera in its own axes, m/s, then rad/s.
         """
-        self._last, self._of_last = _TrackedFrame(arrays, twist), None
+        self._last, self._of_last = _TrackedFrame(arrays, twist, self._link.anchor(T_world_cam)), None
 
     def motion_to(self, arrays: FrameArrays, T_last_cam: Pose) -> FeatureMotion | None:
         """Estimate the motion from the last tracked frame to a lost one; `None` if features do not tell.
@@ -154,8 +158,10 @@ class FrameLocalizer:
         found = near or match_views(last, features, self._sensor, jax.random.key(0), plan=plan, gates=gates)
         if found is None:
             return None
+        # Not from the tracker's state: that is a new one after an interrupted step.
+        T_world_cam = compose(self._link.pose(self._last.anchored), found.T_source_cam)
         is_certain = near is not None or found.is_place
-        return FeatureMotion(found.T_source_cam, found.covariance, found.pairs.shape[1], is_certain)
+        return FeatureMotion(found.T_source_cam, T_world_cam, found.covariance, found.pairs.shape[1], is_certain)
 
     def match_tracked(
         self, state: TrackState, arrays: FrameArrays, output: TrackOutput, weak_inliers: float

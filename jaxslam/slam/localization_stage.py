@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam.config.schema import Config
-from jaxslam.geometry.se3 import IDENTITY, between, compose, displacement
+from jaxslam.geometry.se3 import IDENTITY, between, displacement
 from jaxslam.sensors.frame_arrays import FrameArrays
 from jaxslam.slam.back_end import BackEnd
 from jaxslam.slam.frame_localizer import FeatureMotion, LocalizedPose
@@ -95,8 +95,8 @@ class LocalizationStage:
         """
         if not self._any_tracked or not self._programs.can_map():
             return None
-        last, back = self._tracker.last_pose(), self._back
-        found = back.motion_to(arrays, between(last, np.asarray(flow.predicted.wxyz_xyz, np.float64)))
+        back, predicted = self._back, np.asarray(flow.predicted.wxyz_xyz, np.float64)
+        found = back.motion_to(arrays, between(self._tracker.last_pose(), predicted))
         if found is None:
             return None
         self._tracker.before(arrays)
@@ -109,8 +109,7 @@ class LocalizationStage:
         twist = displacement(IDENTITY, found.T_last_cam) / elapsed_s
         if not (found.is_certain and self._is_plausible(twist)):
             return None
-        T_world_cam = compose(last, found.T_last_cam)
-        self._tracker.state = back.reset_after_motion(self._tracker.state, T_world_cam, twist)
+        self._tracker.state = back.reset_after_motion(self._tracker.state, found.T_world_cam, twist)
         flow = self._tracker.follow(arrays)
         return TrackedAgain(flow, self._at_matched_pose(self._restarted(arrays, flow), found))
 

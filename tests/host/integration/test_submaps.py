@@ -27,8 +27,8 @@ from jaxslam.trajectory.trajectory import read as read_trajectory
 FPS = 15.0
 QUICK = replace(SUBMAP, track=replace(TRACK, restart_after=5))
 """So few frames of a place that is not known until it is a submap."""
-A, B = range(110, 140), range(38)
-"""B ends so far from where it is met again that flow does not find back by itself, as it does with 30 frames."""
+A, B = range(110, 140), range(60)
+"""B ends so far from where it is met again that nothing of its last frame is seen there, as it is with 38 frames."""
 ORDER = [*A, *[BLACK] * 3, *B, *[BLACK] * 3, *range(8, 26)]
 """A place, the lens covered, another place that nothing links to it, the lens covered, the second place again."""
 SECOND = len(A) + 3
