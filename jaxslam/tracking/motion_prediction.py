@@ -34,13 +34,15 @@ def updated_statistics(
 ) -> VelocityStatistics:
     """Take the velocity of a tracked frame into the statistics.
 
+    The first velocity is no change: what was before it is not known.
+
     Args:
         statistics: Statistics of the frames before.
         before: `(6,)` velocity at the frame before, m/s, then rad/s.
         after: `(6,)` velocity at the frame.
         elapsed_s: Time between the two, seconds.
     """
-    known = elapsed_s > 0
+    known = (elapsed_s > 0) & (statistics.squares > 0)
     rate = jnp.where(known, _squares(after - before) / jnp.where(known, elapsed_s, 1), 0)
     return VelocityStatistics(_FORGET * statistics.squares + _squares(after), _FORGET * statistics.changes + rate)
 
