@@ -63,7 +63,7 @@ class ToAndFro:
 
     def _played(self, index: int, source: Frame) -> Frame:
         """Return a frame of the other recording as frame `index`."""
-        timestamp_ns, delay_ns = int(self.timestamps_ns[index]), _depth_delay_ns(source)
+        timestamp_ns, delay_ns = int(self.timestamps_ns[index]), source.depth_delay_ns
         # The frame at a turn comes at the end of the way to it.
         backward = max(index - 1, 0) // self.frames_per_pass % 2 == 1
         return replace(
@@ -83,7 +83,3 @@ class ToAndFro:
         source = self.source_of(np.arange(len(self)))
         shown = known[source]
         return Trajectory(self.timestamps_ns[shown], truth.at(times).T_world_cam[source[shown]])
-
-
-def _depth_delay_ns(frame: Frame) -> int:
-    return 0 if frame.depth_timestamp_ns is None else frame.depth_timestamp_ns - frame.timestamp_ns

@@ -53,7 +53,7 @@ class Matches(NamedTuple):
 
 
 class PoseGates(NamedTuple):
-    """What a pose must meet to be believed.
+    """Thresholds that a pose must meet to be believed.
 
     Attributes:
         min_inliers: Minimum number of matches that agree with it.

@@ -78,6 +78,11 @@ class Frame:
         """`(width, height)` in pixels."""
         return self.image.shape[1], self.image.shape[0]
 
+    @property
+    def depth_delay_ns(self) -> int:
+        """Time from the image to the depth image in nanoseconds; 0 if both have the same time."""
+        return 0 if self.depth_timestamp_ns is None else self.depth_timestamp_ns - self.timestamp_ns
+
 
 def check_frame(frame: Frame, width: int, height: int, *, pair: bool = False) -> None:
     """Refuse a frame that does not fit the camera.

@@ -206,8 +206,7 @@ def _depth(frame: Frame) -> np.ndarray:
 
 
 def _times(frame: Frame, dt_s: float, dtype: DTypeLike) -> tuple[np.ndarray, np.ndarray]:
-    delay_ns = 0 if frame.depth_timestamp_ns is None else frame.depth_timestamp_ns - frame.timestamp_ns
-    return np.asarray(dt_s, dtype), np.asarray(delay_ns * 1e-9, dtype)
+    return np.asarray(dt_s, dtype), np.asarray(frame.depth_delay_ns * 1e-9, dtype)
 
 
 def _readout_sign(frame: Frame, dtype: DTypeLike) -> np.ndarray:

@@ -180,7 +180,7 @@ class LocalizationStage:
         return twist if same_world and self._is_plausible(twist) else np.zeros(6)
 
     def _is_plausible(self, twist: Float[np.ndarray, "6"]) -> bool:
-        """Whether the camera may move at a velocity."""
+        """Tell whether the camera may move at a velocity."""
         return bool((np.linalg.norm(twist.reshape(2, 3), axis=1) < self._fastest).all())
 
     def _track_again(self, arrays: FrameArrays) -> TrackOutput:

@@ -14,7 +14,7 @@ _FORGET = 0.9
 
 
 class VelocityStatistics(NamedTuple):
-    """How fast the camera has moved lately, and how much its velocity has changed: of translation, then of rotation.
+    """Recent speed of the camera and changes of its velocity: of translation, then of rotation.
 
     Both are sums over the frames, in which older ones count less. Only their ratio matters, which is a time: no length
     and no angle is taken for fast or slow.

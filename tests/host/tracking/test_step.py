@@ -140,7 +140,7 @@ class TestCompiled:
         assert counted.traces == 1
 
     def test_rows_read_in_reverse(self, counted: Counted, frames: FrameArrays) -> None:
-        """As with a negative readout time, and not as before."""
+        """Equal to a negative readout time, and unlike a positive one."""
         rolling, reversed_ = (params().sensor._replace(readout_s=jnp.float32(s)) for s in (0.02, -0.02))
         backward = frames._replace(readout_sign=-np.ones(COUNT, np.float32))
         forward, there, expected = (
