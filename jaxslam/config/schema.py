@@ -75,7 +75,7 @@ class TrackConfig(ValidatedConfig):
     min_inliers: Annotated[float, Range(at_least=4)] = 15
     """Minimum number of inliers of a valid pose."""
     weak_inliers: Annotated[float, Range(at_least=4)] = 40
-    """Number of inliers below which the status of a pose is `WEAK`."""
+    """Number of inliers below which the status of a pose is `WEAK`; after a lost frame, fewer are none."""
     min_share: Annotated[float, Share] = 0.3
     """Minimum share of the tracked points that must agree on the pose."""
     detect_below: Annotated[float, Share] = 0.8

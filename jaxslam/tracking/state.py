@@ -199,7 +199,7 @@ class TrackParams(NamedTuple):
             calm scene.
         min_correlation: Smallest correlation of an accepted match with a keyframe.
         min_inliers: Smallest number of inliers of a pose.
-        weak_inliers: Number of inliers below which the status is `WEAK`.
+        weak_inliers: Number of inliers below which the status is `WEAK`; the smallest number after a lost frame.
         min_share: Smallest share of the tracked points that are inliers of the pose.
         detect_below: Share of the capacity below which new points are detected.
         keyframe_below: Share of a keyframe's points in view from which on it shows the view. A keyframe is made if none
