@@ -29,6 +29,9 @@ from .sensors.frame import Frame as Frame
 from .sensors.frame_arrays import FrameArrays as FrameArrays
 from .sensors.frame_arrays import frame_arrays as frame_arrays
 from .sensors.frame_arrays import stack_frames as stack_frames
+from .sensors.imu import ImuSamples as ImuSamples
+from .sensors.imu import ImuSheet as ImuSheet
+from .sensors.motion_prior import MotionPrior as MotionPrior
 from .sensors.rectification import RectifiedPair as RectifiedPair
 from .sensors.stereo_rig import Lens as Lens
 from .sensors.stereo_rig import Rig as Rig
@@ -47,6 +50,7 @@ from .tracking.from_config import track_plan as track_plan
 from .tracking.initial_state import init_state as init_state
 from .tracking.points import KeyframeMatches as KeyframeMatches
 from .tracking.points import TrackedPoints as TrackedPoints
+from .tracking.pose_estimation import PosePrior as PosePrior
 from .tracking.pose_estimation import PoseStatus as PoseStatus
 from .tracking.rollout import rollout as rollout
 from .tracking.state import FlowPlan as FlowPlan

@@ -10,6 +10,7 @@ from jaxslam.benchmark.reports.document import Bullets, Table, to_markdown
 from jaxslam.benchmark.suites.aggregate import shown_label
 from jaxslam.cli.console import console, make_table, plain_console
 from jaxslam.cli.tracking_run import number, track
+from jaxslam.datasets import imu_sheet
 from jaxslam.io.atomic_files import write_atomically
 from jaxslam.semantics.from_config import network_files, preset_needs_network
 from jaxslam.slam.slam import Slam
@@ -54,7 +55,7 @@ def compare_presets(options: "Compare", chosen: tuple[str, ...], dataset: "Datas
         summaries = []
         for seed in range(options.runs):
             console.print(f"{preset}, run {seed + 1} of {options.runs}")
-            slam = Slam(dataset.camera, options.settings(preset, f"run.seed={seed}"))
+            slam = Slam(dataset.camera, options.settings(preset, f"run.seed={seed}"), imu=imu_sheet(dataset))
             folder = out / preset / str(seed)
             summaries.append(track(dataset, slam, preset, folder, quiet=True))
         rows.append(figures(preset, summaries))

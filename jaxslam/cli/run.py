@@ -156,6 +156,7 @@ class Run(OfRecording):
     def main(self) -> None:
         """Run the command."""
         from jaxslam.cli.tracking_run import make_viewer, track  # noqa: PLC0415
+        from jaxslam.datasets import imu_sheet  # noqa: PLC0415
         from jaxslam.map.npz_file import load_map  # noqa: PLC0415
         from jaxslam.slam.slam import Slam  # noqa: PLC0415
 
@@ -165,7 +166,7 @@ class Run(OfRecording):
             raise ConfigError("--dense: a map that stays as it is, by --localize-only, gets no dense one")
         config, dataset = self.settings(self.preset, *_dense(self.dense)), self.opened()
         start = None if self.map is None else load_map(self.map)
-        slam = Slam(dataset.camera, config, slam_map=start, localize_only=self.localize_only)
+        slam = Slam(dataset.camera, config, slam_map=start, localize_only=self.localize_only, imu=imu_sheet(dataset))
         viewer = make_viewer(slam, dataset, live=self.viz, path=self.rrd)
         summary = track(dataset, slam, self.preset, self.folder(), viewer, save_map=self.save_map, quiet=self.json)
         if self.json:

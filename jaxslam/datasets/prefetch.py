@@ -3,15 +3,17 @@
 from collections import deque
 from collections.abc import Generator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from itertools import islice
 from typing import Protocol, TypeVar
 
 import numpy as np
 
-from jaxslam.datasets.protocol import Dataset
+from jaxslam.datasets.protocol import Dataset, imu_sheet
 from jaxslam.errors import DatasetError
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame
+from jaxslam.sensors.imu import ImuSamples, ImuSheet
 from jaxslam.trajectory.trajectory import Trajectory
 
 _Item_co = TypeVar("_Item_co", covariant=True)
@@ -60,11 +62,29 @@ class Subset:
         """The ground truth of the whole recording."""
         return self.whole.ground_truth
 
+    @property
+    def imu(self) -> ImuSheet | None:
+        """Data sheet of the IMU of the whole recording; `None` without one."""
+        return imu_sheet(self.whole)
+
+    @property
+    def imu_samples(self) -> ImuSamples | None:
+        """All samples of the IMU of the whole recording; `None` without one."""
+        return getattr(self.whole, "imu_samples", None)
+
     def __len__(self) -> int:
         return len(self.indices)
 
     def __getitem__(self, index: int) -> Frame:
-        return self.whole[self.indices[index]]
+        index = range(len(self))[index]
+        return self.with_samples(index, self.whole[self.indices[index]])
+
+    def with_samples(self, index: int, frame: Frame) -> Frame:
+        """Return a chosen frame with the samples of the IMU since the chosen frame before it."""
+        if self.imu_samples is None or self.indices.step == 1:
+            return frame
+        fps = self.camera.fps / self.indices.step
+        return replace(frame, imu=self.imu_samples.since_last_frame(self.timestamps_ns, index, fps))
 
 
 class Indexed(Protocol[_Item_co]):

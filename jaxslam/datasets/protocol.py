@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame
+from jaxslam.sensors.imu import ImuSheet
 from jaxslam.sensors.rectification import RectifiedPair
 from jaxslam.trajectory.trajectory import Trajectory
 
@@ -64,6 +65,11 @@ class Associated(Protocol):
     def unmatched(self) -> Unmatched:
         """The number of images without a partner."""
         ...
+
+
+def imu_sheet(dataset: Dataset) -> ImuSheet | None:
+    """Return the data sheet of the IMU whose samples come with the frames of a recording; `None` without one."""
+    return getattr(dataset, "imu", None)
 
 
 class Fit(IntEnum):

@@ -15,6 +15,7 @@ from .imu_preintegration import ImuDelta as ImuDelta
 from .imu_preintegration import ImuState as ImuState
 from .imu_preintegration import predict as predict
 from .imu_preintegration import preintegrate as preintegrate
+from .motion_prior import MotionPrior as MotionPrior
 from .rectification import RectifiedPair as RectifiedPair
 from .rectification import load_camera as load_camera
 from .stereo_rig import Lens as Lens

@@ -32,7 +32,7 @@ class Frame:
         right: Image of the right camera of a rectified pair, with the shape and type of `image`, the left one; `None`
             for a camera that measures depth. With a right image, `depth_m` is only the start value of stereo matching.
         imu: Samples of an IMU after the frame before, up to this frame's time, on the same clock; `None` without an
-            IMU. jaxslam does not use them yet.
+            IMU. A `Slam` that has the data sheet of the IMU predicts from them how the camera turns.
         played_backward: Whether the frame is part of a recording that is played backward. A rolling shutter then reads
             the last row first.
 

@@ -1,6 +1,7 @@
 """Checks of what `Slam` is made of and run on: types first, then whether map, recording and camera fit together."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TypeVar
 
 from jaxslam.config.schema import Config
@@ -8,6 +9,8 @@ from jaxslam.errors import ConfigError, DatasetError, MapFileError
 from jaxslam.map.types import Map
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.camera_difference import difference_of_cameras
+from jaxslam.sensors.imu import ImuSheet
+from jaxslam.sensors.motion_prior import MotionPrior
 from jaxslam.sensors.rectification import RectifiedPair
 from jaxslam.slam.input_warnings import InputWarnings
 
@@ -17,7 +20,13 @@ _OF_RECORDING = ("camera", "timestamps_ns", "__len__", "__getitem__")
 
 
 def check_arguments(
-    camera: object, config: object, slam_map: object, detectors: Mapping[str, object], *, localize_only: bool
+    camera: object,
+    config: object,
+    slam_map: object,
+    detectors: Mapping[str, object],
+    imu: object,
+    *,
+    localize_only: bool,
 ) -> None:
     """Refuse arguments of `Slam` that have the wrong type or do not go together.
 
@@ -26,6 +35,7 @@ def check_arguments(
         config: Expected to be a `Config`, or `None`.
         slam_map: Expected to be a `Map` of a camera of the same image size, or `None`.
         detectors: Detectors by the name of their argument; each is expected to be callable, or `None`.
+        imu: Expected to be an `ImuSheet`, or `None`.
         localize_only: Whether the map stays as it is.
 
     Raises:
@@ -39,6 +49,9 @@ def check_arguments(
     for name, detector in detectors.items():
         if detector is not None and not callable(detector):
             raise TypeError(f"{name}: expected a callable that takes an image, got {type(detector).__name__}")
+    if imu is not None and not isinstance(imu, ImuSheet):
+        hint = "; read_imu_sheet(path) reads a data sheet" if isinstance(imu, str | Path) else ""
+        raise TypeError(f"imu: expected a jaxslam.ImuSheet, got {type(imu).__name__}{hint}")
     if slam_map is not None:
         slam_map = _require("slam_map", slam_map, Map, "; Slam.load(path) reads a map file")
         _check_size(slam_map.camera, camera)
@@ -47,6 +60,17 @@ def check_arguments(
         raise ConfigError(
             f"localize_only: needs the map to localize in: map=, or Slam.load(path, localize_only=True); got {got}"
         )
+
+
+def check_prior(prior: object) -> None:
+    """Refuse what is no motion prior.
+
+    Raises:
+        TypeError: If it is neither a `MotionPrior` nor `None`.
+    """
+    if prior is not None and not isinstance(prior, MotionPrior):
+        hint = "; MotionPrior(T_last_cam, covariance)"
+        raise TypeError(f"prior: expected a jaxslam.MotionPrior, got {type(prior).__name__}{hint}")
 
 
 def warn_of_other_camera(map_camera: Camera, camera: Camera, warnings: InputWarnings) -> None:

@@ -18,15 +18,18 @@ _PAIR_EVERY = 3
 class InputChecks:
     """Looks at the first ten frames, then at every hundredth, and warns of what contradicts the camera."""
 
-    def __init__(self, camera: Camera, warnings: InputWarnings, detector: CheckedDetector | None) -> None:
+    def __init__(
+        self, camera: Camera, warnings: InputWarnings, detector: CheckedDetector | None, *, has_imu: bool = False
+    ) -> None:
         """Begin before the first frame.
 
         Args:
             camera: Camera that takes the frames.
             warnings: Collector of warnings.
             detector: The detector that looks at the same frames, which notices swapped colors.
+            has_imu: Whether the data sheet of an IMU was given.
         """
-        self._camera, self._warnings, self._detector = camera, warnings, detector
+        self._camera, self._warnings, self._detector, self._has_imu = camera, warnings, detector, has_imu
         self._frames = 0
         self._shifts = np.zeros((0, 2))
 
@@ -37,6 +40,7 @@ class InputChecks:
             self._warnings.warn("color order", self._detector.color_suspicion)
         if number >= _FIRST and number % _RARELY:
             return
+        self._look_at_samples(frame)
         if scaled_to_one(to_gray(frame.image)):
             text = "image: expected values from 0 to 255, got 0 and 1 only; it looks like an image scaled to 0 to 1"
             self._warnings.warn("image range", text)
@@ -44,6 +48,16 @@ class InputChecks:
             self._look_at_pair(frame, number)
         elif frame.depth_m is not None and (contradiction := contradiction_of_depth(frame.depth_m)):
             self._warnings.warn("depth scale", f"depth_m: expected meters along the optical axis, got {contradiction}")
+
+    def _look_at_samples(self, frame: Frame) -> None:
+        """Warn of samples of an IMU without its data sheet, and of a data sheet without samples."""
+        if frame.imu is not None and not self._has_imu:
+            text = (
+                "imu: expected the data sheet of the IMU whose samples come with the frames, Slam(imu=...), got none;"
+            )
+            self._warnings.warn("IMU", f"{text} the samples are not used")
+        if frame.imu is None and self._has_imu:
+            self._warnings.warn("IMU", "imu: expected samples of the IMU with each frame, as its data sheet was given")
 
     def _look_at_pair(self, frame: Frame, number: int) -> None:
         if frame.right is None or (number < _FIRST and number % _PAIR_EVERY):

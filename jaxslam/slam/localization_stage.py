@@ -7,9 +7,11 @@ from jaxtyping import Float
 
 from jaxslam.config.schema import Config
 from jaxslam.geometry.se3 import IDENTITY, between, displacement
+from jaxslam.geometry.types import Pose
 from jaxslam.sensors.frame_arrays import FrameArrays
 from jaxslam.slam.back_end import BackEnd
 from jaxslam.slam.frame_localizer import FeatureMotion, LocalizedPose
+from jaxslam.slam.outside_motion import MeasuredMotion
 from jaxslam.slam.pose_history import ConstantVelocity
 from jaxslam.slam.program_compiler import ProgramCompiler
 from jaxslam.slam.tracker import Tracker
@@ -70,6 +72,8 @@ class LocalizationStage:
         self._fastest = float(tracker.params.max_speed_m_per_s), float(tracker.params.max_turn_rad_per_s)
         self._weak_inliers = config.track.weak_inliers
         self._motion = ConstantVelocity()
+        self._outside: Pose | None = None
+        """Pose of the latest frame by the motion that something other than the images measured."""
         self._any_tracked = self._was_lost = False
         self._unrecognized = 0
         """Frames since the last one that was tracked whose place is not in the map."""
@@ -80,15 +84,18 @@ class LocalizationStage:
         return self._motion.lost_s
 
     def predicted(self) -> Float[np.ndarray, "7"]:
-        """Predict the pose of the latest frame, from at most one second of constant velocity."""
-        return self._motion.now()
+        """Predict the pose of the latest frame: as measured outside, else by constant velocity for at most a second."""
+        return self._motion.now() if self._outside is None else self._outside
 
-    def track_by_features(self, arrays: FrameArrays, flow: FlowResult) -> TrackedAgain | None:
+    def track_by_features(
+        self, arrays: FrameArrays, flow: FlowResult, measured: MeasuredMotion | None
+    ) -> TrackedAgain | None:
         """Track a lost frame again, from the motion since the last tracked frame that its features tell.
 
         Args:
             arrays: The frame.
             flow: Points followed into the frame before, with the predicted pose.
+            measured: Motion since the last tracked frame that was measured by something else.
 
         Returns:
             The points and the output; `None` if the frame stays lost.
@@ -101,7 +108,7 @@ class LocalizationStage:
             return None
         self._tracker.before(arrays)
         elapsed_s = self._tracker.elapsed_s() + float(arrays.dt_s)
-        flow = self._tracker.follow(arrays, found.T_last_cam)
+        flow = self._tracker.follow(arrays, found.T_last_cam, measured)
         output = self._tracker.advance(arrays, flow, back.keyframe_demand, back.map_views, map_changed=back.map_changed)
         # Where two places look alike, few points of optical flow agree with a wrong motion too: 18 did, 2.8 m off.
         if int(output.status) != TrackStatus.LOST and (found.is_certain or int(output.status) == TrackStatus.OK):
@@ -114,14 +121,19 @@ class LocalizationStage:
         flow = self._tracker.follow(arrays)
         return TrackedAgain(flow, self._at_matched_pose(self._restarted(arrays, flow), found))
 
-    def localize(self, arrays: FrameArrays, output: TrackOutput, dt_s: float) -> LocalizedOutput:
+    def localize(
+        self, arrays: FrameArrays, output: TrackOutput, dt_s: float, outside: Pose | None = None
+    ) -> LocalizedOutput:
         """Relocalize a frame that is lost, or match one that is weak with the local map, if that is compiled yet.
 
         Args:
             arrays: The frame.
             output: Output of the tracker for the frame.
             dt_s: Time since the frame before, in seconds.
+            outside: `(7,)` pose of the frame by the motion that something other than the images measured; `None` if it
+                is not known.
         """
+        self._outside = outside
         if int(output.status) == TrackStatus.LOST:
             return self._relocalize(arrays, output, dt_s) if self._programs.can_map() else self._not_ready(output)
         if self._needs_map_match(output) and self._programs.can_map():
@@ -158,7 +170,9 @@ class LocalizationStage:
 
     def _relocalize(self, arrays: FrameArrays, lost: TrackOutput, dt_s: float) -> LocalizedOutput:
         """Track a lost frame again from where the map recognizes its place, or from the last pose in a new submap."""
-        predicted = self._motion.after(dt_s) if self._any_tracked else None
+        predicted = None
+        if self._any_tracked:
+            predicted = self._motion.after(dt_s) if self._outside is None else self._outside
         found, unknown = self._back.relocalize(arrays, predicted)
         self._unrecognized += unknown
         if found is not None:

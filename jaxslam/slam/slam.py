@@ -23,7 +23,9 @@ from jaxslam.semantics.from_config import detector_of, key_detector_of, why_no_n
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame, check_frame
 from jaxslam.sensors.frame_arrays import FrameArrays, FrameMemory
-from jaxslam.slam.argument_checks import check_arguments, warn_of_other_camera
+from jaxslam.sensors.imu import ImuSheet
+from jaxslam.sensors.motion_prior import MotionPrior
+from jaxslam.slam.argument_checks import check_arguments, check_prior, warn_of_other_camera
 from jaxslam.slam.back_end import BackEnd
 from jaxslam.slam.background_consistency import BackgroundConsistency
 from jaxslam.slam.call_guard import one_at_a_time, refuse_after_fork
@@ -34,6 +36,7 @@ from jaxslam.slam.input_checks import InputChecks
 from jaxslam.slam.input_warnings import InputWarnings
 from jaxslam.slam.localization_stage import LocalizationStage
 from jaxslam.slam.mask_stage import MaskStage
+from jaxslam.slam.outside_motion import OutsideMotion
 from jaxslam.slam.pose_history import PoseHistory
 from jaxslam.slam.program_compiler import ProgramCompiler
 from jaxslam.slam.recording_run import run_recording
@@ -76,6 +79,7 @@ class Slam:
         localize_only: bool = False,
         detector: Detector | None = None,
         key_detector: Detector | None = None,
+        imu: ImuSheet | None = None,
     ) -> None:
         """Prepare to track a camera; programs are compiled from the first frame on, or in `warm_up`.
 
@@ -87,6 +91,8 @@ class Slam:
             detector: Detector of movable objects, instead of the network of the settings.
             key_detector: Detector of the objects that the dense map keeps at full density, instead of the network with
                 `dense.key_classes`.
+            imu: Data sheet of the IMU whose samples come with the frames, with the place of the camera on it, such as
+                `imu` of a recording. Its angular rates predict how the camera turns; their bias is estimated.
 
         Raises:
             TypeError: If an argument has the wrong type, such as the name of a camera or preset.
@@ -100,10 +106,11 @@ class Slam:
         """
         refuse_after_fork()
         detectors = {"detector": detector, "key_detector": key_detector}
-        check_arguments(camera, config, slam_map, detectors, localize_only=localize_only)
+        check_arguments(camera, config, slam_map, detectors, imu, localize_only=localize_only)
         self.call_lock = threading.RLock()
         self.camera = camera
         self.config = config or Config()
+        self._imu = imu
         # An empty map knows no place: with it, no frame would ever be tracked.
         self._start_map, self._localize_only = (
             slam_map if slam_map is not None and len(slam_map.ids) else None,
@@ -169,7 +176,7 @@ class Slam:
         return self._programs.compile_all()
 
     @one_at_a_time
-    def track(self, frame: Frame) -> FrameResult:
+    def track(self, frame: Frame, prior: MotionPrior | None = None) -> FrameResult:
         """Track one frame.
 
         The first call compiles what tracking itself needs. All else is compiled in a thread meanwhile: keyframes wait
@@ -178,6 +185,9 @@ class Slam:
 
         Args:
             frame: Image with depth, or a stereo pair, of the size of the camera and later than the frame before.
+            prior: Motion of the camera since the frame of the last call, from wheel odometry for example. With its
+                covariance it is one term of the pose, and optical flow begins from it. Where it is not given, the IMU
+                tells how the camera turned, if there is one.
 
         Returns:
             The pose with its status and covariance. A frame that cannot be tracked, such as a black one, is no error:
@@ -186,11 +196,13 @@ class Slam:
         Raises:
             FrameError: If the frame does not fit the camera, or is not later than the frame before. The state is
                 unchanged; go on with the next frame.
+            TypeError: If `prior` is no `MotionPrior`.
             RuntimeError: After `close`, or in a process made by `fork`.
             Exception: Error of a job of mapping or loop closing, or of compiling in the thread.
         """
         check_frame(frame, self.camera.width, self.camera.height, pair=self.camera.is_stereo)
         self._clock.check(frame.timestamp_ns, frame.depth_timestamp_ns)
+        check_prior(prior)
         self._programs.prepare(self._frame)
         began, watch = time.perf_counter(), self.times.stopwatch()
         self._input_checks.look(frame)
@@ -203,7 +215,9 @@ class Slam:
 
         # 2. Optical flow; beside it, a worker computes the stereo depth and the mask.
         self._masks.begin(self._frame, frame, arrays, correction)
-        flow = self._tracker.follow(arrays)
+        measured = self._outside_motion.of_frame(frame, prior, dt_s)
+        flow = self._tracker.follow(arrays, measured=measured)
+        outside = None if measured is None else np.asarray(flow.predicted.wxyz_xyz, np.float64)
         watch.ends("flow")
 
         # 3. Mask: ignore pixels of movable objects.
@@ -216,12 +230,13 @@ class Slam:
         watch.ends("pose")
 
         # 5. Match features of a lost frame with the last one, or relocalize it; match a weak one with the local map.
-        again = self._localization.track_by_features(arrays, flow) if int(output.status) == TrackStatus.LOST else None
+        lost = int(output.status) == TrackStatus.LOST
+        again = self._localization.track_by_features(arrays, flow, measured) if lost else None
         if again is not None:
             flow, output = again
         if int(output.status) != TrackStatus.LOST:  # cues go by a wrong motion while the pose is not known
             arrays, mask = self._masks.exclude_moving(arrays, mask, flow, output)
-        output, num_matched, recognized = self._localization.localize(arrays, output, dt_s)
+        output, num_matched, recognized = self._localization.localize(arrays, output, dt_s, outside)
         lost = int(output.status) == TrackStatus.LOST
         share = None if lost else self._back.update_occlusion(arrays, output)
         watch.ends("match with map")
@@ -350,7 +365,7 @@ class Slam:
         self._warnings = InputWarnings()
         if self._detector is not None:
             self._detector.begin()
-        self._input_checks = InputChecks(self.camera, self._warnings, self._detector)
+        self._input_checks = InputChecks(self.camera, self._warnings, self._detector, has_imu=self._imu is not None)
         if self._start_map is not None:
             warn_of_other_camera(self._start_map.camera, self.camera, self._warnings)
         every = self._detector if self.config.semantics.frames == "every" else None
@@ -381,6 +396,7 @@ class Slam:
         self._localization = LocalizationStage(
             self._tracker, self._back, self._programs, self.config, localize_only=self._localize_only
         )
+        self._outside_motion = OutsideMotion(self._imu if self.config.track.gyro else None)
         self._frame = 0
         self._clock = FrameClock(self.camera.fps, self._warnings)
         self._background = None if self.camera.is_stereo else BackgroundConsistency(self.camera, sensor)
@@ -405,6 +421,8 @@ class Slam:
             return replace(tracked, T_world_cam=self._localization.predicted()) if predicts else tracked
         time_s = self._clock.continuous_ns(tracked.timestamp_ns) * 1e-9
         depth_delay_s = float(arrays.depth_delay_s)
+        is_ok = tracked.status == TrackStatus.OK
+        self._outside_motion.frame_tracked(tracked.twist, tracked.covariance, is_ok=is_ok)
         self._masks.frame_tracked(self._frame, time_s, tracked.T_world_cam, tracked.twist, depth_delay_s)
         self._localization.frame_tracked(tracked.T_world_cam, tracked.twist)
         self._memory.keep()

@@ -3,12 +3,14 @@
 import gc
 from concurrent.futures import ThreadPoolExecutor
 from enum import Enum
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxlie import SE3
-from jaxslam_kernels.se3 import compose
+from jaxslam_kernels.pose.pose_cost import PosePrior
+from jaxslam_kernels.se3 import between, compose
 from jaxslam_kernels.types import Flag
 from jaxtyping import Array, Float
 
@@ -20,6 +22,7 @@ from jaxslam.runtime.compiler_options import FAST_COMPILE, SINGLE_THREAD
 from jaxslam.runtime.garbage import collector_paused
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame_arrays import FrameArrays
+from jaxslam.slam.outside_motion import MeasuredMotion
 from jaxslam.tracking.cue_registry import with_cue_params, with_cues
 from jaxslam.tracking.from_config import track_params, track_plan, with_dense_keyframes
 from jaxslam.tracking.initial_state import init_state
@@ -29,23 +32,60 @@ from jaxslam.tracking.step import FlowResult, follow_points, predicted_pose, tra
 _PATIENT_S = 0.5
 """Seconds from one keyframe to the next for want of points, while mapping is behind. With the preset `ngd` at the rate
 of the camera there was one every tenth of a second, and the threads held each other up."""
+_NO_INFORMATION = np.zeros((6, 6), np.float32)
 _ALL_IS_NEW = 2.0
 """More than the whole of a keyframe's points: a frame that shows them all is kept too."""
+
+
+class _KnownMotion(NamedTuple):
+    """What is known of the motion since the last tracked frame.
+
+    Attributes:
+        T_last_cam: `(7,)` pose of the camera in the axes of the last tracked frame.
+        has_rotation: Whether its rotation is known.
+        has_translation: Whether its translation is known.
+    """
+
+    T_last_cam: Float[Array, "7"]
+    has_rotation: Flag
+    has_translation: Flag
+
+
+def _known_motion(T_last_cam: Pose | None, *, translation: bool = True) -> _KnownMotion:
+    known: Any = (np.bool_(T_last_cam is not None), np.bool_(T_last_cam is not None and translation))
+    motion: Any = (IDENTITY if T_last_cam is None else T_last_cam).astype(np.float32)
+    return _KnownMotion(motion, *known)
 
 
 @compiled(when="warm-up", static="plan", options=FAST_COMPILE | SINGLE_THREAD)
 def _follow_points(
     state: TrackState,
     frame: FrameArrays,
-    T_last_cam: Float[Array, "7"],
-    known: Flag,
+    motion: _KnownMotion,
+    measured: _KnownMotion,
+    information: Float[Array, "6 6"],
     params: TrackParams,
     plan: TrackPlan,
 ) -> FlowResult:
-    """Follow points from a motion since the last frame, or where that is not known, from the velocity."""
-    own, given = predicted_pose(state, frame.dt_s), compose(state.T_world_cam, SE3(T_last_cam))
-    predicted = SE3(jnp.where(known, given.wxyz_xyz, own.wxyz_xyz))
-    return follow_points(state, frame, params, plan, predicted=predicted, is_known=known)
+    """Follow points from a motion since the last frame, or where that is not known, from one that was measured outside.
+
+    What is not known of either comes from the velocity.
+    """
+    own = predicted_pose(state, frame.dt_s)
+    outside = _moved(state.T_world_cam, measured, own)
+    predicted = SE3(jnp.where(motion.has_rotation, _moved(state.T_world_cam, motion, own).wxyz_xyz, outside.wxyz_xyz))
+    is_known = motion.has_rotation | measured.has_rotation
+    prior = PosePrior(outside, information)
+    return follow_points(state, frame, params, plan, predicted=predicted, prior=prior, is_known=is_known)
+
+
+def _moved(T_world_last: SE3, motion: _KnownMotion, own: SE3) -> SE3:
+    """Return the pose after a motion; what is not known of it is that of another pose."""
+    given, moved = SE3(motion.T_last_cam), between(T_world_last, own)
+    # A rotation alone says how the camera points; from where, the velocity says.
+    shift = jnp.where(motion.has_translation, given.translation(), moved.translation())
+    parts = jnp.concatenate([given.wxyz_xyz[:4], shift])
+    return SE3(jnp.where(motion.has_rotation, compose(T_world_last, SE3(parts)).wxyz_xyz, own.wxyz_xyz))
 
 
 @compiled(when="warm-up", static="plan", donate="state", options=FAST_COMPILE)
@@ -126,27 +166,38 @@ class Tracker:
     def compile(self, frame: FrameArrays) -> None:
         """Compile the programs for frames like this one; the state stays as it is."""
         state, other = self.fresh_state(), self.fresh_state()
-        followed = FlowResult(other.pyramid, other.T_world_cam, other.points.uv, other.points.valid)
+        # As `_follow_points` returns it: with NumPy's array the step was compiled anew for the first frame.
+        prior = PosePrior(other.T_world_cam, committed(jnp.asarray(_NO_INFORMATION)))
+        followed = FlowResult(other.pyramid, other.T_world_cam, other.points.uv, other.points.valid, prior)
         # In two threads: XLA compiles one while Python traces the other, 1.2 s less from an empty cache. The step
         # takes longer: it is lowered before, as Python traces one program at a time.
         with collector_paused(), ThreadPoolExecutor(1, thread_name_prefix="jaxslam-compile-flow") as beside:
             lower(_track_followed, state, frame, followed, self.params, self.plan)
-            motion = IDENTITY.astype(np.float32), np.bool_(False)
-            flow = beside.submit(_follow_points, other, frame, *motion, self.params, self.plan)
+            nothing = _known_motion(None), _known_motion(None), _NO_INFORMATION
+            flow = beside.submit(_follow_points, other, frame, *nothing, self.params, self.plan)
             beside.submit(gc.collect)  # while XLA compiles the step; the second frame would wait for it, 0.2 s
             jax.block_until_ready(_track_followed(state, frame, followed, self.params, self.plan))
             jax.block_until_ready(flow.result())
 
-    def follow(self, frame: FrameArrays, T_last_cam: Pose | None = None) -> FlowResult:
+    def follow(
+        self, frame: FrameArrays, T_last_cam: Pose | None = None, measured: MeasuredMotion | None = None
+    ) -> FlowResult:
         """Follow the points of the state into a frame by optical flow.
 
         Args:
             frame: The frame.
             T_last_cam: `(7,)` pose of the camera in the axes of the last tracked frame, from which points are followed;
                 predicted from the velocity if it is not known.
+            measured: Motion since the last tracked frame that was measured by something else; a term of the pose, and
+                the prediction if there is no other.
         """
-        motion = (IDENTITY if T_last_cam is None else T_last_cam).astype(np.float32)
-        return _follow_points(self.state, frame, motion, np.bool_(T_last_cam is not None), self.params, self.plan)
+        outside, information = _known_motion(None), _NO_INFORMATION
+        if measured is not None:
+            prior = measured.prior
+            outside = _known_motion(prior.T_last_cam, translation=prior.has_translation)
+            information = measured.information.astype(np.float32)
+        motion = _known_motion(T_last_cam)
+        return _follow_points(self.state, frame, motion, outside, information, self.params, self.plan)
 
     def last_pose(self) -> Pose:
         """Return the pose `(7,)` of the last tracked frame."""

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxlie import SE3
 from jaxslam_kernels.camera import to_pixels, without_distortion
 from jaxslam_kernels.pose.pnp import ransac_pnp
+from jaxslam_kernels.pose.pose_cost import PosePrior
 from jaxslam_kernels.pose.pose_refine import PoseRefinement, PoseStatus, refine_pose
 from jaxslam_kernels.se3 import to_camera
 from jaxslam_kernels.types import Code, Mask, Pixels, Points, Weights
@@ -26,7 +27,9 @@ instead of 16 in the room xyz.
 """
 
 
-def coarse_pose(step: StepContext, seen: Measurements, votes: Weights, predicted: SE3) -> tuple[SE3, Mask, Code]:
+def coarse_pose(
+    step: StepContext, seen: Measurements, votes: Weights, predicted: SE3, prior: PosePrior | None = None
+) -> tuple[SE3, Mask, Code]:
     """Estimate the pose that most points agree with, by RANSAC.
 
     Args:
@@ -34,6 +37,7 @@ def coarse_pose(step: StepContext, seen: Measurements, votes: Weights, predicted
         seen: Measurements of the points of the state at the predicted pose.
         votes: `(n,)` weights of the points; 0 for a point that is not used.
         predicted: Predicted pose, one of the hypotheses.
+        prior: Pose known beforehand, which votes too; `None` if nothing is known.
 
     Returns:
         The pose, the `(n,)` mask of the points that agree with it, and its `PoseStatus`.
@@ -58,6 +62,7 @@ def coarse_pose(step: StepContext, seen: Measurements, votes: Weights, predicted
         # With even votes the redescending loss is narrow, and its optimum as good as that of the inliers. With a wide
         # one it is not: on the start of Bonn `crowd`, `ngd` would have 12.1 mm instead of 11.0, `rts` 9.4, not 8.5.
         on_inliers=not plan.balance_regions,
+        prior=prior,
     )
     if not plan.balance_regions or view.right is not None:
         return result.T_world_cam, result.inliers, result.status
@@ -73,6 +78,7 @@ def refined_pose(
     matches: KeyframeMatches,
     matches_seen: Measurements,
     coarse: SE3,
+    prior: PosePrior | None = None,
 ) -> tuple[PoseRefinement, Mask]:
     """Refine the coarse pose from tracked points and keyframe matches together.
 
@@ -83,6 +89,7 @@ def refined_pose(
         matches: Keyframe points matched with the frame.
         matches_seen: Measurements of these matches at the coarse pose.
         coarse: Coarse pose.
+        prior: Pose known beforehand, one more term; `None` if nothing is known.
 
     Returns:
         The refinement, and the `(n,)` mask of the tracked points that agree with it.
@@ -102,6 +109,7 @@ def refined_pose(
         sigma_depth=seen.sigma,
         loss="cauchy",
         scale=params.loss_scale,
+        prior=prior,
         max_steps=step.plan.pose_steps,
     )
     close = _close(refined.T_world_cam, X_world, seen.xy, params)

@@ -16,6 +16,7 @@ from jaxslam_kernels.camera import without_distortion
 from jaxslam_kernels.depth.sampling import valid_depth
 from jaxslam_kernels.flow.lk_flow import lk_flow
 from jaxslam_kernels.image.pyramid import Pyramid, build_pyramid
+from jaxslam_kernels.pose.pose_cost import PosePrior
 from jaxslam_kernels.robust import weighted_median
 from jaxslam_kernels.se3 import to_camera
 from jaxslam_kernels.types import Flag, Mask, Pixels, Scalar, Weights
@@ -41,7 +42,7 @@ from jaxslam.tracking.outcome import judge_frame
 from jaxslam.tracking.point_update import probation_weights, update_points
 from jaxslam.tracking.pose_estimation import coarse_pose, fits, measure_matches, refined_pose, worse_status
 from jaxslam.tracking.state import TrackOutput, TrackParams, TrackPlan, TrackState
-from jaxslam.tracking.step_checks import check_cues, check_followed, check_pose, check_state, check_step
+from jaxslam.tracking.step_checks import check_cues, check_followed, check_pose, check_prior, check_state, check_step
 from jaxslam.tracking.step_context import StepContext
 
 
@@ -53,12 +54,14 @@ class FlowResult(NamedTuple):
         predicted: Predicted pose of the camera.
         uv: `(2, n)` positions of the points in the frame, pixels.
         ok: `(n,)` mask of the points that were found.
+        prior: Pose of the camera known beforehand, with its information; `None` if nothing is known.
     """
 
     pyramid: Pyramid
     predicted: SE3
     uv: Pixels
     ok: Mask
+    prior: PosePrior | None = None
 
 
 def track_step(
@@ -68,6 +71,7 @@ def track_step(
     plan: TrackPlan = DEFAULT_PLAN,
     *,
     predicted: SE3 | None = None,
+    prior: PosePrior | None = None,
 ) -> tuple[TrackState, TrackOutput]:
     """Track one frame.
 
@@ -76,8 +80,10 @@ def track_step(
         frame: Image, depth and time of the frame.
         params: Camera and thresholds, traced.
         plan: Array sizes and search settings, static; the plan with which the state was made.
-        predicted: Pose of the camera from which points are tracked, such as that of wheel odometry; by default it is
-            predicted from the velocity.
+        predicted: Pose of the camera from which points are tracked; by default that of `prior`, or else one predicted
+            from the velocity.
+        prior: Pose of the camera known beforehand, such as that of wheel odometry, with its information: the inverse of
+            its covariance in the tangent space at the camera. It is one term of the pose.
 
     Returns:
         The new state and the output for the frame. A frame that cannot be used is not an error: points and pose stay,
@@ -91,7 +97,7 @@ def track_step(
     """
     _check(state, frame, params, plan)
     check_cues(state, frame, params, plan)  # here too: before anything is computed where nothing is traced
-    flow = follow_points(state, frame, params, plan, predicted=predicted)
+    flow = follow_points(state, frame, params, plan, predicted=predicted, prior=prior)
     return track_followed(state, frame, flow, params, plan)
 
 
@@ -107,6 +113,7 @@ def follow_points(
     plan: TrackPlan = DEFAULT_PLAN,
     *,
     predicted: SE3 | None = None,
+    prior: PosePrior | None = None,
     is_known: Flag | bool = True,
 ) -> FlowResult:
     """Track the points of the state into a frame by optical flow: the first part of `track_step`.
@@ -118,7 +125,9 @@ def follow_points(
         frame: Image and time of the frame; the values of depth, `ignore` and `movable` may still change afterward.
         params: Camera and thresholds, traced; the parameters of cues may be missing.
         plan: Array sizes and search settings, static.
-        predicted: Pose of the camera from which points are tracked; by default it is predicted from the velocity.
+        predicted: Pose of the camera from which points are tracked; by default that of `prior`, or else one predicted
+            from the velocity.
+        prior: Pose of the camera known beforehand, with its information, for `track_followed`.
         is_known: Whether `predicted` comes from a measurement, so that points it takes out of the image are gone. If it
             is only predicted from the velocity, they are sought where they were.
 
@@ -130,6 +139,10 @@ def follow_points(
     params = _for_readout(params, frame)
     height, width = frame.image.shape
     pyramid = build_pyramid(frame.image, num_levels=plan.num_levels, dtype=state.twist.dtype)
+    if prior is not None:
+        check_prior(prior, state.twist.dtype)
+    if predicted is None and prior is not None:
+        predicted = prior.T_world_cam
     if predicted is None:
         predicted, is_known = predicted_pose(state, frame.dt_s), False
     check_pose("predicted", predicted)
@@ -141,7 +154,7 @@ def follow_points(
     guess = jnp.where(inside[None, :], guess, points.uv)
     flow = lk_flow(state.pyramid, pyramid, points.uv, guess, points.valid, plan=plan.flow)
     gone = is_known & ~inside
-    return FlowResult(pyramid, predicted, flow.points, flow.ok & (points.weight > 0) & ~gone)
+    return FlowResult(pyramid, predicted, flow.points, flow.ok & (points.weight > 0) & ~gone, prior)
 
 
 def track_followed(
@@ -169,7 +182,7 @@ def track_followed(
     """
     _check_followed(state, frame, followed_points, params, plan)
     params = _for_readout(params, frame)
-    pyramid, predicted, uv, found = followed_points
+    pyramid, predicted, uv, found, prior = followed_points
     # 1. Prepare the frame: depth that can be believed, and the right image of a stereo pair.
     step, X_world = _prepared(state, frame, pyramid, params, plan), state.points.X_world
     # 2. Rays of the tracked points, without distortion: the same for every pose below.
@@ -182,7 +195,9 @@ def track_followed(
     seen = step.measured(rays, X_world, predicted, state.twist)
     regions = _regions(step, seen)
     trust = probation_weights(state.points, params)
-    coarse, agreeing, coarse_status = coarse_pose(step, seen, _votes(step, trust, background, regions), predicted)
+    coarse, agreeing, coarse_status = coarse_pose(
+        step, seen, _votes(step, trust, background, regions), predicted, prior
+    )
     # 5. Dynamic cues: points, regions and objects that move relative to the coarse pose are rejected.
     twist = step.twist_to(coarse)
     seen = step.measured(rays, X_world, coarse, twist)
@@ -199,7 +214,7 @@ def track_followed(
     matches = align_keyframe_points(step._replace(view=static_view), coarse, twist)
     # 7. Refinement of the pose by tracked points and keyframe points together.
     counting, matches_seen = jnp.where(agreeing, trust, 0), measure_matches(step, matches, coarse, twist)
-    refined, inliers = refined_pose(step, seen, counting, matches, matches_seen, coarse)
+    refined, inliers = refined_pose(step, seen, counting, matches, matches_seen, coarse, prior)
     outcome = judge_frame(step, refined, background & rejection.counts(), inliers)
     # 8. Points at the refined pose; new ones, and a keyframe, if they are needed.
     monitored = rejection.monitor_points(uv, state.points.anchor_age, background & ~inliers)
@@ -230,6 +245,8 @@ def _check_followed(
     check_cues(state, frame, params, plan)
     points = expected.points
     check_followed(followed_points, FlowResult(expected.pyramid, expected.T_world_cam, points.uv, points.valid))
+    if followed_points.prior is not None:
+        check_prior(followed_points.prior, jax.typeof(state.twist).dtype)
 
 
 def _for_readout(params: TrackParams, frame: FrameArrays) -> TrackParams:

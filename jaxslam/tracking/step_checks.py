@@ -4,7 +4,7 @@ The checks run while a program is traced, so compiled code contains none of them
 `ValueError`, a wrong type a `TypeError`; the message names the argument, the expected value and the given one.
 """
 
-from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin, get_type_hints
 
 import jax
 import jax.numpy as jnp
@@ -12,11 +12,15 @@ import numpy as np
 from jax.core import Tracer
 from jax.typing import DTypeLike
 from jaxlie import SE3
+from jaxslam_kernels.pose.pose_cost import PosePrior
 
 from jaxslam.dynamics.cue import CueResult
 from jaxslam.dynamics.object_motion import MotionParams
 from jaxslam.sensors.frame_arrays import FrameArrays, check_gray_range
 from jaxslam.tracking.state import TrackParams, TrackPlan, TrackState
+
+if TYPE_CHECKING:
+    from jaxslam.tracking.step import FlowResult
 
 _STATE_DTYPE = " as the state"
 _FINEST = float(jnp.finfo(jnp.float32).eps)
@@ -195,10 +199,10 @@ def _check_numbers(name: str, params: Any, dtype: jnp.dtype) -> None:
             check_array(f"{name}.{field}", value, (5,) if field == "distortion" else (), dtype, _STATE_DTYPE)
 
 
-def check_followed(followed: NamedTuple, expected: NamedTuple) -> None:
-    """Check that a `FlowResult` was computed with this plan, image size and type, as `check_state` does."""
+def check_followed(followed: "FlowResult", expected: "FlowResult") -> None:
+    """Check that a result was computed with this plan, image size and type, as `check_state` does; not its prior."""
     _check_class("followed_points", followed, type(expected))
-    _check_like("followed_points", followed, expected)
+    _check_like("followed_points", followed._replace(prior=None), expected)
 
 
 def check_cue_result(name: str, result: CueResult, num_points: int, dtype: jnp.dtype) -> None:
@@ -280,3 +284,15 @@ def check_pose(name: str, pose: object) -> None:
         TypeError: If it is no `jaxlie.SE3`.
     """
     _check_class(name, pose, SE3)
+
+
+def check_prior(prior: PosePrior, dtype: DTypeLike) -> None:
+    """Check that a prior is a pose with its `(6, 6)` information.
+
+    Raises:
+        ValueError: If the information has another shape.
+        TypeError: If it is no `PosePrior`, or of another type than the state.
+    """
+    _check_class("prior", prior, PosePrior)
+    check_pose("prior.T_world_cam", prior.T_world_cam)
+    check_array("prior.information", prior.information, (6, 6), dtype, _STATE_DTYPE)

@@ -211,6 +211,7 @@ def cases(n: int = 11) -> dict[str, Case]:
             "depth": f(n),
             "initial": transforms(),
             "threshold_px": f(),
+            "prior": PosePrior(transforms(), f(6, 6)),
         },
         partial(draw_samples, num_samples=3, size=4): {"key": KEY, "weights": f(n)},
         pnp.score_poses: {"T_cam_world": f(3, 4, 2), "problem": problem},

@@ -32,7 +32,7 @@ from jaxslam.benchmark.suites.run_names import flattened, run_folder
 from jaxslam.benchmark.suites.suite import Sequence as Clip
 from jaxslam.config.loading import load_config, to_yaml
 from jaxslam.config.schema import Config
-from jaxslam.datasets import Associated, Dataset, Subset, open_dataset
+from jaxslam.datasets import Associated, Dataset, Subset, imu_sheet, open_dataset
 from jaxslam.datasets.catalog import find_recording
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset, with_true_masks
 from jaxslam.datasets.synthetic.cached_dataset import StoredRoom
@@ -254,7 +254,7 @@ def run_here(folder: Path, root: Path | None, rooms: Path | None) -> None:
     dataset, truth = with_true_masks(whole, job.config.semantics)
     flow_ms = flow_time_ms(dataset)
     pictures = RunPictures(len(dataset))
-    slam = Slam(dataset.camera, job.config, detector=truth)
+    slam = Slam(dataset.camera, job.config, detector=truth, imu=imu_sheet(dataset))
     slam.warm_up()
     began = time.perf_counter()
     with slam:

@@ -4,12 +4,13 @@ import numpy as np
 
 from jaxslam.config.schema import SemanticsConfig
 from jaxslam.datasets.prefetch import Subset
-from jaxslam.datasets.protocol import Dataset
+from jaxslam.datasets.protocol import Dataset, imu_sheet
 from jaxslam.datasets.synthetic.ground_truth_detector import LabeledRecording, SceneDetector
 from jaxslam.errors import ConfigError
 from jaxslam.semantics.from_config import SCENE
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame
+from jaxslam.sensors.imu import ImuSheet
 from jaxslam.trajectory.trajectory import Trajectory
 
 
@@ -55,6 +56,8 @@ class _Noted:
         self.camera: Camera = dataset.camera
         self.timestamps_ns: np.ndarray = dataset.timestamps_ns
         self.ground_truth: Trajectory | None = dataset.ground_truth
+        self.imu: ImuSheet | None = imu_sheet(dataset)
+        self._part = dataset if isinstance(dataset, Subset) else None
 
     def __len__(self) -> int:
         return len(self._indices)
@@ -62,4 +65,5 @@ class _Noted:
     def __getitem__(self, index: int) -> Frame:
         rendered = self._room.render(self._indices[index])
         self._detector.note(rendered)
-        return rendered.measured
+        frame = rendered.measured
+        return frame if self._part is None else self._part.with_samples(range(len(self))[index], frame)

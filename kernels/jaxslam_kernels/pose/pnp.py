@@ -18,7 +18,7 @@ from jaxslam_kernels.camera import MIN_DEPTH, Intrinsics
 from jaxslam_kernels.checks import checked
 from jaxslam_kernels.pose.absolute_orientation import absolute_orientation
 from jaxslam_kernels.pose.p3p import p3p, p3p_near
-from jaxslam_kernels.pose.pose_cost import PoseProblem, pose_problem
+from jaxslam_kernels.pose.pose_cost import PosePrior, PoseProblem, pose_problem
 from jaxslam_kernels.pose.pose_refine import PoseStatus, refine_problem, solve_pose, usable_pose
 from jaxslam_kernels.ransac_sampling import draw_samples
 from jaxslam_kernels.robust import Loss
@@ -45,7 +45,8 @@ class PnpResult(NamedTuple):
         inliers: True for points that agree with the pose. All false if none was found.
         num_inliers: Number of inliers.
         score: `Σ w (1 - min(e², 1))` with e the error in thresholds: the weight of the inliers, less for larger errors;
-            `Σ w (1 - min(e, 1))²` if averaged.
+            `Σ w (1 - min(e, 1))²` if averaged. A prior takes away `eᵀ Λ e / 9` with its e and Λ, in which a threshold
+            is three standard deviations too.
         status: A `PoseStatus`.
     """
 
@@ -75,6 +76,7 @@ def ransac_pnp(
     max_steps: int = 25,
     averaged: bool = False,
     on_inliers: bool = True,
+    prior: PosePrior | None = None,
 ) -> PnpResult:
     """Finds the camera pose that most points agree on, among any number of wrong ones.
 
@@ -104,6 +106,8 @@ def ransac_pnp(
         averaged: Whether the score is averaged over thresholds, see `score_poses`, static.
         on_inliers: Whether the pose is refined on its inliers in the end, static. Without, it is the optimum of the
             redescending loss over all points: enough for a pose from which another refinement begins.
+        prior: A pose known beforehand, with its information: it takes part in the score and in the refinement, so that
+            it contradicts a crowd that carries the votes.
 
     Returns:
         A `PnpResult`; everything in it is finite.
@@ -113,19 +117,20 @@ def ransac_pnp(
     sigma_px, sigma_depth = (
         jnp.asarray(threshold, X_world.dtype) / _GATE_SIGMAS for threshold in (threshold_px, threshold_depth)
     )
-    problem, idle = pose_problem(X_world, uv, intrinsics, weights, depth, sigma_px, sigma_depth, _GATE_SIGMAS, None)
+    problem, idle = pose_problem(X_world, uv, intrinsics, weights, depth, sigma_px, sigma_depth, _GATE_SIGMAS, prior)
     fixed = lax.stop_gradient(problem)
     fallback, has_initial = _fallback(initial, X_world.dtype)
     samples = draw_samples(key, fixed.weights, num_hypotheses, SAMPLE_SIZE)
     hypotheses, real = _hypotheses(fixed, samples, lax.stop_gradient(expected_depth))
     hypotheses = jnp.concatenate([hypotheses, _as_transform(fallback)], axis=2)
-    scores = jnp.where(jnp.append(real, has_initial), score_poses(hypotheses, fixed, averaged), -1.0)
+    real = jnp.append(real, has_initial)
+    scores = jnp.where(real, score_poses(hypotheses, fixed, averaged), -jnp.inf)
     best, _ = usable_pose(_as_pose(hypotheses[:, :, jnp.argmax(scores)]))
     if on_inliers:
         pose, status = _refined_on_inliers(best, problem, idle, loss, max_steps, averaged)
     else:
         pose, status = _refined_robustly(best, problem, idle, max_steps, averaged)
-    return _result(pose, status, fixed, fallback, scores.max() >= 0, min_inliers, averaged)
+    return _result(pose, status, fixed, fallback, real.any(), min_inliers, averaged)
 
 
 @checked
@@ -143,7 +148,23 @@ def score_poses(T_cam_world: _Transforms, problem: PoseProblem, averaged: bool =
     error = _squared_errors(T_cam_world[..., None], *(o[..., None, :] for o in _observed(problem)))
     error = jnp.minimum(error, 1.0)
     agreement = jnp.square(1.0 - jnp.sqrt(error)) if averaged else 1.0 - error
-    return agreement @ problem.weights
+    score = agreement @ problem.weights
+    if problem.prior is None:
+        return score
+    return score - _prior_deviation(T_cam_world, problem.prior) / jnp.square(problem.scale)
+
+
+def _prior_deviation(T_cam_world: _Transforms, prior: PosePrior) -> Float[Array, " h"]:
+    """Squared deviation `eᵀ Λ e` of each pose from the prior, see `PosePrior`."""
+    R_cam_world, t_cam_world = T_cam_world[:, :3], T_cam_world[:, 3]
+    R_prior = rotation_matrix(prior.T_world_cam)
+    position = -jnp.einsum("jih,jh->ih", R_cam_world, t_cam_world)
+    offset = R_prior.T @ (position - prior.T_world_cam.translation()[:, None])
+    R = jnp.einsum("ji,kjh->ikh", R_prior, R_cam_world)  # of the sought camera in the predicted one
+    sines = jnp.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    cosine = 0.5 * jnp.sqrt(jnp.maximum(1.0 + jnp.trace(R), 1e-6))  # of half the angle
+    error = jnp.concatenate([offset, 0.5 * sines / cosine[None, :]])
+    return jnp.einsum("ih,ij,jh->h", error, prior.information, error)
 
 
 def _observed(problem: PoseProblem) -> tuple[Array, Array, Array, Array]:

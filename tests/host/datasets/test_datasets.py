@@ -19,10 +19,11 @@ from tiny_recording import (
     write_recording,
 )
 
-from jaxslam.datasets import Associated, Dataset, Subset, Unmatched, dataset_kinds, open_dataset, prefetch
+from jaxslam.datasets import Associated, Dataset, Subset, Unmatched, dataset_kinds, imu_sheet, open_dataset, prefetch
 from jaxslam.errors import CameraError, DatasetError
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame
+from jaxslam.sensors.imu import ImuSamples, ImuSheet
 
 KITCHEN = Camera("kitchen", 640, 480, 545, 545, 320, 240, depth_scale_per_m=5000)
 
@@ -298,6 +299,32 @@ class TestSubset:
         assert Subset(Subset(whole, 1, 5), 1, 3)[0].timestamp_ns == whole.timestamps_ns[2]
         with pytest.raises(DatasetError, match="walk: expected a part of 6 frames, got 6:9"):
             Subset(whole, 6, 9)
+
+
+class Inertial(Subset):
+    """A recording with an IMU of 100 Hz."""
+
+    @property
+    def imu(self) -> ImuSheet:
+        return ImuSheet(100.0, 0.0, 0.0, 0.0, 0.0)
+
+    @property
+    def imu_samples(self) -> ImuSamples:
+        times_ns = np.arange(self.timestamps_ns[0] - 10**9, self.timestamps_ns[-1], 10**7)
+        return ImuSamples(times_ns, np.zeros((len(times_ns), 3)), np.zeros((len(times_ns), 3)))
+
+
+def test_frames_of_every_second_have_the_samples_of_those_between(tmp_path: Path) -> None:
+    whole = Inertial(open_tiny(write_recording(tmp_path)))
+    part = Subset(Subset(whole, 0, 6, 2), 0, 3)
+    assert imu_sheet(part) == whole.imu
+    assert imu_sheet(open_tiny(tmp_path)) is None
+    for index in (1, 2, -1):
+        samples = Subset(whole, 0, 6, 2)[index].imu
+        assert samples is not None
+        end = range(3)[index]
+        expected = whole.imu_samples.between(*part.timestamps_ns[[end - 1, end]].tolist())
+        np.testing.assert_array_equal(samples.timestamps_ns, expected.timestamps_ns)
 
 
 class Recorder(Subset):

@@ -16,8 +16,9 @@ from jaxslam_kernels.camera import Intrinsics
 from jaxslam_kernels.pose.absolute_orientation import absolute_orientation
 from jaxslam_kernels.pose.p3p import p3p, p3p_near
 from jaxslam_kernels.pose.pnp import PnpResult, ransac_pnp, score_poses
-from jaxslam_kernels.pose.pose_cost import pose_cost, pose_problem
+from jaxslam_kernels.pose.pose_cost import PosePrior, pose_cost, pose_problem
 from jaxslam_kernels.pose.pose_refine import PoseStatus
+from jaxslam_kernels.se3 import retract, rotation_matrix
 from linearized import differentiate
 from quick_compile import quick_compile
 from scipy.spatial.transform import Rotation
@@ -308,6 +309,55 @@ class TestRansac:
             with_depth.append(pose_error(_run(seed, inputs)[0].T_world_cam.wxyz_xyz, scene.pose)[0])
             without.append(pose_error(_run(seed, no_depth)[0].T_world_cam.wxyz_xyz, scene.pose)[0])
         assert np.median(with_depth) < 0.9 * np.median(without)
+
+    def test_a_prior_contradicts_a_crowd_that_carries_the_votes(self):
+        """Three in five points move together; what a gyro knows of the rotation alone makes the others win."""
+        rotation_only = np.diag([0.0] * 3 + [1e8] * 3)
+
+        @quick_compile
+        def solve(key, X_world, uv, depth, truth, information):
+            prior = PosePrior(truth, information)
+            return ransac_pnp(key, X_world, uv, camera(), depth=depth, prior=prior)
+
+        for seed in range(5):
+            scene = make_scene(seed, N, noise_px=0.3, noise_depth=0.3)
+            truth = pose_of(scene.pose)
+            R, position = Rotation.from_quat(np.roll(scene.pose[:4], -1)).as_matrix(), scene.pose[4:, None]
+            crowd = np.arange(N) < 0.6 * N
+            turned = Rotation.from_rotvec([0.0, 0.05, 0.02]).as_matrix() @ (R.T @ (scene.X_world - position))
+            theirs = cv2.projectPoints(turned.T.copy(), np.zeros(3), np.zeros(3), MATRIX, DISTORTION)[0][:, 0].T
+            uv, depth = np.where(crowd, theirs, scene.uv), np.where(crowd, turned[2], scene.depth)
+            X_world, *observed = (jnp.asarray(a, jnp.float32) for a in (scene.X_world, uv, depth))
+            results = [
+                solve(jax.random.key(seed), X_world, *observed, truth, jnp.asarray(information, jnp.float32))
+                for information in (0 * rotation_only, rotation_only)
+            ]
+            followed, right = (pose_error(result.T_world_cam.wxyz_xyz, scene.pose) for result in results)
+            assert followed[1] > 0.04
+            assert right[1] < 1e-3
+            assert right[0] < 0.02
+            assert not results[1].inliers[crowd].any()
+            assert results[1].inliers[~crowd].mean() > 0.9
+
+    def test_the_score_of_a_prior_is_its_cost(self):
+        """That of `pose_cost`, in squared thresholds; no point counts, beside which float32 would lose it."""
+        scene = make_scene(3, N)
+        X_world, uv, depth, sigma = scene.arrays()
+        root = np.random.default_rng(3).normal(size=(6, 6))
+        prior = PosePrior(pose_of(scene.pose), jnp.asarray(root @ root.T, jnp.float32))
+        moved = retract(pose_of(scene.pose), jnp.asarray([0.3, -0.2, 0.4, 0.5, -0.7, 0.6], jnp.float32))
+        R_cam_world = rotation_matrix(moved).T
+        T = jnp.concatenate([R_cam_world, -(R_cam_world @ moved.translation())[:, None]], axis=1)[:, :, None]
+
+        @quick_compile
+        def evaluate(X_world, uv, depth, sigma):
+            problem = pose_problem(X_world, uv, camera(), jnp.zeros(N), depth, 1.0, sigma, 3.0, prior)[0]
+            bare = problem._replace(prior=None)
+            costs = [pose_cost(moved, each, "squared").cost for each in (problem, bare)]
+            return costs[0] - costs[1], score_poses(T, bare)[0] - score_poses(T, problem)[0]
+
+        cost, lost = map(float, evaluate(X_world, uv, depth, sigma))
+        np.testing.assert_allclose(lost, 2 * cost / 9, rtol=2e-3)
 
     def test_score_is_the_truncated_residual_or_its_average_over_thresholds(self):
         scene = make_scene(2, N)
