@@ -18,7 +18,8 @@ _MIN_KNOWN = 0.1
 """Smallest share of the middle of a box with depth."""
 _MIDDLE = 0.5
 """Share of a box's width and height, around its center, from which the object's depth is taken."""
-_BINS, _NEAREST_M, _FARTHEST_M = 60, 0.3, 8.0
+_BIN = 0.0547236
+"""Width of a bin of log depth: 5.6 % of the depth, whether that of a hand before the lens or of a car down the road."""
 _REACH, _REACH_M = 0.1, 0.25
 """Half the depth range of an object: a share of its distance, plus meters. Against DeepLab's mask of people in Bonn
 `crowd`, median IoU 0.80, recall 0.90; with 0.4 m 0.79, 0.91; with half the range 0.80, 0.89."""
@@ -92,11 +93,10 @@ def object_depth(inside: Float[np.ndarray, "h w"]) -> float | None:
     known = middle[np.isfinite(middle) & (middle > 0)]
     if len(known) < _MIN_KNOWN * middle.size:
         return None
-    counts, edges = np.histogram(np.log(known), _BINS, (np.log(_NEAREST_M), np.log(_FARTHEST_M)))
-    if not counts.any():
-        return None
-    best = int(np.argmax(np.convolve(counts, [1, 2, 3, 2, 1], "same")))
-    return float(np.exp(0.5 * (edges[best] + edges[best + 1])))
+    bins = np.floor(np.log(known) / _BIN).astype(np.int64)
+    first = int(bins.min())
+    smooth = np.convolve(np.pad(np.bincount(bins - first), 2), [1, 2, 3, 2, 1], "valid")
+    return float(np.exp(_BIN * (first + int(np.argmax(smooth)) + 0.5)))
 
 
 def largest_parts(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:

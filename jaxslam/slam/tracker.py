@@ -32,7 +32,7 @@ from jaxslam.tracking.step import FlowResult, follow_points, predicted_pose, tra
 _PATIENT_S = 0.5
 """Seconds from one keyframe to the next for want of points, while mapping is behind. With the preset `ngd` at the rate
 of the camera there was one every tenth of a second, and the threads held each other up."""
-_NO_INFORMATION = np.zeros((6, 6), np.float32)
+_NO_INFORMATION: Any = np.zeros((6, 6), np.float32)
 _ALL_IS_NEW = 2.0
 """More than the whole of a keyframe's points: a frame that shows them all is kept too."""
 

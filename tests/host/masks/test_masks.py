@@ -91,6 +91,13 @@ class TestBoxMask:
         assert object_depth(depth) is None
         assert not mask_of_detections(detections([[10, 10, 50, 50]]), depth, dilate_px=2).any()
 
+    @pytest.mark.parametrize("scale", [0.06, 1.0, 12.0, 100.0])
+    def test_at_any_distance(self, scale: float) -> None:
+        """A car 30 m down the road and a hand before the lens are masked as a person in a room is."""
+        found = mask_of_detections(detections([[35, 15, 75, 85]]), scale * self.DEPTH, dilate_px=0)
+        assert object_depth(scale * self.DEPTH[15:85, 35:75]) == pytest.approx(1.5 * scale, rel=0.03)
+        assert found[20:80, 40:70].all()
+
     def test_networks_own_masks_come_first(self) -> None:
         own = np.zeros((1, 100, 120), bool)
         own[0, :10] = True
