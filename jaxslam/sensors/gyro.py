@@ -12,9 +12,9 @@ from jaxslam.sensors.motion_prior import MotionPrior
 
 _FIRST_BIAS_RAD_PER_S = 0.1
 """Standard deviation of the bias when the IMU is switched on: that of the IMU of EuRoC is 0.08 rad/s."""
-_MISSING_SAMPLES = 1.5
-"""Longest gap at either end, in intervals of the data sheet, over which a rate holds. In a longer one, samples are
-missing, and nothing is known."""
+_LONGEST_GAP = 2.5
+"""Longest time without a sample, in intervals of the data sheet: one may be missing. At either end of the interval of a
+frame, the rate of the nearest sample holds. In a longer gap, nothing is known."""
 _FORGET = 0.95
 """Share of the errors of earlier frames that is kept."""
 _LARGEST_SIGMAS = 5.0
@@ -106,7 +106,7 @@ class Gyro:
         """Return samples that reach from one time to the other, the first and last rate held; `None` if they do not."""
         if not len(samples) or until_ns <= from_ns:
             return None
-        longest_ns = _MISSING_SAMPLES * 1e9 / self._sheet.rate_hz
+        longest_ns = _LONGEST_GAP * 1e9 / self._sheet.rate_hz
         times = samples.timestamps_ns
         around = np.concatenate([[min(from_ns, times[0])], times, [max(until_ns, times[-1])]])
         inside = (around[:-1] < until_ns) & (around[1:] > from_ns)

@@ -53,9 +53,9 @@ class InputChecks:
         """Warn of samples of an IMU without its data sheet, and of a data sheet without samples."""
         if frame.imu is not None and not self._has_imu:
             text = (
-                "imu: expected the data sheet of the IMU whose samples come with the frames, Slam(imu=...), got none;"
+                "imu: expected the data sheet of the IMU with its samples, Slam(imu=...), got none: they are not used"
             )
-            self._warnings.warn("IMU", f"{text} the samples are not used")
+            self._warnings.warn("IMU", text)
         if frame.imu is None and self._has_imu:
             self._warnings.warn("IMU", "imu: expected samples of the IMU with each frame, as its data sheet was given")
 

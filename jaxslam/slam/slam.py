@@ -230,10 +230,9 @@ class Slam:
         watch.ends("pose")
 
         # 5. Match features of a lost frame with the last one, or relocalize it; match a weak one with the local map.
-        lost = int(output.status) == TrackStatus.LOST
-        again = self._localization.track_by_features(arrays, flow, measured) if lost else None
-        if again is not None:
-            flow, output = again
+        if int(output.status) == TrackStatus.LOST:
+            again = self._localization.track_by_features(arrays, flow, measured)
+            flow, output = again or (flow, output)
         if int(output.status) != TrackStatus.LOST:  # cues go by a wrong motion while the pose is not known
             arrays, mask = self._masks.exclude_moving(arrays, mask, flow, output)
         output, num_matched, recognized = self._localization.localize(arrays, output, dt_s, outside)
