@@ -9,7 +9,7 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from jaxslam.datasets.protocol import Dataset, imu_sheet
+from jaxslam.datasets.protocol import Dataset, imu_samples, imu_sheet
 from jaxslam.errors import DatasetError
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame
@@ -70,7 +70,7 @@ class Subset:
     @property
     def imu_samples(self) -> ImuSamples | None:
         """All samples of the IMU of the whole recording; `None` without one."""
-        return getattr(self.whole, "imu_samples", None)
+        return imu_samples(self.whole)
 
     def __len__(self) -> int:
         return len(self.indices)

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame
-from jaxslam.sensors.imu import ImuSheet
+from jaxslam.sensors.imu import ImuSamples, ImuSheet
 from jaxslam.sensors.rectification import RectifiedPair
 from jaxslam.trajectory.trajectory import Trajectory
 
@@ -70,6 +70,11 @@ class Associated(Protocol):
 def imu_sheet(dataset: Dataset) -> ImuSheet | None:
     """Return the data sheet of the IMU whose samples come with the frames of a recording; `None` without one."""
     return getattr(dataset, "imu", None)
+
+
+def imu_samples(dataset: Dataset) -> ImuSamples | None:
+    """Return all samples of the IMU of a recording, those around the frames too; `None` without one."""
+    return getattr(dataset, "imu_samples", None)
 
 
 class Fit(IntEnum):

@@ -42,7 +42,7 @@ from jaxslam.slam.map_changes import MapChanges
 from jaxslam.slam.map_jobs import MapJob, MapUpdate, MapWriter, PointRemoval
 from jaxslam.slam.place_jobs import IndexUpdate, LoopSearch, PlaceJob, PlaceResult, PlaceSearch, Reload
 from jaxslam.slam.reload_queue import ReloadQueue
-from jaxslam.slam.tracker import KeyframeDemand
+from jaxslam.slam.tracker import KeyframeDemand, MapWishes
 from jaxslam.slam.tracker_map_sync import AnchoredPose, TrackerMapSync, pose_of, tracks_of
 from jaxslam.tracking.from_config import with_dense_keyframes
 from jaxslam.tracking.state import TrackOutput, TrackPlan, TrackState, TrackStatus
@@ -59,7 +59,6 @@ class BackEnd:
 
     Attributes:
         dense: Thread of the dense map; `None` without `dense.enabled`, or with `localize_only`.
-        map_views: Number of keyframes of the map that show what the latest tracked frame does.
     """
 
     def __init__(
@@ -108,7 +107,7 @@ class BackEnd:
         self._states = PointStates(occlusion, sensor, start, most) if occlusion.enabled else None
         self._localizer = FrameLocalizer(sensor, self._plan.features, self._link, self._index, self._states)
         self._arrived: Map | None = None
-        self._coverage, self.map_views = ViewCoverage(with_dense_keyframes(config).keyframe_below), 0
+        self._coverage, self._map_views = ViewCoverage(with_dense_keyframes(config).keyframe_below), 0
         self._changes = MapChanges()
         self._reloads = ReloadQueue(self._link, points_may_leave=self._semantics is not None)
         self._correction = IDENTITY
@@ -122,11 +121,6 @@ class BackEnd:
     def map(self) -> Map:
         """The current map."""
         return self._link.map
-
-    @property
-    def map_changed(self) -> bool:
-        """True if many points of the map are gone, and no keyframe was made since."""
-        return self._changes.pending
 
     @property
     def loops_closed(self) -> int:
@@ -144,8 +138,11 @@ class BackEnd:
         return 0 if self._semantics is None else self._semantics.num_passed_over
 
     @property
-    def keyframe_demand(self) -> KeyframeDemand:
-        """Demand of the maps for the next frame as a keyframe."""
+    def wishes(self) -> MapWishes:
+        """What the maps want of the next frame."""
+        return MapWishes(self._keyframe_demand(), self._map_views, self._changes.pending)
+
+    def _keyframe_demand(self) -> KeyframeDemand:
         # Keyframes wait that mapping has not begun with, as at first; never on the schedule of a deterministic run.
         if not self._config.run.in_turn and self._link.num_on_the_way > _MAX_ON_THE_WAY:
             return KeyframeDemand.FEWER
@@ -300,18 +297,19 @@ class BackEnd:
         self._reloads.replace(())
         return self._link.reset_at_pose(state, T_world_cam, np.zeros(6))
 
-    def frame_tracked(self, tracked: FrameResult, arrays: FrameArrays, frame: int) -> None:
+    def frame_tracked(self, tracked: FrameResult, anchored: AnchoredPose, arrays: FrameArrays, frame: int) -> None:
         """Count the keyframes that show the view, and request those around at intervals.
 
         Args:
             tracked: Result of the frame.
+            anchored: Its pose, relative to a keyframe.
             arrays: The frame, which must not change until another one is tracked.
             frame: Number of the frame.
         """
         T_world_cam = tracked.T_world_cam
-        self._localizer.frame_tracked(arrays, T_world_cam, tracked.twist)
+        self._localizer.frame_tracked(arrays, anchored, tracked.twist)
         if not self._localize_only:
-            self.map_views = self._coverage.num_views(self.map, T_world_cam, self._link.submap_now())
+            self._map_views = self._coverage.num_views(self.map, T_world_cam, self._link.submap_now())
         if frame % _RELOAD_EVERY == 0:
             looks = not self._localize_only and arrays.right is None and tracked.status == TrackStatus.OK
             seen = FrameDepth(tracked.twist, own_copy(arrays), self._sensor) if looks else None

@@ -129,15 +129,15 @@ class FrameLocalizer:
         """Forget the features of the frame before."""
         self.features = self._of_lost = None
 
-    def frame_tracked(self, arrays: FrameArrays, T_world_cam: Pose, twist: Float[np.ndarray, "6"]) -> None:
+    def frame_tracked(self, arrays: FrameArrays, anchored: AnchoredPose, twist: Float[np.ndarray, "6"]) -> None:
         """Keep a frame that was tracked.
 
         Args:
             arrays: The frame; it must not change until another one is tracked.
-            T_world_cam: `(7,)` pose of the camera.
+            anchored: Pose of the camera, relative to a keyframe.
             twist: `(6,)` velocity of the camera in its own axes, m/s, then rad/s.
         """
-        self._last, self._of_last = _TrackedFrame(arrays, twist, self._link.anchor(T_world_cam)), None
+        self._last, self._of_last = _TrackedFrame(arrays, twist, anchored), None
 
     def motion_to(self, arrays: FrameArrays, T_last_cam: Pose) -> FeatureMotion | None:
         """Estimate the motion from the last tracked frame to a lost one; `None` if features do not tell.

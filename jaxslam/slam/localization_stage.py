@@ -14,7 +14,7 @@ from jaxslam.slam.frame_localizer import FeatureMotion, LocalizedPose
 from jaxslam.slam.outside_motion import MeasuredMotion
 from jaxslam.slam.pose_history import ConstantVelocity
 from jaxslam.slam.program_compiler import ProgramCompiler
-from jaxslam.slam.tracker import Tracker
+from jaxslam.slam.tracker import MapWishes, Tracker
 from jaxslam.slam.tracker_map_sync import AnchoredPose
 from jaxslam.tracking.state import TrackOutput, TrackReason, TrackStatus
 from jaxslam.tracking.step import FlowResult
@@ -109,7 +109,7 @@ class LocalizationStage:
         self._tracker.before(arrays)
         elapsed_s = self._tracker.elapsed_s() + float(arrays.dt_s)
         flow = self._tracker.follow(arrays, found.T_last_cam, measured)
-        output = self._tracker.advance(arrays, flow, back.keyframe_demand, back.map_views, map_changed=back.map_changed)
+        output = self._tracker.advance(arrays, flow, back.wishes)
         # Where two places look alike, few points of optical flow agree with a wrong motion too: 18 did, 2.8 m off.
         if int(output.status) != TrackStatus.LOST and (found.is_certain or int(output.status) == TrackStatus.OK):
             return TrackedAgain(flow, output)
@@ -203,7 +203,7 @@ class LocalizationStage:
         return self._restarted(arrays, self._tracker.follow(arrays))
 
     def _restarted(self, arrays: FrameArrays, flow: FlowResult) -> TrackOutput:
-        output = self._tracker.advance(arrays, flow, self._back.keyframe_demand)
+        output = self._tracker.advance(arrays, flow, MapWishes(self._back.wishes.demand))
         if int(output.status) != TrackStatus.STARTED:
             self._tracker.await_relocalization()  # not to start by itself
         return output

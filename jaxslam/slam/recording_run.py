@@ -4,10 +4,11 @@ import gc
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from jaxslam.config.schema import RunConfig
-from jaxslam.datasets import Dataset, prefetch
+from jaxslam.datasets import Dataset, imu_samples, prefetch
 from jaxslam.datasets.realtime import in_real_time
 from jaxslam.errors import DatasetError, FrameError, JaxSlamError
 from jaxslam.sensors.frame import Frame
@@ -43,10 +44,14 @@ def run_recording(
     """
     check_recording(dataset, slam.camera)
     slam.warm_up()
-    records = FrameRecords()
+    records, samples, last_ns = FrameRecords(), imu_samples(dataset), None
     with _frozen_garbage():
         for timestamp_ns, frame in zip(dataset.timestamps_ns, _frames_of(dataset, slam.config.run), strict=True):
+            if isinstance(frame, Frame) and samples is not None and last_ns is not None:
+                # With those of frames between that could not be read, or came too late.
+                frame = replace(frame, imu=samples.between(last_ns, frame.timestamp_ns))  # noqa: PLW2901
             result = _tracked_or_rejected(slam, int(timestamp_ns), frame)
+            last_ns = last_ns if isinstance(result, Rejected) else result.timestamp_ns
             records.append(FrameRecord.of(result))
             if on_frame is not None:
                 on_frame(frame if isinstance(frame, Frame) else None, result)

@@ -225,8 +225,7 @@ class Slam:
         watch.ends("wait for mask")
 
         # 4. Pose: dynamic cues, RANSAC PnP and refinement.
-        back = self._back
-        output = self._tracker.advance(arrays, flow, back.keyframe_demand, back.map_views, map_changed=back.map_changed)
+        output = self._tracker.advance(arrays, flow, self._back.wishes)
         watch.ends("pose")
 
         # 5. Match features of a lost frame with the last one, or relocalize it; match a weak one with the local map.
@@ -425,8 +424,8 @@ class Slam:
         self._masks.frame_tracked(self._frame, time_s, tracked.T_world_cam, tracked.twist, depth_delay_s)
         self._localization.frame_tracked(tracked.T_world_cam, tracked.twist)
         self._memory.keep()
-        self._back.frame_tracked(tracked, arrays, self._frame)
         anchored = self._back.anchor(tracked.T_world_cam)
+        self._back.frame_tracked(tracked, anchored, arrays, self._frame)
         self._history.add(tracked.timestamp_ns, tracked.T_world_cam, anchored, in_map_frame=tracked.in_map_frame)
         return tracked
 

@@ -106,6 +106,20 @@ class KeyframeDemand(Enum):
     """In any case, since the dense map lacks what the frame shows."""
 
 
+class MapWishes(NamedTuple):
+    """What the maps want of the next frame.
+
+    Attributes:
+        demand: How much they want it to be a keyframe.
+        num_views: Number of keyframes of the map that show the view.
+        has_changed: Whether many points of the map are gone, and no keyframe was made since.
+    """
+
+    demand: KeyframeDemand = KeyframeDemand.NORMAL
+    num_views: int = 0
+    has_changed: bool = False
+
+
 class Tracker:
     """Advances the state of tracking frame by frame; starts no submap by itself, except at the first frame.
 
@@ -214,29 +228,20 @@ class Tracker:
         elapsed_s, since_keyframe_s = (jax.device_put(np.asarray(time) - dt_s, *devices) for time in times)
         self.state = self.state._replace(elapsed_s=elapsed_s, since_keyframe_s=since_keyframe_s)
 
-    def advance(
-        self,
-        frame: FrameArrays,
-        followed: FlowResult,
-        demand: KeyframeDemand,
-        map_views: int = 0,
-        *,
-        map_changed: bool = False,
-    ) -> TrackOutput:
+    def advance(self, frame: FrameArrays, followed: FlowResult, wishes: MapWishes) -> TrackOutput:
         """Estimate the pose of a frame and update the state.
 
         Args:
             frame: The frame.
             followed: Result of `follow` for it.
-            demand: How much the maps want this frame to be a keyframe.
-            map_views: Number of keyframes of the map that show the view.
-            map_changed: Whether many points of the map are gone, and no keyframe was made since.
+            wishes: What the maps want of the frame.
 
         Returns:
             Output of the tracker, in NumPy arrays.
         """
-        params = self._params_for[demand]
-        if demand is not KeyframeDemand.NOW:
-            params = params._replace(map_views=np.float32(map_views), map_changed=np.float32(map_changed))
+        params = self._params_for[wishes.demand]
+        if wishes.demand is not KeyframeDemand.NOW:
+            views, changed = np.float32(wishes.num_views), np.float32(wishes.has_changed)
+            params = params._replace(map_views=views, map_changed=changed)
         self.state, output = _track_followed(self.state, frame, followed, params, self.plan)
         return jax.tree.map(np.asarray, output)  # as `device_get`, in a tenth of its time

@@ -19,7 +19,7 @@ from jaxslam.runtime.compiler_options import FAST_COMPILE
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame
 from jaxslam.sensors.frame_arrays import FrameArrays, FrameMemory, frame_arrays
-from jaxslam.slam.tracker import KeyframeDemand, Tracker
+from jaxslam.slam.tracker import MapWishes, Tracker
 from jaxslam.tracking.from_config import track_params, track_plan
 from jaxslam.tracking.initial_state import init_state
 from jaxslam.tracking.state import TrackParams, TrackState
@@ -69,7 +69,7 @@ def _step(scene: Scene) -> Compile:
     tracker, frame = scene.tracker(), scene.blank_frame()
     shapes = jax.eval_shape(partial(follow_points, plan=tracker.plan), tracker.state, frame, tracker.params)
     followed = jax.tree.map(lambda of: np.zeros(of.shape, of.dtype), shapes)
-    return lambda: tracker.advance(frame, followed, KeyframeDemand.NORMAL)
+    return lambda: tracker.advance(frame, followed, MapWishes())
 
 
 def _gradient(scene: Scene) -> Compile:

@@ -21,7 +21,7 @@ from jaxslam.errors import BenchmarkError
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame
 from jaxslam.sensors.frame_arrays import FrameMemory
-from jaxslam.slam.tracker import KeyframeDemand
+from jaxslam.slam.tracker import MapWishes
 
 NUM_WARM, NUM_TRACED = 10, 20
 """Numbers of frames that are tracked before the trace begins, and in it."""
@@ -114,7 +114,7 @@ def trace_tracker(
     def track(some: slice) -> None:
         for frame, step_s in zip(frames[some], steps_s[some], strict=True):
             arrays = memory.hold(frame, step_s)
-            tracker.advance(arrays, tracker.follow(arrays), KeyframeDemand.NORMAL)
+            tracker.advance(arrays, tracker.follow(arrays), MapWishes())
 
     track(slice(NUM_WARM))
     options = ProfileOptions()

@@ -4,13 +4,13 @@ import numpy as np
 
 from jaxslam.config.schema import SemanticsConfig
 from jaxslam.datasets.prefetch import Subset
-from jaxslam.datasets.protocol import Dataset, imu_sheet
+from jaxslam.datasets.protocol import Dataset, imu_samples, imu_sheet
 from jaxslam.datasets.synthetic.ground_truth_detector import LabeledRecording, SceneDetector
 from jaxslam.errors import ConfigError
 from jaxslam.semantics.from_config import SCENE
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame
-from jaxslam.sensors.imu import ImuSheet
+from jaxslam.sensors.imu import ImuSamples, ImuSheet
 from jaxslam.trajectory.trajectory import Trajectory
 
 
@@ -57,6 +57,7 @@ class _Noted:
         self.timestamps_ns: np.ndarray = dataset.timestamps_ns
         self.ground_truth: Trajectory | None = dataset.ground_truth
         self.imu: ImuSheet | None = imu_sheet(dataset)
+        self.imu_samples: ImuSamples | None = imu_samples(dataset)
         self._part = dataset if isinstance(dataset, Subset) else None
 
     def __len__(self) -> int:

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from small_scene import CONFIG, HEIGHT, WIDTH
 
+from jaxslam.datasets import Subset
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
+from jaxslam.errors import DatasetError
 from jaxslam.geometry.se3 import IDENTITY, angle, between, compose, displacement, inverse, retract
 from jaxslam.sensors import Frame, ImuSamples, ImuSheet, MotionPrior
 from jaxslam.slam.frame_result import FrameResult
@@ -122,6 +124,33 @@ class TestSlam:
         assert slam.track(SOURCE[61]).status == TrackStatus.OK
         with pytest.raises(TypeError, match=r"imu: expected a jaxslam\.ImuSheet, got str; read_imu_sheet"):
             Slam(SOURCE.camera, CONFIG, imu="sensor.yaml")  # pyright: ignore[reportArgumentType]
+
+
+class TestRun:
+    def test_samples_of_a_frame_that_cannot_be_read_are_not_lost(self, with_gyro: Slam) -> None:
+        class Damaged(Subset):
+            """Frames 60, 62, 64 and 66, of which the third is damaged, with all samples of a gyro at rest."""
+
+            @property
+            def imu_samples(self) -> ImuSamples:
+                times_ns = np.arange(SOURCE[59].timestamp_ns, SOURCE[66].timestamp_ns, 5_000_000)
+                return ImuSamples(times_ns, np.zeros((len(times_ns), 3)), np.zeros((len(times_ns), 3)))
+
+            def __getitem__(self, index: int) -> Frame:
+                if index == 2:
+                    raise DatasetError("frame 2: damaged")
+                return super().__getitem__(index)
+
+        given: list[Frame | None] = []
+        with_gyro.reset()
+        with_gyro.run(Damaged(SOURCE, 60, 67, 2), lambda frame, _: given.append(frame))
+        assert given[2] is None
+        assert given[1] is not None
+        assert given[3] is not None
+        assert given[3].imu is not None
+        since = given[3].imu.timestamps_ns
+        assert since[0] - given[1].timestamp_ns <= 5_000_000
+        assert given[3].timestamp_ns - since[-1] <= 5_000_000
 
 
 class TestWarnings:
