@@ -68,7 +68,7 @@ class Gyro:
         T_last_cam = compose(inverse(self._T_imu_cam), compose(T_imu, self._T_imu_cam))
         elapsed_s = 1e-9 * (frame.timestamp_ns - last_ns)
         self._variance += self._sheet.gyroscope_random_walk**2 * elapsed_s
-        return MotionPrior(T_last_cam, self._variance_after(elapsed_s) * np.eye(3))
+        return MotionPrior(T_last_cam, self.variance(elapsed_s) * np.eye(3))
 
     def correct(
         self, predicted: MotionPrior, T_last_cam: Pose, covariance: Float64[np.ndarray, "3 3"], elapsed_s: float
@@ -94,10 +94,18 @@ class Gyro:
         self.bias_rad_per_s = self.bias_rad_per_s - gain * error_imu / elapsed_s
         self._variance *= 1 - gain
 
-    def _variance_after(self, elapsed_s: float) -> float:
-        """Return the variance of the rotation about each axis after a time, rad^2."""
+    def variance(self, elapsed_s: float, num_frames: int = 1) -> float:
+        """Return the variance of the rotation about each axis over some frames in turn, rad^2.
+
+        The bias is the same in all of them, so that its error grows with time, and its variance with the square.
+
+        Args:
+            elapsed_s: Time from the first frame to the last, in seconds.
+            num_frames: Number of frames after the first.
+        """
         by_sheet = self._noise(elapsed_s) + self._variance * elapsed_s**2
-        return max(by_sheet, self._squares / max(self._weight, 1.0), np.finfo(np.float32).tiny)
+        so_far = num_frames * self._squares / max(self._weight, 1.0)
+        return max(by_sheet, so_far, np.finfo(np.float32).tiny)
 
     def _noise(self, elapsed_s: float) -> float:
         return self._sheet.gyroscope_noise_density**2 * elapsed_s

@@ -40,7 +40,8 @@ class OutsideMotion:
         """
         self._gyro = None if imu is None else Gyro(imu)
         self._since: MotionPrior | None = None
-        self._is_broken, self._is_gyro, self._elapsed_s = True, True, 0.0
+        self._is_broken, self._is_gyro = True, True
+        self._elapsed_s, self._num_frames = 0.0, 0
         self._covariance = _FIRST_COVARIANCE
 
     def of_frame(self, frame: Frame, prior: MotionPrior | None, dt_s: float) -> MeasuredMotion | None:
@@ -54,13 +55,16 @@ class OutsideMotion:
         turned = None if self._gyro is None else self._gyro.motion(frame)
         motion = turned if prior is None else prior
         self._is_gyro &= prior is None
-        self._elapsed_s += dt_s
+        self._elapsed_s, self._num_frames = self._elapsed_s + dt_s, self._num_frames + 1
         if motion is None:
             self._is_broken = True
         elif not self._is_broken:
             self._since = motion if self._since is None else self._since.then(motion)
         if self._is_broken or self._since is None:
             return None
+        if self._is_gyro and self._gyro is not None:
+            variance = self._gyro.variance(self._elapsed_s, self._num_frames)
+            self._since = MotionPrior(self._since.T_last_cam, variance * np.eye(3))
         return MeasuredMotion(self._since, self._since.information_from(self._covariance))
 
     def frame_tracked(
@@ -77,7 +81,8 @@ class OutsideMotion:
         # The pose before is still in `self._covariance`, which tells what the gyro said of this one.
         if self._gyro is not None and self._since is not None and self._is_gyro and not self._is_broken and is_ok:
             self._correct(self._gyro, self._since, retract(IDENTITY, twist * self._elapsed_s), covariance)
-        self._since, self._is_broken, self._is_gyro, self._elapsed_s = None, False, True, 0.0
+        self._since, self._is_broken, self._is_gyro = None, False, True
+        self._elapsed_s, self._num_frames = 0.0, 0
         self._covariance = covariance
 
     def _correct(self, gyro: Gyro, turned: MotionPrior, T_last_cam: Pose, covariance: np.ndarray) -> None:

@@ -182,6 +182,22 @@ class TestOutsideMotion:
         assert again is not None
         assert angle(between(again.prior.T_last_cam, prior.T_last_cam)) < 1e-9
 
+    def test_the_bias_of_a_gyro_is_the_same_in_all_frames(self) -> None:
+        """Twice as long, twice as uncertain: errors of one bias do not cancel."""
+        motion, samples = OutsideMotion(SHEET), np.arange(0, 1_000_000_001, 5_000_000)
+        deviations = []
+        for index in range(5):
+            now_ns = 100_000_000 * index
+            part = samples[(samples > now_ns - 100_000_000) & (samples <= now_ns)]
+            imu = ImuSamples(part, np.zeros((len(part), 3)), np.zeros((len(part), 3)))
+            known = motion.of_frame(replace(self.FRAME, timestamp_ns=now_ns, imu=imu), None, 0.1)
+            if index == 0:
+                motion.frame_tracked(np.zeros(6), SURE, is_ok=True)
+            else:
+                assert known is not None
+                deviations.append(np.sqrt(known.prior.covariance[0, 0]))
+        np.testing.assert_allclose(deviations, 0.1 * 0.1 * np.arange(1, 5), rtol=0.01)
+
     def test_a_frame_without_one_breaks_the_chain_until_a_frame_is_tracked(self) -> None:
         motion, prior = OutsideMotion(None), MotionPrior(retract(IDENTITY, STEP), SURE)
         motion.frame_tracked(np.zeros(6), SURE, is_ok=True)
