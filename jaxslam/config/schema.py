@@ -77,7 +77,7 @@ class TrackConfig(ValidatedConfig):
     weak_inliers: Annotated[float, Range(at_least=4)] = 40
     """Number of inliers below which the status of a pose is `WEAK`; after a lost frame, fewer are none."""
     gyro: bool = True
-    """Whether the angular rates of an IMU, where the frames have any, tell how the camera turns."""
+    """Use the angular rates of an IMU, where the frames have any, to tell how the camera turns."""
     min_share: Annotated[float, Share] = 0.3
     """Minimum share of the tracked points that must agree on the pose."""
     detect_below: Annotated[float, Share] = 0.8

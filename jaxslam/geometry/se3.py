@@ -82,6 +82,13 @@ def angle(T: Transforms) -> Float[np.ndarray, "..."]:
     return np.asarray(2 * np.arctan2(np.linalg.norm(T[..., 1:4], axis=-1), np.abs(T[..., 0])))
 
 
+def adjoint(T: Pose) -> Float[np.ndarray, "6 6"]:
+    """Return the adjoint of `T_a_b`, which maps a tangent (translation first) from frame b to frame a."""
+    R, (x, y, z) = matrices(T[:4]), T[4:]
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.block([[R, cross @ R], [np.zeros((3, 3)), R]])
+
+
 def displacement(first: Pose, second: Pose) -> Float[np.ndarray, "6"]:
     """Return the `(6,)` tangent vector with which `retract` leads from the first `(7,)` transform to the second."""
     change = between(first, second)

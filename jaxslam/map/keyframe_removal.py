@@ -1,10 +1,8 @@
 """Remove a keyframe from the map."""
 
 import numpy as np
-from jaxtyping import Float
 
-from jaxslam.geometry.se3 import between, compose, inverse
-from jaxslam.geometry.so3 import matrices
+from jaxslam.geometry.se3 import adjoint, between, compose, inverse
 from jaxslam.geometry.types import Pose
 from jaxslam.map.point_records import observations_at, points_at
 from jaxslam.map.spanning_tree import new_anchor, parents_without
@@ -51,15 +49,8 @@ def _loops_without(loops: Loops, keyframe_id: int, anchor: int, T_anchor_keyfram
     T, information = loops.T_source_target.copy(), loops.information.copy()
     T[begins] = compose(T_anchor_keyframe, T[begins])
     T[ends] = compose(T[ends], T_keyframe_anchor)
-    adjoint = _adjoint(T_keyframe_anchor)
-    information[ends] = adjoint.T @ information[ends] @ adjoint
+    to_keyframe = adjoint(T_keyframe_anchor)
+    information[ends] = to_keyframe.T @ information[ends] @ to_keyframe
     source, target = np.where(begins, anchor, loops.source), np.where(ends, anchor, loops.target)
     stays = source != target
     return Loops(source[stays], target[stays], T[stays], information[stays])
-
-
-def _adjoint(T: Pose) -> Float[np.ndarray, "6 6"]:
-    """Return the adjoint of `T_a_b`, which maps a tangent (translation first) from frame b to frame a."""
-    R, (x, y, z) = matrices(T[:4]), T[4:]
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.block([[R, cross @ R], [np.zeros((3, 3)), R]])

@@ -7,8 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from jaxslam.errors import FrameError, brief_repr
-from jaxslam.geometry.se3 import compose, inverse
-from jaxslam.geometry.so3 import matrices
+from jaxslam.geometry.se3 import adjoint, compose, inverse
 from jaxslam.geometry.types import Pose
 
 
@@ -48,7 +47,7 @@ class MotionPrior:
 
     @property
     def has_translation(self) -> bool:
-        """Whether translation was measured, and not only rotation."""
+        """True if translation was measured too, and not only rotation."""
         return self.covariance.shape == (6, 6)
 
     def then(self, after: "MotionPrior") -> "MotionPrior":
@@ -75,13 +74,9 @@ class MotionPrior:
 
 def _moved(covariance: np.ndarray, T: Pose) -> np.ndarray:
     """Return a `(6, 6)` covariance, or `(3, 3)` of a rotation, in the tangent space after a motion, by its adjoint."""
-    back = inverse(T)
-    R = matrices(back[:4])
-    if len(covariance) == 3:
-        return R @ covariance @ R.T
-    crossed = np.cross(back[4:], np.eye(3)).T
-    adjoint = np.block([[R, crossed @ R], [np.zeros((3, 3)), R]])
-    return adjoint @ covariance @ adjoint.T
+    # The last three rows and columns of the adjoint are those of rotations alone.
+    moves = adjoint(inverse(T))[-len(covariance) :, -len(covariance) :]
+    return moves @ covariance @ moves.T
 
 
 def _numbers(name: str, given: Any) -> np.ndarray:

@@ -139,7 +139,7 @@ class BackEnd:
 
     @property
     def wishes(self) -> MapWishes:
-        """What the maps want of the next frame."""
+        """Wishes of the maps for the next frame."""
         return MapWishes(self._keyframe_demand(), self._map_views, self._changes.pending)
 
     def _keyframe_demand(self) -> KeyframeDemand:

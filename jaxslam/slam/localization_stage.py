@@ -73,7 +73,7 @@ class LocalizationStage:
         self._weak_inliers = config.track.weak_inliers
         self._motion = ConstantVelocity()
         self._outside: Pose | None = None
-        """Pose of the latest frame by the motion that something other than the images measured."""
+        """Pose of the latest frame, if it is lost, by the motion that something other than the images measured."""
         self._any_tracked = self._was_lost = False
         self._unrecognized = 0
         """Frames since the last one that was tracked whose place is not in the map."""
@@ -130,8 +130,8 @@ class LocalizationStage:
             arrays: The frame.
             output: Output of the tracker for the frame.
             dt_s: Time since the frame before, in seconds.
-            outside: `(7,)` pose of the frame by the motion that something other than the images measured; `None` if it
-                is not known.
+            outside: `(7,)` pose of a lost frame by the motion that something other than the images measured; `None` if
+                it is not known.
         """
         self._outside = outside
         if int(output.status) == TrackStatus.LOST:

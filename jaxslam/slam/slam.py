@@ -217,7 +217,6 @@ class Slam:
         self._masks.begin(self._frame, frame, arrays, correction)
         measured = self._outside_motion.of_frame(frame, prior, dt_s)
         flow = self._tracker.follow(arrays, measured=measured)
-        outside = None if measured is None else np.asarray(flow.predicted.wxyz_xyz, np.float64)
         watch.ends("flow")
 
         # 3. Mask: ignore pixels of movable objects.
@@ -229,7 +228,9 @@ class Slam:
         watch.ends("pose")
 
         # 5. Match features of a lost frame with the last one, or relocalize it; match a weak one with the local map.
+        outside = None
         if int(output.status) == TrackStatus.LOST:
+            outside = None if measured is None else np.asarray(flow.predicted.wxyz_xyz, np.float64)
             again = self._localization.track_by_features(arrays, flow, measured)
             flow, output = again or (flow, output)
         if int(output.status) != TrackStatus.LOST:  # cues go by a wrong motion while the pose is not known

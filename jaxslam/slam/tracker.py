@@ -38,7 +38,7 @@ _ALL_IS_NEW = 2.0
 
 
 class _KnownMotion(NamedTuple):
-    """What is known of the motion since the last tracked frame.
+    """Known parts of the motion since the last tracked frame.
 
     Attributes:
         T_last_cam: `(7,)` pose of the camera in the axes of the last tracked frame.
@@ -107,7 +107,7 @@ class KeyframeDemand(Enum):
 
 
 class MapWishes(NamedTuple):
-    """What the maps want of the next frame.
+    """Wishes of the maps for the next frame.
 
     Attributes:
         demand: How much they want it to be a keyframe.

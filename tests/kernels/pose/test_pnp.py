@@ -340,7 +340,7 @@ class TestRansac:
             assert results[1].inliers[~crowd].mean() > 0.9
 
     def test_the_score_of_a_prior_is_its_cost(self):
-        """That of `pose_cost`, in squared thresholds; no point counts, beside which float32 would lose it."""
+        """Equal to that in `pose_cost`, in squared thresholds; no point counts, beside which float32 would lose it."""
         scene = make_scene(3, N)
         X_world, uv, depth, sigma = scene.arrays()
         root = np.random.default_rng(3).normal(size=(6, 6))
