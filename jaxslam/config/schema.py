@@ -48,9 +48,9 @@ class TrackConfig(ValidatedConfig):
     """Growth of that standard deviation with the square of depth, 1 / m. It is larger than the noise of a single pixel
     because neighboring pixels share their errors."""
     min_depth_m: Annotated[float, Positive] = 0.3
-    """Smallest valid depth, meters."""
+    """Smallest valid depth of a depth sensor, meters."""
     max_depth_m: Annotated[float, Positive] = 6.0
-    """Largest valid depth, meters."""
+    """Largest valid depth of a depth sensor, meters."""
     disparity_sigma_px: Annotated[float, Positive] = 1.0
     """Standard deviation of the disparity of a stereo pair, pixels. It replaces the depth noise settings there.
 
@@ -58,8 +58,11 @@ class TrackConfig(ValidatedConfig):
     KITTI road, with 0.5, the tracker turned by 0.005 degrees per frame about its axis; by essential matrices of its
     images, it turned by -0.001 degrees.
     """
+    near_baselines: Annotated[float, Positive] = 3.0
+    """Smallest valid depth of a stereo pair, in baselines. It replaces `min_depth_m` there."""
     far_baselines: Annotated[float, Positive] = 75.0
-    """Largest valid depth of a stereo pair, in baselines (ORB-SLAM's `ThDepth`), if the camera file gives none."""
+    """Largest valid depth of a stereo pair, in baselines (ORB-SLAM's `ThDepth`), if the camera file gives none. It
+    replaces `max_depth_m` there."""
     pixel_sigma: Annotated[float, Positive] = 1.0
     """Standard deviation of a tracked point, pixels."""
     loss_scale: Annotated[float, Positive] = 1.0
@@ -115,8 +118,9 @@ class TrackConfig(ValidatedConfig):
     again."""
     restart_after: Annotated[float, Range(at_least=0)] = 15
     """Number of lost frames after which tracking starts again at the last pose."""
-    max_speed_m_per_s: Annotated[float, Positive] = 5.0
-    """Maximum plausible speed of the camera, meters per second."""
+    max_speed_m_per_s: Annotated[float, Positive] | None = None
+    """Maximum plausible speed of the camera, meters per second. If not set, the largest valid depth in a second: 6 m/s
+    for a depth sensor, 40 m/s for a pair with a baseline of 0.54 m."""
     max_turn_rad_per_s: Annotated[float, Positive] = 12.0
     """Maximum plausible angular speed of the camera, radians per second."""
 

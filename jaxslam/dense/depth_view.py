@@ -12,9 +12,9 @@ from jaxslam.runtime.compiled import compiled
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.downscale import Downscaler, ImageGrid
 
-_EDGE_SHARE, _EDGE_M = 0.025, 0.04
+_EDGE_SHARE, _EDGE_REACH = 0.025, 1 / 150
 """Difference of depth around a pixel above which it is on an outline, where a sensor mixes near and far depth: a share
-of the depth per pixel of the step, plus meters."""
+of the depth per pixel of the step, plus a share of the farthest valid depth."""
 _THREE = np.ones((3, 3), np.uint8)
 
 _rays = compiled(when="warm-up")(normalize)
@@ -130,7 +130,7 @@ class DepthView:
         good = self.is_believed(small, ignore)
         small = np.where(good, small, np.float32(0))
         least, most = np.where(good, small, np.float32(2 * self.farthest_m)), small
-        limit = _EDGE_SHARE * self.step * small + _EDGE_M
+        limit = _EDGE_SHARE * self.step * small + np.float32(_EDGE_REACH * self.farthest_m)
         most, least = _dilated(most), _eroded(least)
         outline = most - least >= limit
         # On a plane the inverse depth is linear in the pixel coordinates, so its mean is the value at the center.

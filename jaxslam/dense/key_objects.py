@@ -19,8 +19,8 @@ from jaxslam.semantics import Detections
 
 _BOUNDS = (2.0, 98.0)
 """Percentiles of an object's points along each axis that bound its 3D box."""
-_BEYOND_M = 0.03
-"""Margin of the 3D box beyond these percentiles, meters."""
+_BEYOND = 0.05
+"""Margin of the 3D box beyond these percentiles, as a share of its size."""
 _FEWEST = 50
 """Fewest points of an object from which its size is estimated."""
 
@@ -93,14 +93,14 @@ def object_boxes(
     for number, box in enumerate(found.boxes):
         mask = np.zeros(depth.shape, bool)
         if found.masks is None:
-            add_box(mask, depth, box / view.step)
+            add_box(mask, depth, box / view.step, float(view.intrinsics.fx))
         else:
             mask |= view.every(found.masks[number])
         inside = (mask & (depth > 0)).ravel()
         if inside.sum() < _FEWEST:
             continue
         low, high = np.percentile(view.points(depth, inside), _BOUNDS, axis=1)
-        boxes.append(np.stack([low - _BEYOND_M, high + _BEYOND_M]))
+        boxes.append(np.stack([low, high]) + _BEYOND * (high - low) * [[-1], [1]])
     return np.array(boxes, np.float32).reshape(-1, 2, 3)
 
 

@@ -15,8 +15,9 @@ from jaxslam.map.types import Map
 Poses: TypeAlias = Mapping[int, np.ndarray | None]
 """The `(7,)` pose of the depth of each keyframe, by keyframe id. A pose is `None` if the keyframe is not in the map or
 in a submap that is not shown."""
-_NEAR_M, _NEAR_RAD = 1.5, 0.6
-"""Largest distance (meters) and rotation (radians) between keyframes with overlapping views."""
+_NEAR_REACH, _NEAR_RAD = 0.25, 0.6
+"""Largest distance (as a share of the farthest valid depth) and rotation (radians) between keyframes with overlapping
+views."""
 _COUNTS = 65535
 """Number of quantization steps of the depth."""
 
@@ -106,7 +107,8 @@ class KeyframeDepths:
             return None
         there = np.stack([at for _, at in others])
         change = between(np.broadcast_to(pose, there.shape), there)
-        near = np.flatnonzero((np.linalg.norm(change[:, 4:], axis=1) < _NEAR_M) & (angle(change) < _NEAR_RAD))
+        near_m = _NEAR_REACH * self._view.farthest_m
+        near = np.flatnonzero((np.linalg.norm(change[:, 4:], axis=1) < near_m) & (angle(change) < _NEAR_RAD))
         if not len(near):
             return None
         # Evenly spaced in time: the keyframes just before would show the same person at the same place.

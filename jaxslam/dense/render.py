@@ -23,8 +23,11 @@ _BACKGROUND, _PATH_RGB = 24, (255, 160, 0)
 _VIEW = 0.9
 """Tangent of half the horizontal field of view of the perspective view."""
 _MAX_SPLAT_PX = 6
-_HEADROOM_M = 0.3
-"""Height above the camera, meters, beyond which points are left out of the top view because they are a ceiling."""
+_HEADROOM = 0.1
+"""Height above the camera, as a share of the extent of the shown part, beyond which points are left out of the top view
+because they are a ceiling."""
+_NEAREST = 0.03
+"""Smallest depth that is drawn, as a share of the extent of the shown part."""
 
 
 class _Screen(NamedTuple):
@@ -74,7 +77,7 @@ def picture(cloud: DenseCloud, T_world_cam: Float[np.ndarray, "k 7"]) -> UInt8[n
     """
     stand = _stand(cloud, T_world_cam)
     path = T_world_cam[:, 4:]
-    highest = (path @ stand.axes[1]).min() - _HEADROOM_M if len(path) else -np.inf
+    highest = (path @ stand.axes[1]).min() - _HEADROOM * stand.extent_m if len(path) else -np.inf
     below = cloud.points @ stand.axes[1].astype(np.float32) > highest
     views = (
         (cloud, lambda X: _ahead(X, stand)),
@@ -121,7 +124,7 @@ def _ahead(X: np.ndarray, stand: _Stand) -> _Screen:
     axes = np.stack([right, down * cos - ahead * sin, ahead * cos + down * sin])
     eye = stand.center - 1.9 * stand.extent_m * axes[2]
     x, y, z = ((X - eye) @ axes.T).T
-    seen = np.where(z > 0.1, z, np.inf)
+    seen = np.where(z > _NEAREST * stand.extent_m, z, np.inf)
     focal = 0.5 * _WIDTH / _VIEW
     return _Screen(np.stack([0.5 * _WIDTH + focal * x / seen, 0.5 * _HEIGHT + focal * y / seen]), z, focal / seen)
 

@@ -190,7 +190,8 @@ class VoxelLayer:
             view: Pixel grid of the depth images.
         """
         arrays = T_world_cam.astype(np.float32), looks.depth, looks.least, poses.astype(np.float32), view.intrinsics
-        return np.asarray(num_past(self._cloud(part), *arrays))[: len(part.counts)]
+        counts = num_past(self._cloud(part), *arrays, np.float32(self.voxel_m))
+        return np.asarray(counts)[: len(part.counts)]
 
     def make_room(self) -> None:
         """Remove free voxels if the grid is nearly full; if that is not enough, enlarge the voxels."""

@@ -39,8 +39,8 @@ MISS, SEEN = -0.85, 0.4
 """Log-odds of a voxel that a depth image sees through, and of a voxel in which it sees a surface. OctoMap uses a
 probability of 0.4 for a miss, because its rays graze surfaces; here the surface must be clearly behind the voxel, so a
 miss counts as much as a point."""
-_SAME_SHARE, _SAME_M = 0.03, 0.03
-"""Largest difference between equal depths, a share plus meters: sensors are 1 to 2 % off at four meters."""
+_SAME_SHARE, _SAME_VOXELS = 0.03, 1.5
+"""Largest difference between equal depths, a share plus a number of voxels: sensors are 1 to 2 % off at four meters."""
 _State = TypeVar("_State")
 
 
@@ -150,7 +150,7 @@ def looked(
         start = blocks[index] * size
         first = jnp.minimum(start, len(sums) - size)
         voxels = centroids(grid._replace(sums=sums), first, voxel_m, size=size)
-        seen = _seen(voxels.X, pose, depth, least, intrinsics)
+        seen = _seen(voxels.X, pose, depth, least, intrinsics, voxel_m)
         counts = (voxels.counts > 0) & (first + jnp.arange(size, dtype=jnp.int32) >= start)
         evidence = jnp.where(seen.past, MISS, jnp.where(seen.there, SEEN, 0)).astype(sums.dtype)
         return weighed(grid._replace(sums=sums), first, jnp.where(counts, evidence, 0)).sums
@@ -166,13 +166,14 @@ def num_past(
     leasts: Float[Array, "k h w"],
     poses: Float[Array, "k 7"],
     intrinsics: Intrinsics,
+    voxel_m: Float[Array, ""],
 ) -> Int[Array, " m"]:
     """Count the depth images that see through each point of a keyframe."""
 
     def count(start: Array, counts: Array) -> Array:
         X = to_world(SE3(pose), cloud.block(start)[0])
         # One image after the other: batched, the images would be fetched from memory again for each point.
-        past = [_seen(X, *one, intrinsics).past for one in zip(poses, depths, leasts, strict=True)]
+        past = [_seen(X, *one, intrinsics, voxel_m).past for one in zip(poses, depths, leasts, strict=True)]
         return lax.dynamic_update_slice(counts, sum(one.astype(jnp.int32) for one in past), (start,))
 
     return _over_blocks(cloud, count, jnp.zeros(cloud.size, jnp.int32))
@@ -208,6 +209,8 @@ def _cut(array: Array, start: Array) -> Array:
     return lax.dynamic_slice_in_dim(array, start, _POINTS, axis=array.ndim - 1)
 
 
-def _seen(X: Points, pose: Array, depth: Array, least: Array, intrinsics: Intrinsics) -> Visibility:
-    limits = jnp.float32(_SAME_SHARE), jnp.float32(_SAME_M)
+def _seen(
+    X: Points, pose: Array, depth: Array, least: Array, intrinsics: Intrinsics, voxel_m: Float[Array, ""]
+) -> Visibility:
+    limits = jnp.float32(_SAME_SHARE), jnp.float32(_SAME_VOXELS) * voxel_m
     return classify_visibility(X, SE3(pose), depth, least, intrinsics, same_share=limits[0], same_m=limits[1])

@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float
 
 from jaxslam.dynamics.cue import CueResult
 
-_DEPTH_STEP, _DEPTH_STEP_M = 0.05, 0.05
-"""Largest depth difference within one surface: a share of the depth, plus meters."""
+_DEPTH_STEP = 0.075
+"""Largest depth difference within one surface, as a share of the depth."""
 
 
 def moving_points(verdicts: Sequence[CueResult]) -> Bool[np.ndarray, " n"]:
@@ -41,7 +41,7 @@ def mask_around(
     rows = np.clip(v[:, None] + steps, 0, height - 1)[:, :, None]
     columns = np.clip(u[:, None] + steps, 0, width - 1)[:, None, :]
     around, center = depth[rows, columns], there[:, None, None]
-    alike = np.abs(around - center) <= _DEPTH_STEP * center + _DEPTH_STEP_M
+    alike = np.abs(around - center) <= _DEPTH_STEP * center
     which, row, column = np.nonzero(alike | (center <= 0) | (around <= 0))
     mask[rows[which, row, 0], columns[which, 0, column]] = True
     return mask

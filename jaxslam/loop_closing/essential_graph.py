@@ -25,9 +25,10 @@ from jaxslam.runtime.worker import step_back
 
 _STRONG = 100
 """Common points from which two covisible keyframes get an edge (ORB-SLAM's essential graph)."""
-_EDGE_M, _EDGE_M_PER_M, _EDGE_RAD, _EDGE_RAD_PER_RAD = 0.005, 0.005, 0.002, 0.005
-"""Standard deviation of the relative pose of two keyframes, and its growth with distance and angle to allow for
-calibration errors. In the synthetic room it is 3 mm and 0.7 mrad at 0.6 m and 20 degrees; recordings are worse."""
+_EDGE_REACH, _EDGE_M_PER_M, _EDGE_RAD, _EDGE_RAD_PER_RAD = 1 / 1200, 0.005, 0.002, 0.005
+"""Standard deviation of the relative pose of two keyframes, as a share of the largest valid depth, and its growth with
+distance and angle to allow for calibration errors. It is 5 mm for a sensor that measures up to 6 m. In the synthetic
+room it is 3 mm and 0.7 mrad at 0.6 m and 20 degrees; recordings are worse."""
 _MAX_CHI2 = 16.8
 """Maximum that a loop may add to the squared whitened error of the graph: the 99 % quantile for six degrees of freedom.
 At the optimum, that is the squared contradiction in standard deviations of loop and graph together."""
@@ -50,7 +51,7 @@ class _Graph(NamedTuple):
 
 
 def poses_with_loop(
-    slam_map: Map, source: int, target: int, T_source_target: Pose, information: np.ndarray
+    slam_map: Map, source: int, target: int, T_source_target: Pose, information: np.ndarray, farthest_m: float
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Optimize the poses of a submap with a loop; `None` if the loop is not within the uncertainty of the graph.
 
@@ -60,6 +61,7 @@ def poses_with_loop(
         target: Id of the second keyframe, in the same submap.
         T_source_target: `(7,)` measured relative pose.
         information: `(6, 6)` inverse covariance of the measurement.
+        farthest_m: Largest valid depth of the sensor, meters, with which the errors of relative poses grow.
 
     Returns:
         Ids of the keyframes of the submap and their optimized poses, with the first keyframe's unchanged; `None` if the
@@ -70,7 +72,7 @@ def poses_with_loop(
         return None
     ids, poses = slam_map.ids[inside], slam_map.T_world_cam[inside]
     ends = rows(ids, np.array([source, target]))[:, None]
-    graph = _graph(slam_map, inside)
+    graph = _graph(slam_map, inside, farthest_m)
     with_loop = _Graph(
         np.append(graph.source, ends[0]),
         np.append(graph.target, ends[1]),
@@ -123,7 +125,7 @@ def _compile_beside(num_keyframes: int) -> None:
     compile_graph(num_keyframes)
 
 
-def _graph(slam_map: Map, inside: np.ndarray) -> _Graph:
+def _graph(slam_map: Map, inside: np.ndarray, farthest_m: float) -> _Graph:
     """Build the edges of a submap: spanning tree, strong covisibility, and earlier loops."""
     ids, poses = slam_map.ids[inside], slam_map.T_world_cam[inside]
     child = np.flatnonzero(slam_map.parent[inside] != NONE)
@@ -139,7 +141,7 @@ def _graph(slam_map: Map, inside: np.ndarray) -> _Graph:
     pairs = pairs[:, np.sort(first)[: len(inside) * _EDGES_A_NODE - len(old) - 1]]
     source, target = np.concatenate([pairs, ends], axis=1)
     relative = between(poses[pairs[0]], poses[pairs[1]])
-    sigma_m = _EDGE_M + _EDGE_M_PER_M * np.linalg.norm(relative[:, 4:], axis=1)
+    sigma_m = _EDGE_REACH * farthest_m + _EDGE_M_PER_M * np.linalg.norm(relative[:, 4:], axis=1)
     sigma_rad = _EDGE_RAD + _EDGE_RAD_PER_RAD * angle(relative)
     # Covisibility edges come from the same observations as the tree and are no further evidence: they share its weight.
     share = max(tree.shape[1], 1) / max(pairs.shape[1], 1)

@@ -27,8 +27,9 @@ from jaxslam.sensors.sensor_model import SensorModel
 
 _LATEST = 10
 """Keyframes too recent to count as a place seen long ago, and keyframes allowed until a loop has entered the map."""
-_AGREE_M, _AGREE_RAD = 0.05, 0.04
-"""Maximum difference between the corrections of two keyframes, in meters and radians."""
+_AGREE_REACH, _AGREE_RAD = 1 / 120, 0.04
+"""Maximum difference between the corrections of two keyframes, as a share of the largest valid depth, and in radians:
+5 cm for a sensor that measures up to 6 m, 34 cm on a road seen by a pair with a baseline of 0.54 m."""
 _REMEMBERED = 3
 """Number of keyframes for which a first candidate waits for a second one that agrees."""
 _MAX_SEEN_THROUGH = 0.3
@@ -37,8 +38,8 @@ come out below 0.28 in a static room, and three of four come out below it in a c
 _COMMON_ERRORS = 3.0
 """Factor on the standard deviation of a recognition for the errors that its features share: depth, calibration,
 and the keyframe's own pose relative to its points. On recordings, poses are off by this much more."""
-_LOOP_M, _LOOP_RAD = 0.01, 0.005
-"""Minimum standard deviation of a loop, in meters and radians."""
+_LOOP_REACH, _LOOP_RAD = 1 / 600, 0.005
+"""Minimum standard deviation of a loop, as a share of the largest valid depth, and in radians."""
 
 
 class LoopClosure(NamedTuple):
@@ -74,6 +75,7 @@ class LoopClosing:
     def __init__(self, index: PlaceIndex, sensor: SensorModel, plan: FeaturePlan) -> None:
         """Share a place index, to which keyframes are added here."""
         self._index, self._sensor, self._plan = index, sensor, plan
+        self._farthest_m = float(sensor.max_depth_m)
         self._candidates: list[_Candidate] = []
         self._closed: tuple[int, int] | None = None
 
@@ -92,10 +94,10 @@ class LoopClosing:
         # 3. Consistency (section VII-A): a recent candidate must ask for the same correction. The paper wants three
         #    consecutive ones; here two suffice, as their full poses must agree.
         self._candidates = [c for c in self._candidates if c.keyframe >= keyframe_id - _REMEMBERED]
-        agreed = any(_agree(slam_map, candidate, other) for other in self._candidates)
+        agreed = any(_agree(slam_map, candidate, other, self._farthest_m) for other in self._candidates)
         self._candidates.append(candidate)
         # 4. Essential graph optimization (section VII-D). The map itself is corrected later, by local mapping.
-        closure = _closure(slam_map, candidate) if agreed else None
+        closure = _closure(slam_map, candidate, self._farthest_m) if agreed else None
         if closure is not None:
             self._candidates.clear()
             self._closed = len(slam_map.loops.source), keyframe_id
@@ -139,7 +141,7 @@ def _familiar(slam_map: Map, keyframe_id: int) -> set[int]:
     return {*near.tolist(), *latest.tolist(), keyframe_id}
 
 
-def _agree(slam_map: Map, one: _Candidate, other: _Candidate) -> bool:
+def _agree(slam_map: Map, one: _Candidate, other: _Candidate, farthest_m: float) -> bool:
     """Return whether two candidates imply the same correction between keyframes of the same submaps."""
     pairs = [(c.recognition.keyframe, c.keyframe) for c in (one, other)]
     if not has(slam_map.ids, np.array(pairs).ravel()).all():
@@ -149,18 +151,19 @@ def _agree(slam_map: Map, one: _Candidate, other: _Candidate) -> bool:
         return False
     pose = slam_map.pose(one.keyframe)
     apart = between(compose(one.T_new_old, pose), compose(other.T_new_old, pose))
-    return bool(np.linalg.norm(apart[4:]) < _AGREE_M and angle(apart) < _AGREE_RAD)
+    return bool(np.linalg.norm(apart[4:]) < _AGREE_REACH * farthest_m and angle(apart) < _AGREE_RAD)
 
 
-def _closure(slam_map: Map, candidate: _Candidate) -> LoopClosure | None:
+def _closure(slam_map: Map, candidate: _Candidate, farthest_m: float) -> LoopClosure | None:
     """Compute the correction for a loop; `None` if it contradicts the rest of the map."""
     found = candidate.recognition
-    covariance = _COMMON_ERRORS**2 * found.covariance + np.diag([_LOOP_M**2] * 3 + [_LOOP_RAD**2] * 3)
+    least = np.repeat([_LOOP_REACH * farthest_m, _LOOP_RAD], 3)
+    covariance = _COMMON_ERRORS**2 * found.covariance + np.diag(least**2)
     information = np.linalg.inv(covariance)
     information = 0.5 * (information + information.T)
     source, target = found.keyframe, candidate.keyframe
     first, second = slam_map.submap[rows(slam_map.ids, np.array([source, target]))]
     changed = np.zeros(0, np.int64), np.zeros((0, 7))  # two submaps are merged, each unchanged in itself
     if first == second:
-        changed = poses_with_loop(slam_map, source, target, found.T_keyframe_cam, information)
+        changed = poses_with_loop(slam_map, source, target, found.T_keyframe_cam, information, farthest_m)
     return None if changed is None else LoopClosure(source, target, found.T_keyframe_cam, information, *changed)

@@ -8,8 +8,8 @@ from jaxslam.geometry.types import Pose
 from jaxslam.sensors.camera import Camera
 
 _NEAR_PX = 8.0
-_SAME_SHARE, _SAME_M = 0.1, 0.02
-"""Largest depth difference within one surface: a share of the depth, plus meters."""
+_SAME_SHARE = 0.11
+"""Largest depth difference within one surface, as a share of the depth."""
 _MIN_COMPARED = 50
 
 
@@ -37,7 +37,7 @@ def see_through_ratio(camera: Camera, source: Features, target: Features, T_sour
         return 0.0
     X_source = camera.back_project(source.uv[:, known].astype(np.float64), source.depth[known])
     X = to_local(T_source_target, X_source)
-    X = X[:, X[2] > _SAME_M]
+    X = X[:, X[2] > 0]
     uv = X[:2] / X[2] * focal + center
     apart, nearest = (
         np.asarray(a) for a in KDTree(target.uv[:, measured].T).query(uv.T, distance_upper_bound=_NEAR_PX)
@@ -45,6 +45,6 @@ def see_through_ratio(camera: Camera, source: Features, target: Features, T_sour
     close = np.isfinite(apart)
     expected = X[2, close]
     farther = target.depth[measured][nearest[close]] - expected
-    bound = _SAME_SHARE * expected + _SAME_M
+    bound = _SAME_SHARE * expected
     through, same = np.count_nonzero(farther > bound), np.count_nonzero(np.abs(farther) <= bound)
     return through / (through + same) if through + same >= _MIN_COMPARED else 0.0

@@ -22,14 +22,13 @@ LOCAL_KEYFRAMES = 15
 """Number of most covisible keyframes whose points form the local map."""
 _IN_VIEW = 5
 """Number of further keyframes that show most of what is in view, whatever their age."""
-_NEAR_M, _NEAR_RAD = 0.15, 0.15
-"""Maximum distance of the result from the approximate pose, in meters and radians."""
+_NEAR_REACH, _NEAR_RAD = 1 / 40, 0.15
+"""Maximum distance of the result from the approximate pose, as a share of the largest valid depth, and in radians.
+15 cm for a sensor that measures up to 6 m."""
 _GATES = PoseGates(min_inliers=15, min_cells=2, max_sigma=np.inf)
 """Place recognition needs more, because an object may exist twice; here the camera pose is known approximately, and a
 person may leave little of the view. In Bonn's `crowd`, 15 of 15 points agree in two cells beside someone: alone they
 tell a position to 0.28 m."""
-_PRIOR_INFORMATION = np.diag(np.repeat([_NEAR_M / 3, _NEAR_RAD / 3], 3) ** -2.0)
-"""Inverse covariance of the approximate pose: three standard deviations are the farthest that the result may be off."""
 RADII_PX = (15.0, 5.0)
 """Search radii around the predicted pixels at octave 0: the first one, and the one once the pose is better known."""
 WIDE_RADII_PX = (45.0, *RADII_PX)
@@ -110,6 +109,7 @@ def match_local_map(
         The pose in the axes of the keyframe, combined with the approximate one.
     """
     origin, found, T_first = slam_map.pose(keyframe_id), None, T_keyframe_cam
+    near_m = _NEAR_REACH * float(sensor.max_depth_m)
     near, at = local_keyframes(slam_map, keyframe_id), compose(origin, T_keyframe_cam)
     submap = int(slam_map.submap[slam_map.row(keyframe_id)])
     in_view = keyframes_in_view(slam_map, at, submap, set(near.tolist()), _IN_VIEW)
@@ -128,21 +128,21 @@ def match_local_map(
         found = fit_pose(T_keyframe_cam, matches, sensor, _GATES)
         if found is None:
             return None
-        found = _with_prior(found, T_first)
+        found = _with_prior(found, T_first, near_m)
         T_keyframe_cam = found.T_origin_cam
-        if not _near(T_keyframe_cam, T_first):
+        apart = between(T_keyframe_cam, T_first)
+        if np.linalg.norm(apart[4:]) >= near_m or angle(apart) >= _NEAR_RAD:
             return None
     return found
 
 
-def _with_prior(found: FeaturePose, T_prior: Pose) -> FeaturePose:
-    """Combine a pose with the approximate one that it was looked for at: few matches leave some directions open."""
+def _with_prior(found: FeaturePose, T_prior: Pose, near_m: float) -> FeaturePose:
+    """Combine a pose with the approximate one that it was looked for at: few matches leave some directions open.
+
+    Three standard deviations of the approximate pose are the farthest that the result may be off.
+    """
     information = np.linalg.inv(found.covariance)
-    both = information + _PRIOR_INFORMATION
-    step = np.linalg.solve(both, _PRIOR_INFORMATION @ displacement(found.T_origin_cam, T_prior))
+    prior = np.diag(np.repeat([near_m / 3, _NEAR_RAD / 3], 3) ** -2.0)
+    both = information + prior
+    step = np.linalg.solve(both, prior @ displacement(found.T_origin_cam, T_prior))
     return found._replace(T_origin_cam=retract(found.T_origin_cam, step), covariance=np.linalg.inv(both))
-
-
-def _near(T_a: Pose, T_b: Pose) -> bool:
-    apart = between(T_a, T_b)
-    return bool(np.linalg.norm(apart[4:]) < _NEAR_M and angle(apart) < _NEAR_RAD)

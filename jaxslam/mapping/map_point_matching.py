@@ -15,7 +15,6 @@ from jaxslam.map.point_records import NONE, Observations, empty_observations, ha
 from jaxslam.map.types import Map
 
 _MARGIN_PX = 1.0
-_NEAREST_M = 0.1
 _SAME_PX = 2.0
 """Largest distance of a tracked point from the feature that shows it."""
 _MAX_DEPTH_ERROR = 0.1
@@ -136,11 +135,11 @@ def find_points(
     """
     camera = slam_map.camera
     X = to_local(T_world_cam, points.X_world)
-    front = X[2] > _NEAREST_M
+    front = X[2] > 0
     z = np.where(front, X[2], 1.0)
     uv = camera.project(np.stack([X[0], X[1], z]))
     inside = front & (uv > -_MARGIN_PX).all(axis=0) & (uv < [[camera.width], [camera.height]]).all(axis=0)
-    octave = np.log(points.size / np.linalg.norm(X, axis=0).clip(_NEAREST_M)) / np.log(plan.scale_factor)
+    octave = np.log(points.size / np.linalg.norm(np.where(front, X, 1.0), axis=0)) / np.log(plan.scale_factor)
     octave = np.clip(np.round(octave), 0, plan.num_levels - 1).astype(np.int64)
     where = np.flatnonzero(inside)
     match = match_by_projection(

@@ -24,7 +24,6 @@ _MIN_PARALLAX = np.deg2rad(2.0)
 """Smallest angle between the two rays, radians: with a focal length of 525 pixels, depth is then known to 10 %."""
 _SCALE_FACTOR = 1.5
 """Largest factor between the ratio of distances and the ratio of feature sizes, besides one pyramid level."""
-_NEAREST_M = 0.1
 
 
 class Triangulated(NamedTuple):
@@ -62,7 +61,7 @@ def triangulate(
     a, b = (ray[:, index] for ray, index in zip(rays, pairs, strict=True))
     X = _intersections(a, b, T_first_second)
     X_second = transform(inverse(T_first_second), X)
-    good = np.isfinite(X).all(axis=0) & (X[2] > _NEAREST_M) & (X_second[2] > _NEAREST_M)
+    good = np.isfinite(X).all(axis=0) & (X[2] > 0) & (X_second[2] > 0)
     X, X_second = np.where(good, X, 1.0), np.where(good, X_second, 1.0)
     near, far = np.linalg.norm(X, axis=0), np.linalg.norm(X_second, axis=0)
     turned = matrices(T_first_second[:4]) @ X_second

@@ -16,7 +16,7 @@ _MAX_TURN = 0.7
 """Cosine of the largest angle between the directions from which a point was and is seen."""
 _SCALES = (0.5, 2.0)
 """Bounds on the ratio of the earlier to the current distance of a point."""
-_MIN_DEPTH_M, _MARGIN_PX = 0.1, 8
+_MARGIN_PX = 8
 
 
 class ViewCoverage:
@@ -81,9 +81,9 @@ class ViewCoverage:
 def in_view(camera: Camera, T_world_cam: Pose, X_world: Float[np.ndarray, "3 n"]) -> Bool[np.ndarray, " n"]:
     """Tell which points are in the image of a camera, not at its margin."""
     X = to_local(T_world_cam, X_world)
-    uv = camera.project(np.stack([X[0], X[1], np.where(X[2] > _MIN_DEPTH_M, X[2], np.inf)]))
+    uv = camera.project(np.stack([X[0], X[1], np.where(X[2] > 0, X[2], np.inf)]))
     size = np.array([[camera.width], [camera.height]])
-    return (X[2] > _MIN_DEPTH_M) & ((uv > _MARGIN_PX) & (uv < size - _MARGIN_PX)).all(axis=0)
+    return (X[2] > 0) & ((uv > _MARGIN_PX) & (uv < size - _MARGIN_PX)).all(axis=0)
 
 
 def seen_alike(

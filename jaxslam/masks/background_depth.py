@@ -33,8 +33,8 @@ _KEPT_S = 1.0
 """Time for which frames are kept, seconds."""
 _NEW_SHARE = 0.003
 """Smallest share of the image that a new surface covers."""
-_NEW_RANGE_M = 0.2
-"""Margin of the depth range of an object beyond that of its new surface, meters."""
+_NEW_RANGE = 0.12
+"""Margin of the depth range of an object beyond that of its new surface, as a share of its depth."""
 _TIMING_S = 0.0125
 """Uncertainty of the time of a row of a depth image, seconds: half the readout time of a rolling shutter. A rotating
 camera displaces edges by that: on TUM `fr1_rpy`, at 2 rad/s, desks got false new surfaces of 20 pixels along their
@@ -200,7 +200,8 @@ def new_surfaces(seen: BackgroundSurfaces, mask: Bool[np.ndarray, "h w"]) -> Boo
             continue
         core = piece == index
         nearest, farthest = np.percentile(seen.depth[core], _PERCENTILES)
-        alike = (seen.depth > nearest - _NEW_RANGE_M) & (seen.depth < farthest + _NEW_RANGE_M) & ~seen.unmoved
+        nearest, farthest = (1 - _NEW_RANGE) * nearest, (1 + _NEW_RANGE) * farthest
+        alike = (seen.depth > nearest) & (seen.depth < farthest) & ~seen.unmoved
         num_parts, part = cv2.connectedComponents(alike.view(np.uint8), connectivity=4)
         held = np.bincount(part[core], minlength=num_parts)
         held[0] = 0  # the background

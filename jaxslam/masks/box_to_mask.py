@@ -20,15 +20,17 @@ _MIDDLE = 0.5
 """Share of a box's width and height, around its center, from which the object's depth is taken."""
 _BIN = 0.0547236
 """Width of a bin of log depth: 5.6 % of the depth, whether that of a hand before the lens or of a car down the road."""
-_REACH, _REACH_M = 0.1, 0.25
-"""Half the depth range of an object: a share of its distance, plus meters. Against DeepLab's mask of people in Bonn
-`crowd`, median IoU 0.80, recall 0.90; with 0.4 m 0.79, 0.91; with half the range 0.80, 0.89."""
+_REACH, _REACH_PER_WIDTH = 0.1, 0.5
+"""Half the depth range of an object: a share of its distance, plus a share of the width of its box.
+
+Against DeepLab's masks of people in Bonn `crowd`, mean IoU 0.767, recall 0.91; with 0.3 of the width 0.766, 0.88;
+with 0.2 of the distance alone 0.760, 0.88; with 0.1 of the distance and 0.25 m for every object 0.769, 0.90."""
 _MIN_PART = 0.2
 """Smallest size of a component of the object, as a share of the largest one: an arm behind a bag is separate."""
 
 
 def mask_of_detections(
-    detections: Detections, depth: Float[np.ndarray, "h w"], *, dilate_px: int = 2
+    detections: Detections, depth: Float[np.ndarray, "h w"], focal_px: float, *, dilate_px: int = 2
 ) -> Bool[np.ndarray, "h w"]:
     """Return the mask of all detected objects: the detector's own masks or, for a box without one, from depth.
 
@@ -37,6 +39,7 @@ def mask_of_detections(
     Args:
         detections: Detections in the image.
         depth: `(h, w)` depth image, meters; 0 where depth is missing.
+        focal_px: Horizontal focal length of the depth image, pixels.
         dilate_px: Radius of the dilation, pixels.
     """
     mask = np.zeros(depth.shape, bool)
@@ -48,7 +51,7 @@ def mask_of_detections(
         mask |= detections.masks.any(axis=0)
         boxes = detections.boxes[~detections.masks.any(axis=(1, 2))]
     for box in boxes:
-        add_box(mask, depth, box)
+        add_box(mask, depth, box, focal_px)
     return dilated(mask, dilate_px)
 
 
@@ -60,13 +63,16 @@ def reduced_detections(detections: Detections, reduced: Downscaler) -> Detection
     return detections._replace(boxes=detections.boxes / reduced.step, masks=masks, class_mask=class_mask)
 
 
-def add_box(mask: Bool[np.ndarray, "h w"], depth: Float[np.ndarray, "h w"], box: Iterable[float]) -> None:
+def add_box(
+    mask: Bool[np.ndarray, "h w"], depth: Float[np.ndarray, "h w"], box: Iterable[float], focal_px: float
+) -> None:
     """Add the object in a box to a mask, in place; add nothing if too little of the box has depth.
 
     Args:
         mask: `(h, w)` mask to add to.
         depth: `(h, w)` depth image, meters; 0 where depth is missing.
         box: Left, top, right and bottom of the box, pixels; it may extend beyond the image.
+        focal_px: Horizontal focal length of the depth image, pixels.
     """
     height, width = depth.shape
     left, top, right, bottom = (float(side) for side in box)
@@ -80,7 +86,8 @@ def add_box(mask: Bool[np.ndarray, "h w"], depth: Float[np.ndarray, "h w"], box:
     distance = object_depth(inside)
     if distance is None:
         return
-    near = np.abs(inside - distance) < _REACH_M + _REACH * distance
+    reach = _REACH + _REACH_PER_WIDTH * inside.shape[1] / focal_px
+    near = np.abs(inside - distance) < reach * distance
     mask[rows, columns] |= largest_parts(near)
 
 

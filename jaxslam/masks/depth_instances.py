@@ -10,8 +10,8 @@ from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.downscale import Downscaler, ImageGrid
 
 _WIDTH_PX = 320
-_STEP, _STEP_M = 0.04, 0.03
-"""Difference of depth between neighboring pixels that separates objects: a share of the depth, plus meters."""
+_STEP = 0.055
+"""Difference of depth between neighboring pixels that separates objects, as a share of the depth."""
 _MIN = 0.002
 """Smallest share of the image that an object covers; a smaller one has too few points for a motion estimate."""
 _REACH_PX = 4
@@ -84,6 +84,6 @@ def _steps(depth: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     steps = np.zeros(depth.shape, bool)
     for axis in (0, 1):
         before = depth[:-1] if axis == 0 else depth[:, :-1]
-        apart = np.abs(np.diff(depth, axis=axis)) > _STEP * before + _STEP_M
+        apart = np.abs(np.diff(depth, axis=axis)) > _STEP * before
         (steps[:-1] if axis == 0 else steps[:, :-1])[...] |= apart
     return steps

@@ -41,16 +41,20 @@ _FLOW = FlowPlan(finest=LevelPlan(window=11, iterations=3, tolerance=0.2, accept
 quarters of the time."""
 _NEIGHBORS_PX = 20.0
 """Radius of DBSCAN, pixels, if every cell has a point; it grows with the spacing of the points."""
-_PX_PER_M = 100.0
-"""Number of pixels that a meter of depth counts as in DBSCAN."""
+_PX_PER_LOG_DEPTH = 330.0
+"""Number of pixels that a factor of e in depth counts as in DBSCAN: 3.3 for a hundredth of the depth. Against DeepLab's
+masks of people in Bonn `crowd`, carried on by five frames, mean IoU 0.724; with 250, 0.721; with 100 a meter, 0.723."""
 _MIN_NEIGHBORS = 5
 """Fewest neighbors of a core point in DBSCAN, the point itself included."""
 _GROW_PX = 4
 """Dilation of a moved part of the mask, pixels, besides a share of its size."""
 _DEPTH_TAIL = 20
 """One in this many points of a cluster is ignored as too near, and one as too far, for its depth range."""
-_DEPTH_MARGIN_M = 0.2
-"""Margin of the object's depth range beyond the points of its cluster, meters."""
+_MARGIN_REACH = 1 / 30
+"""Margin of the object's depth range beyond the points of its cluster, as a share of the largest valid depth.
+
+20 cm for a sensor that measures up to 6 m. With shares of the object's depth or of its size in the image, mean IoU as
+above is 0.70 to 0.71 instead of 0.72."""
 _MIN_SHARE = 0.05
 """Smallest share of the cluster's points that a connected component of the new mask holds."""
 
@@ -154,18 +158,21 @@ def as_objects(uv: Pixels, ok: Mask, depth: Float[Array, "h w"], spacing: Float[
     z = depth.at[row, column].get(mode="fill", fill_value=0)
     known = ok & inside & jnp.isfinite(z) & (z > 0)
     # Scaled as if every cell had a point: the points of a large mask are farther apart, but not more objects.
-    points = jnp.concatenate([uv / spacing, _PX_PER_M * jnp.where(known, z, 0)[None]])
+    points = jnp.concatenate([uv, _PX_PER_LOG_DEPTH * jnp.log(jnp.where(known, z, 1))[None]]) / spacing
     label = dbscan(points, known, radius=_NEIGHBORS_PX, min_points=_MIN_NEIGHBORS).label
     return MaskFlow(uv, jnp.where(known, z, 0), label)
 
 
-def predicted_mask(origin: TrackedMask, followed: MaskFlow, depth: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+def predicted_mask(
+    origin: TrackedMask, followed: MaskFlow, depth: Float[np.ndarray, "h w"], farthest_m: float
+) -> Bool[np.ndarray, "h w"]:
     """Predict the mask in a later frame from the tracked points (III-C.6).
 
     Args:
         origin: The earlier mask.
         followed: Its points in the later frame.
         depth: `(h, w)` later depth image, meters; 0 where depth is missing.
+        farthest_m: Largest valid depth of the sensor, meters, with which objects count as thicker.
     """
     uv, z, label = (np.asarray(each) for each in followed)
     new = np.zeros_like(origin.mask)
@@ -179,7 +186,7 @@ def predicted_mask(origin: TrackedMask, followed: MaskFlow, depth: Float[np.ndar
         pieces = np.zeros(origin.num, bool)
         pieces[origin.held[points]] = True
         old = _bounded(_pieces(origin.piece, pieces), origin.corner)
-        _add_object(new, old, origin.uv[:, points], uv[:, points], z[points], depth)
+        _add_object(new, old, origin.uv[:, points], uv[:, points], z[points], depth, _MARGIN_REACH * farthest_m)
     return new
 
 
@@ -201,7 +208,13 @@ class _Region(NamedTuple):
 
 
 def _add_object(
-    new: np.ndarray, old: _Region, before: np.ndarray, now: np.ndarray, z: np.ndarray, depth: np.ndarray
+    new: np.ndarray,
+    old: _Region,
+    before: np.ndarray,
+    now: np.ndarray,
+    z: np.ndarray,
+    depth: np.ndarray,
+    margin_m: float,
 ) -> None:
     """Add one object to the new mask: move its part of the old mask, cut it by depth, and keep what its points are on.
 
@@ -215,6 +228,7 @@ def _add_object(
         now: `(2, k)` positions of its points in the later frame, pixels.
         z: `(k,)` depths of its points in the later frame, meters.
         depth: `(h, w)` later depth image, meters.
+        margin_m: Margin of its depth range beyond that of its points, meters.
     """
     # The median motion and the depth range. `np.median` and `np.percentile` take 0.3 ms, most of it overhead.
     count = now.shape[1]
@@ -226,7 +240,7 @@ def _add_object(
         return
     # The connected components at the object's depth that hold its points.
     here = around.slices()
-    right_depth = (depth[here] > nearest - _DEPTH_MARGIN_M) & (depth[here] < farthest + _DEPTH_MARGIN_M)
+    right_depth = (depth[here] > nearest - margin_m) & (depth[here] < farthest + margin_m)
     num, piece = cv2.connectedComponents((around.inside & right_depth).view(np.uint8), connectivity=4)
     hits = np.bincount(_at(piece, now, around.corner), minlength=num)
     hits[0] = 0  # the background

@@ -69,6 +69,18 @@ def depth_noise(camera: Camera, config: TrackConfig) -> DepthNoise:
     return DepthNoise(0.0, config.disparity_sigma_px / (camera.fx * camera.baseline_m))
 
 
+def min_valid_depth(camera: Camera, config: TrackConfig) -> float:
+    """Give the smallest valid depth of a sensor, meters.
+
+    Args:
+        camera: The camera or stereo pair. The limit of a pair is a number of baselines.
+        config: Settings of the tracker, which hold the limit of a depth sensor and the number of baselines.
+    """
+    if camera.baseline_m is None or not camera.is_stereo:
+        return config.min_depth_m
+    return config.near_baselines * camera.baseline_m
+
+
 def max_valid_depth(camera: Camera, config: TrackConfig) -> float:
     """Give the largest valid depth of a sensor, meters.
 
@@ -99,7 +111,7 @@ def sensor_model(camera: Camera, config: TrackConfig, dtype: DTypeLike = jnp.flo
         readout_s=jnp.asarray(camera.readout_s, dtype),
         depth_sigma_m=jnp.asarray(noise.sigma_m, dtype),
         depth_sigma_per_m2=jnp.asarray(noise.sigma_per_m2, dtype),
-        min_depth_m=jnp.asarray(config.min_depth_m, dtype),
+        min_depth_m=jnp.asarray(min_valid_depth(camera, config), dtype),
         max_depth_m=jnp.asarray(max_valid_depth(camera, config), dtype),
         baseline_m=jnp.asarray(baseline_m, dtype),
     )

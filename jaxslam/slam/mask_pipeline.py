@@ -5,7 +5,6 @@ goes wrong in the detector is told with the frame, and tracking goes on.
 """
 
 import enum
-import math
 from functools import partial
 from typing import NamedTuple
 
@@ -24,6 +23,7 @@ from jaxslam.runtime.stage_timer import StageTimes
 from jaxslam.semantics import Detector
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.downscale import Downscaler, ImageGrid
+from jaxslam.sensors.sensor_model import max_valid_depth
 from jaxslam.slam.semantic_thread import DetectedMask, DetectionJob, SemanticThread
 
 _MAX_FRAMES = 30
@@ -98,24 +98,23 @@ class MaskPipeline:
         detector: Detector | None,
         config: Config,
         *,
-        farthest_m: float = math.inf,
         times: StageTimes | None = None,
     ) -> None:
         """Start with no mask.
 
         Args:
-            camera: Camera that takes the frames.
+            camera: Camera that takes the frames, whose largest valid depth bounds what is compared.
             detector: Detector of movable objects; `None` for none.
             config: Settings of the run, the detector and the masks, of which `dynamics.new_surfaces` adds what has
                 come before surfaces seen earlier.
-            farthest_m: Largest depth that tells of such surfaces, meters.
             times: Record of the duration of every detection.
         """
         self._propagate, self._new_surfaces = config.semantics.propagate, config.dynamics.new_surfaces
         self._dilate_px, self._seed = config.semantics.dilate_px, config.run.seed
         self._reduced = Downscaler(ImageGrid.of(camera), WIDTH_PX)
         self._semantics = None if detector is None else SemanticThread(detector, self._reduced, config, times)
-        self._surfaces = SurfaceMemory(self._reduced.raster, farthest_m)
+        self._farthest_m = max_valid_depth(camera, config.track)
+        self._surfaces = SurfaceMemory(self._reduced.raster, self._farthest_m)
         self._seen: dict[int, _BufferedFrame] = {}
         self._next: DetectedMask | None = None
         self._carried_from: tuple[int, np.ndarray] | None = None
@@ -240,7 +239,7 @@ class MaskPipeline:
         pyramids = [self._seen[between].pyramid for between in range(found.frame, frame)]
         now = self._seen[frame]
         now.pyramid, followed = follow(found.origin, pyramids, now.gray, self._depth)
-        return predicted_mask(found.origin, followed, self._depth)
+        return predicted_mask(found.origin, followed, self._depth, self._farthest_m)
 
     def _forget(self, frame: int) -> None:
         """Drop what no mask can come from any more."""

@@ -39,7 +39,6 @@ class MaskStage:
         memory: FrameMemory,
         detector: Detector | None,
         *,
-        max_depth_m: float,
         instances: InstanceFinder | None,
         times: StageTimes,
     ) -> None:
@@ -50,7 +49,6 @@ class MaskStage:
             config: Settings of the run, the detector and the masks.
             memory: Buffers of the frame, of which this stage sets the ignored pixels and the movable objects.
             detector: Detector that looks at every frame; `None` for none.
-            max_depth_m: Largest valid depth, meters.
             instances: Finder of movable objects, where the tracker classifies their motion; `None` where all pixels of
                 a mask are ignored.
             times: Record of the duration of every job.
@@ -58,7 +56,7 @@ class MaskStage:
         self._memory, self._instances, self._times = memory, instances, times
         self._reach_px = config.dynamics.reach_px
         self._rough_depth = RoughDepth(camera) if camera.is_stereo else None
-        self._pipeline = _mask_pipeline(camera, config, detector, max_depth_m, times)
+        self._pipeline = _mask_pipeline(camera, config, detector, times)
         self._found: FrameMask | None = None
         idle = self._pipeline is None and self._rough_depth is None
         self._worker: Worker[tuple[str, Callable[[], None]], None] = make_worker(
@@ -205,10 +203,8 @@ class MaskStage:
         return self._memory.ignoring(arrays, objects.rest if given is None else objects.rest | given)
 
 
-def _mask_pipeline(
-    camera: Camera, config: Config, detector: Detector | None, max_depth_m: float, times: StageTimes
-) -> MaskPipeline | None:
+def _mask_pipeline(camera: Camera, config: Config, detector: Detector | None, times: StageTimes) -> MaskPipeline | None:
     """Make the mask pipeline, if a detector looks at every frame or new surfaces count as moving."""
     if detector is None and not config.dynamics.new_surfaces:
         return None
-    return MaskPipeline(camera, detector, config, farthest_m=max_depth_m, times=times)
+    return MaskPipeline(camera, detector, config, times=times)

@@ -77,7 +77,8 @@ def detect_mask(
     detector: Detector, reduced: Downscaler, rgb: UInt8[np.ndarray, "h w 3"], depth: Float[np.ndarray, "_h _w"]
 ) -> Bool[np.ndarray, "_h _w"]:
     """Run a detector on an image and return its undilated mask, at the size of masks."""
-    return mask_of_detections(reduced_detections(detector(rgb), reduced), depth, dilate_px=0)
+    found, focal_px = reduced_detections(detector(rgb), reduced), float(reduced.raster.intrinsics.fx)
+    return mask_of_detections(found, depth, focal_px, dilate_px=0)
 
 
 class SemanticThread:

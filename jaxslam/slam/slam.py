@@ -386,7 +386,6 @@ class Slam:
             self.config,
             self._memory,
             every,
-            max_depth_m=float(sensor.max_depth_m),
             instances=self._instances,
             times=self.times,
         )

@@ -49,8 +49,8 @@ def track_params(camera: Camera, config: TrackConfig, dtype: DTypeLike = jnp.flo
     """
     dtype = floating_dtype(dtype)
     max_speed_m_per_s = config.max_speed_m_per_s
-    if camera.is_stereo:
-        max_speed_m_per_s = max(max_speed_m_per_s, max_valid_depth(camera, config))
+    if max_speed_m_per_s is None:
+        max_speed_m_per_s = max_valid_depth(camera, config)
     of = lambda value: jnp.asarray(value, dtype)
     return TrackParams(
         sensor=sensor_model(camera, config, dtype),

@@ -23,6 +23,8 @@ _MAX_TURN = 0.7
 """Cosine of the largest angle between the directions from which a point is looked up and was seen."""
 _MAX_SCALE = 2.0
 """How much nearer or farther it may be."""
+_COVERED = 0.12
+"""Difference of measured and expected depth from which something covers a point, as a share of its depth."""
 _MAX_SHIFT_PX = 12.0
 """A point found further from where the pose predicts it is another one."""
 
@@ -70,7 +72,7 @@ def align_keyframe_points(step: StepContext, T_world_cam: SE3, twist: Float[Arra
     seen_depth = sample_depth(view.depth, jax.lax.stop_gradient(guess), reach=0)
     column, row = jnp.round(jax.lax.stop_gradient(guess)).astype(jnp.int32)
     ignored = view.frame.ignore.at[row, column].get(mode="fill", fill_value=True)
-    covered = (seen_depth > 0) & (jnp.abs(seen_depth - X_there[2]) > 0.1 * X_there[2] + 0.05)
+    covered = (seen_depth > 0) & (jnp.abs(seen_depth - X_there[2]) > _COVERED * X_there[2])
     # 3. Alignment of their patches.
     source = index // n
     X_world = take(jnp.moveaxis(keyframes.X_world, 1, 0).reshape(3, k * n))

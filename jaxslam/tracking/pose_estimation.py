@@ -16,14 +16,15 @@ from jaxslam.tracking.points import KeyframeMatches
 from jaxslam.tracking.state import TrackParams
 from jaxslam.tracking.step_context import StepContext
 
-_DEPTH_GATE_M, _DEPTH_SIGMAS = 0.1, 3.0
-"""Of depth that supports a pose hypothesis: meters, and deviations with even votes or of a pair.
+_NEAR_SIGMAS, _DEPTH_SIGMAS = 20.0, 3.0
+"""Error of depth up to which it supports a pose hypothesis, in standard deviations of depth close to the camera (10 cm
+by default), and with even votes or of a pair in its own standard deviations.
 
-With even votes points vote by deviations, and of those that agree the ones within both count for what follows. Meters
-in the vote too: Bonn `crowd` loses a frame in two of five runs, and a frame of noise moves what follows by 7 mm instead
-of 6. Deviations alone: a rendered room with people who sit has 4.1 mm instead of 2.4; meters in the vote alone, or as a
-weight of zero for points that are kept: 4.1 too. The larger of 0.1 m and one deviation for all: `static` has 36 mm
-instead of 16 in the room xyz.
+With even votes points vote by the latter, and of those that agree the ones within both count for what follows. The
+former in the vote too: Bonn `crowd` loses a frame in two of five runs, and a frame of noise moves what follows by 7 mm
+instead of 6. The latter alone: a rendered room with people who sit has 4.1 mm instead of 2.4; the former in the vote
+alone, or as a weight of zero for points that are kept: 4.1 too. The larger of 0.1 m and one deviation for all: `static`
+has 36 mm instead of 16 in the room xyz.
 """
 
 
@@ -44,6 +45,7 @@ def coarse_pose(
     """
     state, view, params, plan = step
     by_noise = plan.balance_regions or view.right is not None
+    near_gate_m = _NEAR_SIGMAS * params.sensor.depth_sigma_m
     expected_depth = jnp.where(seen.depth > 0, seen.depth, to_camera(predicted, state.points.X_world)[2])
     result = ransac_pnp(
         jax.random.fold_in(state.random_key(), state.frame),
@@ -53,7 +55,7 @@ def coarse_pose(
         weights=votes,
         depth=seen.depth,
         threshold_px=params.ransac_px,
-        threshold_depth=_DEPTH_SIGMAS * seen.sigma if by_noise else _DEPTH_GATE_M,
+        threshold_depth=_DEPTH_SIGMAS * seen.sigma if by_noise else near_gate_m,
         averaged=plan.balance_regions,
         num_hypotheses=plan.num_hypotheses,
         max_steps=plan.pose_steps,
@@ -67,7 +69,7 @@ def coarse_pose(
     if not plan.balance_regions or view.right is not None:
         return result.T_world_cam, result.inliers, result.status
     apart_m = to_camera(result.T_world_cam, state.points.X_world)[2] - seen.depth
-    near = (seen.depth <= 0) | (jnp.abs(apart_m) < _DEPTH_GATE_M)
+    near = (seen.depth <= 0) | (jnp.abs(apart_m) < near_gate_m)
     return result.T_world_cam, result.inliers & near, result.status
 
 

@@ -67,7 +67,7 @@ def _carry(reduced: Downscaler, before: Pyramid, origin: TrackedMask, now: View)
     """The new mask, from the old one and its points, and both frames, of which the earlier one's pyramid is there."""
     depth = np.ascontiguousarray(reduced.every(now.depth))
     _, followed = follow(origin, [before], reduced.mean(now.gray), depth)
-    return reduced.whole(predicted_mask(origin, followed, depth))
+    return reduced.whole(predicted_mask(origin, followed, depth, 6.0))
 
 
 def test_carrying_a_mask(dataset, views, opencv, capsys):
@@ -86,7 +86,7 @@ def test_carrying_a_mask(dataset, views, opencv, capsys):
         "points of the mask": lambda: make_origin(mask_before, small, 0),
         "smaller image": lambda: reduced.mean(now.gray),
         "flow, objects": lambda: follow(origin, [pyramid], gray, depth),
-        "new mask": lambda: predicted_mask(origin, followed, depth),
+        "new mask": lambda: predicted_mask(origin, followed, depth, 6.0),
         "larger mask": lambda: reduced.whole(mask_before),
     }
     compared: dict[str, Comparison] = {name: compare(piece, opencv) for name, piece in pieces.items()}

@@ -39,10 +39,10 @@ def depth_change(
     T_then_now: SE3,
     intrinsics: Intrinsics,
     *,
-    same_share: Scalar | float = 0.03,
-    same_m: Scalar | float = 0.02,
-    new_share: Scalar | float = 0.05,
-    new_m: Scalar | float = 0.15,
+    same_share: Scalar | float = 0.04,
+    same_m: Scalar | float = 0.0,
+    new_share: Scalar | float = 0.1,
+    new_m: Scalar | float = 0.0,
 ) -> DepthChange:
     """Compare two depth images of one camera.
 

@@ -28,6 +28,7 @@ STEP = 48
 ROUND = [*range(0, FRAMES, STEP), *range(STEP // 4, 3 * STEP, STEP)]
 """A whole round of the room, and on to what was seen first."""
 TIGHT = np.linalg.inv(np.diag([0.01**2] * 3 + [0.005**2] * 3))
+FARTHEST_M = 6.0
 
 
 def drifted(slam_map: Map, meters: float, radians: float, seed: int = 0) -> Map:
@@ -94,7 +95,7 @@ class TestLook:
         assert look_at_all(until(before, last - 1)) == []
 
     def test_candidates_that_do_not_agree_close_nothing(self, truth, monkeypatch):
-        monkeypatch.setattr(module, "_AGREE_M", 1e-6)
+        monkeypatch.setattr(module, "_AGREE_REACH", 1e-6)
         assert look_at_all(drifted(truth, 0.006, 0.004)) == []
 
     def test_a_keyframe_that_is_gone_is_passed_over(self, truth):
@@ -144,7 +145,7 @@ class TestWrongLoops:
     def accepted(self, slam_map: Map, error: np.ndarray, information: np.ndarray = TIGHT) -> bool:
         source, target = int(slam_map.ids[0]), int(slam_map.ids[-1])
         measured = retract(between(slam_map.pose(source), slam_map.pose(target)), error)
-        return poses_with_loop(slam_map, source, target, measured, information) is not None
+        return poses_with_loop(slam_map, source, target, measured, information, FARTHEST_M) is not None
 
     @pytest.mark.parametrize("meters", [0.3, 0.5, 1.0, 3.0])
     def test_by_meters(self, truth, meters):
@@ -163,7 +164,8 @@ class TestWrongLoops:
         source, target = int(truth.ids[0]), int(truth.ids[-1])
         measured = between(truth.pose(source), truth.pose(target))
         found = [
-            poses_with_loop(drifted(truth, 0.006, 0.003, seed), source, target, measured, TIGHT) for seed in range(20)
+            poses_with_loop(drifted(truth, 0.006, 0.003, seed), source, target, measured, TIGHT, FARTHEST_M)
+            for seed in range(20)
         ]
         assert sum(one is not None for one in found) >= 19
 

@@ -26,7 +26,8 @@ from jaxslam.masks.propagation import (
 from jaxslam.semantics import Detections, no_detections
 from jaxslam.sensors.frame import to_gray
 
-HEIGHT, WIDTH = 240, 320
+HEIGHT, WIDTH, FOCAL_PX = 240, 320, 262.5
+FARTHEST_M = 6.0
 FIRST, LAST = 10, 14
 
 
@@ -63,38 +64,38 @@ class TestBoxMask:
     DEPTH[20:80, 40:70] = 1.5
 
     def test_object_before_a_wall(self) -> None:
-        mask = mask_of_detections(detections([[35, 15, 75, 85]]), self.DEPTH, dilate_px=0)
+        mask = mask_of_detections(detections([[35, 15, 75, 85]]), self.DEPTH, FOCAL_PX, dilate_px=0)
         np.testing.assert_array_equal(mask, self.DEPTH < 2)
 
     def test_several_and_what_reaches_past_the_image(self) -> None:
         depth = self.DEPTH.copy()
         depth[50:, 100:] = 1.0
-        mask = mask_of_detections(detections([[35, 15, 75, 85], [95, 45, 150, 130]]), depth, dilate_px=0)
+        mask = mask_of_detections(detections([[35, 15, 75, 85], [95, 45, 150, 130]]), depth, FOCAL_PX, dilate_px=0)
         np.testing.assert_array_equal(mask, depth < 2)
 
     def test_as_far_away_but_apart(self) -> None:
         """A small thing in the same box and depth, not attached."""
         depth = self.DEPTH.copy()
         depth[20:26, 30:34] = 1.5
-        mask = mask_of_detections(detections([[28, 15, 75, 85]]), depth, dilate_px=0)
+        mask = mask_of_detections(detections([[28, 15, 75, 85]]), depth, FOCAL_PX, dilate_px=0)
         np.testing.assert_array_equal(mask, self.DEPTH < 2)
 
     @pytest.mark.parametrize(
         "box", [[50, 30, 51, 31], [200, 10, 220, 50], [70, 60, 40, 20], [np.nan, 0, 10, 10], [-50, -50, -10, -10]]
     )
     def test_boxes_of_nothing(self, box: list[float]) -> None:
-        assert not mask_of_detections(detections([box]), self.DEPTH, dilate_px=0).any()
+        assert not mask_of_detections(detections([box]), self.DEPTH, FOCAL_PX, dilate_px=0).any()
 
     @pytest.mark.parametrize("value", [0.0, np.nan])
     def test_without_depth(self, value: float) -> None:
         depth = np.full((60, 60), value, np.float32)
         assert object_depth(depth) is None
-        assert not mask_of_detections(detections([[10, 10, 50, 50]]), depth, dilate_px=2).any()
+        assert not mask_of_detections(detections([[10, 10, 50, 50]]), depth, FOCAL_PX, dilate_px=2).any()
 
     @pytest.mark.parametrize("scale", [0.06, 1.0, 12.0, 100.0])
     def test_at_any_distance(self, scale: float) -> None:
         """A car 30 m down the road and a hand before the lens are masked as a person in a room is."""
-        found = mask_of_detections(detections([[35, 15, 75, 85]]), scale * self.DEPTH, dilate_px=0)
+        found = mask_of_detections(detections([[35, 15, 75, 85]]), scale * self.DEPTH, FOCAL_PX, dilate_px=0)
         assert object_depth(scale * self.DEPTH[15:85, 35:75]) == pytest.approx(1.5 * scale, rel=0.03)
         assert found[20:80, 40:70].all()
 
@@ -102,9 +103,9 @@ class TestBoxMask:
         own = np.zeros((1, 100, 120), bool)
         own[0, :10] = True
         found = detections([[35, 15, 75, 85]])._replace(masks=own)
-        np.testing.assert_array_equal(mask_of_detections(found, self.DEPTH, dilate_px=0), own[0])
+        np.testing.assert_array_equal(mask_of_detections(found, self.DEPTH, FOCAL_PX, dilate_px=0), own[0])
         labeled = no_detections()._replace(class_mask=own[0])
-        np.testing.assert_array_equal(mask_of_detections(labeled, self.DEPTH, dilate_px=0), own[0])
+        np.testing.assert_array_equal(mask_of_detections(labeled, self.DEPTH, FOCAL_PX, dilate_px=0), own[0])
 
     def test_people_of_the_room(self) -> None:
         _, depth, truth = seen(FIRST)
@@ -114,7 +115,7 @@ class TestBoxMask:
             rows, columns = (np.flatnonzero((instance == number).any(axis=axis)) for axis in (1, 0))
             boxes.append([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1])
         assert boxes
-        found = mask_of_detections(detections(boxes), depth, dilate_px=0)
+        found = mask_of_detections(detections(boxes), depth, FOCAL_PX, dilate_px=0)
         print(f"overlap with the truth {overlap(found, truth):.3f}")
         assert overlap(found, truth) > 0.8
 
@@ -131,7 +132,7 @@ class TestBoxMask:
     @settings(max_examples=50, deadline=None)
     def test_stays_in_its_box(self, box: list[float]) -> None:
         mask = np.zeros(self.DEPTH.shape, bool)
-        add_box(mask, self.DEPTH, box)
+        add_box(mask, self.DEPTH, box, FOCAL_PX)
         rows, columns = np.nonzero(mask)
         assert ((columns >= box[0] - 1) & (columns <= box[2]) & (rows >= box[1] - 1) & (rows <= box[3])).all()
 
@@ -217,7 +218,7 @@ def carried(first: int, last: int) -> tuple[np.ndarray, TrackedMask, MaskFlow]:
     origin = make_origin(mask, gray, 0)
     pyramids = [pyramid(seen(index)[0]) for index in range(first, last)]
     _, followed = follow(origin, pyramids, seen(last)[0], seen(last)[1])
-    return predicted_mask(origin, followed, seen(last)[1]), origin, followed
+    return predicted_mask(origin, followed, seen(last)[1], FARTHEST_M), origin, followed
 
 
 def moved(mask: np.ndarray, shift_px: tuple[int, int], depth: np.ndarray) -> tuple[TrackedMask, MaskFlow]:
@@ -240,7 +241,7 @@ class TestPropagation:
         u, v = shift_px
         mask, truth = rectangle(64, 64, 196, 176), rectangle(60 + u, 60 + v, 200 + u, 180 + v)
         depth = np.where(truth, 1.5, 3.0).astype(np.float32)
-        np.testing.assert_array_equal(predicted_mask(*moved(mask, shift_px, depth), depth), truth)
+        np.testing.assert_array_equal(predicted_mask(*moved(mask, shift_px, depth), depth, FARTHEST_M), truth)
 
     def test_pieces_without_points_do_not_move(self) -> None:
         """Of two parts of a mask on one surface, points were followed of one only."""
@@ -250,7 +251,7 @@ class TestPropagation:
         origin = make_origin(followed_part | other, np.zeros(depth.shape, np.uint8), 0)
         column, row = points.uv.astype(int) - origin.corner[:, None]
         origin = origin._replace(uv=points.uv, held=np.where(points.ok, origin.piece[row, column], 0))
-        new = predicted_mask(origin, followed, depth)
+        new = predicted_mask(origin, followed, depth, FARTHEST_M)
         assert (new & followed_part).sum() == followed_part.sum()
         assert not (new & other).any()
 
@@ -265,25 +266,25 @@ class TestPropagation:
             depth[np.roll(part, shift, axis=1)] = z
             truth |= np.roll(part, shift, axis=1)
         followed = as_objects(now, origin.ok, depth, origin.spacing)
-        np.testing.assert_array_equal(predicted_mask(origin, followed, depth), truth)
+        np.testing.assert_array_equal(predicted_mask(origin, followed, depth, FARTHEST_M), truth)
 
     def test_points_far_apart(self) -> None:
         """One object fills an image of which every third cell has a point."""
         mask, depth = np.ones((HEIGHT, WIDTH), bool), np.full((HEIGHT, WIDTH), 2.0, np.float32)
         assert make_origin(mask, np.zeros(mask.shape, np.uint8), 0).spacing > 3
-        assert predicted_mask(*moved(mask, (0, 0), depth), depth).all()
+        assert predicted_mask(*moved(mask, (0, 0), depth), depth, FARTHEST_M).all()
 
     def test_piece_too_small_for_a_cluster(self) -> None:
         """Three cells high: it is followed nevertheless, and it alone."""
         near, far, beside = rectangle(10, 10, 170, 230), rectangle(250, 90, 257, 112), rectangle(230, 90, 250, 112)
         depth = np.where(near, 1.2, np.where(far, 3.5, np.where(beside, 4.2, 5.0))).astype(np.float32)
-        np.testing.assert_array_equal(predicted_mask(*moved(near | far, (0, 0), depth), depth), near | far)
+        np.testing.assert_array_equal(predicted_mask(*moved(near | far, (0, 0), depth), depth, FARTHEST_M), near | far)
 
     def test_far_beside_near(self) -> None:
         """Both are followed, though one has a twentieth of the other's pixels."""
         near, far = rectangle(10, 10, 170, 230), rectangle(250, 90, 274, 162)
         depth = np.where(near, 1.2, np.where(far, 3.5, 5.0)).astype(np.float32)
-        np.testing.assert_array_equal(predicted_mask(*moved(near | far, (0, 0), depth), depth), near | far)
+        np.testing.assert_array_equal(predicted_mask(*moved(near | far, (0, 0), depth), depth, FARTHEST_M), near | far)
 
     def test_people_are_followed(self) -> None:
         """Better than the mask left where it was."""
@@ -298,13 +299,13 @@ class TestPropagation:
         origin = make_origin(np.zeros(gray.shape, bool), gray, 0)
         _, followed = follow(origin, [pyramid(gray)], gray, depth)
         assert (np.asarray(followed.label) == -1).all()
-        assert not predicted_mask(origin, followed, depth).any()
+        assert not predicted_mask(origin, followed, depth, FARTHEST_M).any()
 
     @pytest.mark.parametrize("value", [0.0, np.nan])
     def test_without_depth(self, value: float) -> None:
         mask, depth = seen(FIRST)[2], np.full((HEIGHT, WIDTH), value, np.float32)
-        assert not predicted_mask(*moved(mask, (0, 0), depth), depth).any()
+        assert not predicted_mask(*moved(mask, (0, 0), depth), depth, FARTHEST_M).any()
 
     def test_out_of_the_image(self) -> None:
         depth, mask = seen(FIRST)[1:]
-        assert not predicted_mask(*moved(mask, (1000, 1000), depth), depth).any()
+        assert not predicted_mask(*moved(mask, (1000, 1000), depth), depth, FARTHEST_M).any()

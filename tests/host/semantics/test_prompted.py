@@ -358,7 +358,7 @@ class TestDetector:
         depth = np.full((192, 256), 4.0)
         depth[40:140, 170:210] = 1.5
         result = PromptedDetector(segmenter, lambda image: found(boxes))(white(self.SIZE))
-        mask = mask_of_detections(result, depth, dilate_px=0)
+        mask = mask_of_detections(result, depth, 250.0, dilate_px=0)
         assert_is_box(mask & (depth != 1.5), boxes[0], self.SIZE)
         assert (mask & (depth == 1.5)).sum() == (depth == 1.5).sum()
         low = PromptedDetector(segmenter, lambda image: found(boxes), min_iou=UNSURE - 0.05)(white(self.SIZE))

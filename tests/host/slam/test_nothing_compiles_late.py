@@ -133,7 +133,7 @@ def test_loops_of_a_map_that_grows(compiled: list[str], num_keyframes: int) -> N
         if thread.name == essential_graph.COMPILE_THREAD:
             thread.join()
     compiled.clear()
-    assert essential_graph.poses_with_loop(slam_map, 0, num_keyframes - 1, loop, np.eye(6)) is not None
+    assert essential_graph.poses_with_loop(slam_map, 0, num_keyframes - 1, loop, np.eye(6), 6.0) is not None
     assert compiled == []
 
 

@@ -31,7 +31,7 @@ def test_mask_of_every_frame_in_any_order(room: SyntheticDataset) -> None:
     for index in (4, 0, 5, 4, 1):
         frame = room.render(index)
         found = detector(frame.rgb)
-        mask = mask_of_detections(found, frame.depth_m, dilate_px=0)
+        mask = mask_of_detections(found, frame.depth_m, room.camera.fx, dilate_px=0)
         np.testing.assert_array_equal(mask, frame.instance_mask > 0)
         assert mask.any()
 
@@ -65,7 +65,7 @@ def test_some_labels(label: str) -> None:
     assert {name for one in found for name in one.labels} == {label}
     for one, frame in zip(found, frames, strict=True):
         numbers = (1,) if label == "person" else (2, 3)
-        mask = mask_of_detections(one, frame.depth_m, dilate_px=0)
+        mask = mask_of_detections(one, frame.depth_m, room.camera.fx, dilate_px=0)
         np.testing.assert_array_equal(mask, np.isin(frame.instance_mask, numbers))
 
 
@@ -102,7 +102,7 @@ def test_what_is_rendered_already_is_not_again(room: SyntheticDataset, monkeypat
     rendered = Rendered(monkeypatch)
     detector = SceneDetector(room, frames)
     for frame in frames:
-        mask = mask_of_detections(detector(frame.rgb), frame.depth_m, dilate_px=0)
+        mask = mask_of_detections(detector(frame.rgb), frame.depth_m, room.camera.fx, dilate_px=0)
         np.testing.assert_array_equal(mask, frame.instance_mask > 0)
     assert rendered.indices == []
     detector(image)

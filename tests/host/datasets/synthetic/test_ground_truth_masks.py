@@ -53,7 +53,7 @@ class TestWithTrueMasks:
             np.testing.assert_array_equal(frame.image, true.rgb)
             np.testing.assert_array_equal(frame.depth_m, true.depth_m)
             assert frame.dynamic_mask is None
-            mask = mask_of_detections(detector(frame.image), true.depth_m, dilate_px=0)
+            mask = mask_of_detections(detector(frame.image), true.depth_m, room.camera.fx, dilate_px=0)
             np.testing.assert_array_equal(mask, true.instance_mask > 0)
         with pytest.raises(IndexError):
             dataset[len(room)]
@@ -62,7 +62,7 @@ class TestWithTrueMasks:
         dataset, detector = with_true_masks(room, dataclasses.replace(TRUTH, labels=("person",)))
         assert detector is not None
         true = room.render(2)
-        mask = mask_of_detections(detector(dataset[2].image), true.depth_m, dilate_px=0)
+        mask = mask_of_detections(detector(dataset[2].image), true.depth_m, room.camera.fx, dilate_px=0)
         np.testing.assert_array_equal(mask, np.isin(true.instance_mask, (1, 3)))
         assert (true.instance_mask == 2).any()
 

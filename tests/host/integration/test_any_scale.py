@@ -1,0 +1,128 @@
+"""No length is absolute: a scene whose lengths are times a factor, with its sensor, is tracked the same."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from real_networks import real_network
+
+from jaxslam import Camera, Config, Frame, FrameResult, Slam, TrackStatus, load_config
+from jaxslam.datasets import Dataset, open_dataset
+from jaxslam.datasets.prefetch import Subset
+from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
+from jaxslam.trajectory.evaluation import evaluate
+from jaxslam.worlds.library import load_world
+from jaxslam.worlds.stored_world import StoredWorld
+
+PRESETS = ("default", "ngd", "trs", "usd", "rts", "occlusion")
+
+
+def scaled_camera(camera: Camera, factor: float) -> Camera:
+    """The same camera with its baseline, if it is a pair, times a factor."""
+    if camera.baseline_m is None:
+        return camera
+    far_m = None if camera.far_depth_m is None else factor * camera.far_depth_m
+    return dataclasses.replace(camera, baseline_m=factor * camera.baseline_m, far_depth_m=far_m)
+
+
+def scaled_sensor(config: Config, factor: float) -> list[str]:
+    """The settings of a depth sensor for a scene whose lengths are times a factor."""
+    track, tolerance_m = config.track, config.dynamics.trajectory.tolerance_m
+    return [
+        f"track.depth_sigma_m={track.depth_sigma_m * factor!r}",
+        f"track.depth_sigma_per_m2={track.depth_sigma_per_m2 / factor!r}",
+        f"track.min_depth_m={track.min_depth_m * factor!r}",
+        f"track.max_depth_m={track.max_depth_m * factor!r}",
+        f"dynamics.trajectory.tolerance_m={tolerance_m * factor!r}",
+    ]
+
+
+def tracked(
+    frames: Sequence[Frame], camera: Camera, factor: float, preset: str = "default", overrides: Sequence[str] = ()
+) -> list[FrameResult]:
+    """Track frames with their depth times a factor."""
+    settings = [*scaled_sensor(load_config(preset), factor), *overrides]
+    results = []
+    with Slam(scaled_camera(camera, factor), load_config(preset, overrides=settings)) as slam:
+        for frame in frames:
+            depth_m = None if frame.depth_m is None else frame.depth_m * np.float32(factor)
+            results.append(slam.track(dataclasses.replace(frame, depth_m=depth_m)))
+    return results
+
+
+def assert_same(results: Sequence[FrameResult], scaled: Sequence[FrameResult], factor: float) -> None:
+    """Compare to the bit: a power of two changes no rounding."""
+    for index, (one, other) in enumerate(zip(results, scaled, strict=True)):
+        names = ("status", "reason", "keyframe", "num_inliers", "num_matched", "mask_source", "mask_age")
+        assert [getattr(one, name) for name in names] == [getattr(other, name) for name in names], index
+        np.testing.assert_array_equal(one.T_world_cam[:4], other.T_world_cam[:4], str(index))
+        np.testing.assert_array_equal(factor * one.T_world_cam[4:], other.T_world_cam[4:], str(index))
+        np.testing.assert_array_equal(one.dynamic_mask, other.dynamic_mask, str(index))
+
+
+@pytest.mark.parametrize(("baseline_m", "factor"), [(None, 0.25), (0.12, 16.0)])
+def test_room(baseline_m: float | None, factor: float) -> None:
+    """Frames until the first adjustment of the map, whose solver rounds in another way."""
+    size = {"width": 320, "height": 240, "fps": 15.0}
+    room = SyntheticDataset(SyntheticConfig(frames=20, people=2, path="xyz", baseline_m=baseline_m, **size))
+    cues = ["dynamics.new_surfaces=true", "dynamics.cues=[trajectory]"] if baseline_m is None else []
+    overrides = ["semantics.model=null", "dynamics.new_surfaces=false", *cues]
+    frames = [room[index] for index in range(len(room))]
+    results, scaled = (tracked(frames, room.camera, f, overrides=overrides) for f in (1.0, factor))
+    assert sum(result.status == TrackStatus.OK for result in results) >= 18
+    assert baseline_m or sum(result.dynamic_mask.any() for result in results) > 5
+    assert_same(results, scaled, factor)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("recording", "indices"),
+    [("bonn/rgbd_bonn_crowd", range(30)), ("kitti/sequences/06", range(7)), ("kitti/sequences/06", range(0, 18, 3))],
+)
+@pytest.mark.parametrize("preset", PRESETS)
+def test_recordings(data_dir: Path, recording: str, indices: range, preset: str) -> None:
+    """With real networks, and on a road with more than 3 m between two frames."""
+    if not (data_dir / recording).is_dir():
+        pytest.skip(f"JAXSLAM_DATA holds no {recording}")
+    overrides = [f"semantics.model={real_network('yolox_nano')}"]
+    dataset = open_dataset(data_dir / recording)
+    frames = [dataset[index] for index in indices]
+    results, scaled = (tracked(frames, dataset.camera, factor, preset, overrides) for factor in (1.0, 4.0))
+    assert sum(result.status != TrackStatus.LOST for result in results) >= len(frames) - 1
+    assert_same(results, scaled, 4.0)
+
+
+def world(name: str, factor: float, size: tuple[int, int], frames: int) -> Dataset:
+    """The first frames of a rendered world times a factor, with images of another size."""
+    described = load_world(name)
+    camera = described.camera
+    focal = {} if camera.fx is None else {"fx": camera.fx * size[0] / camera.width}
+    camera = dataclasses.replace(camera, width=size[0], height=size[1], **focal)
+    return Subset(StoredWorld(dataclasses.replace(described, scale=factor, camera=camera)), stop=frames)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "size", "frames"), [("house", (320, 240), 240), ("kitchen", (320, 240), 240), ("road", (613, 184), 80)]
+)
+@pytest.mark.parametrize("factor", [10.0, 1 / 3])
+def test_worlds(name: str, size: tuple[int, int], frames: int, factor: float) -> None:
+    """Rounding differs from frame to frame, and so the maps do: in the median of three seeds, the errors agree."""
+    statuses, errors = [], []
+    for each in (1.0, factor):
+        dataset = world(name, each, size, frames)
+        runs = []
+        for seed in range(3):
+            settings = [] if dataset.camera.is_stereo else scaled_sensor(load_config("default"), each)
+            config = load_config("default", overrides=["semantics.model=null", f"run.seed={seed}", *settings])
+            with Slam(dataset.camera, config) as slam:
+                records = slam.run(dataset)
+                error_m = evaluate(slam.trajectory, dataset.ground_truth).ate_rmse_m
+            runs.append(([record.status for record in records], error_m / each))
+        statuses.append(np.array([status for status, _ in runs]))
+        errors.append(np.median([error_m for _, error_m in runs]))
+    print(name, factor, errors, np.mean(statuses[0] == statuses[1]))
+    assert np.mean(statuses[0] == statuses[1]) >= 0.98
+    assert 1 / 1.15 < errors[1] / errors[0] < 1.15
