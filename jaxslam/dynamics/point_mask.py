@@ -29,7 +29,7 @@ def mask_around(
 
     Args:
         uv: Pixel positions; those outside the image are ignored.
-        depth: Depth image in meters, 0 where missing.
+        depth: Depth image in meters; 0 or NaN where missing.
         reach_px: Half the side of the square around each point, in pixels.
     """
     height, width = depth.shape
@@ -42,6 +42,6 @@ def mask_around(
     columns = np.clip(u[:, None] + steps, 0, width - 1)[:, None, :]
     around, center = depth[rows, columns], there[:, None, None]
     alike = np.abs(around - center) <= _DEPTH_STEP * center
-    which, row, column = np.nonzero(alike | (center <= 0) | (around <= 0))
+    which, row, column = np.nonzero(alike | ~(center > 0) | ~(around > 0))
     mask[rows[which, row, 0], columns[which, 0, column]] = True
     return mask

@@ -51,7 +51,7 @@ class Regions(NamedTuple):
         of_pixel: `(h', w')` region of one pixel in each block of `step_px` by `step_px`; -1 where depth is missing.
         of_point: `(n,)` region of each point; -1 for none.
         centers: `(3, k)` region centers in camera axes, in meters; not finite for a region without pixels.
-        num_pixels: `(k,)` number of sampled pixels in each region.
+        num_pixels: `(k,)` number of sampled pixels in each region; 1 for a region of a frame without depth.
     """
 
     of_pixel: Int[Array, "h w"]
@@ -98,6 +98,8 @@ def find_regions(
 ) -> Regions:
     """Divide a depth image into regions. The division is a discrete choice, constant for differentiation.
 
+    A frame without any depth keeps the centers of the frame before.
+
     Args:
         key: Key of the random choices: the starting centers of regions without a known center.
         depth: `(h, w)` depth image in meters, 0 where missing.
@@ -113,9 +115,11 @@ def find_regions(
     known = sampled.reshape(-1) > 0
     points = back_project(intrinsics, jnp.asarray([u.ravel(), v.ravel()], depth.dtype), sampled.reshape(-1))
     found = kmeans(key, points, known, num_clusters=plan.num_regions, num_steps=plan.num_steps, initial=before)
-    there = found.counts > 0
-    centers = lax.stop_gradient(jnp.where(there[None, :], found.centers, jnp.inf))
-    return Regions(found.label.reshape(sampled.shape), _nearest(X_cam, centers), centers, found.counts)
+    has_depth, of_before = jnp.any(known), jnp.isfinite(before).all(axis=0)
+    counts = jnp.where(has_depth, found.counts, of_before.astype(found.counts.dtype))
+    centers = jnp.where(has_depth, found.centers, before)
+    centers = lax.stop_gradient(jnp.where((counts > 0)[None, :], centers, jnp.inf))
+    return Regions(found.label.reshape(sampled.shape), _nearest(X_cam, centers), centers, counts)
 
 
 def region_weights(verdicts: Sequence[RegionCueResult]) -> Float[Array, " k"]:

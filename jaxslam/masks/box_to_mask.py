@@ -70,7 +70,8 @@ def add_box(
 
     Args:
         mask: `(h, w)` mask to add to.
-        depth: `(h, w)` depth image, meters; 0 where depth is missing.
+        depth: `(h, w)` depth image, meters; 0 where depth is missing. Where it is missing everywhere, the whole box is
+            added.
         box: Left, top, right and bottom of the box, pixels; it may extend beyond the image.
         focal_px: Horizontal focal length of the depth image, pixels.
     """
@@ -82,6 +83,9 @@ def add_box(
     rows = slice(max(int(top), 0), int(np.clip(np.ceil(bottom), 0, height)))
     inside = depth[rows, columns]
     if min(inside.shape) < _MIN_SIDE_PX:
+        return
+    if not (depth > 0).any():
+        mask[rows, columns] = True
         return
     distance = object_depth(inside)
     if distance is None:

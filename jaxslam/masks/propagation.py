@@ -164,14 +164,15 @@ def as_objects(uv: Pixels, ok: Mask, depth: Float[Array, "h w"], spacing: Float[
 
 
 def predicted_mask(
-    origin: TrackedMask, followed: MaskFlow, depth: Float[np.ndarray, "h w"], farthest_m: float
+    origin: TrackedMask, followed: MaskFlow, depth: Float[np.ndarray, "h w"] | None, farthest_m: float
 ) -> Bool[np.ndarray, "h w"]:
     """Predict the mask in a later frame from the tracked points (III-C.6).
 
     Args:
         origin: The earlier mask.
         followed: Its points in the later frame.
-        depth: `(h, w)` later depth image, meters; 0 where depth is missing.
+        depth: `(h, w)` later depth image, meters; 0 where depth is missing. `None` for a frame without depth, in which
+            the parts of the mask are moved only.
         farthest_m: Largest valid depth of the sensor, meters, with which objects count as thicker.
     """
     uv, z, label = (np.asarray(each) for each in followed)
@@ -213,7 +214,7 @@ def _add_object(
     before: np.ndarray,
     now: np.ndarray,
     z: np.ndarray,
-    depth: np.ndarray,
+    depth: np.ndarray | None,
     margin_m: float,
 ) -> None:
     """Add one object to the new mask: move its part of the old mask, cut it by depth, and keep what its points are on.
@@ -227,7 +228,7 @@ def _add_object(
         before: `(2, k)` positions of its points in the earlier frame, pixels.
         now: `(2, k)` positions of its points in the later frame, pixels.
         z: `(k,)` depths of its points in the later frame, meters.
-        depth: `(h, w)` later depth image, meters.
+        depth: `(h, w)` later depth image, meters; `None` without one.
         margin_m: Margin of its depth range beyond that of its points, meters.
     """
     # The median motion and the depth range. `np.median` and `np.percentile` take 0.3 ms, most of it overhead.
@@ -235,11 +236,15 @@ def _add_object(
     shift = np.round(np.sort(now - before, axis=1)[:, count // 2]).astype(int)
     nearest, farthest = np.sort(z)[[count // _DEPTH_TAIL, -1 - count // _DEPTH_TAIL]]
     # The moved and dilated part of the old mask.
-    around = _in_view(_grown(old._replace(corner=old.corner + shift)), new.shape)
+    moved = old._replace(corner=old.corner + shift)
+    around = _in_view(moved if depth is None else _grown(moved), new.shape)
     if not around.inside.size:
         return
-    # The connected components at the object's depth that hold its points.
     here = around.slices()
+    if depth is None:
+        new[here] |= around.inside
+        return
+    # The connected components at the object's depth that hold its points.
     right_depth = (depth[here] > nearest - margin_m) & (depth[here] < farthest + margin_m)
     num, piece = cv2.connectedComponents((around.inside & right_depth).view(np.uint8), connectivity=4)
     hits = np.bincount(_at(piece, now, around.corner), minlength=num)

@@ -25,7 +25,7 @@ class Frame:
             where they fit no frame rate, the tracker counts frames instead.
         image: `(height, width, 3)` RGB or `(height, width)` gray, uint8.
         depth_m: `(height, width)` float32 depth along the optical axis in meters; 0 or NaN where missing. `None` for
-            a stereo pair.
+            a stereo pair, and for a frame that the depth sensor has nothing for, as one of half the rate.
         dynamic_mask: `(height, width)` bool, true where objects move or may move; `None` if unknown.
         depth_timestamp_ns: Time of the depth image, int nanoseconds, for a sensor that takes it apart from the color
             image but within a second of it; `None` if both have the same time.
@@ -37,8 +37,8 @@ class Frame:
             the last row first.
 
     Raises:
-        FrameError: If a field has the wrong type or shape, the images differ in size, there is neither depth nor a
-            right image, or a sample of the IMU is later than the frame.
+        FrameError: If a field has the wrong type or shape, the images differ in size, or a sample of the IMU is later
+            than the frame.
     """
 
     timestamp_ns: int
@@ -58,10 +58,6 @@ class Frame:
         _check_image("image", self.image)
         if self.depth_m is not None:
             _check_plane("depth_m", self.depth_m, np.float32, self.size)
-        elif self.right is None:
-            raise FrameError(
-                "depth_m: expected (height, width) float32, or a right image of a stereo pair, got neither"
-            )
         if self.right is not None:
             _check_image("right", self.right)
             if self.right.shape != self.image.shape:
@@ -94,8 +90,8 @@ def check_frame(frame: Frame, width: int, height: int, *, pair: bool = False) ->
         pair: Whether the camera takes stereo pairs.
 
     Raises:
-        FrameError: If it is not a `Frame`, its size differs from the camera's, or one of depth image and stereo pair
-            is given where the other is expected.
+        FrameError: If it is not a `Frame`, its size differs from the camera's, or a depth image or a stereo pair is
+            given where the other is expected.
     """
     if not isinstance(frame, Frame):
         got = f"{type(frame).__name__}; make one: Frame(timestamp_ns, image, depth_m)"
@@ -104,7 +100,7 @@ def check_frame(frame: Frame, width: int, height: int, *, pair: bool = False) ->
         raise FrameError(f"image: expected the camera's {_by((width, height))} pixels, got {_by(frame.size)}")
     if pair and frame.right is None:
         raise FrameError("right: expected the right image, as the camera is a stereo pair, got none")
-    if not pair and frame.depth_m is None:
+    if not pair and frame.depth_m is None and frame.right is not None:
         raise FrameError(
             "depth_m: expected depth, as the camera is no stereo pair (baseline_m), got a right image alone"
         )

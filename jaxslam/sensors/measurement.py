@@ -11,12 +11,14 @@ from jaxslam_kernels.flow.lk_flow import FlowPlan
 from jaxslam_kernels.image.pyramid import Pyramid, build_pyramid
 from jaxslam_kernels.rolling_shutter import as_if_at_once, image_velocity, row_time
 from jaxslam_kernels.se3 import to_camera
-from jaxslam_kernels.types import DepthImage, Mask, Pixels, Points, Scalar, Weights
+from jaxslam_kernels.types import DepthImage, Flag, Mask, Pixels, Points, Scalar, Weights
 from jaxtyping import Array, Bool, Float
 
 from jaxslam.sensors.frame_arrays import FrameArrays
 from jaxslam.sensors.sensor_model import SensorModel
 
+_SPARSE_PX = 8
+"""Spacing of the pixels that tell whether a frame has depth at all."""
 RIGHT_LEVELS = 2
 """Of the pyramid of the right image: where matching begins is known to a few pixels."""
 _EXPECTED_PX = 1.0
@@ -44,6 +46,10 @@ class PreparedFrame(NamedTuple):
     depth: DepthImage
     elapsed_s: Scalar
     right: Pyramid | None = None
+
+    def has_depth(self) -> Flag:
+        """Return whether the frame has depth at all; a sensor may have none for some frames."""
+        return jnp.any(self.depth[::_SPARSE_PX, ::_SPARSE_PX] > 0)
 
     def with_right(self) -> "PreparedFrame":
         """The same frame with the right image of its pair, if it is one."""

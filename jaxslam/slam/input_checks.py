@@ -30,7 +30,7 @@ class InputChecks:
             has_imu: Whether the data sheet of an IMU was given.
         """
         self._camera, self._warnings, self._detector, self._has_imu = camera, warnings, detector, has_imu
-        self._frames = 0
+        self._frames = self._without_depth = 0
         self._shifts = np.zeros((0, 2))
 
     def look(self, frame: Frame) -> None:
@@ -46,7 +46,11 @@ class InputChecks:
             self._warnings.warn("image range", text)
         if self._camera.is_stereo:
             self._look_at_pair(frame, number)
-        elif frame.depth_m is not None and (contradiction := contradiction_of_depth(frame.depth_m)):
+        elif frame.depth_m is None:
+            self._without_depth += number < _FIRST
+            if self._without_depth == _FIRST:
+                self._warnings.warn("no depth", "depth_m: expected depth now and then to start with, got none so far")
+        elif contradiction := contradiction_of_depth(frame.depth_m):
             self._warnings.warn("depth scale", f"depth_m: expected meters along the optical axis, got {contradiction}")
 
     def _look_at_samples(self, frame: Frame) -> None:

@@ -30,6 +30,8 @@ _MAX_FRAMES = 30
 """Frames kept for a detector that takes long; what it says of older ones is of no use."""
 _TRUSTED_FRAMES = 5
 """Frames after a detection during which what stands still stays in the mask: a person may."""
+_DEPTH_FRAMES = 15
+"""Frames after one with depth during which the detector waits for the next such frame: depth divides boxes."""
 
 WIDTH_PX = 320
 """Masks are made at about so many columns: one of a third of the image is carried on in 1.5 ms, at 640 in 5.4."""
@@ -119,7 +121,9 @@ class MaskPipeline:
         self._next: DetectedMask | None = None
         self._carried_from: tuple[int, np.ndarray] | None = None
         self._detected_in: int | None = None
-        self._depth = aligned_array(self._reduced.raster.shape, np.float32)
+        self._depth, self._level = (aligned_array(self._reduced.raster.shape, np.float32) for _ in range(2))
+        self._level[:] = 1  # stands for the depth of a frame without any
+        self._has_depth, self._depth_in = False, -_DEPTH_FRAMES
         self._mask = np.zeros(self._reduced.raster.shape, bool)
 
     def compile(self) -> None:
@@ -137,11 +141,16 @@ class MaskPipeline:
             frame: Its number.
             image: `(h, w, 3)` RGB or `(h, w)`.
             gray: `(h, w)` uint8; copied.
-            depth: Meters; copied.
+            depth: Meters; copied. A frame without any depth keeps the mask of the one before, moved by optical flow.
         """
         self._seen[frame] = _BufferedFrame(self._reduced.mean(gray))
         np.copyto(self._depth, self._reduced.every(depth))
-        found, error = (None, "") if self._semantics is None else self._semantics.newest(self._shown(frame, image))
+        self._has_depth = bool((self._depth > 0).any())
+        if self._has_depth:
+            self._depth_in = frame
+        found, error = None, ""
+        if self._semantics is not None:
+            found, error = self._semantics.newest(self._shown(frame, image), looks=self._detects_in(frame))
         source = self._update_mask(frame, found)
         self._forget(frame)
         if not self._mask.any():  # and so nothing is carried on
@@ -162,6 +171,9 @@ class MaskPipeline:
             T_world_cam: `(7,)` pose of the camera when the depth of the frame was taken.
             turn_rad_per_s: Angular speed of the camera.
         """
+        if not self._has_depth:
+            self._prepare(frame + 1)
+            return
         seen = self._surfaces.compare(time_s, T_world_cam, turn_rad_per_s, self._depth, self._carried_from)
         if self._carried_from is not None and self._propagate:
             # While nothing is detected, what only stands there may never have been part of an object.
@@ -187,7 +199,7 @@ class MaskPipeline:
             frame: Its number.
             image: `(h, w, 3)` RGB or `(h, w)`; copied.
         """
-        if self._semantics is not None:
+        if self._semantics is not None and self._detects_in(frame):
             self._semantics.submit(self._shown(frame, image))
 
     def apply_map_correction(self, T_new_old: Float[np.ndarray, "7"]) -> None:
@@ -198,6 +210,10 @@ class MaskPipeline:
         """End the thread."""
         if self._semantics is not None:
             self._semantics.close()
+
+    def _detects_in(self, frame: int) -> bool:
+        """Return whether the detector may look at a frame: it has depth, or there has been none for a while."""
+        return self._has_depth or frame - self._depth_in >= _DEPTH_FRAMES
 
     def _shown(self, frame: int, image: np.ndarray) -> DetectionJob:
         return DetectionJob(frame, image, self._seen[frame].gray, self._depth)
@@ -238,8 +254,9 @@ class MaskPipeline:
             return found.origin.mask
         pyramids = [self._seen[between].pyramid for between in range(found.frame, frame)]
         now = self._seen[frame]
-        now.pyramid, followed = follow(found.origin, pyramids, now.gray, self._depth)
-        return predicted_mask(found.origin, followed, self._depth, self._farthest_m)
+        depth = self._depth if self._has_depth else None
+        now.pyramid, followed = follow(found.origin, pyramids, now.gray, self._level if depth is None else depth)
+        return predicted_mask(found.origin, followed, depth, self._farthest_m)
 
     def _forget(self, frame: int) -> None:
         """Drop what no mask can come from any more."""

@@ -78,7 +78,7 @@ class MaskStage:
             correction: Correction of the world `(7,)` since the frame before.
         """
         depth = np.asarray(arrays.depth)
-        if frame.depth_m is None:
+        if self._matches_pair(frame):
             assert self._memory.matched_depth is not None
             depth = self._memory.matched_depth
             self._worker.submit(("match pair", partial(self._match_pair, frame, depth)), number)
@@ -98,7 +98,7 @@ class MaskStage:
         """
         self._worker.flush()
         assert self._found is not None
-        if frame.depth_m is None:
+        if self._matches_pair(frame):
             depth: Any = self._memory.matched_depth
             arrays = arrays._replace(depth=depth)
         return self._with_ignored(arrays, self._found.mask, frame.dynamic_mask), self._found
@@ -173,6 +173,10 @@ class MaskStage:
             work()
         finally:
             watch.ends(stage)
+
+    def _matches_pair(self, frame: Frame) -> bool:
+        """Return whether the depth of a frame comes from matching its stereo pair here."""
+        return self._rough_depth is not None and frame.depth_m is None
 
     def _match_pair(self, frame: Frame, depth: np.ndarray) -> None:
         assert self._rough_depth is not None

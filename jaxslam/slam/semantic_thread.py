@@ -116,17 +116,21 @@ class SemanticThread:
             latency_frames=latency_frames,
         )
 
-    def newest(self, seen: DetectionJob) -> tuple[DetectedMask | None, str]:
+    def newest(self, seen: DetectionJob, *, looks: bool = True) -> tuple[DetectedMask | None, str]:
         """The newest mask there is by a frame, if it is newer than the last one, and what went wrong; told once.
 
         The first frame of all waits for its mask: whatever the tracker starts with would else be taken for static.
+
+        Args:
+            seen: The frame.
+            looks: Whether the detector may look at the frame if it has to wait for its mask.
         """
         found, error = self._newest(seen.frame)
-        if self._all_wait or not self._begun:
+        if looks and (self._all_wait or not self._begun):
             self.submit(seen)
             later, failed = self._awaited(seen.frame)
             found, error = later or found, failed or error
-        self._begun = True
+        self._begun |= looks
         return found, error
 
     def submit(self, seen: DetectionJob) -> None:

@@ -210,7 +210,7 @@ class Slam:
         # 1. Take over what mapping and loop closing have corrected since the frame before.
         self._tracker.state, correction = self._back.update(self._tracker.state, self._frame)
         dt_s = self._clock.elapsed_s(frame.timestamp_ns)
-        arrays = self._memory.hold(frame, dt_s, depth_follows=frame.depth_m is None)
+        arrays = self._memory.hold(frame, dt_s, depth_follows=frame.depth_m is None and self.camera.is_stereo)
         watch.ends("take over")
 
         # 2. Optical flow; beside it, a worker computes the stereo depth and the mask.

@@ -36,6 +36,7 @@ class KeyframeCandidate(NamedTuple):
         started: Whether tracking starts in the frame.
         since_keyframe_s: Time since the last keyframe, seconds.
         movable: Share of the image covered by movable objects.
+        has_depth: Whether the frame has any depth.
     """
 
     T_world_cam: SE3
@@ -48,10 +49,14 @@ class KeyframeCandidate(NamedTuple):
     started: Flag
     since_keyframe_s: Scalar
     movable: Scalar
+    has_depth: Flag
 
 
 def keyframe_reason(state: TrackState, frame: KeyframeCandidate, params: TrackParams, plan: TrackPlan) -> Code:
-    """Return the `KeyframeReason` of a frame; `NONE` if it does not become a keyframe."""
+    """Return the `KeyframeReason` of a frame; `NONE` if it does not become a keyframe.
+
+    A keyframe waits for a frame with depth: without, it would add no points, and surfaces that move are not known.
+    """
     num_points, since_s = frame.tracked.shape[0], frame.since_keyframe_s
     old = frame.tracked & (frame.points.age > state.since_keyframe)
     num_kept = jnp.sum(frame.tracked, dtype=since_s.dtype)
@@ -77,7 +82,8 @@ def keyframe_reason(state: TrackState, frame: KeyframeCandidate, params: TrackPa
         else _adds_information(state.keyframes, frame, params, plan)
     )
     urgent = (KeyframeReason.FEW_POINTS, KeyframeReason.WEAK)
-    conditions = [condition if reason in urgent else condition & may for condition, reason in causes]
+    may, may_at_once = may & frame.has_depth, frame.has_depth
+    conditions = [condition & (may_at_once if reason in urgent else may) for condition, reason in causes]
     codes = [code(reason) for reason in (KeyframeReason.STARTED, *(reason for _, reason in causes))]
     return jnp.select([frame.started, *conditions], codes, code(KeyframeReason.NONE))
 

@@ -193,7 +193,7 @@ def track_followed(
     step = step._replace(params=_widened(params, state.points.uv, uv, background))
     # 4. Coarse pose: RANSAC PnP, in which no region of the depth image has more than an even share of the votes.
     seen = step.measured(rays, X_world, predicted, state.twist)
-    regions = _regions(step, seen)
+    regions = _regions(step, seen, predicted)
     trust = probation_weights(state.points, params)
     coarse, agreeing, coarse_status = coarse_pose(
         step, seen, _votes(step, trust, background, regions), predicted, prior
@@ -311,14 +311,18 @@ def _widened(params: TrackParams, before: Pixels, after: Pixels, background: Mas
     return params._replace(ransac_px=params.ransac_px + extra, outlier_px=params.outlier_px + extra)
 
 
-def _regions(step: StepContext, seen: Measurements) -> Regions | None:
-    """Segment the depth image into surfaces, if the plan asks for them."""
+def _regions(step: StepContext, seen: Measurements, predicted: SE3) -> Regions | None:
+    """Segment the depth image into surfaces, if the plan asks for them.
+
+    Without depth, points are where the map has them.
+    """
     state, plan = step.state, step.plan
     if plan.regions is None:
         return None
     key = jax.random.fold_in(state.random_key(), -1 - state.frame)
     ideal = without_distortion(step.params.sensor.intrinsics)
-    return find_regions(key, step.view.depth, state.regions.centers, seen.in_camera(), ideal, plan.regions)
+    X_cam = jnp.where(step.view.has_depth(), seen.in_camera(), to_camera(predicted, state.points.X_world))
+    return find_regions(key, step.view.depth, state.regions.centers, X_cam, ideal, plan.regions)
 
 
 def _votes(step: StepContext, trust: Weights, background: Mask, regions: Regions | None) -> Weights:

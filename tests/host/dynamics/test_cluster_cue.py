@@ -50,6 +50,20 @@ def divided(depth: np.ndarray, before: Any = None, plan: RegionPlan = PLAN) -> R
 
 
 class TestRegions:
+    def test_a_frame_without_depth_keeps_the_centers(self) -> None:
+        """Points are in the nearest region of before, and no pixel is in one."""
+        before = divided(box_before_wall())
+        found = divided(np.zeros((HEIGHT, WIDTH)), before.centers)
+        np.testing.assert_array_equal(found.centers, before.centers)
+        np.testing.assert_array_equal(found.of_point, before.of_point)
+        assert (found.of_pixel == -1).all()
+        np.testing.assert_array_equal(found.num_pixels > 0, before.num_pixels > 0)
+
+    def test_no_depth_at_first(self) -> None:
+        found = divided(np.zeros((HEIGHT, WIDTH)))
+        assert (found.of_point == -1).all()
+        assert not found.num_pixels.any()
+
     def test_no_region_holds_two_surfaces(self) -> None:
         found = divided(box_before_wall())
         rows, columns = (np.minimum(np.arange(0, size, 4) + 2, size - 1) for size in (HEIGHT, WIDTH))

@@ -43,3 +43,10 @@ class TestMaskAround:
 
     def test_no_points(self) -> None:
         assert not mask_around(np.zeros((2, 0)), self.depth, 3).any()
+
+    def test_nan_is_missing(self):
+        uv, missing = np.array([[20.0], [15.0]]), self.depth.copy()
+        missing[10:20, 15:25] = 0
+        np.testing.assert_array_equal(
+            mask_around(uv, np.where(missing == 0, np.nan, missing), 4), mask_around(uv, missing, 4)
+        )

@@ -210,6 +210,13 @@ def test_only_first_frames_and_every_hundredth_are_looked_at() -> None:
     assert named_at == [100]
 
 
+def test_no_depth_in_the_first_frames() -> None:
+    """Depth now and then is enough; a camera without any cannot start."""
+    blind = [replace(frame, depth_m=None) for frame in clip().frames[:FRAMES]]
+    assert seen(clip().camera, blind) == "depth_m: expected depth now and then to start with, got none so far"
+    assert seen(clip().camera, [*blind[1:], clip().frames[FRAMES - 1]]) == ""
+
+
 def test_small_changes_of_a_map_camera_are_not_named(trackers: Trackers) -> None:
     """Two calibrations of one camera."""
     assert trackers.of_map(fx=1.003 * clip().camera.fx, cx=clip().camera.cx + 0.3) == ""

@@ -59,6 +59,28 @@ def overlap(a: np.ndarray, b: np.ndarray) -> float:
     return np.count_nonzero(a & b) / max(np.count_nonzero(a | b), 1)
 
 
+class TestWithoutDepth:
+    BLIND = np.zeros((100, 120), np.float32)
+
+    @pytest.mark.parametrize("missing", [0.0, np.nan])
+    def test_a_box_is_masked_as_a_whole(self, missing: float):
+        depth = self.BLIND + np.float32(missing)
+        mask = mask_of_detections(detections([[35, 15, 75, 85]]), depth, FOCAL_PX, dilate_px=0)
+        assert mask[15:85, 35:75].all()
+        assert mask.sum() == 70 * 40
+
+    def test_a_mask_is_moved_as_it_is(self):
+        """Neither cut nor dilated, however many frames go by."""
+        gray, _, mask = seen(FIRST)
+        for index in range(FIRST + 1, LAST + 1):
+            now = seen(index)[0]
+            origin = make_origin(mask, gray, 0)
+            _, followed = follow(origin, [pyramid(gray)], now, np.ones((HEIGHT, WIDTH), np.float32))
+            mask, gray = predicted_mask(origin, followed, None, FARTHEST_M), now
+        print(f"overlap after {LAST - FIRST} frames: {overlap(mask, seen(LAST)[2]):.2f}")
+        assert overlap(mask, seen(LAST)[2]) > 0.75
+
+
 class TestBoxMask:
     DEPTH = np.full((100, 120), 3.0, np.float32)
     DEPTH[20:80, 40:70] = 1.5
@@ -90,6 +112,7 @@ class TestBoxMask:
     def test_without_depth(self, value: float) -> None:
         depth = np.full((60, 60), value, np.float32)
         assert object_depth(depth) is None
+        depth[:5, :5] = 1  # the frame has depth, and the box has none
         assert not mask_of_detections(detections([[10, 10, 50, 50]]), depth, FOCAL_PX, dilate_px=2).any()
 
     @pytest.mark.parametrize("scale", [0.06, 1.0, 12.0, 100.0])

@@ -79,7 +79,6 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {
     "big-endian depth": (frame(depth_m=depth_as(">f4")), "depth_m: expected .* got >f4"),
     "depth of another size": (frame(depth_m=depth_as("f4")[:60]), "depth_m: expected the image's 160x120 pixels"),
     "depth in a column": (frame(depth_m=depth_as("f4")[..., None]), r"depth_m: expected .* got shape \(120, 160, 1\)"),
-    "no depth": (frame(depth_m=None), "depth_m: expected .* got neither"),
     "a pair": (frame(depth_m=None, right=IMAGE), "depth_m: expected depth, as the camera is no stereo pair"),
     "a mask of bytes": (frame(dynamic_mask=np.zeros((HEIGHT, WIDTH), np.uint8)), "dynamic_mask: expected .* got uint8"),
     "a mask of another size": (frame(dynamic_mask=np.zeros((9, 9), bool)), "dynamic_mask: expected the image's"),

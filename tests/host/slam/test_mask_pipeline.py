@@ -72,12 +72,13 @@ def masks_of(
         made.close()
 
 
-def mask_of(made: MaskPipeline, index: int, moved_to: np.ndarray | None = None) -> FrameMask:
+def mask_of(made: MaskPipeline, index: int, moved_to: np.ndarray | None = None, *, has_depth: bool = True) -> FrameMask:
     frame, time_s = rendered()[0].frames[index], float(1e-9 * source().timestamps_ns[index])
     pose: np.ndarray = source().T_world_cam[index] if moved_to is None else moved_to
     turn = float(turns()[index])
     assert frame.depth_m is not None
-    mask = made.mask_frame(index, frame.image, to_gray(frame.image), frame.depth_m)
+    depth_m = frame.depth_m if has_depth else np.zeros_like(frame.depth_m)
+    mask = made.mask_frame(index, frame.image, to_gray(frame.image), depth_m)
     made.frame_tracked(index, time_s, pose, turn)
     made.submit_for_detection(index, frame.image)
     return mask
@@ -93,6 +94,37 @@ def turns() -> np.ndarray:
 def overlaps(masks: list[FrameMask]) -> np.ndarray:
     truth = rendered()[1]
     return np.array([np.sum(m.mask & t) / max(np.sum(m.mask | t), 1) for m, t in zip(masks, truth, strict=False)])
+
+
+class TestDepthNowAndThen:
+    """Every third frame has depth."""
+
+    def masks(self, latency_frames: int, num: int = 12) -> list[FrameMask]:
+        settings = SemanticsConfig(latency_frames=latency_frames, dilate_px=0)
+        made = MaskPipeline(source().camera, knows_all, Config(run=RunConfig(deterministic=True), semantics=settings))
+        try:
+            return [mask_of(made, index, has_depth=index % 3 == 0) for index in range(num)]
+        finally:
+            made.close()
+
+    def test_masks_move_along(self) -> None:
+        found = overlaps(self.masks(2))
+        print("overlap with the truth:", np.round(found, 2))
+        assert found.min() > 0.7
+
+    @pytest.mark.parametrize("latency_frames", [0, 2])
+    def test_the_detector_waits_for_depth(self, latency_frames: int) -> None:
+        masks = self.masks(latency_frames)
+        looked_at = {index - mask.age for index, mask in enumerate(masks)}
+        assert {frame % 3 for frame in looked_at} == {0}
+
+    def test_it_looks_again_when_depth_stays_away(self) -> None:
+        made = MaskPipeline(source().camera, knows_all, Config(semantics=SemanticsConfig(latency_frames=0)))
+        try:
+            ages = [mask_of(made, index, has_depth=index == 0).age for index in range(20)]
+        finally:
+            made.close()
+        assert ages == [*range(15), *[0] * 5]
 
 
 class TestSchedule:

@@ -39,6 +39,7 @@ def _reason(
     weak=False,
     lost=False,
     started=False,
+    has_depth=True,
 ) -> KeyframeReason:
     """Why a frame is kept that shows points 2 m away, after the camera has moved since a keyframe at the origin.
 
@@ -63,6 +64,7 @@ def _reason(
         started=jnp.asarray(started),
         since_keyframe_s=number(since_s),
         movable=number(movable),
+        has_depth=jnp.asarray(has_depth),
     )
     params = PARAMS._replace(map_views=number(map_views), map_changed=number(map_changed))
     return KeyframeReason(int(keyframe_reason(state, candidate, params, plan)))
@@ -105,6 +107,13 @@ def test_a_change_of_the_map_is_one(plan) -> None:
     assert changed(map_views=100) == KeyframeReason.CHANGED  # as well known as it was
     assert changed(since_s=0.1) == KeyframeReason.NONE
     assert changed(lost=True) == KeyframeReason.NONE
+
+
+@pytest.mark.parametrize("plan", [AS_NEEDED, SPARING])
+def test_it_waits_for_depth(plan) -> None:
+    for cause in ({}, {"overlap": 0.9, "new": int(0.95 * N)}, {"weak": True}, {"overlap": 0.9, "map_changed": True}):
+        assert _reason(plan, **cause) != KeyframeReason.NONE
+        assert _reason(plan, **cause, has_depth=False) == KeyframeReason.NONE
 
 
 def test_not_soon_after_the_last_one() -> None:

@@ -1,0 +1,103 @@
+"""Depth in some frames only: a sensor of a lower rate, and one that fails for a while."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from real_networks import real_network
+
+from jaxslam import Camera, Config, Frame, FrameResult, KeyframeReason, Slam, TrackReason, TrackStatus, load_config
+from jaxslam.datasets import open_dataset
+from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
+from jaxslam.trajectory.evaluation import evaluate
+from jaxslam.trajectory.trajectory import Trajectory
+
+CONFIG = load_config("default", overrides=["semantics.model=null"])
+
+
+@functools.cache
+def room() -> tuple[SyntheticDataset, tuple[Frame, ...]]:
+    made = SyntheticDataset(SyntheticConfig(width=320, height=240, frames=45, people=1, path="xyz", fps=15.0))
+    return made, tuple(made[index] for index in range(len(made)))
+
+
+def without_depth(frame: Frame) -> Frame:
+    return dataclasses.replace(frame, depth_m=None)
+
+
+def tracked(change: Callable[[int, Frame], Frame], camera: Camera, frames: tuple[Frame, ...]) -> list[FrameResult]:
+    with Slam(camera, CONFIG) as slam:
+        return [slam.track(change(index, frame)) for index, frame in enumerate(frames)]
+
+
+def error_m(results: list[FrameResult], truth: Trajectory) -> float:
+    times_ns = np.array([result.timestamp_ns for result in results])
+    return evaluate(Trajectory(times_ns, np.stack([result.T_world_cam for result in results])), truth).ate_rmse_m
+
+
+def test_every_third_frame() -> None:
+    """Keyframes are those with depth."""
+    source, frames = room()
+    whole = tracked(lambda _, frame: frame, source.camera, frames)
+    some = tracked(lambda index, frame: without_depth(frame) if index % 3 else frame, source.camera, frames)
+    assert all(result.status != TrackStatus.LOST for result in some)
+    assert {index % 3 for index, result in enumerate(some) if result.keyframe != KeyframeReason.NONE} == {0}
+    errors_m = [error_m(results, source.ground_truth) for results in (whole, some)]
+    print("error in mm with all depth, with a third:", 1e3 * np.array(errors_m))
+    assert errors_m[1] < 0.005
+
+
+def test_none_is_as_depth_without_a_pixel() -> None:
+    source, frames = room()
+    blank = np.zeros((source.camera.height, source.camera.width), np.float32)
+    none = tracked(lambda i, frame: without_depth(frame) if i % 2 else frame, source.camera, frames[:12])
+    holes = [blank, np.full_like(blank, np.nan)]
+    for hole in holes:
+        change = lambda i, frame, hole=hole: dataclasses.replace(frame, depth_m=hole) if i % 2 else frame
+        for one, other in zip(none, tracked(change, source.camera, frames[:12]), strict=True):
+            np.testing.assert_array_equal(one.T_world_cam, other.T_world_cam)
+            np.testing.assert_array_equal(one.dynamic_mask, other.dynamic_mask)
+
+
+def test_start_waits_for_depth() -> None:
+    source, frames = room()
+    results = tracked(lambda index, frame: without_depth(frame) if index < 3 else frame, source.camera, frames[:6])
+    lost, started, ok = TrackStatus.LOST, TrackStatus.STARTED, TrackStatus.OK
+    assert [result.status for result in results] == [lost, lost, lost, started, ok, ok]
+    assert {result.reason for result in results[:3]} == {TrackReason.NO_DEPTH.text}
+
+
+def test_a_sensor_that_fails_for_a_second() -> None:
+    """What is known of the points carries the pose; no keyframe is made until there is depth again."""
+    source, frames = room()
+    results = tracked(lambda i, frame: without_depth(frame) if 10 <= i < 25 else frame, source.camera, frames)
+    assert all(result.status != TrackStatus.LOST for result in results)
+    assert all(result.keyframe == KeyframeReason.NONE for result in results[10:25])
+    print("error in mm:", 1e3 * error_m(results, source.ground_truth))
+    assert error_m(results, source.ground_truth) < 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("every", [3, 5, 10])
+def test_in_a_crowd(data_dir: Path, every: int) -> None:
+    """Bonn `crowd`, in the median of three seeds."""
+    folder = data_dir / "bonn" / "rgbd_bonn_crowd"
+    if not folder.is_dir():
+        pytest.skip(f"JAXSLAM_DATA holds no {folder.name}")
+    dataset, model = open_dataset(folder), real_network("yolox_nano")
+    assert dataset.ground_truth is not None
+    errors_m = []
+    for seed in range(3):
+        config: Config = load_config("default", overrides=[f"semantics.model={model}", f"run.seed={seed}"])
+        with Slam(dataset.camera, config) as slam:
+            results = []
+            for index in range(len(dataset)):
+                frame = dataset[index]
+                results.append(slam.track(without_depth(frame) if index % every else frame))
+        assert sum(result.status == TrackStatus.LOST for result in results) <= 0.01 * len(dataset)
+        errors_m.append(error_m(results, dataset.ground_truth))
+    print(every, "error in mm:", 1e3 * np.array(errors_m))
+    assert np.median(errors_m) <= 0.016
