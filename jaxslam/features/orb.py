@@ -243,7 +243,7 @@ def _ideal(uv_raw: Pixels, twist: Float[Array, "6"], frame: FrameArrays, sensor:
     """Convert pixels to those of the ideal camera and read depth; of a stereo pair by matching."""
     sensor = sensor.for_readout(frame.readout_sign)
     believed = valid_depth(frame.depth, sensor.min_depth_m, sensor.max_depth_m)
-    rough, matched = sample_depth(believed, uv_raw), None
+    rough, matched = sample_depth(believed, uv_raw, noise=sensor.depth_step_m()), None
     if frame.right is not None:
         pyramid = build_pyramid(frame.image, num_levels=RIGHT_LEVELS, dtype=uv_raw.dtype)
         view = PreparedFrame(frame, pyramid, believed, frame.dt_s).with_right()

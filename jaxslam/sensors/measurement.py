@@ -123,7 +123,8 @@ class PixelRays(NamedTuple):
         measured = self.matched
         if measured is None:
             focal = jnp.stack([sensor.intrinsics.fx, sensor.intrinsics.fy])[:, None]
-            measured = sample_depth(depth, self.uv + focal * velocity * depth_delay_s, reach=reach)
+            there = self.uv + focal * velocity * depth_delay_s
+            measured = sample_depth(depth, there, reach=reach, noise=sensor.depth_step_m())
         return Measurements(at_once, measured, depth_sigma(measured, sensor))
 
     def from_pose(

@@ -36,6 +36,10 @@ class SensorModel(NamedTuple):
     max_depth_m: Scalar
     baseline_m: Scalar
 
+    def depth_step_m(self) -> Scalar:
+        """Return the step of depth that the rough depth of a pair has on any surface; 0 for a camera that measures."""
+        return 0.2 * self.baseline_m
+
     def for_readout(self, sign: Scalar | None) -> "SensorModel":
         """Return the model with the direction in which a frame's rolling shutter reads the rows.
 

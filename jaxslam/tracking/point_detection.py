@@ -111,7 +111,7 @@ def _candidates(points: TrackedPoints, step: StepContext, twist: Float[Array, "6
     corners = grid_corners(corner_score(image), inside & ~ignore, cell=cell)
     taken = occupied_cells(points.uv / 2, points.valid, (image.shape[0], image.shape[1]), cell=cell)
     uv = corners.points * 2
-    rough = sample_depth(depth, uv, reach=2)
+    rough = sample_depth(depth, uv, reach=2, noise=sensor.depth_step_m())
     seen = pixel_rays(uv, sensor).measured(rough, twist, depth, view.frame.depth_delay_s, sensor, reach=2)
     good = (corners.score > _MIN_SCORE) & ~taken & (rough > 0) & (seen.depth > 0)
     return _Candidates(uv, corners.score, rough, seen, good)
@@ -122,7 +122,8 @@ def _order(
 ) -> tuple[Int[Array, " m"], Code]:
     """Order the candidates: those in `first`, then good ones on one surface, then by score; and count those used."""
     plan = step.plan
-    one_surface = sample_depth(step.view.depth, found.uv, reach=plan.flow.finest.window // 2, max_step=_DEPTH_STEP) > 0
+    reach, noise = plan.flow.finest.window // 2, step.params.sensor.depth_step_m()
+    one_surface = sample_depth(step.view.depth, found.uv, reach=reach, max_step=_DEPTH_STEP, noise=noise) > 0
     keys, room = (-found.score, ~one_surface, ~found.good), jnp.sum(found.good, dtype=jnp.int32)
     if first is not None and plan.motion is not None:
         column, row = jnp.round(found.uv).astype(jnp.int32)

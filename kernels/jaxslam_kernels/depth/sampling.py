@@ -22,7 +22,9 @@ def valid_depth(
 
 
 @checked
-def sample_depth(depth: DepthImage, uv: Pixels, *, reach: int = 1, max_step: float = 0.06) -> Weights:
+def sample_depth(
+    depth: DepthImage, uv: Pixels, *, reach: int = 1, max_step: float = 0.06, noise: Scalar | float = 0.0
+) -> Weights:
     """Depth at the nearest pixel, or 0 where its surroundings do not agree.
 
     Differentiable in the depth image; in `uv` the derivative is zero, because the nearest pixel stays the same.
@@ -31,7 +33,8 @@ def sample_depth(depth: DepthImage, uv: Pixels, *, reach: int = 1, max_step: flo
         depth: Depth image in meters, at least as large as the surroundings; 0 or NaN where missing.
         uv: `(2, n)` pixel coordinates. Where one is not a number, or the surroundings leave the image, the result is 0.
         reach: The surroundings are `2 * reach + 1` pixels a side, and all must have depth; static.
-        max_step: Largest difference of depth in them, as a share of the depth in the middle.
+        max_step: Largest difference of depth in them, as a share of the depth in the middle,
+        noise: and so much more, in the unit of the depth, which noise alone makes at any depth.
     """
     side = 2 * reach + 1
     # Far outside where it is not a number, and never so far that the conversion to integers overflows.
@@ -39,7 +42,7 @@ def sample_depth(depth: DepthImage, uv: Pixels, *, reach: int = 1, max_step: flo
     around = apart(lambda: _windows(depth, center[::-1].T - reach, side)).reshape(-1, side * side)
     low, high = jnp.min(around, axis=1), jnp.max(around, axis=1)
     middle = around[:, side * side // 2]
-    smooth = (low > 0) & jnp.isfinite(high) & (high - low <= max_step * middle)
+    smooth = (low > 0) & jnp.isfinite(high) & (high - low <= max_step * middle + noise)
     return jnp.where(smooth, middle, 0)
 
 

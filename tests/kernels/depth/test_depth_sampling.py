@@ -86,6 +86,13 @@ class TestSampleDepth:
         depth[5, 6] *= 1 + rise
         assert (_sample[1](depth, np.full((2, 1), 5.0, np.float32))[0] > 0) == agrees
 
+    @pytest.mark.parametrize(("rise", "agrees"), [(0.059, True), (0.061, False)])
+    def test_noise_is_allowed_at_any_depth(self, rise, agrees):
+        depth = np.full((H, W), 0.4, np.float32)
+        depth[5, 6] += rise
+        sample = sample_depth(jnp.asarray(depth), jnp.full((2, 1), 5.0), max_step=0.1, noise=0.02)
+        assert (sample[0] > 0) == agrees
+
     def test_nearest_pixel(self, x64):
         uv = np.array([[4.49, 3.51, 4.4], [6.4, 5.6, 6.49]])
         depth = np.arange(H * W, dtype=float).reshape(H, W)
