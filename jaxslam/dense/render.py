@@ -35,7 +35,7 @@ class _Screen(NamedTuple):
 
     Attributes:
         uv: `(2, n)` image coordinates, pixels.
-        depth: `(n,)` depth behind the screen, meters; points that are not in front of the viewer are hidden.
+        depth: `(n,)` depth behind the screen, meters; 0 for points that are not in front of the viewer, and hidden.
         pixel_per_m: `(n,)` scale at each point, pixels per meter.
     """
 
@@ -124,9 +124,10 @@ def _ahead(X: np.ndarray, stand: _Stand) -> _Screen:
     axes = np.stack([right, down * cos - ahead * sin, ahead * cos + down * sin])
     eye = stand.center - 1.9 * stand.extent_m * axes[2]
     x, y, z = ((X - eye) @ axes.T).T
-    seen = np.where(z > _NEAREST * stand.extent_m, z, np.inf)
+    front = z > _NEAREST * stand.extent_m
+    seen, depth = np.where(front, z, np.inf), np.where(front, z, 0.0)
     focal = 0.5 * _WIDTH / _VIEW
-    return _Screen(np.stack([0.5 * _WIDTH + focal * x / seen, 0.5 * _HEIGHT + focal * y / seen]), z, focal / seen)
+    return _Screen(np.stack([0.5 * _WIDTH + focal * x / seen, 0.5 * _HEIGHT + focal * y / seen]), depth, focal / seen)
 
 
 def _from_above(X: np.ndarray, stand: _Stand) -> _Screen:
@@ -141,7 +142,7 @@ def _drawn(screen: _Screen, cloud: DenseCloud) -> UInt8[np.ndarray, "h w 3"]:
     """Draw each point as a square of the projected size of its voxel, the farthest first."""
     panel = np.full((_HEIGHT * _WIDTH, 3), _BACKGROUND, np.uint8)
     order = np.argsort(-screen.depth)
-    order = order[screen.depth[order] > 0.1]
+    order = order[screen.depth[order] > 0]
     voxels_m = np.where(cloud.is_key, 0.25, 1.0) * cloud.voxel_m
     side = np.clip(np.ceil(screen.pixel_per_m * voxels_m), 1, _MAX_SPLAT_PX).astype(np.int64)[order]
     column, row = np.clip(np.nan_to_num(screen.uv[:, order]), -1e6, 1e6).astype(np.int64)
@@ -161,7 +162,7 @@ def _drawn(screen: _Screen, cloud: DenseCloud) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def _draw_path(panel: UInt8[np.ndarray, "h w 3"], screen: _Screen) -> None:
-    line = np.rint(np.clip(screen.uv.T, -1e4, 1e4)).astype(np.int32)[screen.depth > 0.1]
+    line = np.rint(np.clip(screen.uv.T, -1e4, 1e4)).astype(np.int32)[screen.depth > 0]
     if len(line):
         cv2.polylines(panel, [line.reshape(-1, 1, 2)], isClosed=False, color=_PATH_RGB, thickness=2)
         cv2.circle(panel, tuple(line[-1].tolist()), 6, _PATH_RGB, -1)

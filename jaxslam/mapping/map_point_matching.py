@@ -136,10 +136,10 @@ def find_points(
     camera = slam_map.camera
     X = to_local(T_world_cam, points.X_world)
     front = X[2] > 0
-    z = np.where(front, X[2], 1.0)
-    uv = camera.project(np.stack([X[0], X[1], z]))
+    X = np.where(front, X, 1.0)
+    uv = camera.project(X)
     inside = front & (uv > -_MARGIN_PX).all(axis=0) & (uv < [[camera.width], [camera.height]]).all(axis=0)
-    octave = np.log(points.size / np.linalg.norm(np.where(front, X, 1.0), axis=0)) / np.log(plan.scale_factor)
+    octave = np.log(points.size / np.linalg.norm(X, axis=0)) / np.log(plan.scale_factor)
     octave = np.clip(np.round(octave), 0, plan.num_levels - 1).astype(np.int64)
     where = np.flatnonzero(inside)
     match = match_by_projection(

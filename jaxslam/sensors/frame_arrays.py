@@ -199,13 +199,13 @@ def stack_frames(frames: Sequence[Frame], previous_ns: int | None = None, dtype:
 
 def _depth(frame: Frame) -> np.ndarray:
     """Return the depth image of a frame, all 0 if it has none and is no stereo pair."""
-    if frame.depth_m is None and frame.right is None:
+    if frame.depth_m is not None:
+        return frame.depth_m
+    if frame.right is None:
         return np.zeros(frame.size[::-1], np.float32)
-    if frame.depth_m is None:
-        raise FrameError(
-            "depth_m: expected depth for matching to begin with, got none; see jaxslam.sensors.stereo_depth.RoughDepth"
-        )
-    return frame.depth_m
+    raise FrameError(
+        "depth_m: expected depth for matching to begin with, got none; see jaxslam.sensors.stereo_depth.RoughDepth"
+    )
 
 
 def _times(frame: Frame, dt_s: float, dtype: DTypeLike) -> tuple[np.ndarray, np.ndarray]:

@@ -171,9 +171,14 @@ class MaskPipeline:
             T_world_cam: `(7,)` pose of the camera when the depth of the frame was taken.
             turn_rad_per_s: Angular speed of the camera.
         """
-        if not self._has_depth:
-            self._prepare(frame + 1)
-            return
+        if self._has_depth:
+            self._correct_by_depth(frame, time_s, T_world_cam, turn_rad_per_s)
+        self._prepare(frame + 1)
+
+    def _correct_by_depth(
+        self, frame: int, time_s: float, T_world_cam: Float[np.ndarray, "7"], turn_rad_per_s: float
+    ) -> None:
+        """Compare the depth of the last frame with that of earlier ones, correct its mask by it, and store both."""
         seen = self._surfaces.compare(time_s, T_world_cam, turn_rad_per_s, self._depth, self._carried_from)
         if self._carried_from is not None and self._propagate:
             # While nothing is detected, what only stands there may never have been part of an object.
@@ -182,7 +187,6 @@ class MaskPipeline:
         if self._new_surfaces:
             self._mask = self._surfaces.with_new_surfaces(self._mask, seen)
         self._surfaces.remember(frame, time_s, T_world_cam, turn_rad_per_s, self._mask)
-        self._prepare(frame + 1)
 
     def frame_lost(self, frame: int) -> None:
         """Take in that nobody knows where the camera was in the last frame."""

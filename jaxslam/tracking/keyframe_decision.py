@@ -82,8 +82,8 @@ def keyframe_reason(state: TrackState, frame: KeyframeCandidate, params: TrackPa
         else _adds_information(state.keyframes, frame, params, plan)
     )
     urgent = (KeyframeReason.FEW_POINTS, KeyframeReason.WEAK)
-    may, may_at_once = may & frame.has_depth, frame.has_depth
-    conditions = [condition & (may_at_once if reason in urgent else may) for condition, reason in causes]
+    conditions = [condition if reason in urgent else condition & may for condition, reason in causes]
+    conditions = [condition & frame.has_depth for condition in conditions]
     codes = [code(reason) for reason in (KeyframeReason.STARTED, *(reason for _, reason in causes))]
     return jnp.select([frame.started, *conditions], codes, code(KeyframeReason.NONE))
 

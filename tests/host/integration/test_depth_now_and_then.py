@@ -71,7 +71,7 @@ def test_start_waits_for_depth() -> None:
 
 
 def test_a_sensor_that_fails_for_a_second() -> None:
-    """What is known of the points carries the pose; no keyframe is made until there is depth again."""
+    """Points of known depth carry the pose; no keyframe is made until there is depth again."""
     source, frames = room()
     results = tracked(lambda i, frame: without_depth(frame) if 10 <= i < 25 else frame, source.camera, frames)
     assert all(result.status != TrackStatus.LOST for result in results)
