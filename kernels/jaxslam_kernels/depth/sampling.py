@@ -23,7 +23,7 @@ def valid_depth(
 
 @checked
 def sample_depth(
-    depth: DepthImage, uv: Pixels, *, reach: int = 1, max_step: float = 0.06, noise: Scalar | float = 0.0
+    depth: DepthImage, uv: Pixels, *, reach: int = 1, max_step: float = 0.05, noise: Scalar | float = 0.0
 ) -> Weights:
     """Depth at the nearest pixel, or 0 where its surroundings do not agree.
 

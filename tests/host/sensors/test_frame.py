@@ -39,7 +39,6 @@ class TestStructure:
             ("image", np.zeros((HEIGHT, WIDTH, 4), np.uint8), "got shape (12, 16, 4); drop the alpha"),
             ("image", np.zeros((HEIGHT, WIDTH, 1), np.uint8), "got shape (12, 16, 1)"),
             ("image", np.zeros((0, 0, 3), np.uint8), "got shape (0, 0, 3)"),
-            ("depth_m", None, "a right image of a stereo pair, got neither"),
             ("depth_m", [[1.0]], "float32, got list"),
             (
                 "depth_m",
@@ -64,13 +63,14 @@ class TestStructure:
         [
             {"image": np.zeros_like(RGB)},
             {"image": np.full_like(RGB, 255)},
+            {"depth_m": None},
             {"depth_m": np.zeros_like(DEPTH)},
             {"depth_m": np.full_like(DEPTH, np.nan)},
             {"depth_m": np.full_like(DEPTH, np.inf)},
             {"depth_m": -DEPTH},
             {"dynamic_mask": np.ones((HEIGHT, WIDTH), bool)},
         ],
-        ids=["black", "white", "no depth", "NaN depth", "infinite depth", "negative depth", "all dynamic"],
+        ids=["black", "white", "no image", "no depth", "NaN", "infinite", "negative depth", "all dynamic"],
     )
     def test_leaves_content_to_the_tracker(self, content: dict[str, np.ndarray]) -> None:
         make(**content)

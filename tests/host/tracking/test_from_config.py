@@ -14,8 +14,8 @@ from jaxslam.tracking.from_config import track_params, track_plan
 from jaxslam.tracking.state import TrackParams, TrackPlan
 
 CAMERA = Camera("test", width=64, height=48, fx=50.0, fy=50.0, cx=31.5, cy=23.5)
-OTHER = {"new_points": "keyframes", "keyframe_policy": "sparing"}
-"""Values other than the default of settings that are no numbers."""
+OTHER = {"new_points": "keyframes", "keyframe_policy": "sparing", "max_speed_m_per_s": 3.0}
+"""Values other than the default of settings whose default is no number."""
 
 
 def changed(name: str) -> TrackConfig:
