@@ -20,6 +20,7 @@ from jaxslam.results.run_results import RESULT_FILES, RunInfo, write_results
 from jaxslam.sensors.frame import Frame
 from jaxslam.slam.frame_records import FrameRecords
 from jaxslam.slam.frame_result import FrameRecord, FrameResult, Rejected
+from jaxslam.slam.relative_pose_log import RelativePoseLog
 from jaxslam.slam.slam import Slam
 from jaxslam.trajectory.evaluation import Evaluation
 from jaxslam.visualization.snapshots import RunPictures
@@ -94,20 +95,20 @@ def track(
         KeyboardInterrupt: After Ctrl-C or SIGTERM.
     """
     began = time.perf_counter()
-    pictures = RunPictures(len(dataset))
+    pictures, poses = RunPictures(len(dataset)), RelativePoseLog()
     with Interruption() as interruption, slam, viewer or nullcontext():
         make_folder(out, ConfigError)
         if save_map is not None:
             check_writable(save_map, "--save-map", ConfigError)
         with PartialResults(out) as partial:
-            watchers = [pictures, partial] if viewer is None else [pictures, partial, viewer]
+            watchers = [pictures, poses, partial, *([] if viewer is None else [viewer])]
             records, failure = _tracked(dataset, slam, watchers, interruption, quiet=quiet)
             cut_short = None if failure is None else _why_cut_short(failure, interruption)
             if cut_short is not None:
                 console.print(f"Cut short ({cut_short}): writing what was computed. Ctrl-C ends at once.", markup=False)
             info = RunInfo(dataset, preset, time.perf_counter() - began, cut_short)
             try:
-                summary, evaluation = write_results(out, slam, records, info, pictures)
+                summary, evaluation = write_results(out, slam, records, info, pictures, poses.poses())
             except Exception:  # a second Ctrl-C ends at once, but a picture that fails costs no map
                 _save_map(slam, save_map)
                 raise
@@ -192,6 +193,11 @@ def _print_summary(summary: dict[str, Any], evaluation: Evaluation | None, out: 
     pairs = "" if evaluation is None else f" ({evaluation.rpe_spacing})"
     table.add_row("RPE over 1 s", number(summary["rpe_trans_m_per_s"], 4), f"m/s RMSE{pairs}")
     table.add_row("RPE over 1 s, rotation", number(summary["rpe_rot_deg_per_s"], 3), "deg/s RMSE")
+    if (consistency := summary["consistency"]) is not None:
+        far = (
+            f"(1: errors are as large as the covariances say; {consistency['beyond_5_sigma_percent']:.1f} % > 5 sigma)"
+        )
+        table.add_row("NEES", number(consistency["nees"], 2), far)
     if summary["track_ms"] is not None:
         for name in ("median", "p95", "max"):
             table.add_row(f"tracking time, {name}", number(summary["track_ms"][name], 1), "ms a frame")

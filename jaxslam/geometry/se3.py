@@ -89,13 +89,13 @@ def adjoint(T: Pose) -> Float[np.ndarray, "6 6"]:
     return np.block([[R, cross @ R], [np.zeros((3, 3)), R]])
 
 
-def displacement(first: Pose, second: Pose) -> Float[np.ndarray, "6"]:
-    """Return the `(6,)` tangent vector with which `retract` leads from the first `(7,)` transform to the second."""
+def displacement(first: Transforms, second: Transforms) -> Float[np.ndarray, "... 6"]:
+    """Return the `(..., 6)` tangents with which `retract` leads from the first `(..., 7)` transforms to the second."""
     change = between(first, second)
-    sine = np.linalg.norm(change[1:4])
-    turn = angle(change) * np.copysign(1.0, change[0])
-    axis = change[1:4] / sine if sine > 0 else np.zeros(3)
-    return np.concatenate([change[4:], turn * axis])
+    sine = np.linalg.norm(change[..., 1:4], axis=-1, keepdims=True)
+    turn = angle(change)[..., None] * np.copysign(1.0, change[..., :1])
+    axis = change[..., 1:4] / np.where(sine > 0, sine, 1.0)
+    return np.concatenate([change[..., 4:], turn * axis], axis=-1)
 
 
 def retract(T: Pose, tangent: Num[np.ndarray, "6"]) -> Pose:

@@ -21,8 +21,10 @@ from jaxslam.runtime.machine import machine, peak_rss_mb
 from jaxslam.slam.frame_result import FrameRecord
 from jaxslam.slam.slam import Slam
 from jaxslam.tracking.state import TrackStatus
+from jaxslam.trajectory.consistency import RelativePoses, evaluate_consistency
 from jaxslam.trajectory.evaluation import Evaluation, evaluate
 from jaxslam.trajectory.trajectory import Trajectory, write_kitti_frames, write_tum
+from jaxslam.visualization.consistency_plot import plot_consistency
 from jaxslam.visualization.mask_gallery import write_mask_pictures
 from jaxslam.visualization.plots import Snapshot, plot_map, plot_snapshots, plot_trajectory
 from jaxslam.visualization.snapshots import RunPictures
@@ -30,10 +32,13 @@ from jaxslam.visualization.snapshots import RunPictures
 _ALWAYS = ("trajectory.txt", "trajectory_online.txt", "frames.csv", "summary.json", "config.yaml")
 _OF_THE_PATH = ("plot.png", "trajectory_kitti.txt")
 _OF_THE_MAP = ("trajectory_keyframes.txt", "map.png")
-_ERRORS, _FAILURES = "errors.csv", "failures.png"
+_ERRORS, _CONSISTENCY, _FAILURES = "errors.csv", "consistency.png", "failures.png"
 _OTHER_SUBMAP = "trajectory_submap_{}.txt"
 _OF_MASKS = ("masks.png", "masks.gif")
-RESULT_FILES = (*_ALWAYS, *_OF_THE_PATH, *_OF_THE_MAP, _ERRORS, _FAILURES, *_OF_MASKS, *DENSE_FILES)
+RESULT_FILES = (
+    *(*_ALWAYS, *_OF_THE_PATH, *_OF_THE_MAP),
+    *(_ERRORS, _CONSISTENCY, _FAILURES, *_OF_MASKS, *DENSE_FILES),
+)
 """All files that a run can write. A run without a path, keyframes, ground truth, masks or a dense map writes none of
 the files about them."""
 
@@ -62,6 +67,7 @@ def write_results(
     records: Sequence[FrameRecord],
     info: RunInfo,
     pictures: RunPictures | None = None,
+    poses: RelativePoses | None = None,
 ) -> tuple[dict[str, Any], Evaluation | None]:
     """Write the files of `RESULT_FILES` that the run has content for: trajectories, a summary, settings and pictures.
 
@@ -72,6 +78,8 @@ def write_results(
         records: One record per frame, from `Slam.run`.
         info: Recording, preset and duration of the run.
         pictures: Frames that were kept to be shown.
+        poses: Poses with their covariances, from `RelativePoseLog`, which are compared with the ground truth; `None`
+            to leave that out.
 
     Returns:
         summary: Content of `summary.json`.
@@ -88,6 +96,7 @@ def write_results(
     dense, dense_files = write_dense(folder, slam.dense_mapping, trajectory, slam.times.ms)
     summary = _summary(slam, records, info, evaluation) | {
         "evaluation_problem": problem,
+        "consistency": _write_consistency(folder / _CONSISTENCY, truth, poses, _title(slam, info)),
         "dense": dense,
         "poses_in_other_submaps": _write_other_submaps(folder, slam),
     }
@@ -104,6 +113,8 @@ def write_results(
     if evaluation is not None:
         write_errors(folder / _ERRORS, evaluation)
         there.add(_ERRORS)
+    if summary["consistency"] is not None:
+        there.add(_CONSISTENCY)
     for name in there.symmetric_difference(RESULT_FILES):
         (folder / name).unlink(missing_ok=True)
     return summary, evaluation
@@ -117,6 +128,19 @@ def _write_other_submaps(folder: Path, slam: Slam) -> dict[str, int]:
     for number, path in others.items():
         write_tum(folder / _OTHER_SUBMAP.format(number), path)
     return {_OTHER_SUBMAP.format(number): len(path) for number, path in others.items()}
+
+
+def _write_consistency(
+    path: Path, truth: Trajectory | None, poses: RelativePoses | None, title: str
+) -> dict[str, Any] | None:
+    """Compare poses with their covariances, draw that, and return the figures; `None` if no pose has ground truth."""
+    if truth is None or poses is None:
+        return None
+    consistency = evaluate_consistency(poses, truth)
+    if consistency is None:
+        return None
+    plot_consistency(consistency, path, title=title)
+    return consistency.summary()
 
 
 def _write_pictures(

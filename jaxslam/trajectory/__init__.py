@@ -1,4 +1,4 @@
-"""Trajectories, their file formats, and their evaluation: ATE, RPE, KITTI drift, coverage."""
+"""Trajectories, their file formats, and their evaluation: ATE, RPE, KITTI drift, coverage, consistency."""
 
 import lazy_loader
 

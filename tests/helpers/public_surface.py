@@ -36,6 +36,7 @@ from jaxslam.map import save_map
 from jaxslam.results import run_results
 from jaxslam.slam import FrameRecord
 from jaxslam.slam.dense_thread import DenseMapping
+from jaxslam.trajectory import RelativePoses
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = Path(jaxslam.__file__).parent
@@ -242,7 +243,14 @@ def _write_made_up_run(folder: Path) -> None:
     frames.name, frames.__getitem__.return_value = "made up", frame
     comparison = [name for name, value in vars(run_results).items() if value is jaxslam.evaluate]
     with mock.patch.object(run_results, comparison[0], return_value=_evaluation(path)):
-        run_results.write_results(folder, slam, _records(), run_results.RunInfo(frames, "default", 1.0))
+        poses = RelativePoses(
+            path.timestamps_ns[1:],
+            path.timestamps_ns[:-1],
+            path.T_world_cam[1:],
+            np.eye(6, dtype=np.float32)[None][[0, 0]],
+        )
+        info = run_results.RunInfo(frames, "default", 1.0)
+        run_results.write_results(folder, slam, _records(), info, poses=poses)
 
 
 def _records() -> list[FrameRecord]:

@@ -8,6 +8,7 @@ FILES = ALWAYS | {
     "trajectory_kitti.txt",
     "map.png",
     "errors.csv",
+    "consistency.png",
     "failures.png",
 }
 """Of a run with poses, keyframes and a ground truth."""

@@ -38,6 +38,8 @@ ACCURACY = (
     Column("RPE, deg/frame", "rpe_rot_deg_per_frame", 4),
     Column("t_rel, %", "kitti_trans_percent", 3),
     Column("r_rel, deg/100 m", "kitti_rot_deg_per_100m", 3),
+    Column("NEES", "nees", 2),
+    Column("> 5 sigma, %", "beyond_5_sigma_percent", 1, "most"),
 )
 """How good trajectories are; those of KITTI only where a path is long enough."""
 RUNNING = (
@@ -105,7 +107,7 @@ def median_run(results: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
 
 def figures_of(result: Mapping[str, Any]) -> dict[str, float | None]:
     """Every figure of a run that a table may show or a verdict needs, by name."""
-    flat = {**(result["evaluation"] or {}), **result}
+    flat = {**(result["evaluation"] or {}), **(result.get("consistency") or {}), **result}
     if frames := flat.get("frames"):
         flat["tracked_of_all_percent"] = 100 * flat["tracked"] / frames
         if (matched := flat.get("num_matched")) is not None:

@@ -44,6 +44,9 @@ from jaxslam.results.run_results import RunInfo, write_results
 from jaxslam.runtime.compile_cache import enable_compile_cache
 from jaxslam.runtime.threads import bound_threads
 from jaxslam.semantics.from_config import preset_needs_network
+from jaxslam.sensors.frame import Frame
+from jaxslam.slam.frame_result import FrameResult, Rejected
+from jaxslam.slam.relative_pose_log import RelativePoseLog
 from jaxslam.slam.slam import Slam
 from jaxslam.visualization.snapshots import RunPictures
 from jaxslam.worlds.stored_world import StoredWorld
@@ -253,14 +256,19 @@ def run_here(folder: Path, root: Path | None, rooms: Path | None) -> None:
     whole, recording = opened(job.clip, root, rooms)
     dataset, truth = with_true_masks(whole, job.config.semantics)
     flow_ms = flow_time_ms(dataset)
-    pictures = RunPictures(len(dataset))
+    pictures, poses = RunPictures(len(dataset)), RelativePoseLog()
+
+    def watch(frame: Frame | None, result: FrameResult | Rejected) -> None:
+        pictures(frame, result)
+        poses(frame, result)
+
     slam = Slam(dataset.camera, job.config, detector=truth, imu=imu_sheet(dataset))
     slam.warm_up()
     began = time.perf_counter()
     with slam:
-        records = slam.run(dataset, pictures)
+        records = slam.run(dataset, watch)
     info = RunInfo(dataset, job.preset, time.perf_counter() - began)
-    summary, _ = write_results(folder, slam, records, info, pictures)
+    summary, _ = write_results(folder, slam, records, info, pictures, poses.poses())
     times = summary["track_ms"]
     ratios = {} if flow_ms is None else {f"flow_ratio_{name}": round(times[name] / flow_ms, 4) for name in times or ()}
     result = about(job) | {

@@ -21,6 +21,7 @@ from jaxslam.errors import TrajectoryError
 from jaxslam.results.dense_results import DENSE_FILES
 from jaxslam.results.frame_table import read_errors, read_track_ms
 from jaxslam.results.run_results import RESULT_FILES, RunInfo, write_results
+from jaxslam.slam.relative_pose_log import RelativePoseLog
 from jaxslam.slam.slam import Slam
 from jaxslam.trajectory.trajectory import Trajectory, read_tum
 from jaxslam.visualization.snapshots import RunPictures
@@ -52,6 +53,16 @@ def masked(pictures: RunPictures) -> Any:
 
     def show(frame: Any, result: Any) -> None:
         pictures(frame, replace(result, dynamic_mask=np.ones_like(result.dynamic_mask)))
+
+    return show
+
+
+def both(first: Any, second: Any) -> Any:
+    """Shows frames to two watchers."""
+
+    def show(frame: Any, result: Any) -> None:
+        first(frame, result)
+        second(frame, result)
 
     return show
 
@@ -140,15 +151,17 @@ class TestTables:
 class TestSmallScene:
     def test_files_and_summary(self, tmp_path: Path) -> None:
         recording, slam = clip(), Slam(clip().camera, CONFIG)
-        pictures = RunPictures(len(recording))
-        records = slam.run(recording, pictures)
+        pictures, poses = RunPictures(len(recording)), RelativePoseLog()
+        records = slam.run(recording, both(pictures, poses))
         info = RunInfo(recording, "default", 1.5)
-        summary, evaluation = write_results(tmp_path / "out", slam, records, info, pictures)
+        summary, evaluation = write_results(tmp_path / "out", slam, records, info, pictures, poses.poses())
         assert {path.name for path in (tmp_path / "out").iterdir()} == FILES
         assert json.loads((tmp_path / "out/summary.json").read_text()) == summary
         check_summary(summary)
         assert evaluation is not None
         assert summary["ate_rmse_m"] == evaluation.ate_rmse_m
+        assert summary["consistency"]["num_poses"] == 59
+        assert 0 < summary["consistency"]["nees"] < 10
         assert (summary["frames"], summary["tracked"], summary["first_loss_s"]) == (60, 60, None)
         assert len(pictures.snapshots) == 4
         assert pictures.losses == []
@@ -160,12 +173,12 @@ class TestSmallScene:
     def test_masks_of_this_run_only(self, tmp_path: Path) -> None:
         """Their pictures are there if there were masks, and go with the next run that has none."""
         recording, slam = clip(), Slam(clip().camera, CONFIG)
-        pictures = RunPictures(len(recording))
-        records, info = slam.run(recording, masked(pictures)), RunInfo(recording, "default", 1.5)
-        write_results(tmp_path, slam, records, info, pictures)
+        pictures, poses = RunPictures(len(recording)), RelativePoseLog()
+        records, info = slam.run(recording, both(masked(pictures), poses)), RunInfo(recording, "default", 1.5)
+        write_results(tmp_path, slam, records, info, pictures, poses.poses())
         assert {path.name for path in tmp_path.iterdir()} == FILES | MASK_FILES == set(RESULT_FILES) - set(DENSE_FILES)
         write_results(tmp_path, slam, records, info)
-        assert {path.name for path in tmp_path.iterdir()} == FILES
+        assert {path.name for path in tmp_path.iterdir()} == FILES - {"consistency.png"}
 
     def test_nothing_tracked_and_no_truth(self, tmp_path: Path) -> None:
         recording, slam = clip(), Slam(clip().camera, CONFIG)
@@ -174,6 +187,7 @@ class TestSmallScene:
         summary, evaluation = write_results(tmp_path, slam, [], RunInfo(recording, "default", 0.1))
         assert evaluation is None
         assert summary["evaluation_problem"] == "no ground truth"
+        assert summary["consistency"] is None
         assert (summary["frames"], summary["tracked_percent"], summary["track_ms"]) == (0, 0, None)
         assert {path.name for path in tmp_path.iterdir()} == ALWAYS
 
