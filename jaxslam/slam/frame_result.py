@@ -16,10 +16,10 @@ class FrameResult:
     Attributes:
         timestamp_ns: Time of the frame, nanoseconds.
         T_world_cam: `(7,)` float64 pose of the camera as `wxyz_xyz`; the last known pose where `status` is `LOST`.
-        covariance: `(6, 6)` covariance of the pose in its submap, in the tangent space at the camera: translation (m),
-            then rotation (rad). It tells how well the image determines the pose relative to the points around the
-            camera, but neither the drift of the map nor the place of another submap. It is 1e-12 on the diagonal at
-            the first frame of a submap, which is the origin by definition, and 100 where `status` is `LOST`.
+        covariance: `(6, 6)` covariance of the pose relative to the keyframes around it, in the tangent space at the
+            camera: translation (m), then rotation (rad); see `PoseUncertainty`. It tells neither the drift of the map
+            nor the place of another submap. It is 1e-12 on the diagonal at the first frame of a submap, which is the
+            origin by definition, and 100 where `status` is `LOST`.
         status: Quality of the pose.
         reason: Reason why the pose is worse than `OK`, or why a `RELOCALIZED` frame had been lost; empty for `OK`.
         twist: `(6,)` velocity of the camera in its own axes: m/s, then rad/s.

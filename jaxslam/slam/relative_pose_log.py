@@ -73,7 +73,7 @@ class RelativePoseLog:
             T_reference_cam = between(reference.T_world_cam, result.T_world_cam)
             record = (result.timestamp_ns, reference.timestamp_ns, T_reference_cam, result.covariance)
             self._records.append(record)
-        if result.status in (TrackStatus.OK, TrackStatus.STARTED):
+        if result.status in (TrackStatus.OK, TrackStatus.STARTED) or result.is_keyframe:
             self._earlier.append(_Earlier(result.timestamp_ns, result.T_world_cam, result.is_keyframe))
 
     def poses(self) -> RelativePoses:

@@ -38,6 +38,7 @@ from jaxslam.slam.localization_stage import LocalizationStage
 from jaxslam.slam.mask_stage import MaskStage
 from jaxslam.slam.outside_motion import OutsideMotion
 from jaxslam.slam.pose_history import PoseHistory
+from jaxslam.slam.pose_uncertainty import PoseUncertainty
 from jaxslam.slam.program_compiler import ProgramCompiler
 from jaxslam.slam.recording_run import run_recording
 from jaxslam.slam.status_log import StatusLog
@@ -249,10 +250,12 @@ class Slam:
             result = self._background.check(result, arrays)
         self._clock.advance(frame.timestamp_ns)
         result = self._recorded(result, dt_s, arrays)
+        covariance = self._uncertainty.of_pose(result, output, self._tracker.state.keyframes)
         self._masks.submit_for_detection(self._frame, frame.image)
         self._frame += 1
         watch.ends("hand over")
-        return replace(result, track_ms=(time.perf_counter() - began) * 1e3, warnings=self._warnings.taken())
+        track_ms = (time.perf_counter() - began) * 1e3
+        return replace(result, covariance=covariance, track_ms=track_ms, warnings=self._warnings.taken())
 
     def run(
         self, dataset: Dataset, on_frame: Callable[[Frame | None, FrameResult | Rejected], None] | None = None
@@ -398,6 +401,7 @@ class Slam:
         self._frame = 0
         self._clock = FrameClock(self.camera.fps, self._warnings)
         self._background = None if self.camera.is_stereo else BackgroundConsistency(self.camera, sensor)
+        self._uncertainty = PoseUncertainty(self.camera, sensor, self.config.track.pixel_sigma)
         self._history = PoseHistory()
         self._status_log = StatusLog()
 

@@ -315,7 +315,8 @@ class TrackOutput(NamedTuple):
 
     Attributes:
         T_world_cam: Pose of the camera; if `status` is `LOST`, the pose of the last tracked frame.
-        covariance: `(6, 6)` covariance of the pose in the tangent space at the camera, translation first.
+        covariance: `(6, 6)` covariance of the pose in the tangent space at the camera, translation first: that of the
+            fit to this frame, for the assumed errors of pixels and depth, as if the points were exact.
         status: A `TrackStatus`.
         reason: A `TrackReason`.
         num_inliers: Number of tracked points that agree with the pose.

@@ -4,39 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from frame_results import RESULT
 
 from jaxslam.errors import DatasetError
 from jaxslam.geometry.se3 import IDENTITY, between, compose, retract
 from jaxslam.slam.frame_result import FrameResult, Rejected
-from jaxslam.slam.mask_pipeline import MaskSource
 from jaxslam.slam.relative_pose_log import RelativePoseLog
 from jaxslam.tracking.state import KeyframeReason, TrackStatus
 
 STEP_NS = 100_000_000
-NOTHING = np.zeros(0)
-RESULT = FrameResult(
-    timestamp_ns=0,
-    T_world_cam=IDENTITY,
-    covariance=np.eye(6, dtype=np.float32),
-    status=TrackStatus.OK,
-    reason="",
-    twist=np.zeros(6),
-    num_inliers=0,
-    inlier_ratio=0.0,
-    num_keyframe_matches=0,
-    num_matched=0,
-    residual_px=0.0,
-    uv=NOTHING,
-    weights=NOTHING,
-    followed=NOTHING,
-    keyframe=KeyframeReason.NONE,
-    correction=IDENTITY,
-    dynamic_mask=np.zeros((2, 2), bool),
-    mask_source=MaskSource.NONE,
-    mask_age=-1,
-    detector_error="",
-    track_ms=0.0,
-)
 
 
 def result(index: int, **values: object) -> FrameResult:
@@ -83,13 +59,13 @@ def test_world_that_is_corrected() -> None:
 
 
 @pytest.mark.parametrize("status", [TrackStatus.WEAK, TrackStatus.LOST, TrackStatus.RELOCALIZED])
-def test_only_ok_poses_count(status: TrackStatus) -> None:
-    """Neither relative to others, nor others relative to them."""
-    poses = logged(
-        [result(0, status=TrackStatus.STARTED), result(1, status=status, keyframe=KEYFRAME), result(2)]
-    ).poses()
+@pytest.mark.parametrize("keyframe", [KeyframeReason.NONE, KEYFRAME])
+def test_only_ok_poses_count(status: TrackStatus, keyframe: KeyframeReason) -> None:
+    """Those of other frames are relative to nothing, and only those of keyframes are references."""
+    results = [result(0, status=TrackStatus.STARTED), result(1, status=status, keyframe=keyframe), result(2)]
+    poses = logged(results).poses()
     assert poses.timestamps_ns.tolist() == [2 * STEP_NS]
-    assert poses.reference_ns.tolist() == [0]
+    assert poses.reference_ns.tolist() == [0 if keyframe == KeyframeReason.NONE else STEP_NS]
 
 
 def test_submaps_have_nothing_in_common() -> None:
