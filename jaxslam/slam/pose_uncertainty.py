@@ -16,10 +16,9 @@ from jaxslam.slam.frame_result import FrameResult
 from jaxslam.tracking.points import KeyframeRing
 from jaxslam.tracking.state import TrackOutput, TrackStatus
 
-_LEAST_SCALE = 0.6
+_LEAST_SCALE = 0.5
 """Smallest ratio of the errors of pixels to their assumed standard deviation. In rendered rooms the residuals are 0.15
-to 0.4 of it, but a part of the errors is common to many points, and leaves no residuals. In twelve rendered scenes,
-1,521 poses, 0.9 % of the errors are beyond 5 standard deviations with 0.5, and 0.1 % with 0.7."""
+to 0.4 of it, but a part of the errors is common to many points, and leaves no residuals."""
 
 
 class PoseUncertainty:
@@ -36,6 +35,8 @@ class PoseUncertainty:
         self._focal_px, self._pixel_sigma = (camera.fx + camera.fy) / 2, pixel_sigma
         self._sigma_m, self._sigma_per_m2 = float(sensor.depth_sigma_m), float(sensor.depth_sigma_per_m2)
         self._T_world_cam: Pose | None = None
+        self._reference = np.zeros((6, 6))
+        """Covariance of the latest keyframe, at the last pose: it is not where it was thought to be either."""
         self._inherited = np.zeros((6, 6))
         """Covariance, at the last pose, of the poses at which the points were found that are followed."""
 
@@ -53,17 +54,22 @@ class PoseUncertainty:
             return tracked.covariance
         if tracked.status not in (TrackStatus.OK, TrackStatus.WEAK) or self._T_world_cam is None:
             self._T_world_cam, self._inherited = tracked.T_world_cam, np.zeros((6, 6))
+            self._reference = tracked.covariance.astype(np.float64)
             return tracked.covariance
         moved = adjoint(between(tracked.T_world_cam, compose(tracked.correction, self._T_world_cam)))
-        inherited, fit = moved @ self._inherited @ moved.T, np.asarray(output.covariance, np.float64)
+        reference, inherited = (moved @ covariance @ moved.T for covariance in (self._reference, self._inherited))
+        fit = np.asarray(output.covariance, np.float64)
+        own = self._variance_factor(tracked, output, keyframes) * fit
         weights, matched = np.asarray(output.weights), np.asarray(output.keyframe_matches.weight)
         followed, new = np.asarray(output.tracked), (weights > 0) & ~np.asarray(output.tracked)
         share = weights[followed].sum() / max(weights[followed].sum() + matched.sum(), 1e-9)
-        own = self._variance_factor(tracked, output, keyframes) * fit + share**2 * inherited
         share_new = new.sum() / max((weights > 0).sum(), 1)
-        self._inherited = np.zeros((6, 6)) if tracked.is_keyframe else (1 - share_new) * inherited + share_new * own
-        self._T_world_cam = tracked.T_world_cam
-        return (own + (tracked.covariance - fit)).astype(np.float32)
+        since = own + share**2 * inherited
+        self._T_world_cam, self._reference = tracked.T_world_cam, reference
+        self._inherited = (1 - share_new) * inherited + share_new * since
+        if tracked.is_keyframe:
+            self._reference, self._inherited = own, np.zeros((6, 6))
+        return (since + reference + (tracked.covariance - fit)).astype(np.float32)
 
     def _variance_factor(self, tracked: FrameResult, output: TrackOutput, keyframes: KeyframeRing) -> float:
         """Factor of the assumed variance of pixels: what residuals say, and what common errors of depth add."""

@@ -61,12 +61,12 @@ def result(pose: np.ndarray = IDENTITY, residual_px: float = 0.2, **values: Any)
 
 
 def test_at_a_keyframe(uncertainty: PoseUncertainty) -> None:
-    """Six tenths of the assumed pixels, as residuals do not tell all errors; more where residuals are larger."""
+    """Half of the assumed pixels, as residuals do not tell all errors; more where residuals are larger."""
     covariance = uncertainty.of_pose(result(), output(), ring())
     assert covariance.dtype == np.float32
-    np.testing.assert_allclose(covariance, 0.36 * FIT, rtol=1e-5)
+    np.testing.assert_allclose(covariance, 0.25 * FIT, rtol=1e-3)
     blurred = uncertainty.of_pose(result(residual_px=1.5), output(), ring())
-    np.testing.assert_allclose(blurred, 2.25 * FIT, rtol=1e-5)
+    np.testing.assert_allclose(blurred, 2.25 * FIT, rtol=1e-3)
 
 
 def test_grows_with_the_way_from_a_keyframe(uncertainty: PoseUncertainty) -> None:
@@ -75,35 +75,37 @@ def test_grows_with_the_way_from_a_keyframe(uncertainty: PoseUncertainty) -> Non
         there = retract(IDENTITY, np.array([way, 0, 0, 0, 0, 0]))
         uncertainty.of_pose(result(there), output(), ring(there[4:]))  # where it was before does not matter
         covariance = uncertainty.of_pose(result(there), output(), ring())
-        np.testing.assert_allclose(covariance, (0.36 + pixels**2) * FIT, rtol=1e-4)
+        np.testing.assert_allclose(covariance, (0.25 + pixels**2) * FIT, rtol=1e-3, atol=3e-11)
     near = uncertainty.of_pose(result(there), output(), ring(np.array([4.0, 0, 0])))
-    np.testing.assert_allclose(near, 0.36 * FIT, rtol=1e-4)
+    np.testing.assert_allclose(near, 0.25 * FIT, rtol=1e-3, atol=3e-11)
 
 
 def test_a_turn_needs_no_depth(uncertainty: PoseUncertainty) -> None:
     turned = retract(IDENTITY, np.array([0, 0, 0, 0.1, 0.2, 0]))
-    np.testing.assert_allclose(uncertainty.of_pose(result(turned), output(), ring()), 0.36 * FIT, rtol=1e-5)
+    np.testing.assert_allclose(uncertainty.of_pose(result(turned), output(), ring()), 0.25 * FIT, rtol=1e-3, atol=3e-11)
 
 
 def test_new_points_are_as_unsure_as_the_pose_that_put_them_there(uncertainty: PoseUncertainty) -> None:
     unsure = 100 * FIT
     none, half = ~EVERY, np.arange(8) < 4
     first = uncertainty.of_pose(result(covariance=unsure), output(unsure, followed=none), ring())
-    np.testing.assert_allclose(first, 36 * FIT, rtol=1e-5)
+    np.testing.assert_allclose(first, 25 * FIT, rtol=1e-3)
     followed = uncertainty.of_pose(result(), output(), ring())
-    np.testing.assert_allclose(followed, 36.36 * FIT, rtol=1e-5)
+    np.testing.assert_allclose(followed, 25.25 * FIT, rtol=1e-3)
     held = uncertainty.of_pose(result(), output(matched=8), ring())  # half of the points are those of a keyframe
-    np.testing.assert_allclose(held, (0.36 + 36 / 4) * FIT, rtol=1e-5)
-    uncertainty.of_pose(result(), output(followed=half), ring())  # half of them are replaced, at 36.36
+    np.testing.assert_allclose(held, (0.25 + 25 / 4) * FIT, rtol=1e-3)
+    uncertainty.of_pose(result(), output(followed=half), ring())  # half of them are replaced, at 25.25
     mixed = uncertainty.of_pose(result(), output(), ring())
-    np.testing.assert_allclose(mixed, (0.36 + (36 + 36.36) / 2) * FIT, rtol=1e-5)
+    np.testing.assert_allclose(mixed, (0.25 + (25 + 25.25) / 2) * FIT, rtol=1e-3)
 
 
 def test_a_keyframe_is_the_new_reference(uncertainty: PoseUncertainty) -> None:
+    """Its own errors are those of all frames that are relative to it, whatever points they share."""
     unsure = 100 * FIT
-    keyframe = result(covariance=unsure, keyframe=KeyframeReason.FEW_POINTS)
-    uncertainty.of_pose(keyframe, output(unsure, followed=~EVERY), ring())
-    np.testing.assert_allclose(uncertainty.of_pose(result(), output(), ring()), 0.36 * FIT, rtol=1e-5)
+    uncertainty.of_pose(result(covariance=unsure), output(unsure, followed=~EVERY), ring())
+    keyframe = uncertainty.of_pose(result(keyframe=KeyframeReason.FEW_POINTS), output(), ring())
+    np.testing.assert_allclose(keyframe, 25.25 * FIT, rtol=1e-3)  # it is relative to the keyframe before
+    np.testing.assert_allclose(uncertainty.of_pose(result(), output(), ring()), 0.5 * FIT, rtol=1e-3)
 
 
 def test_turns_with_the_camera(uncertainty: PoseUncertainty) -> None:
@@ -117,9 +119,7 @@ def test_turns_with_the_camera(uncertainty: PoseUncertainty) -> None:
     np.testing.assert_array_equal(uncertainty.of_pose(lost, output(), ring()), lost.covariance)
     back = result(turned, correction=inverse(correction))
     covariance = uncertainty.of_pose(back, output(), ring())
-    np.testing.assert_allclose(
-        np.diag(covariance)[:3], [3.6e-9 + 0.36e-6, 3.6e-9 + 0.72e-6, 1.44e-4 + 1.44e-6], rtol=1e-3
-    )
+    np.testing.assert_allclose(np.diag(covariance)[:3], [2.5e-9 + 0.25e-6, 2.5e-9 + 0.5e-6, 1e-4 + 1e-6], rtol=1e-3)
 
 
 def test_places_that_are_recognized_begin_anew(uncertainty: PoseUncertainty) -> None:
@@ -127,14 +127,14 @@ def test_places_that_are_recognized_begin_anew(uncertainty: PoseUncertainty) -> 
     uncertainty.of_pose(result(covariance=unsure), output(unsure, followed=~EVERY), ring())
     recognized = result(status=TrackStatus.RELOCALIZED, covariance=3 * FIT)
     np.testing.assert_array_equal(uncertainty.of_pose(recognized, output(), ring()), 3 * FIT)
-    np.testing.assert_allclose(uncertainty.of_pose(result(), output(), ring()), 0.36 * FIT, rtol=1e-5)
+    np.testing.assert_allclose(uncertainty.of_pose(result(), output(), ring()), 3.25 * FIT, rtol=1e-3)
 
 
 def test_doubt_of_others_stays(uncertainty: PoseUncertainty) -> None:
     """What the background does not confirm is added by `BackgroundConsistency`, and is not of the fit."""
     doubt = np.diag([1e-2, 1e-2, 1e-2, 0, 0, 0]).astype(np.float32)
     covariance = uncertainty.of_pose(result(covariance=FIT + doubt), output(), ring())
-    np.testing.assert_allclose(covariance, 0.36 * FIT + doubt, rtol=1e-4, atol=1e-12)
+    np.testing.assert_allclose(covariance, 0.25 * FIT + doubt, rtol=1e-3, atol=1e-12)
 
 
 @pytest.mark.parametrize("factor", [0.25, 8.0])
@@ -150,10 +150,11 @@ def test_any_scale(factor: float) -> None:
             max_depth_m=6 * scale,
         )
         made = PoseUncertainty(CAMERA, sensor_model(CAMERA, config), 1.0)
-        made.of_pose(replace(RESULT, status=TrackStatus.STARTED), output(), ring())
+        nothing = np.zeros((6, 6), np.float32)
+        made.of_pose(replace(RESULT, status=TrackStatus.STARTED, covariance=nothing), output(), ring())
         fit = (FIT * np.outer(np.repeat([scale, 1], 3), np.repeat([scale, 1], 3))).astype(np.float32)
         for step in range(3):
             pose = retract(IDENTITY, scale * step * np.array([0.5, 0, 0, 0, 0, 0]))
             seen = output(fit, followed=np.arange(8) > step, scale=scale)
             found.append(made.of_pose(result(pose, covariance=fit), seen, ring()))
-    np.testing.assert_allclose(after, np.outer(units, units) * np.array(there), rtol=1e-4)
+    np.testing.assert_allclose(after, np.outer(units, units) * np.array(there), rtol=1e-3, atol=1e-12)
