@@ -194,10 +194,8 @@ def _print_summary(summary: dict[str, Any], evaluation: Evaluation | None, out: 
     table.add_row("RPE over 1 s", number(summary["rpe_trans_m_per_s"], 4), f"m/s RMSE{pairs}")
     table.add_row("RPE over 1 s, rotation", number(summary["rpe_rot_deg_per_s"], 3), "deg/s RMSE")
     if (consistency := summary["consistency"]) is not None:
-        far = (
-            f"(1: errors are as large as the covariances say; {consistency['beyond_5_sigma_percent']:.1f} % > 5 sigma)"
-        )
-        table.add_row("NEES", number(consistency["nees"], 2), far)
+        far = f"{consistency['beyond_5_sigma_percent']:.1f} % of poses beyond 5 sigma"
+        table.add_row("NEES", number(consistency["nees"], 2), f"1 if covariances are right and the truth exact; {far}")
     if summary["track_ms"] is not None:
         for name in ("median", "p95", "max"):
             table.add_row(f"tracking time, {name}", number(summary["track_ms"][name], 1), "ms a frame")

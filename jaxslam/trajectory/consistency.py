@@ -38,7 +38,9 @@ class Consistency:
 
     The normalized estimation error squared (NEES) of a pose is `eᵀ Σ⁻¹ e / 6`, with the error `e` of its motion from
     the reference pose and the covariance `Σ` that was given out. Its mean is 1 if covariances are right, more if they
-    promise too much, and less if they promise too little (Bar-Shalom et al. 2001, section 5.4).
+    promise too much, and less if they promise too little (Bar-Shalom et al. 2001, section 5.4). Errors of the ground
+    truth count too: motion capture that is good to a few millimeters, or that follows markers instead of the camera,
+    says nothing about covariances of a millimeter.
 
     Attributes:
         num_poses: Number of poses that were compared with the ground truth.
