@@ -96,7 +96,7 @@ def write_results(
     dense, dense_files = write_dense(folder, slam.dense_mapping, trajectory, slam.times.ms)
     summary = _summary(slam, records, info, evaluation) | {
         "evaluation_problem": problem,
-        "consistency": _write_consistency(folder / _CONSISTENCY, truth, poses, _title(slam, info)),
+        **_write_consistency(folder / _CONSISTENCY, truth, poses, _title(slam, info)),
         "dense": dense,
         "poses_in_other_submaps": _write_other_submaps(folder, slam),
     }
@@ -130,17 +130,21 @@ def _write_other_submaps(folder: Path, slam: Slam) -> dict[str, int]:
     return {_OTHER_SUBMAP.format(number): len(path) for number, path in others.items()}
 
 
-def _write_consistency(
-    path: Path, truth: Trajectory | None, poses: RelativePoses | None, title: str
-) -> dict[str, Any] | None:
-    """Compare poses with their covariances, draw that, and return the figures; `None` if no pose has ground truth."""
-    if truth is None or poses is None:
-        return None
-    consistency = evaluate_consistency(poses, truth)
-    if consistency is None:
-        return None
-    plot_consistency(consistency, path, title=title)
-    return consistency.summary()
+def _write_consistency(path: Path, truth: Trajectory | None, poses: RelativePoses | None, title: str) -> dict[str, Any]:
+    """Compare poses with their covariances, draw that, and return its part of the summary.
+
+    A covariance that cannot be compared is named there: it costs the run no other file.
+    """
+    consistency, problem = None, None
+    if truth is not None and poses is not None:
+        try:
+            consistency = evaluate_consistency(poses, truth)
+        except TrajectoryError as error:
+            problem = str(error)
+    if consistency is not None:
+        plot_consistency(consistency, path, title=title)
+    figures = None if consistency is None else consistency.summary()
+    return {"consistency": figures, "consistency_problem": problem}
 
 
 def _write_pictures(

@@ -69,6 +69,7 @@ class PoseUncertainty:
         self._inherited = (1 - share_new) * inherited + share_new * since
         if tracked.is_keyframe:
             self._reference, self._inherited = own, np.zeros((6, 6))
+        # The result may hold more than the fit: what `BackgroundConsistency` adds stays as it is.
         return (since + reference + (tracked.covariance - fit)).astype(np.float32)
 
     def _variance_factor(self, tracked: FrameResult, output: TrackOutput, keyframes: KeyframeRing) -> float:

@@ -1,6 +1,6 @@
 """Consistency of a tracker: whether the errors of its poses are as large as its covariances say."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,6 +9,7 @@ from jaxtyping import Float32, Float64
 from jaxslam.errors import TrajectoryError
 from jaxslam.geometry.se3 import between, displacement
 from jaxslam.geometry.types import Poses, Timestamps
+from jaxslam.trajectory.evaluation_figures import without_arrays
 from jaxslam.trajectory.trajectory import Trajectory
 
 _FAR_SIGMAS = 5.0
@@ -71,8 +72,7 @@ class Consistency:
 
     def summary(self) -> dict[str, Any]:
         """All figures without the arrays, ready for JSON."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {name: value for name, value in values.items() if not isinstance(value, np.ndarray)}
+        return without_arrays(self)
 
     def __str__(self) -> str:
         return (

@@ -1,7 +1,7 @@
 """The figures of an evaluation, printable and ready for JSON."""
 
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxslam_kernels.trajectory.alignment import AlignmentKind
@@ -10,6 +10,9 @@ from jaxtyping import Float64, Int
 
 from jaxslam.geometry.types import Pose, Positions, Timestamps
 from jaxslam.trajectory.pose_pairs import spacing
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 ALIGNMENT_NAMES: dict[AlignmentKind, str] = {
     "none": "without alignment",
@@ -147,12 +150,7 @@ class Evaluation:
 
     def summary(self) -> dict[str, Any]:
         """All figures and settings, without the arrays; ready for JSON."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {
-            name: list(value) if isinstance(value, tuple) else value
-            for name, value in values.items()
-            if not isinstance(value, np.ndarray)
-        }
+        return without_arrays(self)
 
     def __str__(self) -> str:
         ate_figures = (
@@ -195,3 +193,13 @@ class Evaluation:
             f"{unknown}\n  estimated a pose each {self.pose_interval_s:.3f} s (median), none for up to"
             f" {self.longest_gap_s:.3f} s, over {self.span_percent:.1f} % of the reference's time"
         )
+
+
+def without_arrays(figures: "DataclassInstance") -> dict[str, Any]:
+    """Fields of a dataclass that are no arrays, ready for JSON."""
+    values = {field.name: getattr(figures, field.name) for field in fields(figures)}
+    return {
+        name: list(value) if isinstance(value, tuple) else value
+        for name, value in values.items()
+        if not isinstance(value, np.ndarray)
+    }

@@ -28,11 +28,17 @@ def plot_consistency(consistency: Consistency, path: Path, *, title: str = "") -
     """
     figure = Figure(figsize=(8, 7), layout="constrained")
     translation, rotation, nees = figure.subplots(3, sharex=True)
-    _draw_errors(
-        translation, consistency, 1e3 * consistency.translation_error_m, 1e3 * consistency.translation_sigma_m, "mm"
+    stamps = consistency.timestamps_ns
+    columns = (
+        (stamps - stamps[0]) / 1e9,
+        consistency.nees_of_pose,
+        *(1e3 * consistency.translation_error_m, 1e3 * consistency.translation_sigma_m),
+        *(consistency.rotation_error_deg, consistency.rotation_sigma_deg),
     )
-    _draw_errors(rotation, consistency, consistency.rotation_error_deg, consistency.rotation_sigma_deg, "deg")
-    nees.plot(*_over_time(consistency, consistency.nees_of_pose), color="tab:blue", label="NEES of a pose")
+    seconds, nees_of_pose, *errors = with_breaks(stamps, np.column_stack(columns)).T
+    _draw_errors(translation, seconds, *errors[:2], label="translation [mm]")
+    _draw_errors(rotation, seconds, *errors[2:], label="rotation [deg]")
+    nees.plot(seconds, nees_of_pose, color="tab:blue", label="NEES of a pose")
     nees.axhline(consistency.nees, color="0.3", linestyle="--", linewidth=0.8, label=f"mean {consistency.nees:.2f}")
     nees.axhspan(*_CONSISTENT, color="tab:green", alpha=0.2, linewidth=0, label="consistent within a factor of 2")
     nees.set(yscale="log", xlabel="time [s]", ylabel="NEES")
@@ -45,20 +51,10 @@ def plot_consistency(consistency: Consistency, path: Path, *, title: str = "") -
     write_atomically(path, png(figure), TrajectoryError)
 
 
-def _draw_errors(axes: Axes, consistency: Consistency, errors: np.ndarray, sigmas: np.ndarray, unit: str) -> None:
+def _draw_errors(axes: Axes, seconds: np.ndarray, error: np.ndarray, sigma: np.ndarray, label: str) -> None:
     """Draw errors over time above the area within one and two standard deviations."""
-    seconds, error = _over_time(consistency, errors)
-    sigma = _over_time(consistency, sigmas)[1]
     for times, alpha in ((2, 0.15), (1, 0.25)):
         axes.fill_between(seconds, times * sigma, color="tab:orange", alpha=alpha, linewidth=0, label=f"{times} sigma")
     axes.plot(seconds, error, color="tab:blue", label="error")
-    axes.set_ylabel(f"{'translation' if unit == 'mm' else 'rotation'} [{unit}]")
+    axes.set_ylabel(label)
     axes.set_ylim(bottom=0)
-
-
-def _over_time(consistency: Consistency, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Seconds since the first pose and values, with breaks where poses are missing."""
-    stamps = consistency.timestamps_ns
-    seconds = (stamps - stamps[0]) / 1e9
-    both = with_breaks(stamps, np.column_stack([seconds, values]))
-    return both[:, 0], both[:, 1]

@@ -179,6 +179,11 @@ class TestSmallScene:
         assert {path.name for path in tmp_path.iterdir()} == FILES | MASK_FILES == set(RESULT_FILES) - set(DENSE_FILES)
         write_results(tmp_path, slam, records, info)
         assert {path.name for path in tmp_path.iterdir()} == FILES - {"consistency.png"}
+        wrong = poses.poses()._replace(covariance=np.zeros_like(poses.poses().covariance))
+        summary, _ = write_results(tmp_path, slam, records, info, poses=wrong)
+        assert summary["consistency"] is None
+        assert summary["consistency_problem"].startswith("covariance: expected positive definite")
+        assert {path.name for path in tmp_path.iterdir()} == FILES - {"consistency.png"}
 
     def test_nothing_tracked_and_no_truth(self, tmp_path: Path) -> None:
         recording, slam = clip(), Slam(clip().camera, CONFIG)

@@ -109,7 +109,7 @@ def test_a_keyframe_is_the_new_reference(uncertainty: PoseUncertainty) -> None:
 
 
 def test_turns_with_the_camera(uncertainty: PoseUncertainty) -> None:
-    """What was unsure along x is unsure along z after a quarter turn about y, also when the world is corrected."""
+    """A variance along x is one along z after a quarter turn about y, also when the world is corrected."""
     unsure = 1e-8 * np.eye(6, dtype=np.float32)
     unsure[0, 0] = 4e-4
     uncertainty.of_pose(result(covariance=unsure), output(unsure, followed=~EVERY), ring())
@@ -131,7 +131,7 @@ def test_places_that_are_recognized_begin_anew(uncertainty: PoseUncertainty) -> 
 
 
 def test_doubt_of_others_stays(uncertainty: PoseUncertainty) -> None:
-    """What the background does not confirm is added by `BackgroundConsistency`, and is not of the fit."""
+    """`BackgroundConsistency` adds the motion that the background does not confirm, which is not of the fit."""
     doubt = np.diag([1e-2, 1e-2, 1e-2, 0, 0, 0]).astype(np.float32)
     covariance = uncertainty.of_pose(result(covariance=FIT + doubt), output(), ring())
     np.testing.assert_allclose(covariance, 0.25 * FIT + doubt, rtol=1e-3, atol=1e-12)

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from matplotlib.image import imread
+from recorded_figures import recorded_figures
 
 from jaxslam.errors import TrajectoryError
 from jaxslam.trajectory.consistency import Consistency
@@ -29,14 +29,7 @@ CONSISTENCY = Consistency(
 
 
 def test_draws_errors_and_deviations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn: list[Figure] = []
-
-    class Recorded(Figure):
-        def __init__(self, *args: object, **kwargs: object) -> None:
-            super().__init__(*args, **kwargs)  # type: ignore[arg-type]
-            drawn.append(self)
-
-    monkeypatch.setattr(consistency_plot, "Figure", Recorded)
+    drawn = recorded_figures(consistency_plot, monkeypatch)
     plot_consistency(CONSISTENCY, tmp_path / "consistency.png", title="a run")
     translation, rotation, nees = drawn[0].axes
     labels = [axes.get_ylabel() for axes in (translation, rotation, nees)]

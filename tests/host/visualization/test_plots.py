@@ -7,6 +7,7 @@ from matplotlib import font_manager
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.image import imread
+from recorded_figures import recorded_figures
 from small_map import small_map
 
 from jaxslam.errors import TrajectoryError
@@ -29,15 +30,7 @@ def make_trajectory(n=60, offset=0.0):
 @pytest.fixture
 def figures(monkeypatch):
     """The figures that get drawn."""
-    drawn = []
-
-    class Recorded(Figure):
-        def __init__(self, *args, **kwargs):
-            super().__init__(*args, **kwargs)
-            drawn.append(self)
-
-    monkeypatch.setattr(visualize, "Figure", Recorded)
-    return drawn
+    return recorded_figures(visualize, monkeypatch)
 
 
 def test_draws_the_evaluated_path_and_its_errors(tmp_path, figures):
