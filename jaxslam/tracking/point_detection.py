@@ -7,12 +7,13 @@ from jaxlie import SE3
 from jaxslam_kernels.depth.sampling import sample_depth
 from jaxslam_kernels.image.corners import corner_score, grid_corners, occupied_cells
 from jaxslam_kernels.se3 import to_world
-from jaxslam_kernels.types import Code, Mask, Pixels, Weights
+from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Scalar, Weights
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.sensors.measurement import Measurements, depth_sigma, match_depth, pixel_rays
 from jaxslam.tracking.points import TrackedPoints
 from jaxslam.tracking.step_context import StepContext
+from jaxslam.tracking.unknown_depth import assumed_depth
 
 _MIN_SCORE = 2.0
 """Smallest eigenvalue of a corner worth tracking, in squared intensity a squared pixel, on the second level."""
@@ -45,6 +46,7 @@ def detect_new_points(
     T_world_cam: SE3,
     twist: Float[Array, "6"],
     *,
+    may_lack_depth: Flag | bool = False,
     first: Bool[Array, "h w"] | None = None,
     cell_px: int | None = None,
 ) -> tuple[TrackedPoints, Code]:
@@ -64,6 +66,7 @@ def detect_new_points(
         step: Context of the step; pixels that its frame ignores give no points.
         T_world_cam: Pose of the frame.
         twist: `(6,)` velocity of the camera in its own axes, m/s, then rad/s.
+        may_lack_depth: Whether corners of unknown depth become points too, which wait until their depth is known.
         first: `(h, w)` mask of pixels whose corners come before all others; some slots are kept free for them.
         cell_px: Side of the cells instead of that of the plan, pixels, static.
 
@@ -71,7 +74,8 @@ def detect_new_points(
         The points, and the number of grid cells that hold a corner, with depth or without.
     """
     state, view, params, plan = step
-    found = _candidates(points, step, twist, (cell_px or plan.cell_px) // 2)
+    assumed = jnp.where(may_lack_depth, assumed_depth(points, T_world_cam, params.sensor.min_depth_m), 0)
+    found = _candidates(points, step, twist, (cell_px or plan.cell_px) // 2, assumed)
     rank = jnp.cumsum(~points.valid, dtype=jnp.int32) - 1
     order, room = _order(found, step, rank, first)
     candidate = order[jnp.clip(rank, 0, order.shape[0] - 1)]
@@ -80,16 +84,19 @@ def detect_new_points(
     seen = Measurements(*chosen)
     matched = match_depth(view, uv, rough, new, params.sensor, known_point=False, plan=plan.pair_flow)
     if matched is not None:
-        seen, new = Measurements(seen.xy, matched, depth_sigma(matched, params.sensor)), new & (matched > 0)
-    X_world = to_world(T_world_cam, seen.in_camera())
+        seen = Measurements(seen.xy, matched, depth_sigma(matched, params.sensor))
+        new &= may_lack_depth | (matched > 0)
+    known = seen.depth > 0
+    X_world = to_world(T_world_cam, seen._replace(depth=jnp.where(known, seen.depth, assumed)).in_camera())
+    X_anchor = jnp.where(known[None, :], X_world, T_world_cam.translation()[:, None])
     put = lambda old, fresh: jnp.where(new, fresh, old)
     filled = TrackedPoints(
         uv=put(points.uv, uv),
         xy=put(points.xy, seen.xy),
         depth=put(points.depth, seen.depth),
         X_world=put(points.X_world, X_world),
-        X_anchor=put(points.X_anchor, X_world),
-        information=put(points.information, 1 / jnp.square(seen.sigma)),
+        X_anchor=put(points.X_anchor, X_anchor),
+        information=put(points.information, jnp.where(known, 1 / jnp.square(seen.sigma), 0)),
         weight=jnp.where(new, 1, points.weight),
         age=jnp.where(new, 0, points.age),
         anchor_age=jnp.where(new, 0, points.anchor_age),
@@ -99,8 +106,18 @@ def detect_new_points(
     return filled, jnp.sum(found.score > _MIN_SCORE, dtype=jnp.int32)
 
 
-def _candidates(points: TrackedPoints, step: StepContext, twist: Float[Array, "6"], cell: int) -> _Candidates:
-    """Find and measure the best corner of each cell; `cell` is the side of the cells on the second level, pixels."""
+def _candidates(
+    points: TrackedPoints, step: StepContext, twist: Float[Array, "6"], cell: int, assumed: Scalar
+) -> _Candidates:
+    """Find and measure the best corner of each cell.
+
+    Args:
+        points: Current points.
+        step: Context of the step.
+        twist: `(6,)` velocity of the camera in its own axes, m/s, then rad/s.
+        cell: Side of the cells on the second level, pixels.
+        assumed: Depth to assume at corners of unknown depth, meters; 0 if there are to be none.
+    """
     view, sensor = step.view, step.params.sensor
     border, depth = view.pyramid.border, view.depth
     image = view.pyramid.levels[1][border:-border, border:-border]
@@ -112,8 +129,9 @@ def _candidates(points: TrackedPoints, step: StepContext, twist: Float[Array, "6
     taken = occupied_cells(points.uv / 2, points.valid, (image.shape[0], image.shape[1]), cell=cell)
     uv = corners.points * 2
     rough = sample_depth(depth, uv, reach=2, noise=sensor.depth_step_m())
+    rough = jnp.where(rough > 0, rough, assumed)
     seen = pixel_rays(uv, sensor).measured(rough, twist, depth, view.frame.depth_delay_s, sensor, reach=2)
-    good = (corners.score > _MIN_SCORE) & ~taken & (rough > 0) & (seen.depth > 0)
+    good = (corners.score > _MIN_SCORE) & ~taken & ((assumed > 0) | ((rough > 0) & (seen.depth > 0)))
     return _Candidates(uv, corners.score, rough, seen, good)
 
 

@@ -19,8 +19,9 @@ class TrackedPoints(NamedTuple):
         depth: `(n,)` depths measured there, meters; 0 where depth is missing.
         X_world: `(3, n)` positions in the world, fused over the last few frames, meters.
         X_anchor: `(3, n)` positions in the world measured `anchor_age` frames ago, meters; a slowly moving point drifts
-            away from its anchor.
-        information: `(n,)` inverse variances of the depths, 1 / m^2.
+            away from its anchor. For a point of unknown depth, the position of the camera that detected it.
+        information: `(n,)` inverse variances of the depths, 1 / m^2; 0 for a point of unknown depth, whose `X_world` is
+            only somewhere on the ray along which it was detected.
         weight: `(n,)` weights of the points, 0 to 1; the caller may change them between steps.
         age: `(n,)` number of frames since each point was detected.
         anchor_age: `(n,)` number of frames since `X_anchor` was measured.
@@ -39,6 +40,10 @@ class TrackedPoints(NamedTuple):
     anchor_age: Int[Array, " n"]
     id: Int[Array, " n"]
     valid: Mask
+
+    def has_position(self) -> Mask:
+        """Return the `(n,)` mask of the points whose depth is known, measured or from parallax."""
+        return self.information > 0
 
 
 def empty_points(num_points: int, dtype: DTypeLike) -> TrackedPoints:

@@ -114,7 +114,7 @@ def refined_pose(
         prior=prior,
         max_steps=step.plan.pose_steps,
     )
-    close = _close(refined.T_world_cam, X_world, seen.xy, params)
+    close = reprojects(refined.T_world_cam, X_world, seen.xy, params)
     return refined, (trust > 0) & close[: trust.shape[0]]
 
 
@@ -122,15 +122,6 @@ def worse_status(coarse: Code, refined: Code) -> Code:
     """The `PoseStatus` of a refined pose, `NOT_CONVERGED` also where the coarse pose it began with is."""
     only_coarse = (refined == PoseStatus.OK) & (coarse == PoseStatus.NOT_CONVERGED)
     return jnp.where(only_coarse, coarse, refined)
-
-
-def _close(T_world_cam: SE3, X_world: Points, xy: Pixels, params: TrackParams) -> Mask:
-    """Tell which points are seen within the outlier threshold of where the pose puts them."""
-    X_cam = to_camera(T_world_cam, X_world)
-    front = X_cam[2] > params.sensor.min_depth_m / 2
-    predicted = X_cam[:2] / jnp.where(front, X_cam[2], 1)[None, :]
-    error = to_pixels(params.sensor.intrinsics, predicted) - to_pixels(params.sensor.intrinsics, xy)
-    return front & (jnp.sum(jnp.square(error), axis=0) < jnp.square(params.outlier_px))
 
 
 def measure_matches(step: StepContext, matches: KeyframeMatches, coarse: SE3, twist: Float[Array, "6"]) -> Measurements:
@@ -159,4 +150,13 @@ def fits(step: StepContext, seen: Measurements, pose: SE3) -> Mask:
     X_world = step.state.points.X_world
     apart_m = jnp.abs(to_camera(pose, X_world)[2] - seen.depth)
     near = (seen.depth <= 0) | (apart_m < _DEPTH_SIGMAS * seen.sigma)
-    return _close(pose, X_world, seen.xy, step.params) & near
+    return reprojects(pose, X_world, seen.xy, step.params) & near
+
+
+def reprojects(T_world_cam: SE3, X_world: Points, xy: Pixels, params: TrackParams) -> Mask:
+    """Tell which points are seen within the outlier threshold of where the pose puts them."""
+    X_cam = to_camera(T_world_cam, X_world)
+    front = X_cam[2] > params.sensor.min_depth_m / 2
+    predicted = X_cam[:2] / jnp.where(front, X_cam[2], 1)[None, :]
+    error = to_pixels(params.sensor.intrinsics, predicted) - to_pixels(params.sensor.intrinsics, xy)
+    return front & (jnp.sum(jnp.square(error), axis=0) < jnp.square(params.outlier_px))

@@ -44,6 +44,7 @@ from jaxslam.tracking.pose_estimation import coarse_pose, fits, measure_matches,
 from jaxslam.tracking.state import TrackOutput, TrackParams, TrackPlan, TrackState
 from jaxslam.tracking.step_checks import check_cues, check_followed, check_pose, check_prior, check_state, check_step
 from jaxslam.tracking.step_context import StepContext
+from jaxslam.tracking.unknown_depth import with_located
 
 
 class FlowResult(NamedTuple):
@@ -187,8 +188,9 @@ def track_followed(
     step, X_world = _prepared(state, frame, pyramid, params, plan), state.points.X_world
     # 2. Rays of the tracked points, without distortion: the same for every pose below.
     rays = _tracked_rays(step, uv, found, predicted)
-    # 3. Background points: those outside the mask and on no movable object.
+    # 3. Background points: those outside the mask and on no movable object. Points of unknown depth wait.
     masked, objects = _masked(frame, uv), _object_ids(step, uv)
+    found, waiting = found & state.points.has_position(), found & ~masked & ~state.points.has_position()
     background = _background(step, found & ~masked, objects)
     step = step._replace(params=_widened(params, state.points.uv, uv, background))
     # 4. Coarse pose: RANSAC PnP, in which no region of the depth image has more than an even share of the votes.
@@ -221,6 +223,7 @@ def track_followed(
     pose = refined.T_world_cam
     seen = step.measured(rays, X_world, pose, step.twist_to(pose))
     kept = update_points(step, uv, seen, inliers, monitored, pose)
+    kept = with_located(kept, step, uv, seen, waiting & ~monitored & rejection.at_rest(uv), pose)
     new_state, output = conclude(step, FrameEstimate(refined, matches, kept, outcome, rejection))
     if plan.pose_steps > DEFAULT_PLAN.pose_steps:
         # Not always: one more use of the coarse pose's status has XLA round the pose itself in another way.

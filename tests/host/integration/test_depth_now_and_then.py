@@ -14,6 +14,8 @@ from jaxslam.datasets import open_dataset
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.trajectory.evaluation import evaluate
 from jaxslam.trajectory.trajectory import Trajectory
+from jaxslam.worlds.library import load_world
+from jaxslam.worlds.stored_world import StoredWorld
 
 CONFIG = load_config("default", overrides=["semantics.model=null"])
 
@@ -78,6 +80,21 @@ def test_a_sensor_that_fails_for_a_second() -> None:
     assert all(result.keyframe == KeyframeReason.NONE for result in results[10:25])
     print("error in mm:", 1e3 * error_m(results, source.ground_truth))
     assert error_m(results, source.ground_truth) < 0.01
+
+
+def test_a_sensor_that_fails_on_the_way() -> None:
+    """Almost three seconds in a corridor: points of before leave the picture, and parallax locates new ones."""
+    corridor = load_world("corridor")
+    focal = {} if corridor.camera.fx is None else {"fx": 0.75 * corridor.camera.fx}
+    camera = dataclasses.replace(corridor.camera, width=480, height=360, **focal)
+    source = StoredWorld(dataclasses.replace(corridor, camera=camera))
+    frames = tuple(source[index] for index in range(120))
+    results = tracked(lambda i, frame: without_depth(frame) if 30 <= i < 110 else frame, source.camera, frames)
+    assert all(result.status in (TrackStatus.OK, TrackStatus.STARTED) for result in results)
+    way_m = np.linalg.norm(results[110].T_world_cam[4:] - results[30].T_world_cam[4:])
+    print(f"way without depth {way_m:.2f} m, error {1e3 * error_m(results, source.ground_truth):.1f} mm")
+    assert way_m > 1.5
+    assert error_m(results, source.ground_truth) < 0.03 * way_m
 
 
 @pytest.mark.slow
