@@ -53,15 +53,15 @@ def located(
     points = state.points._replace(
         X_world=array(X / X[2] * ASSUMED_M), X_anchor=jnp.zeros((3, N)), valid=jnp.asarray(WAITING)
     )
-    depth = np.full((CAMERA.height, CAMERA.width), 3.0 if frame_has_depth else 0.0)
-    ignore, blank = np.zeros(depth.shape, bool), np.zeros(depth.shape, np.uint8)
-    frame = FrameArrays(blank, depth.astype(np.float32), ignore, np.float32(1 / 30), np.float32(0))
+    size = (CAMERA.height, CAMERA.width)
+    depth, ignore = jnp.full(size, 3.0 if frame_has_depth else 0.0), jnp.zeros(size, bool)
+    frame = FrameArrays(jnp.zeros(size, jnp.uint8), depth, ignore, array(1 / 30), array(0))
     pose = SE3(array([1, 0, 0, 0, *moved_m]))
     now = X - np.array(moved_m)[:, None]
     xy = now[:2] / now[2] - np.array([[0], [shift_px / CAMERA.fy]])
     measured = array(np.zeros(N) if measured_m is None else measured_m)
     seen = Measurements(array(xy), measured, depth_sigma(measured, PARAMS.sensor))
-    view = PreparedFrame(frame, state.pyramid, array(depth), array(1 / 30))
+    view = PreparedFrame(frame, state.pyramid, depth, array(1 / 30))
     step = StepContext(state._replace(points=points), view, PARAMS, PLAN)
     none = jnp.zeros(N, bool)
     kept = KeptPoints(points._replace(valid=none), none, none)
@@ -101,7 +101,9 @@ def test_measured_depth_comes_first() -> None:
     points = located((0.0, 0.0, 0.0), measured_m=measured_m, frame_has_depth=True).points
     np.testing.assert_array_equal(points.valid, np.arange(N) < 25)  # the others have no depth in a frame that has it
     np.testing.assert_allclose(points.X_world[:, :25], X[:, :25], rtol=1e-5)
-    np.testing.assert_allclose(points.information[:25], 1 / depth_sigma(measured_m[:25], PARAMS.sensor) ** 2, rtol=1e-5)
+    np.testing.assert_allclose(
+        points.information[:25], 1 / depth_sigma(points.depth[:25], PARAMS.sensor) ** 2, rtol=1e-5
+    )
     np.testing.assert_allclose(points.depth[:25], X[2, :25], rtol=1e-6)
 
 
