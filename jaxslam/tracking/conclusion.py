@@ -134,7 +134,7 @@ def _ending(step: StepContext, estimate: FrameEstimate, motion: _Motion) -> _End
         has_depth=step.view.has_depth(),
     )
     points, num_corners = _with_new_points(step, estimate, motion, candidate)
-    num_started = jnp.sum(points.valid & points.has_position(), dtype=state.twist.dtype)
+    num_started = jnp.sum(points.has_position(), dtype=state.twist.dtype)
     failed = motion.start & (num_started < params.min_inliers)
     started = motion.start & ~failed
     few_corners = num_corners.astype(state.twist.dtype) < params.min_inliers
@@ -170,10 +170,8 @@ def _with_new_points(
     held = state.points._replace(valid=state.points.valid & ~motion.start)
     points = _choose(lost, held, kept.points)
     few = params.detect_below * plan.num_points
-    num_points, num_located = (
-        jnp.sum(mask, dtype=few.dtype) for mask in (points.valid, points.valid & points.has_position())
-    )
-    wanted = (num_points < few) & (view.has_depth() | (num_located < _FEW_LOCATED * few))
+    num_points, num_located = (jnp.sum(mask, dtype=few.dtype) for mask in (points.valid, points.has_position()))
+    wanted = (num_points < few) & (candidate.has_depth | (num_located < _FEW_LOCATED * few))
     if plan.new_points == "keyframes":
         wanted &= keyframe_reason(state, candidate, params, plan) > 0
     unmonitored = rejection.unmonitored(view, kept.monitored)
@@ -181,7 +179,7 @@ def _with_new_points(
         wanted |= jnp.any(unmonitored) & (state.frame % _MONITOR_EVERY == 0)
     free = rejection.without_monitored(view, kept.monitored, plan)
     detect = partial(detect_new_points, step=step._replace(view=free), T_world_cam=motion.T_world_cam)
-    detect = partial(detect, twist=motion.twist, may_lack_depth=~lost & ~view.has_depth(), first=unmonitored)
+    detect = partial(detect, twist=motion.twist, may_lack_depth=~lost & ~candidate.has_depth, first=unmonitored)
     branch = (motion.start | (wanted & ~lost)).astype(jnp.int32)
     branches = [lambda points: (points, jnp.zeros((), jnp.int32)), detect]
     if plan.motion is not None:  # more features from the rest, as in USD-SLAM
@@ -236,9 +234,7 @@ def _output(step: StepContext, estimate: FrameEstimate, motion: _Motion, ending:
         num_keyframe_matches=jnp.sum(matches.weight > 0),
         residual_px=refined.residual_scale * step.params.pixel_sigma,
         uv=points.uv,
-        weights=jnp.where(
-            points.valid & points.has_position() & ending.at_rest & (~lost | motion.start), points.weight, 0
-        ),
+        weights=jnp.where(points.has_position() & ending.at_rest & (~lost | motion.start), points.weight, 0),
         tracked=kept.tracked & ~lost,
         X_world=points.X_world,
         id=points.id,

@@ -35,7 +35,7 @@ class KeptPoints(NamedTuple):
 def probation_weights(points: TrackedPoints, params: TrackParams) -> Weights:
     """Return the `(n,)` weights of the points, lower while one is on probation; 0 for one without a position."""
     served = (points.age + 1).astype(points.weight.dtype) / params.probation_frames
-    return jnp.where(points.valid & points.has_position(), points.weight * jnp.minimum(served, 1), 0)
+    return jnp.where(points.has_position(), points.weight * jnp.minimum(served, 1), 0)
 
 
 def update_points(

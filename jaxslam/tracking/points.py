@@ -43,7 +43,7 @@ class TrackedPoints(NamedTuple):
 
     def has_position(self) -> Mask:
         """Return the `(n,)` mask of the points whose depth is known, measured or from parallax."""
-        return self.information > 0
+        return self.valid & (self.information > 0)
 
 
 def empty_points(num_points: int, dtype: DTypeLike) -> TrackedPoints:

@@ -36,7 +36,7 @@ def assumed_depth(points: TrackedPoints, T_world_cam: SE3, nearest_m: Scalar) ->
         nearest_m: Smallest depth to assume, meters.
     """
     depth = to_camera(T_world_cam, points.X_world)[2]
-    known = points.valid & points.has_position() & (depth > nearest_m)
+    known = points.has_position() & (depth > nearest_m)
     return jnp.maximum(weighted_median(depth, known.astype(depth.dtype)), nearest_m)
 
 

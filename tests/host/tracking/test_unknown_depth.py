@@ -83,7 +83,7 @@ def test_parallax_tells_the_depth() -> None:
     assert np.corrcoef(sigma_m, X[2, has_position] ** 2)[0, 1] > 0.9
 
 
-def test_they_wait_while_the_camera_only_turns_or_rests() -> None:
+def test_they_wait_while_the_camera_rests() -> None:
     points = located((0.0, 0.0, 0.0)).points
     np.testing.assert_array_equal(points.valid, WAITING)
     assert not points.has_position().any()
