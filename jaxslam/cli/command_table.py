@@ -138,6 +138,13 @@ COMMANDS = (
         takes_gpu=True,
     ),
     Command(
+        ("bench", "live"),
+        "bench_live:Live",
+        "Time frames at the rate of the camera, in turn with other programs.",
+        "Wall and processor time, median, 95th percentile, late frames, memory. Nothing else should run on the machine"
+        " meanwhile.",
+    ),
+    Command(
         ("bench", "soak"),
         "bench_soak:Soak",
         "Track for hours in one place, and show what grows: keyframes, memory, time, error.",
