@@ -34,14 +34,14 @@ def mask_around(
     """
     height, width = depth.shape
     mask = np.zeros(depth.shape, bool)
-    at = np.round(uv[:, np.isfinite(uv).all(axis=0)]).astype(int)
+    at = np.round(uv[:, np.isfinite(uv).all(axis=0)]).astype(np.int32)
     u, v = at[:, (at[0] >= 0) & (at[1] >= 0) & (at[0] < width) & (at[1] < height)]
-    there = depth[v, u]
-    steps = np.arange(-reach_px, reach_px + 1)
+    steps = np.arange(-reach_px, reach_px + 1, dtype=np.int32)
     rows = np.clip(v[:, None] + steps, 0, height - 1)[:, :, None]
     columns = np.clip(u[:, None] + steps, 0, width - 1)[:, None, :]
-    around, center = depth[rows, columns], there[:, None, None]
+    # Flat indices once for reading and writing: half the time of two indices and `nonzero`.
+    pixels = rows * width + columns
+    around, center = depth.reshape(-1)[pixels], depth[v, u][:, None, None]
     alike = np.abs(around - center) <= _DEPTH_STEP * center
-    which, row, column = np.nonzero(alike | ~(center > 0) | ~(around > 0))
-    mask[rows[which, row, 0], columns[which, 0, column]] = True
+    mask.reshape(-1)[pixels[alike | ~(center > 0) | ~(around > 0)]] = True
     return mask

@@ -84,9 +84,11 @@ def angle(T: Transforms) -> Float[np.ndarray, "..."]:
 
 def adjoint(T: Pose) -> Float[np.ndarray, "6 6"]:
     """Return the adjoint of `T_a_b`, which maps a tangent (translation first) from frame b to frame a."""
-    R, (x, y, z) = matrices(T[:4]), T[4:]
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.block([[R, cross @ R], [np.zeros((3, 3)), R]])
+    R, (x, y, z) = matrices(T[:4]), T[4:].tolist()
+    result = np.zeros((6, 6))
+    result[:3, :3] = result[3:, 3:] = R
+    result[:3, 3:] = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ R
+    return result
 
 
 def displacement(first: Transforms, second: Transforms) -> Float[np.ndarray, "... 6"]:

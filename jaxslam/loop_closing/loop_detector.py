@@ -82,7 +82,7 @@ class LoopClosing:
     def look(self, slam_map: Map, keyframe_id: int) -> LoopClosure | None:
         """Add a keyframe of the map; return the loop that it closes, if any."""
         # 0. The keyframe may have been culled before its turn came.
-        if not has(slam_map.ids, np.array([keyframe_id]))[0]:
+        if not slam_map.has_keyframe(keyframe_id):
             return None
         # 1. Loop candidate detection and its relative pose (sections VII-A and VII-B): place recognition.
         found = self._recognized(slam_map, keyframe_id)
@@ -106,7 +106,7 @@ class LoopClosing:
     def replace(self, slam_map: Map, keyframe_id: int) -> None:
         """Update the place index after a keyframe of the map has lost features."""
         with self._index.lock:
-            if keyframe_id in self._index and has(slam_map.ids, np.array([keyframe_id]))[0]:
+            if keyframe_id in self._index and slam_map.has_keyframe(keyframe_id):
                 self._index.replace(keyframe_id, slam_map.keyframe(keyframe_id).features)
 
     def _recognized(self, slam_map: Map, keyframe_id: int) -> Recognition | None:

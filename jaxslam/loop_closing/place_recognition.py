@@ -10,7 +10,6 @@ from jaxtyping import Float64, Int64
 from jaxslam.features.orb import DEFAULT_PLAN, FeaturePlan, Features
 from jaxslam.features.view_matching import match_views
 from jaxslam.loop_closing.place_index import PlaceIndex
-from jaxslam.map.point_records import has
 from jaxslam.map.types import Keyframe, Map
 from jaxslam.sensors.sensor_model import SensorModel
 
@@ -62,7 +61,7 @@ def recognize(
         plan: Settings of feature extraction.
     """
     for keyframe_id, _ in index.query(features, exclude, limit):
-        if has(slam_map.ids, np.array([keyframe_id]))[0]:
+        if slam_map.has_keyframe(keyframe_id):
             found = verify(slam_map.keyframe(keyframe_id), features, sensor, seed=seed, plan=plan)
             if found is not None:
                 return found

@@ -121,7 +121,33 @@ class Map(NamedTuple):
         Raises:
             KeyError: If the keyframe is not in the map.
         """
-        return int(rows(self.ids, np.array([keyframe_id]))[0])
+        # Of one id in plain Python: `rows` takes five times as long, and every frame asks for a few.
+        at = int(self.ids.searchsorted(keyframe_id))
+        if at == len(self.ids) or self.ids[at] != keyframe_id:
+            raise KeyError(f"not in the map: [{keyframe_id}]")
+        return at
+
+    def has_keyframe(self, keyframe_id: int | np.integer) -> bool:
+        """Return whether a keyframe is in the map, and not culled."""
+        at = int(self.ids.searchsorted(keyframe_id))
+        return at < len(self.ids) and bool(self.ids[at] == keyframe_id)
+
+    def surviving_keyframe(self, keyframe_id: int) -> int:
+        """Return a keyframe's id, or if it was culled, that of its anchor that is still in the map.
+
+        Raises:
+            KeyError: If the keyframe was never in this map.
+        """
+        while not self.has_keyframe(keyframe_id):
+            keyframe_id = int(self.culled.anchor[self._culled_row(keyframe_id)])
+        return keyframe_id
+
+    def _culled_row(self, keyframe_id: int) -> int:
+        """Return the row of a keyframe among the culled ones; raises `KeyError` if it is not one of them."""
+        found = np.flatnonzero(self.culled.ids == keyframe_id)
+        if not len(found):
+            raise KeyError(f"keyframe {keyframe_id} was never in this map")
+        return int(found[0])
 
     def keyframe(self, keyframe_id: int) -> Keyframe:
         """Return a keyframe.
@@ -138,12 +164,10 @@ class Map(NamedTuple):
             KeyError: If the keyframe was never in this map.
         """
         T_anchor_keyframe = IDENTITY
-        while not has(self.ids, np.array([keyframe_id]))[0]:
-            found = np.flatnonzero(self.culled.ids == keyframe_id)
-            if not len(found):
-                raise KeyError(f"keyframe {keyframe_id} was never in this map")
-            T_anchor_keyframe = compose(self.culled.T_anchor_keyframe[found[0]], T_anchor_keyframe)
-            keyframe_id = int(self.culled.anchor[found[0]])
+        while not self.has_keyframe(keyframe_id):
+            row = self._culled_row(keyframe_id)
+            T_anchor_keyframe = compose(self.culled.T_anchor_keyframe[row], T_anchor_keyframe)
+            keyframe_id = int(self.culled.anchor[row])
         return compose(self.T_world_cam[self.row(keyframe_id)], T_anchor_keyframe)
 
     def with_arrays(self, points: MapPoints | None = None, observations: Observations | None = None) -> "Map":

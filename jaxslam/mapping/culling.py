@@ -93,7 +93,7 @@ def without_isolated(slam_map: Map, keyframe_id: int) -> Map:
         keyframe_id: Id of the latest keyframe.
     """
     candidate = keyframe_id - KEEP_LATEST
-    if not has(slam_map.ids, np.array([candidate]))[0]:
+    if not slam_map.has_keyframe(candidate):
         return slam_map
     row = slam_map.row(candidate)
     if slam_map.parent[row] == NONE or len(covisible(slam_map, candidate)[0]):

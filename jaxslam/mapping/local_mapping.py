@@ -29,7 +29,7 @@ from jaxslam.map.edit import with_descriptors, with_keyframe, with_observations,
 from jaxslam.map.partial_map import PartialMap, extract_around, merge_back, most_shared
 from jaxslam.map.point_fusion import with_fused_points
 from jaxslam.map.point_records import NONE, Observations, has, rows
-from jaxslam.map.types import Keyframe, Map, covisible, empty_map, point_submaps, surviving_keyframes
+from jaxslam.map.types import Keyframe, Map, covisible, empty_map, point_submaps
 from jaxslam.mapping.culling import (
     CONFIRM_WITHIN,
     within_memory,
@@ -360,7 +360,7 @@ def with_new_keyframe(slam_map: Map, new: NewKeyframe, features: Features) -> Ma
     pose, parent, submap = new.T_parent_keyframe, new.parent, new.submap
     if parent != NONE:
         pose = compose(slam_map.pose(parent), pose)
-        parent = int(surviving_keyframes(slam_map, np.array([parent]))[0])
+        parent = slam_map.surviving_keyframe(parent)
         submap = int(slam_map.submap[slam_map.row(parent)])  # the submap may have been merged into another one
     encoded, jpeg = cv2.imencode(".jpg", np.asarray(new.frame.image), _JPEG)
     if not encoded:

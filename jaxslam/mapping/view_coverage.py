@@ -48,16 +48,14 @@ class ViewCoverage:
         """
         if slam_map is not self._map:
             self._take(slam_map)
-        apart_m = np.linalg.norm(slam_map.T_world_cam[:, 4:] - T_world_cam[4:], axis=1)
-        near = np.flatnonzero((slam_map.submap == submap) & (apart_m < self._reach_m))
+        apart_m2 = _squared_norm((slam_map.T_world_cam[:, 4:] - T_world_cam[4:]).T)
+        near = np.flatnonzero((slam_map.submap == submap) & (apart_m2 < np.square(self._reach_m)))
         if not len(near):
             return 0
         T_world_keyframe = slam_map.T_world_cam[near]
-        position = T_world_keyframe[:, 4:, None]
-        X_world = matrices(T_world_keyframe[:, :4]) @ self._X_cam[near] + position
-        X_world, then = (
-            np.moveaxis(np.broadcast_to(of, X_world.shape), 1, 0).reshape(3, -1) for of in (X_world, position)
-        )
+        X_world = matrices(T_world_keyframe[:, :4]) @ self._X_cam[near] + T_world_keyframe[:, 4:, None]
+        X_world = X_world.transpose(1, 0, 2).reshape(3, -1)
+        then = T_world_keyframe[:, 4:].T.repeat(_NUM_SAMPLES, axis=1)
         seen = in_view(slam_map.camera, T_world_cam, X_world) & seen_alike(X_world, then, T_world_cam[4:, None])
         return int((seen.reshape(len(near), _NUM_SAMPLES).mean(axis=1) >= self._at_least).sum())
 
@@ -81,9 +79,9 @@ class ViewCoverage:
 def in_view(camera: Camera, T_world_cam: Pose, X_world: Float[np.ndarray, "3 n"]) -> Bool[np.ndarray, " n"]:
     """Tell which points are in the image of a camera, not at its margin."""
     X = to_local(T_world_cam, X_world)
-    uv = camera.project(np.stack([X[0], X[1], np.where(X[2] > 0, X[2], np.inf)]))
-    size = np.array([[camera.width], [camera.height]])
-    return (X[2] > 0) & ((uv > _MARGIN_PX) & (uv < size - _MARGIN_PX)).all(axis=0)
+    u, v = camera.project(np.stack([X[0], X[1], np.where(X[2] > 0, X[2], np.inf)]))
+    right, low = camera.width - _MARGIN_PX, camera.height - _MARGIN_PX
+    return (X[2] > 0) & (u > _MARGIN_PX) & (u < right) & (v > _MARGIN_PX) & (v < low)
 
 
 def seen_alike(
@@ -97,6 +95,10 @@ def seen_alike(
         now: Present position of the camera, meters.
     """
     was, is_now = X_world - then, X_world - now
-    far, near = np.linalg.norm(was, axis=0), np.linalg.norm(is_now, axis=0)
-    alike = (was * is_now).sum(axis=0) > _MAX_TURN * near * far
-    return alike & (far > _SCALES[0] * near) & (far < _SCALES[1] * near)
+    far2, near2 = _squared_norm(was), _squared_norm(is_now)
+    alike = np.einsum("in,in->n", was, is_now) > _MAX_TURN * np.sqrt(far2 * near2)
+    return alike & (far2 > _SCALES[0] ** 2 * near2) & (far2 < _SCALES[1] ** 2 * near2)
+
+
+def _squared_norm(vectors: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, " n"]:
+    return np.einsum("in,in->n", vectors, vectors)

@@ -5,10 +5,13 @@ the errors of its depth, which matter the more the camera has moved since, and p
 pose put them that was itself unsure.
 """
 
+import math
+
 import numpy as np
 from jaxtyping import Float32
 
-from jaxslam.geometry.se3 import adjoint, between, compose, to_local
+from jaxslam.geometry.se3 import adjoint, between, compose
+from jaxslam.geometry.so3 import matrices
 from jaxslam.geometry.types import Pose
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.sensor_model import SensorModel
@@ -79,8 +82,10 @@ class PoseUncertainty:
         seen = np.asarray(output.weights) > 0
         if not there.any() or not seen.any():
             return residual**2
-        moved_m = np.linalg.norm(np.asarray(keyframes.T_world_cam)[there, 4:] - tracked.T_world_cam[4:], axis=1).min()
-        depth_m = float(np.median(to_local(tracked.T_world_cam, np.asarray(output.X_world)[:, seen].astype(float))[2]))
+        apart = np.asarray(keyframes.T_world_cam)[there, 4:] - tracked.T_world_cam[4:]
+        moved_m = math.sqrt((apart * apart).sum(axis=1).min())
+        from_camera = np.asarray(output.X_world)[:, seen] - tracked.T_world_cam[4:, None]
+        depth_m = float(np.median(matrices(tracked.T_world_cam[:4])[:, 2] @ from_camera))
         if depth_m <= 0:
             return residual**2
         depth_error = self._sigma_m / depth_m + self._sigma_per_m2 * depth_m

@@ -12,8 +12,8 @@ from jaxtyping import Float
 
 from jaxslam.geometry.se3 import IDENTITY, angle, between, compose, inverse, to_local, transform
 from jaxslam.geometry.types import Pose
-from jaxslam.map.point_records import NONE, has
-from jaxslam.map.types import Map, surviving_keyframes
+from jaxslam.map.point_records import NONE
+from jaxslam.map.types import Map
 from jaxslam.mapping.local_mapping import NewKeyframe, TrackedObservations
 from jaxslam.runtime.compiled import compiled
 from jaxslam.runtime.padding import padded
@@ -97,7 +97,7 @@ class TrackerMapSync:
             anchored = AnchoredPose(above.keyframe, compose(above.T_keyframe_cam, anchored.T_keyframe_cam))
         if anchored.keyframe == NONE:
             return None
-        standing_id = int(surviving_keyframes(self.map, np.array([anchored.keyframe]))[0])
+        standing_id = self.map.surviving_keyframe(anchored.keyframe)
         return AnchoredPose(standing_id, between(self.map.pose(standing_id), self.pose(anchored)))
 
     def tracker_pose(self, keyframe_id: int) -> Pose:
@@ -124,7 +124,7 @@ class TrackerMapSync:
             if above.keyframe == NONE:
                 return self._new_submaps[keyframe_id]
             keyframe_id = above.keyframe
-        return int(self.map.submap[self.map.row(int(surviving_keyframes(self.map, np.array([keyframe_id]))[0]))])
+        return int(self.map.submap[self.map.row(self.map.surviving_keyframe(keyframe_id))])
 
     @property
     def num_on_the_way(self) -> int:
@@ -212,7 +212,7 @@ class TrackerMapSync:
 
     def slot_for(self, keyframe_id: int, keep: set[int]) -> int | None:
         """Choose a slot, not among those to keep, for a reloaded keyframe; `None` if it is loaded already or gone."""
-        if keyframe_id in self._slots or not knows(self.map, keyframe_id):
+        if keyframe_id in self._slots or not self.map.has_keyframe(keyframe_id):
             return None
         free = range(self._plan.num_keyframes, len(self._slots))
         return next((slot for slot in free if self._slots[slot] not in keep), None)
@@ -236,11 +236,6 @@ class TrackerMapSync:
 def pose_of(output: TrackOutput) -> Pose:
     """`(7,)` the pose, its quaternion of unit length in float64."""
     return compose(np.asarray(output.T_world_cam.wxyz_xyz, np.float64), IDENTITY)
-
-
-def knows(slam_map: Map, keyframe_id: int) -> bool:
-    """Whether a keyframe is in a map."""
-    return bool(has(slam_map.ids, np.array([keyframe_id]))[0])
 
 
 def tracks_of(output: TrackOutput) -> TrackedObservations:
