@@ -142,6 +142,8 @@ class TrackPlan(NamedTuple):
             information (`sparing`).
         pose_steps: Largest number of cost evaluations in each refinement of the pose; `TrackOutput.pose_status` tells
             whether it was reached.
+        pose_tolerance: Length of the step at which a refinement of the pose stops, in standard deviations of the pose;
+            `None` for what the floating-point type resolves.
         pair_flow: Settings of the matching along the rows of a stereo pair.
     """
 
@@ -154,7 +156,7 @@ class TrackPlan(NamedTuple):
     num_hypotheses: int = _SETTINGS.num_hypotheses
     cell_px: int = _SETTINGS.cell_px
     new_points: Literal["always", "keyframes"] = _SETTINGS.new_points
-    flow: FlowPlan = FlowPlan()
+    flow: FlowPlan = FlowPlan(first_level=1)
     look_up: LevelPlan = LevelPlan(15, 8, 0.05)
     cues: tuple[Cue, ...] = ()
     regions: RegionPlan | None = None
@@ -162,6 +164,7 @@ class TrackPlan(NamedTuple):
     motion: MotionPlan | None = None
     keyframe_policy: Literal["as_needed", "sparing"] = _SETTINGS.keyframe_policy
     pose_steps: int = 25
+    pose_tolerance: float | None = 0.01
     pair_flow: FlowPlan = ROW_PLAN
 
     def exact(self) -> "TrackPlan":
@@ -181,6 +184,7 @@ class TrackPlan(NamedTuple):
             flow=self.flow._replace(finest=to_the_end(self.flow.finest)),
             look_up=to_the_end(self.look_up),
             pose_steps=1000,
+            pose_tolerance=None,
             pair_flow=self.pair_flow._replace(finest=to_the_end(self.pair_flow.finest)),
         )
 

@@ -153,7 +153,10 @@ def follow_points(
     guess = points.uv + lax.stop_gradient(after - before)
     inside = jnp.all((guess > 0) & (guess < jnp.array([[width - 1], [height - 1]], guess.dtype)), axis=0)
     guess = jnp.where(inside[None, :], guess, points.uv)
-    flow = lk_flow(state.pyramid, pyramid, points.uv, guess, points.valid, plan=plan.flow)
+    # From the coarsest level for a pair: on a road, points with little texture stay where the search begins, near the
+    # prediction. KITTI 06 has 0.043 m then, not 0.028 (medians of ten seeds), though more points are found.
+    flow_plan = plan.flow if frame.right is None else plan.flow._replace(first_level=None)
+    flow = lk_flow(state.pyramid, pyramid, points.uv, guess, points.valid, plan=flow_plan)
     gone = is_known & ~inside
     return FlowResult(pyramid, predicted, flow.points, flow.ok & (points.weight > 0) & ~gone, prior)
 
