@@ -59,6 +59,7 @@ def coarse_pose(
         averaged=plan.balance_regions,
         num_hypotheses=plan.num_hypotheses,
         max_steps=plan.pose_steps,
+        tolerance=plan.pose_tolerance,
         initial=predicted,
         expected_depth=expected_depth,
         # With even votes the redescending loss is narrow, and its optimum as good as that of the inliers. With a wide
@@ -113,6 +114,7 @@ def refined_pose(
         scale=params.loss_scale,
         prior=prior,
         max_steps=step.plan.pose_steps,
+        tolerance=step.plan.pose_tolerance,
     )
     close = reprojects(refined.T_world_cam, X_world, seen.xy, params)
     return refined, (trust > 0) & close[: trust.shape[0]]

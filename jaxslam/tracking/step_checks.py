@@ -233,6 +233,8 @@ def check_plan(plan: TrackPlan) -> None:
     for name, least in _MIN.items():
         if getattr(plan, name) < least:
             raise ValueError(f"plan.{name}: expected at least {least}, got {getattr(plan, name)}")
+    if plan.pose_tolerance is not None and not plan.pose_tolerance > 0:
+        raise ValueError(f"plan.pose_tolerance: expected more than 0, or None, got {plan.pose_tolerance}")
     for name, hint in get_type_hints(TrackPlan).items():
         if get_origin(hint) is Literal and getattr(plan, name) not in get_args(hint):
             raise ValueError(f"plan.{name}: expected one of {get_args(hint)}, got {getattr(plan, name)!r}")

@@ -74,6 +74,7 @@ def ransac_pnp(
     num_hypotheses: int = 128,
     loss: Loss = "huber",
     max_steps: int = 25,
+    tolerance: float | None = None,
     averaged: bool = False,
     on_inliers: bool = True,
     prior: PosePrior | None = None,
@@ -103,6 +104,7 @@ def ransac_pnp(
         num_hypotheses: Number of samples, static.
         loss: The loss of the last refinement over the inliers, with a scale of half a threshold, static.
         max_steps: Bound on the steps of the last refinement, static.
+        tolerance: Length of the step at which the last refinement stops, static; see `refine_pose`.
         averaged: Whether the score is averaged over thresholds, see `score_poses`, static.
         on_inliers: Whether the pose is refined on its inliers in the end, static. Without, it is the optimum of the
             redescending loss over all points: enough for a pose from which another refinement begins.
@@ -127,9 +129,9 @@ def ransac_pnp(
     scores = jnp.where(real, score_poses(hypotheses, fixed, averaged), -jnp.inf)
     best, _ = usable_pose(_as_pose(hypotheses[:, :, jnp.argmax(scores)]))
     if on_inliers:
-        pose, status = _refined_on_inliers(best, problem, idle, loss, max_steps, averaged)
+        pose, status = _refined_on_inliers(best, problem, idle, loss, max_steps, tolerance, averaged)
     else:
-        pose, status = _refined_robustly(best, problem, idle, max_steps, averaged)
+        pose, status = _refined_robustly(best, problem, idle, max_steps, tolerance, averaged)
     return _result(pose, status, fixed, fallback, real.any(), min_inliers, averaged)
 
 
@@ -213,7 +215,13 @@ def _hypotheses(
 
 
 def _refined_on_inliers(
-    best: SE3, problem: PoseProblem, idle: PoseProblem, loss: Loss, max_steps: int, averaged: bool
+    best: SE3,
+    problem: PoseProblem,
+    idle: PoseProblem,
+    loss: Loss,
+    max_steps: int,
+    tolerance: float | None,
+    averaged: bool,
 ) -> tuple[SE3, Code]:
     """Refine the best hypothesis on all points under a redescending loss, then on the points that agree with that."""
     fixed = lax.stop_gradient(problem)
@@ -221,16 +229,16 @@ def _refined_on_inliers(
     consensus = _better(solved, best, fixed, averaged)
     inliers, _ = _consensus(consensus, fixed, averaged)
     on_inliers = problem._replace(weights=jnp.where(inliers, problem.weights, 0.0), scale=0.5 * problem.scale)
-    refined = refine_problem(consensus, on_inliers, _agreeing_idle(consensus, idle), loss, max_steps)
+    refined = refine_problem(consensus, on_inliers, _agreeing_idle(consensus, idle), loss, max_steps, tolerance)
     return refined.T_world_cam, refined.status
 
 
 def _refined_robustly(
-    best: SE3, problem: PoseProblem, idle: PoseProblem, max_steps: int, averaged: bool
+    best: SE3, problem: PoseProblem, idle: PoseProblem, max_steps: int, tolerance: float | None, averaged: bool
 ) -> tuple[SE3, Code]:
     """Refine the best hypothesis on all points under a redescending loss."""
     narrowed, idle = (_narrowed(points, averaged) for points in (problem, idle))
-    refined = refine_problem(best, narrowed, idle, "geman_mcclure", max_steps)
+    refined = refine_problem(best, narrowed, idle, "geman_mcclure", max_steps, tolerance)
     return _better(refined.T_world_cam, best, lax.stop_gradient(problem), averaged), refined.status
 
 

@@ -110,6 +110,7 @@ def refine_pose(
     scale: Scalar | float = 2.0,
     prior: PosePrior | None = None,
     max_steps: int = 25,
+    tolerance: float | None = None,
 ) -> PoseRefinement:
     """Finds the pose that explains where points are seen, and how far away.
 
@@ -130,20 +131,27 @@ def refine_pose(
         scale: Its scale in standard deviations, traced.
         prior: A pose known beforehand, with its information.
         max_steps: Bound on the evaluations of the cost, static.
+        tolerance: Length of the next step, in standard deviations of the estimate, at which the solver stops, static;
+            `None` for what the floating-point type resolves.
 
     Returns:
         A `PoseRefinement`; everything in it is finite, and so are its derivatives.
     """
     problem, idle = pose_problem(X_world, uv, intrinsics, weights, depth, sigma_px, sigma_depth, scale, prior)
-    return refine_problem(T_world_cam, problem, idle, loss, max_steps)
+    return refine_problem(T_world_cam, problem, idle, loss, max_steps, tolerance)
 
 
 def refine_problem(
-    T_world_cam: SE3, problem: PoseProblem, idle: PoseProblem, loss: Loss, max_steps: int
+    T_world_cam: SE3,
+    problem: PoseProblem,
+    idle: PoseProblem,
+    loss: Loss,
+    max_steps: int,
+    tolerance: float | None = None,
 ) -> PoseRefinement:
     """`refine_pose` on a problem that is already clean; the idle points matter to derivatives only."""
     initial, finite_initial = usable_pose(T_world_cam)
-    optimum, solver = solve_pose(initial, problem, loss, max_steps)
+    optimum, solver = solve_pose(initial, problem, loss, max_steps, tolerance)
     optimum = SE3(optimum.wxyz_xyz + tangent_basis(optimum) @ _optimum_shift(optimum, problem, idle, loss))
     status = jnp.select(
         [
@@ -160,17 +168,20 @@ def refine_problem(
     return _report(pose, problem, idle, loss, status, solver.num_steps)
 
 
-def solve_pose(initial: SE3, problem: PoseProblem, loss: Loss, max_steps: int) -> tuple[SE3, SolverReport]:
+def solve_pose(
+    initial: SE3, problem: PoseProblem, loss: Loss, max_steps: int, tolerance: float | None = None
+) -> tuple[SE3, SolverReport]:
     """The optimum from a finite initial pose; constant for differentiation."""
     initial, problem = lax.stop_gradient((initial, problem))
     epsilon = float(jnp.finfo(problem.xy.dtype).eps)
+    atol = 3.0 * epsilon**0.5 if tolerance is None else tolerance
 
     def cost(T_world_cam: SE3, problem: PoseProblem) -> tuple[Scalar, NormalEquations]:
         return pose_cost(T_world_cam, problem, loss)[:2]
 
     solution = optx.minimise(
         cost,
-        ManifoldLevenbergMarquardt(retract=retract, atol=3.0 * epsilon**0.5, rtol=8.0 * epsilon),
+        ManifoldLevenbergMarquardt(retract=retract, atol=atol, rtol=8.0 * epsilon),
         initial,
         problem,
         has_aux=True,

@@ -458,6 +458,19 @@ class TestDegenerate:
         before, after = pose_error(scene.initial, scene.pose), pose_error(result.T_world_cam.wxyz_xyz, scene.pose)
         assert after < before
 
+    @pytest.mark.parametrize("tolerance", [0.1, 0.01])
+    def test_tolerance_ends_early_within_as_many_deviations(self, tolerance):
+        scene = make_scene(23, N)
+        X_world, uv, _, _ = scene.arrays()
+        precise, rough = (
+            quick_compile(partial(refine_pose, tolerance=each))(pose_of(scene.initial), X_world, uv, camera())
+            for each in (None, tolerance)
+        )
+        assert precise.status == rough.status == PoseStatus.OK
+        assert int(rough.num_steps) < int(precise.num_steps)
+        error = _tangent(np.asarray(rough.T_world_cam.wxyz_xyz), np.asarray(precise.T_world_cam.wxyz_xyz))
+        assert np.sqrt(error @ np.linalg.solve(np.asarray(precise.covariance), error)) < 2 * tolerance
+
 
 any_seed = given(seed=st.integers(0, 2**32 - 1))
 few_examples = settings(max_examples=6, deadline=None, derandomize=True)
