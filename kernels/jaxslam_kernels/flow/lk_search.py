@@ -78,7 +78,7 @@ class FlowPlan(NamedTuple):
     chunk: int = 32
     along_rows: bool = False
     first_level: int | None = None
-    near_px: float = 4.0
+    near_px: float = 8.0
 
     def level(self, level: int, num_levels: int) -> LevelPlan:
         """The plan of a level, 0 the finest."""
@@ -342,18 +342,21 @@ def search(
     guess: Pixels,
     usable: Mask,
     min_texture: Scalar,
+    near: Flag,
     *,
     plan: FlowPlan,
     settle: Callable[..., Search] = _settle,
 ) -> Solution:
     """Search all points; not differentiable, `lk_flow` is. `settle` finds them on one level, from where it begins.
 
+    Guesses that are not `near` are not searched from the plan's first level.
+
     Under `vmap` the batch is worked off one after the other: chunks fill the vector units already, a batch would only
     wait for its slowest member, and chunks without points would no longer be left out.
     """
 
     @jax.custom_batching.sequential_vmap
-    def search_all(previous, current, points, guess, usable, min_texture):
+    def search_all(previous, current, points, guess, usable, min_texture, near):
         fixed = {"previous": previous, "current": current, "plan": plan, "min_texture": min_texture, "settle": settle}
         chunk = partial(_search_chunk, **fixed)
         if plan.first_level is None or plan.first_level >= len(previous.levels) - 1:
@@ -366,8 +369,8 @@ def search(
             return found, wanted & ~_is_sure(found, guess, wanted, plan), number + 1
 
         nothing = jnp.zeros_like(points[0])
-        begin = Solution(jnp.zeros_like(points), nothing, nothing, nothing), usable, jnp.zeros((), jnp.int32)
+        begin = Solution(jnp.zeros_like(points), nothing, nothing, nothing), usable, (~near).astype(jnp.int32)
         # A loop, so that the search is compiled once.
         return lax.while_loop(lambda carry: (carry[2] < 2) & carry[1].any(), attempt, begin)[0]
 
-    return search_all(previous, current, points, guess, usable, min_texture)
+    return search_all(previous, current, points, guess, usable, min_texture, near)

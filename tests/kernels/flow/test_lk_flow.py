@@ -129,6 +129,12 @@ class TestMatchesReference:
             right = [np.mean(distances(flow.points, truth)[visible] < 1) for flow in (expected, found)]
             assert right[1] > right[0] - 0.01
 
+    def test_guesses_that_are_not_near_are_searched_from_the_coarsest_level(self):
+        inputs, _ = image_pair()
+        search = partial(lk_flow, plan=FlowPlan(first_level=0), near=False)
+        found = quick_compile(flow_of(search, 2))(inputs)
+        np.testing.assert_allclose(found.points, track(inputs).points, atol=1e-4)
+
     def test_no_first_level_above_the_coarsest(self):
         """The search begins at the coarsest level then, as without one."""
         inputs, _ = image_pair()
