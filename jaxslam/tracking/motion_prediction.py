@@ -70,23 +70,5 @@ def predict_pose(T_world_cam: SE3, twist: Float[Array, "6"], statistics: Velocit
     return retract(T_world_cam, twist * jnp.repeat(lasting_s, 3, total_repeat_length=6))
 
 
-def prediction_error(statistics: VelocityStatistics, elapsed_s: Scalar) -> Float[Array, "2"]:
-    """Return the standard deviations of the predicted translation and rotation, meters and radians.
-
-    A velocity that changes by `dv` from one frame to the next displaces the camera by `dv t` from where it was
-    predicted, with `dv^2 = r t` for changes that add up at random.
-
-    Args:
-        statistics: Statistics of the velocity.
-        elapsed_s: Time since the last pose, seconds.
-
-    Returns:
-        `(2,)`; infinite as long as no velocity is known.
-    """
-    rate = (1 - _FORGET) * statistics.changes  # the mean, once the sum holds about ten frames
-    squared = lax.stop_gradient(rate * jnp.maximum(elapsed_s, 0) ** 3)
-    return jnp.where(statistics.squares > 0, jnp.sqrt(squared), jnp.inf)
-
-
 def _squares(twist: Float[Array, "6"]) -> Float[Array, "2"]:
     return jnp.sum(jnp.square(twist.reshape(2, 3)), axis=1)

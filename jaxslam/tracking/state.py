@@ -156,7 +156,7 @@ class TrackPlan(NamedTuple):
     num_hypotheses: int = _SETTINGS.num_hypotheses
     cell_px: int = _SETTINGS.cell_px
     new_points: Literal["always", "keyframes"] = _SETTINGS.new_points
-    flow: FlowPlan = FlowPlan(first_level=1)
+    flow: FlowPlan = FlowPlan()
     look_up: LevelPlan = LevelPlan(15, 8, 0.05)
     cues: tuple[Cue, ...] = ()
     regions: RegionPlan | None = None

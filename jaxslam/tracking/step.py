@@ -37,7 +37,7 @@ from jaxslam.tracking.conclusion import FrameEstimate, conclude
 from jaxslam.tracking.dynamic_rejection import FramePoints, reject_dynamic_points
 from jaxslam.tracking.initial_state import DEFAULT_PLAN, state_shapes
 from jaxslam.tracking.keyframe_ring import align_keyframe_points
-from jaxslam.tracking.motion_prediction import predict_pose, prediction_error
+from jaxslam.tracking.motion_prediction import predict_pose
 from jaxslam.tracking.outcome import judge_frame
 from jaxslam.tracking.point_update import probation_weights, update_points
 from jaxslam.tracking.pose_estimation import coarse_pose, fits, measure_matches, refined_pose, worse_status
@@ -153,24 +153,9 @@ def follow_points(
     guess = points.uv + lax.stop_gradient(after - before)
     inside = jnp.all((guess > 0) & (guess < jnp.array([[width - 1], [height - 1]], guess.dtype)), axis=0)
     guess = jnp.where(inside[None, :], guess, points.uv)
-    # From the coarsest level for a pair: on a road, points with little texture stay where the search begins, near the
-    # prediction. KITTI 06 has 0.043 m then, not 0.028 (medians of ten seeds), though more points are found.
-    flow_plan = plan.flow if frame.right is None else plan.flow._replace(first_level=None)
-    near = is_known | (_error_px(state, frame.dt_s, params) < flow_plan.near_px)
-    flow = lk_flow(state.pyramid, pyramid, points.uv, guess, points.valid, plan=flow_plan, near=near)
+    flow = lk_flow(state.pyramid, pyramid, points.uv, guess, points.valid, plan=plan.flow)
     gone = is_known & ~inside
     return FlowResult(pyramid, predicted, flow.points, flow.ok & (points.weight > 0) & ~gone, prior)
-
-
-def _error_px(state: TrackState, dt_s: Scalar, params: TrackParams) -> Scalar:
-    """Return the standard deviation of where the velocity predicts points in the image, in pixels."""
-    translation, rotation = prediction_error(state.velocity, state.elapsed_s + dt_s)
-    depth = to_camera(state.T_world_cam, state.points.X_world)[2]
-    known = state.points.has_position() & (depth > 0)
-    inverse = jnp.sum(jnp.where(known, 1 / jnp.where(known, depth, 1), 0)) / jnp.maximum(
-        jnp.sum(known, dtype=depth.dtype), 1
-    )
-    return lax.stop_gradient(params.sensor.intrinsics.fx * (rotation + translation * inverse))
 
 
 def track_followed(

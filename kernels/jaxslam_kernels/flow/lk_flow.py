@@ -14,7 +14,7 @@ from jaxslam_kernels.flow.lk_search import FlowPlan, LevelPlan, difference, look
 from jaxslam_kernels.image.patches import Window
 from jaxslam_kernels.image.pyramid import Pyramid
 from jaxslam_kernels.implicit_positions import ConvergedPositions, implicit_positions
-from jaxslam_kernels.types import Flag, Mask, Pixels, Scalar
+from jaxslam_kernels.types import Mask, Pixels, Scalar
 
 __all__ = ["Flow", "FlowPlan", "FlowStatus", "LevelPlan", "lk_flow", "lk_flow_forward_backward"]
 
@@ -69,7 +69,6 @@ def lk_flow(
     *,
     plan: FlowPlan = DEFAULT_PLAN,
     min_texture: Scalar | float = 1.0,
-    near: Flag | bool = True,
 ) -> Flow:
     """Track points from one image to the next.
 
@@ -89,8 +88,6 @@ def lk_flow(
         plan: Windows and iterations, static.
         min_texture: Smallest accepted eigenvalue of the mean gradient matrix, in squared intensity a squared pixel;
             positive.
-        near: Whether guesses are good enough to begin the search at `FlowPlan.first_level`. If most are not, that costs
-            half as much again.
 
     Returns:
         Positions with a status for each; a point that was not tracked is where its search ended, or at its guess if
@@ -106,7 +103,7 @@ def lk_flow(
     usable = finite & wanted & _inside(points, previous)
     held, start = (jnp.where(usable[None, :], pixels, 0) for pixels in (points, guess))
     threshold = jnp.asarray(min_texture, points.dtype)
-    inputs = _Inputs(previous, current, held, start, usable, threshold, jnp.asarray(near))
+    inputs = _Inputs(previous, current, held, start, usable, threshold)
     found = implicit_positions(partial(_solve, plan=plan), partial(_explain, plan=plan), inputs)
     end = found.measures
     reasons = (
@@ -162,7 +159,6 @@ class _Inputs(NamedTuple):
     guess: Pixels
     usable: Mask
     min_texture: Scalar
-    near: Flag
 
 
 class _End(NamedTuple):

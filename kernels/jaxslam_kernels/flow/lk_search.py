@@ -18,10 +18,7 @@ from jaxslam_kernels.image import patches
 from jaxslam_kernels.image.patches import Window
 from jaxslam_kernels.image.pyramid import Pyramid
 from jaxslam_kernels.program_parts import apart
-from jaxslam_kernels.types import Flag, Mask, Pixels, Scalar
-
-_ALIKE = 2.0
-"""Times the mean residual of the points found near their guess up to which one of them is taken for the right one."""
+from jaxslam_kernels.types import Mask, Pixels, Scalar
 
 
 class LevelPlan(NamedTuple):
@@ -66,10 +63,6 @@ class FlowPlan(NamedTuple):
             page faults alone.
         along_rows: Whether points only move along their row, as from left to right in a rectified pair. What the two
             images differ by in brightness over a window does not count then: two cameras expose apart.
-        first_level: Level at which the search begins, where guesses are good; the points it does not find within
-            `near_px` of their guess, or that look less alike than others, are searched from the coarsest level. `None`
-            to search all from there.
-        near_px: Distance from its guess up to which a point that was found from `first_level` counts as found, pixels.
     """
 
     coarsest: LevelPlan = LevelPlan(21, 12, 0.2)
@@ -77,8 +70,6 @@ class FlowPlan(NamedTuple):
     finest: LevelPlan = LevelPlan(21, 6, 0.03)
     chunk: int = 32
     along_rows: bool = False
-    first_level: int | None = None
-    near_px: float = 8.0
 
     def level(self, level: int, num_levels: int) -> LevelPlan:
         """The plan of a level, 0 the finest."""
@@ -256,9 +247,8 @@ def _search_chunk(
     plan: FlowPlan,
     min_texture: Scalar,
     settle: Callable[..., Search],
-    from_coarsest: Flag | bool = True,
 ) -> Solution:
-    """Search one chunk of finite points, from the coarsest level to the finest, or from the plan's first level."""
+    """Search one chunk of finite points, from the coarsest level to the finest."""
     num_levels, border = len(previous.levels), previous.border
 
     def search_level(level: int, flow: Pixels) -> tuple[Search, Template, Pixels]:
@@ -276,11 +266,7 @@ def _search_chunk(
 
     flow = (guess - points) / 2**num_levels
     for level in range(num_levels - 1, 0, -1):
-        refined = lambda flow, level=level: search_level(level, 2 * flow)[2]
-        if plan.first_level is None or level <= plan.first_level:
-            flow = refined(flow)
-        else:
-            flow = lax.cond(from_coarsest, refined, lambda flow: 2 * flow, flow)
+        flow = search_level(level, 2 * flow)[2]
     search, template, _ = search_level(0, 2 * flow)
     window = Window(plan.finest.window)
     sight = apart(lambda: look(search.position, current.levels[0], border, window))
@@ -317,18 +303,6 @@ def in_chunks(function: Callable[..., Any], arrays: tuple[Array, ...], wanted: M
     return jax.tree.map(join, lax.map(one, tuple(map(split, (*arrays, wanted)))))
 
 
-def _is_sure(found: Solution, guess: Pixels, wanted: Mask, plan: FlowPlan) -> Mask:
-    """Tell which points were found near their guess and look about as alike as the others; false for NaN.
-
-    Without the latter, one in two thousand points of a rendered room is taken for another one like it.
-    """
-    moved = jnp.sum(jnp.square(found.position - guess), axis=0)
-    near = (found.last_step < plan.finest.accepted**2) & (moved < plan.near_px**2)
-    counted = near & wanted
-    mean = jnp.sum(jnp.where(counted, found.residual, 0)) / jnp.maximum(jnp.sum(counted, dtype=moved.dtype), 1)
-    return near & (found.residual <= _ALIKE * mean)
-
-
 def _settle(
     search: Search, template: Template, level: Float[Array, "h w"], border: int, plan: LevelPlan, **_: Any
 ) -> Search:
@@ -342,35 +316,20 @@ def search(
     guess: Pixels,
     usable: Mask,
     min_texture: Scalar,
-    near: Flag,
     *,
     plan: FlowPlan,
     settle: Callable[..., Search] = _settle,
 ) -> Solution:
     """Search all points; not differentiable, `lk_flow` is. `settle` finds them on one level, from where it begins.
 
-    Guesses that are not `near` are not searched from the plan's first level.
-
     Under `vmap` the batch is worked off one after the other: chunks fill the vector units already, a batch would only
     wait for its slowest member, and chunks without points would no longer be left out.
     """
 
     @jax.custom_batching.sequential_vmap
-    def search_all(previous, current, points, guess, usable, min_texture, near):
+    def search_all(previous, current, points, guess, usable, min_texture):
         fixed = {"previous": previous, "current": current, "plan": plan, "min_texture": min_texture, "settle": settle}
         chunk = partial(_search_chunk, **fixed)
-        if plan.first_level is None or plan.first_level >= len(previous.levels) - 1:
-            return in_chunks(chunk, (points, guess, usable), usable, plan.chunk)
+        return in_chunks(chunk, (points, guess, usable), usable, plan.chunk)
 
-        def attempt(carry: tuple[Solution, Mask, Array]) -> tuple[Solution, Mask, Array]:
-            before, wanted, number = carry
-            found = in_chunks(partial(chunk, from_coarsest=number > 0), (points, guess, wanted), wanted, plan.chunk)
-            found = jax.tree.map(lambda new, old: jnp.where(wanted, new, old), found, before)
-            return found, wanted & ~_is_sure(found, guess, wanted, plan), number + 1
-
-        nothing = jnp.zeros_like(points[0])
-        begin = Solution(jnp.zeros_like(points), nothing, nothing, nothing), usable, (~near).astype(jnp.int32)
-        # A loop, so that the search is compiled once.
-        return lax.while_loop(lambda carry: (carry[2] < 2) & carry[1].any(), attempt, begin)[0]
-
-    return search_all(previous, current, points, guess, usable, min_texture, near)
+    return search_all(previous, current, points, guess, usable, min_texture)

@@ -8,7 +8,7 @@ from jax import lax
 from jaxlie import SE3
 from jaxslam_kernels.se3 import displacement
 
-from jaxslam.tracking.motion_prediction import VelocityStatistics, predict_pose, prediction_error, updated_statistics
+from jaxslam.tracking.motion_prediction import VelocityStatistics, predict_pose, updated_statistics
 
 DT_S = 0.05
 NONE = VelocityStatistics(jnp.zeros(2), jnp.zeros(2))
@@ -85,17 +85,3 @@ def test_a_camera_at_rest_stays_and_has_a_derivative() -> None:
     assert value == 0
     np.testing.assert_allclose(gradient[:3], 0.1, rtol=1e-5)
     assert np.isfinite(gradient).all()
-
-
-def test_error_of_predictions_is_that_of_a_shaken_camera() -> None:
-    """Of the displacement in the next frame, translation and rotation."""
-    twists = shaken()
-    off = np.diff(twists, axis=0).reshape(-1, 2, 3) * DT_S
-    expected = np.sqrt(np.sum(np.square(off), axis=2).mean(axis=0))
-    errors = [prediction_error(after(twists[k : k + 100]), jnp.float32(DT_S)) for k in range(0, 300, 10)]
-    np.testing.assert_allclose(np.mean(errors, axis=0), expected, rtol=0.15)
-
-
-def test_error_of_predictions_without_a_velocity_is_infinite() -> None:
-    assert np.isinf(prediction_error(NONE, jnp.float32(DT_S))).all()
-    assert np.isfinite(prediction_error(after(steady()), jnp.float32(DT_S))).all()

@@ -1,7 +1,5 @@
 """Optical flow against OpenCV's and against known warps, in batches, and its failures."""
 
-from functools import partial
-
 import cv2
 import jax
 import jax.numpy as jnp
@@ -24,7 +22,7 @@ from flow_cases import (
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from jaxslam_kernels.flow.lk_flow import Flow, FlowPlan, FlowStatus, lk_flow, lk_flow_forward_backward
+from jaxslam_kernels.flow.lk_flow import Flow, FlowStatus, lk_flow, lk_flow_forward_backward
 from jaxslam_kernels.image.pyramid import build_pyramid
 from quick_compile import quick_compile
 
@@ -104,42 +102,6 @@ class TestMatchesReference:
         guided = distances(track(inputs).points, truth)[visible] < 1
         assert guided.mean() > 0.9
         assert alone.mean() < 0.5
-
-    @pytest.mark.parametrize("first_level", [0, 1, 2])
-    def test_search_that_begins_near_the_guess(self, first_level):
-        """Whether guesses are good for all, for some or for none, what is found is what the whole search finds."""
-        image = picture(320, 240)
-        points = corners(image, 300, distance=5)
-        whole, near = (
-            quick_compile(flow_of(partial(lk_flow, plan=FlowPlan(first_level=level)), 4))
-            for level in (None, first_level)
-        )
-        known = warp(image, 16, seed=2)
-        visible, truth = known.visible(points), known.move(points)
-        previous, current = known.previous.astype(np.float32), known.current.astype(np.float32)
-        for share in (1.0, 0.7, 0.0):
-            good = np.random.default_rng(3).random(points.shape[1]) < share
-            guess = np.where(good, truth + 1.0, points).astype(np.float32)
-            inputs = Inputs(previous, current, points, guess, visible, np.float32(1))
-            expected, found = whole(inputs), near(inputs)
-            assert all_finite(found)
-            both = np.asarray(expected.ok & found.ok)
-            assert both.sum() > 0.97 * np.asarray(expected.ok).sum()
-            assert np.mean(distances(found.points, expected.points)[both] < 0.1) > 0.97
-            right = [np.mean(distances(flow.points, truth)[visible] < 1) for flow in (expected, found)]
-            assert right[1] > right[0] - 0.01
-
-    def test_guesses_that_are_not_near_are_searched_from_the_coarsest_level(self):
-        inputs, _ = image_pair()
-        search = partial(lk_flow, plan=FlowPlan(first_level=0), near=False)
-        found = quick_compile(flow_of(search, 2))(inputs)
-        np.testing.assert_allclose(found.points, track(inputs).points, atol=1e-4)
-
-    def test_no_first_level_above_the_coarsest(self):
-        """The search begins at the coarsest level then, as without one."""
-        inputs, _ = image_pair()
-        found = quick_compile(flow_of(partial(lk_flow, plan=FlowPlan(first_level=5)), 2))(inputs)
-        np.testing.assert_allclose(found.points, track(inputs).points, atol=1e-4)
 
     def test_forward_backward_keeps_what_is_right(self):
         inputs, known = image_pair()
