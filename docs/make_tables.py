@@ -1,23 +1,25 @@
-"""Rewrite the tables of README.md and docs/measured-results.md from stored results.
+"""Rewrite the tables of README.md, docs/measured-results.md and docs/performance.md from stored results.
 
-Run `python docs/make_tables.py` after a file in `configs/benchmarks/baselines` or `configs/benchmarks/published` has
-changed.
+Run `python docs/make_tables.py` after a file in `configs/benchmarks/baselines`, `configs/benchmarks/published` or
+`docs/performance` has changed.
 A table stands between the comments `<!-- NAME: begin ... -->` and `<!-- NAME: end -->`; nothing else is touched.
 """
 
+import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from jaxslam.benchmark.reports.document import Table, to_markdown
+from jaxslam.benchmark.reports.live import markdown_report
 from jaxslam.benchmark.suites.accuracy_ruler import AccuracyBaseline, load_accuracy_baseline
 from jaxslam.benchmark.suites.published import Figure, published_for
 from jaxslam.config.loading import configs_dir
 from jaxslam.datasets.synthetic import SyntheticConfig
 
 DOCS = Path(__file__).resolve().parent
-PAGES = (DOCS.parent / "README.md", DOCS / "measured-results.md")
+PAGES = (DOCS.parent / "README.md", DOCS / "measured-results.md", DOCS / "performance.md")
 _SYSTEMS_IN_README = ("DROID-W", "DynaSLAM", "Occlusion SLAM", "RTS-SLAM", "NGD-SLAM", "ORB-SLAM2")
 
 
@@ -29,6 +31,7 @@ def tables() -> dict[str, str]:
         "accuracy": "\n".join(map(accuracy_table, baselines)),
         "published": "\n".join(published_tables(baselines)),
         "results": results_table(baselines[0]),
+        "live": "\n".join(live_report(file) for file in sorted((DOCS / "performance").glob("*.json"))),
     }
 
 
@@ -56,6 +59,11 @@ def accuracy_table(baseline: AccuracyBaseline) -> str:
     columns = ("name", "recording", "frames", "seeds", "tracked", "ATE, median", "ATE, range")
     measured = f"Commit {baseline.commit}, preset `{baseline.preset}`, on {baseline.machine};\n{baseline.versions}:\n"
     return f"{measured}\n{table(columns, rows)}"
+
+
+def live_report(file: Path) -> str:
+    """Make the section of one live measurement."""
+    return f"#{markdown_report(json.loads(file.read_text(encoding='utf-8')))}"
 
 
 def published_tables(baselines: list[AccuracyBaseline]) -> list[str]:
