@@ -227,8 +227,8 @@ def check_plan(plan: TrackPlan) -> None:
     """Check that the parts of a plan are consistent.
 
     Raises:
-        ValueError: If a number is too small, a side of cells is odd or one of a window even, a word is unknown, more
-            keyframes are looked into than there are, or even votes lack regions.
+        ValueError: If a number is too small, a tolerance is not positive, a side of cells is odd or one of a window
+            even, a word is unknown, more keyframes are looked into than there are, or even votes lack regions.
     """
     for name, least in _MIN.items():
         if getattr(plan, name) < least:

@@ -6,16 +6,18 @@
 import argparse
 import gc
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from jaxslam.benchmark.live.figures import LiveFigures
 from jaxslam.config.loading import load_config
-from jaxslam.datasets import Dataset, Subset, open_dataset
+from jaxslam.datasets import Dataset, Subset, imu_samples, imu_sheet, open_dataset
 from jaxslam.errors import TrajectoryError
 from jaxslam.runtime.compile_cache import enable_compile_cache
+from jaxslam.sensors.frame import Frame
 from jaxslam.slam.slam import Slam
 from jaxslam.tracking.state import TrackStatus
 from jaxslam.trajectory.evaluation import evaluate
@@ -34,9 +36,9 @@ def live_run(dataset: Dataset, rate_hz: float, preset: str, settings: Sequence[s
         settings: Settings as `key=value`.
     """
     config = load_config(preset, None, ("run.deterministic=false", *settings))
-    frames = [dataset[index] for index in range(len(dataset))]
+    frames = list(_frames(dataset))
     took_s, late, tracked = [], 0, 0
-    with Slam(dataset.camera, config) as slam:
+    with Slam(dataset.camera, config, imu=imu_sheet(dataset)) as slam:
         slam.warm_up()
         gc.collect()
         gc.freeze()
@@ -67,6 +69,17 @@ def live_run(dataset: Dataset, rate_hz: float, preset: str, settings: Sequence[s
         late=late,
         ate_m=ate_m,
     )
+
+
+def _frames(dataset: Dataset) -> Iterator[Frame]:
+    """Read all frames, each with the samples of the IMU since the one before."""
+    samples, last_ns = imu_samples(dataset), None
+    for index in range(len(dataset)):
+        frame = dataset[index]
+        if samples is not None and last_ns is not None:
+            frame = replace(frame, imu=samples.between(last_ns, frame.timestamp_ns))
+        last_ns = frame.timestamp_ns
+        yield frame
 
 
 def main() -> None:

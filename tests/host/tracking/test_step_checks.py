@@ -243,6 +243,7 @@ class TestPlan:
             ({"num_sources": 8}, "num_sources: expected at most num_keyframes + num_reloaded, 7, got 8"),
             ({"new_points": "sometimes"}, "new_points: expected one of ('always', 'keyframes'), got 'sometimes'"),
             ({"balance_regions": True}, "regions: expected a RegionPlan for balance_regions, got None"),
+            ({"pose_tolerance": 0.0}, "pose_tolerance: expected more than 0, or None, got 0.0"),
             ({"look_up": LevelPlan(14, 8, 0.05)}, "look_up.window: expected an odd number, got 14"),
             ({"flow": FlowPlan(middle=LevelPlan(10, 5, 0.2))}, "flow.middle.window: expected an odd number, got 10"),
             ({"motion": MotionPlan(dense_cell_px=13)}, "motion.dense_cell_px: expected an even number"),
