@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxslam.benchmark.reports.document import Table, to_markdown
-from jaxslam.benchmark.reports.live import markdown_report
+from jaxslam.benchmark.reports.live import MEANING, section
 from jaxslam.benchmark.suites.accuracy_ruler import AccuracyBaseline, load_accuracy_baseline
 from jaxslam.benchmark.suites.published import Figure, published_for
 from jaxslam.config.loading import configs_dir
@@ -31,7 +31,7 @@ def tables() -> dict[str, str]:
         "accuracy": "\n".join(map(accuracy_table, baselines)),
         "published": "\n".join(published_tables(baselines)),
         "results": results_table(baselines[0]),
-        "live": "\n".join(live_report(file) for file in sorted((DOCS / "performance").glob("*.json"))),
+        "live": live_report(),
     }
 
 
@@ -61,9 +61,10 @@ def accuracy_table(baseline: AccuracyBaseline) -> str:
     return f"{measured}\n{table(columns, rows)}"
 
 
-def live_report(file: Path) -> str:
-    """Make the section of one live measurement."""
-    return f"#{markdown_report(json.loads(file.read_text(encoding='utf-8')))}"
+def live_report() -> str:
+    """Make a section of each live measurement, and say what the figures mean."""
+    files = sorted((DOCS / "performance").glob("*.json"))
+    return "\n".join([*(section(json.loads(file.read_text(encoding="utf-8"))) for file in files), MEANING])
 
 
 def published_tables(baselines: list[AccuracyBaseline]) -> list[str]:

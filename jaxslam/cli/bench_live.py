@@ -55,7 +55,7 @@ class Live(WithJson):
         if self.rate is not None and not 0 < self.rate < float("inf"):
             raise BenchmarkError(f"--rate: expected frames a second, more than 0, got {self.rate:g}")
         from jaxslam.benchmark.live.program import ours, parse_program  # noqa: PLC0415
-        from jaxslam.benchmark.reports.live import how, markdown_report, picture  # noqa: PLC0415
+        from jaxslam.benchmark.reports.live import MEANING, conditions, markdown_report, picture  # noqa: PLC0415
         from jaxslam.cli.measurement_files import write_measurements  # noqa: PLC0415
         from jaxslam.config.loading import load_config  # noqa: PLC0415
         from jaxslam.datasets import Subset, open_dataset  # noqa: PLC0415
@@ -88,7 +88,7 @@ class Live(WithJson):
             print_json(content)
         else:
             _print_tables(runs)
-            plain_console.print(how(content))
+            plain_console.print(f"{conditions(content)} {MEANING}")
         write_measurements(self.out, "live", content, markdown_report(content), picture(content))
 
     def _measured(self, programs: "Sequence[Program]") -> list[dict[str, Any]]:

@@ -64,24 +64,35 @@ def _row(program: str, runs: Runs) -> list[str]:
     ]
 
 
+MEANING = (
+    "All programs run in turn, each in a process of its own, with nothing else running. Images are loaded before the"
+    " clock starts; each frame is given when it is due, or as soon as the one before is done. Median, 95th percentile"
+    " and maximum of the wall time of a frame; processor time of the whole process for a frame, mapping beside"
+    " included; frames that were due before the one before was done; fewest frames tracked in a round; peak memory with"
+    " the loaded images. The table has medians over rounds, with the range; a ratio is the median of the ratios of the"
+    " rounds."
+)
+"""What the figures of the tables are."""
+
+
 def markdown_report(content: Mapping[str, Any]) -> str:
     """Return the content of `live.json` as tables, and how it was measured."""
+    return f"{section(content)}\n{to_markdown([Paragraph(MEANING)])}"
+
+
+def section(content: Mapping[str, Any]) -> str:
+    """Return the tables of `live.json` under a heading, and where they were measured, without what they mean."""
     title = f"Live: {content['recording']}, {content['rate_hz']:g} Hz"
     ratios = ratio_rows(content["runs"])
     tables = [Table([COLUMNS, *rows(content["runs"])]), *([Table([RATIO_COLUMNS, *ratios])] if ratios else [])]
-    return to_markdown([Heading(title, 1), *tables, Paragraph(how(content))])
+    return to_markdown([Heading(title), *tables, Paragraph(conditions(content))])
 
 
-def how(content: Mapping[str, Any]) -> str:
-    """Say what the figures mean, and where they were measured."""
+def conditions(content: Mapping[str, Any]) -> str:
+    """Say with which settings and on which machine the figures were measured."""
     settings = "".join(f", {setting}" for setting in content["settings"])
     return (
-        f"Preset {content['preset']}{settings}; {content['rounds']} rounds of all programs in turn, each in a process"
-        " of its own, nothing else running. Images are loaded before the clock starts; each frame is given when it is"
-        " due, or as soon as the one before is done. Median, 95th percentile and maximum of the wall time of a frame;"
-        " processor time of the whole process for a frame, mapping beside included; frames that were due before the one"
-        " before was done; fewest frames tracked in a round; peak memory with the loaded images. The table has medians"
-        " over rounds, with the range; a ratio is the median of the ratios of the rounds."
+        f"Preset {content['preset']}{settings}; {content['rounds']} rounds."
         f" Processor: {content['cpu']} ({content['vectors']}), {content['cores']} cores."
         f" jaxslam: {content['commit'] or content['versions']['jaxslam']}."
     )

@@ -100,7 +100,7 @@ class TestReport:
     def test_pages(self, tmp_path: Path) -> None:
         content = self.content()
         report = markdown_report(content)
-        assert "# Live: fr1, 30 Hz" in report
+        assert "## Live: fr1, 30 Hz" in report
         assert content["cpu"] in report
         (tmp_path / "live.png").write_bytes(picture(content))
         assert np.ptp(imread(tmp_path / "live.png")) > 0
