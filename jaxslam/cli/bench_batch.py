@@ -8,7 +8,7 @@ from typing import Any
 from rich.table import Table
 
 from jaxslam.cli.console import console, make_table, plain_console, print_json, progress_bar
-from jaxslam.cli.shared_options import WithJson, image_size
+from jaxslam.cli.shared_options import WithJson, check_at_least, image_size
 from jaxslam.errors import BenchmarkError
 from jaxslam.io.atomic_files import make_folder
 
@@ -73,8 +73,7 @@ class Batch(WithJson):
             raise BenchmarkError(
                 f"--frames: expected at least {_MIN_FRAMES}, to align them with the ground truth, got {self.frames}"
             )
-        if self.rounds < 1:
-            raise BenchmarkError(f"--rounds: expected at least 1, got {self.rounds}")
+        check_at_least("--rounds", self.rounds, 1)
         return image_size(self.size)
 
     def _measured(self, counts: Sequence[int], different: int, width: int, height: int) -> list[dict[str, Any]]:

@@ -9,7 +9,7 @@ import tyro
 from rich.table import Table
 
 from jaxslam.cli.console import console, make_table, plain_console, print_json, progress_bar
-from jaxslam.cli.shared_options import WithJson
+from jaxslam.cli.shared_options import WithJson, check_at_least
 from jaxslam.errors import BenchmarkError
 from jaxslam.io.atomic_files import make_folder
 
@@ -36,8 +36,8 @@ class Kernels(WithJson):
 
     def main(self) -> None:
         """Run the command."""
-        if self.rounds is not None and self.rounds < 1:
-            raise BenchmarkError(f"--rounds: expected at least 1, got {self.rounds}")
+        if self.rounds is not None:
+            check_at_least("--rounds", self.rounds, 1)
         from jaxslam.benchmark.kernels.registry import chosen  # noqa: PLC0415
         from jaxslam.benchmark.kernels.report import markdown_report, picture  # noqa: PLC0415
         from jaxslam.cli.measurement_files import write_measurements  # noqa: PLC0415

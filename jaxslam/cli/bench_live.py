@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from jaxslam.cli.console import console, make_table, plain_console, print_json, progress_bar
-from jaxslam.cli.shared_options import Settings, WithJson, flat
+from jaxslam.cli.shared_options import Settings, WithJson, check_at_least, flat
 from jaxslam.errors import BenchmarkError
 from jaxslam.io.atomic_files import make_folder
 
@@ -50,8 +50,7 @@ class Live(WithJson):
     def main(self) -> None:
         """Run the command."""
         for name, value, least in (("rounds", self.rounds, 1), ("start", self.start, 0), ("every", self.every, 1)):
-            if value < least:
-                raise BenchmarkError(f"--{name}: expected at least {least}, got {value}")
+            check_at_least(f"--{name}", value, least)
         if self.rate is not None and not 0 < self.rate < float("inf"):
             raise BenchmarkError(f"--rate: expected frames a second, more than 0, got {self.rate:g}")
         from jaxslam.benchmark.live.program import ours, parse_program  # noqa: PLC0415
@@ -68,7 +67,7 @@ class Live(WithJson):
             "recording": str(self.recording),
             "rate": f"{rate_hz:g}",
             "start": str(self.start),
-            "stop": str(self.stop),
+            "stop": str(dataset.indices.stop),
             "every": str(self.every),
         }
         others = [parse_program(text, values) for text in self.others]

@@ -9,7 +9,7 @@ import tyro
 from rich.table import Table
 
 from jaxslam.cli.console import console, make_table, print_json, progress_bar
-from jaxslam.cli.shared_options import Settings, WithJson, flat, image_size
+from jaxslam.cli.shared_options import Settings, WithJson, check_at_least, flat, image_size
 from jaxslam.errors import BenchmarkError
 from jaxslam.io.atomic_files import make_folder
 
@@ -105,8 +105,7 @@ class Soak(WithJson):
             ("people", self.people, 1),
             ("covered-every", self.covered_every, 0),
         ):
-            if value < least:
-                raise BenchmarkError(f"--{name}: expected at least {least}, got {value}")
+            check_at_least(f"--{name}", value, least)
         if not 0 <= self.detector_fails <= 1:
             raise BenchmarkError(f"--detector-fails: expected a share from 0 to 1, got {self.detector_fails:g}")
 

@@ -31,6 +31,12 @@ def flat(settings: Settings) -> tuple[str, ...]:
     return tuple(itertools.chain(*settings))
 
 
+def check_at_least(option: str, value: int, least: int) -> None:
+    """Raise `BenchmarkError` if the value of an option is below the least."""
+    if value < least:
+        raise BenchmarkError(f"{option}: expected at least {least}, got {value}")
+
+
 def image_size(text: str) -> tuple[int, int]:
     """Return the width and height that `--size` gives, pixels.
 

@@ -1,7 +1,7 @@
 """The protocol of a recording, and of the loader of one kind of recording."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -75,6 +75,19 @@ def imu_sheet(dataset: Dataset) -> ImuSheet | None:
 def imu_samples(dataset: Dataset) -> ImuSamples | None:
     """Return all samples of the IMU of a recording, those around the frames too; `None` without one."""
     return getattr(dataset, "imu_samples", None)
+
+
+def with_imu(frame: Frame, samples: ImuSamples | None, since_ns: int | None) -> Frame:
+    """Return a frame with the samples of the IMU since the frame before; as it is where either is missing.
+
+    Args:
+        frame: The frame.
+        samples: All samples of the recording.
+        since_ns: Time of the frame before, nanoseconds.
+    """
+    if samples is None or since_ns is None:
+        return frame
+    return replace(frame, imu=samples.between(since_ns, frame.timestamp_ns))
 
 
 class Fit(IntEnum):

@@ -138,16 +138,18 @@ class Map(NamedTuple):
         Raises:
             KeyError: If the keyframe was never in this map.
         """
-        while not self.has_keyframe(keyframe_id):
-            keyframe_id = int(self.culled.anchor[self._culled_row(keyframe_id)])
-        return keyframe_id
+        return self._anchored(keyframe_id)[0]
 
-    def _culled_row(self, keyframe_id: int) -> int:
-        """Return the row of a keyframe among the culled ones; raises `KeyError` if it is not one of them."""
-        found = np.flatnonzero(self.culled.ids == keyframe_id)
-        if not len(found):
-            raise KeyError(f"keyframe {keyframe_id} was never in this map")
-        return int(found[0])
+    def _anchored(self, keyframe_id: int) -> tuple[int, Pose]:
+        """Return the keyframe still in the map that another one is anchored to, and the other's pose relative to it."""
+        T_anchor_keyframe = IDENTITY
+        while not self.has_keyframe(keyframe_id):
+            found = np.flatnonzero(self.culled.ids == keyframe_id)
+            if not len(found):
+                raise KeyError(f"keyframe {keyframe_id} was never in this map")
+            T_anchor_keyframe = compose(self.culled.T_anchor_keyframe[found[0]], T_anchor_keyframe)
+            keyframe_id = int(self.culled.anchor[found[0]])
+        return keyframe_id, T_anchor_keyframe
 
     def keyframe(self, keyframe_id: int) -> Keyframe:
         """Return a keyframe.
@@ -163,12 +165,8 @@ class Map(NamedTuple):
         Raises:
             KeyError: If the keyframe was never in this map.
         """
-        T_anchor_keyframe = IDENTITY
-        while not self.has_keyframe(keyframe_id):
-            row = self._culled_row(keyframe_id)
-            T_anchor_keyframe = compose(self.culled.T_anchor_keyframe[row], T_anchor_keyframe)
-            keyframe_id = int(self.culled.anchor[row])
-        return compose(self.T_world_cam[self.row(keyframe_id)], T_anchor_keyframe)
+        anchor, T_anchor_keyframe = self._anchored(keyframe_id)
+        return compose(self.T_world_cam[self.row(anchor)], T_anchor_keyframe)
 
     def with_arrays(self, points: MapPoints | None = None, observations: Observations | None = None) -> "Map":
         """Return the map with other points, other observations, or both, instead of all that it has."""

@@ -1,16 +1,15 @@
 """Run a tracker over a whole recording."""
 
-import gc
 import logging
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from jaxslam.config.schema import RunConfig
 from jaxslam.datasets import Dataset, imu_samples, prefetch
+from jaxslam.datasets.protocol import with_imu
 from jaxslam.datasets.realtime import in_real_time
 from jaxslam.errors import DatasetError, FrameError, JaxSlamError
+from jaxslam.runtime.garbage import garbage_frozen
 from jaxslam.sensors.frame import Frame
 from jaxslam.slam.argument_checks import check_recording
 from jaxslam.slam.frame_records import FrameRecords
@@ -45,11 +44,11 @@ def run_recording(
     check_recording(dataset, slam.camera)
     slam.warm_up()
     records, samples, last_ns = FrameRecords(), imu_samples(dataset), None
-    with _frozen_garbage():
+    with garbage_frozen():
         for timestamp_ns, frame in zip(dataset.timestamps_ns, _frames_of(dataset, slam.config.run), strict=True):
-            if isinstance(frame, Frame) and samples is not None and last_ns is not None:
+            if isinstance(frame, Frame):
                 # With those of frames between that could not be read, or came too late.
-                frame = replace(frame, imu=samples.between(last_ns, frame.timestamp_ns))  # noqa: PLW2901
+                frame = with_imu(frame, samples, last_ns)  # noqa: PLW2901
             result = _tracked_or_rejected(slam, int(timestamp_ns), frame)
             last_ns = last_ns if isinstance(result, Rejected) else result.timestamp_ns
             records.append(FrameRecord.of(result))
@@ -96,14 +95,3 @@ class _ErrorsAsValues:
         if not isinstance(frame, Frame):
             return DatasetError(f"frame {index}: expected a jaxslam.Frame, got {type(frame).__name__}")
         return frame
-
-
-@contextmanager
-def _frozen_garbage() -> Iterator[None]:
-    """Keep the garbage collector away from older objects: scanning all of them takes 0.3 s of a frame."""
-    gc.collect()
-    gc.freeze()
-    try:
-        yield
-    finally:
-        gc.unfreeze()

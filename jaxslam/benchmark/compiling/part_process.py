@@ -25,6 +25,7 @@ from jaxslam.benchmark.compiling.hlo_text import (
 from jaxslam.benchmark.compiling.parts import PARTS, Scene
 from jaxslam.benchmark.compiling.recorder import CompiledProgram, recorded
 from jaxslam.benchmark.compiling.self_times import NUM_TRACED, NUM_WARM, Spent, room_through_lens, trace_tracker
+from jaxslam.benchmark.process_ending import how_it_ended, last_words
 from jaxslam.config.loading import load_config
 from jaxslam.datasets import Dataset, open_dataset
 from jaxslam.errors import BenchmarkError, JaxSlamError, nearest
@@ -95,9 +96,8 @@ def measure_part(job: PartJob, *, plain: bool = False) -> list[dict[str, Any]]:
         env=_plain_environment() if plain else None,
     )
     if done.returncode:
-        last = (done.stderr.strip().splitlines() or ["nothing was said"])[-1]
-        how = f"killed by signal {-done.returncode}" if done.returncode < 0 else f"ended with {done.returncode}"
-        said = last.removeprefix(_ERROR) if last.startswith(_ERROR) else f"{how}: {last}"
+        last = last_words(done.stderr)
+        said = last.removeprefix(_ERROR) if last.startswith(_ERROR) else f"{how_it_ended(done.returncode)}: {last}"
         raise BenchmarkError(f"{job.part}: {said}")
     return json.loads(done.stdout)
 

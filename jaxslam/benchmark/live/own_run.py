@@ -4,10 +4,8 @@
 """
 
 import argparse
-import gc
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +13,10 @@ import numpy as np
 from jaxslam.benchmark.live.figures import LiveFigures
 from jaxslam.config.loading import load_config
 from jaxslam.datasets import Dataset, Subset, imu_samples, imu_sheet, open_dataset
+from jaxslam.datasets.protocol import with_imu
 from jaxslam.errors import TrajectoryError
 from jaxslam.runtime.compile_cache import enable_compile_cache
+from jaxslam.runtime.garbage import garbage_frozen
 from jaxslam.sensors.frame import Frame
 from jaxslam.slam.slam import Slam
 from jaxslam.tracking.state import TrackStatus
@@ -40,18 +40,17 @@ def live_run(dataset: Dataset, rate_hz: float, preset: str, settings: Sequence[s
     took_s, late, tracked = [], 0, 0
     with Slam(dataset.camera, config, imu=imu_sheet(dataset)) as slam:
         slam.warm_up()
-        gc.collect()
-        gc.freeze()
-        began, processor_s = time.perf_counter(), time.process_time()
-        for number, frame in enumerate(frames):
-            wait_s = began + number / rate_hz - time.perf_counter()
-            late += wait_s < 0 < number
-            time.sleep(max(0.0, wait_s))
-            start = time.perf_counter()
-            result = slam.track(frame)
-            took_s.append(time.perf_counter() - start)
-            tracked += result.status != TrackStatus.LOST
-        processor_s = time.process_time() - processor_s
+        with garbage_frozen():
+            began, processor_s = time.perf_counter(), time.process_time()
+            for number, frame in enumerate(frames):
+                wait_s = began + number / rate_hz - time.perf_counter()
+                late += wait_s < 0 < number
+                time.sleep(max(0.0, wait_s))
+                start = time.perf_counter()
+                result = slam.track(frame)
+                took_s.append(time.perf_counter() - start)
+                tracked += result.status != TrackStatus.LOST
+            processor_s = time.process_time() - processor_s
         slam.finish()
         trajectory = slam.trajectory
     try:
@@ -76,10 +75,8 @@ def _frames(dataset: Dataset) -> Iterator[Frame]:
     samples, last_ns = imu_samples(dataset), None
     for index in range(len(dataset)):
         frame = dataset[index]
-        if samples is not None and last_ns is not None:
-            frame = replace(frame, imu=samples.between(last_ns, frame.timestamp_ns))
+        yield with_imu(frame, samples, last_ns)
         last_ns = frame.timestamp_ns
-        yield frame
 
 
 def main() -> None:
@@ -90,8 +87,7 @@ def main() -> None:
     parser.add_argument("--set", action="append", default=[])
     given = parser.parse_args()
     enable_compile_cache()
-    stop = None if given.stop == "None" else int(given.stop)
-    dataset = Subset(open_dataset(Path(given.recording)), int(given.start), stop, int(given.every))
+    dataset = Subset(open_dataset(Path(given.recording)), int(given.start), int(given.stop), int(given.every))
     print(live_run(dataset, float(given.rate), given.preset, given.set).as_json())
 
 

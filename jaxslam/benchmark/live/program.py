@@ -4,13 +4,13 @@ import shlex
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import psutil
 
 from jaxslam.benchmark.live.figures import LiveFigures, parse_figures
+from jaxslam.benchmark.process_ending import last_words
 from jaxslam.errors import BenchmarkError
 
 _LOOK_EVERY_S = 0.1
@@ -69,8 +69,7 @@ def run_program(program: Program) -> LiveFigures:
     finally:
         memory.stop()
     if process.returncode:
-        last = errors.strip().splitlines()[-1:] or ["no message"]
-        raise BenchmarkError(f"{program.name}: exit code {process.returncode}: {last[0]}")
+        raise BenchmarkError(f"{program.name}: exit code {process.returncode}: {last_words(errors)}")
     return replace(parse_figures(program.name, printed), peak_mb=memory.peak_mb)
 
 
@@ -106,8 +105,9 @@ class _PeakMemory:
     def _watch(self) -> None:
         try:
             process = psutil.Process(self._pid)
-            while not self._stopped.is_set():
+            while True:
                 self.peak_mb = max(self.peak_mb, process.memory_info().rss / 1e6)
-                time.sleep(_LOOK_EVERY_S)
+                if self._stopped.wait(_LOOK_EVERY_S):
+                    return
         except psutil.Error:  # it has ended
             return

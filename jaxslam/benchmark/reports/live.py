@@ -2,7 +2,7 @@
 
 import statistics
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 from matplotlib.figure import Figure
 
@@ -77,15 +77,15 @@ MEANING = (
 
 def markdown_report(content: Mapping[str, Any]) -> str:
     """Return the content of `live.json` as tables, and how it was measured."""
-    return f"{section(content)}\n{to_markdown([Paragraph(MEANING)])}"
+    return f"{section(content, level=1)}\n{to_markdown([Paragraph(MEANING)])}"
 
 
-def section(content: Mapping[str, Any]) -> str:
+def section(content: Mapping[str, Any], level: Literal[1, 2] = 2) -> str:
     """Return the tables of `live.json` under a heading, and where they were measured, without what they mean."""
     title = f"Live: {content['recording']}, {content['rate_hz']:g} Hz"
     ratios = ratio_rows(content["runs"])
     tables = [Table([COLUMNS, *rows(content["runs"])]), *([Table([RATIO_COLUMNS, *ratios])] if ratios else [])]
-    return to_markdown([Heading(title), *tables, Paragraph(conditions(content))])
+    return to_markdown([Heading(title, level), *tables, Paragraph(conditions(content))])
 
 
 def conditions(content: Mapping[str, Any]) -> str:

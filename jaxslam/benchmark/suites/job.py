@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxslam.benchmark.process_ending import how_it_ended, last_words
 from jaxslam.benchmark.reference_flow import flow_time_ms
 from jaxslam.benchmark.suites.provenance import (
     camera_sha256,
@@ -319,10 +320,7 @@ def about(job: Job) -> dict[str, Any]:
 
 
 def _problem(done: "subprocess.CompletedProcess[str]") -> str:
-    words = done.stderr.strip().splitlines()
-    last = words[-1][-_LAST_WORDS:] if words else "nothing was said"
-    how = f"killed by signal {-done.returncode}" if done.returncode < 0 else f"ended with {done.returncode}"
-    return f"{how}: {last}"
+    return f"{how_it_ended(done.returncode)}: {last_words(done.stderr)[-_LAST_WORDS:]}"
 
 
 def _end_with_parent() -> None:

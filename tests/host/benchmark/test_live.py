@@ -72,7 +72,7 @@ class TestProgram:
             run_program(Program("other", ("/nowhere/slam",)))
 
     def test_own_process_says_what_is_wrong(self, tmp_path: Path) -> None:
-        values = {"recording": str(tmp_path), "rate": "30", "start": "0", "stop": "None", "every": "1"}
+        values = {"recording": str(tmp_path), "rate": "30", "start": "0", "stop": "9", "every": "1"}
         with pytest.raises(BenchmarkError, match=f"jaxslam: exit code 1: .*{tmp_path.name}"):
             run_program(ours({**values, "preset": "default"}, ()))
 
@@ -100,7 +100,7 @@ class TestReport:
     def test_pages(self, tmp_path: Path) -> None:
         content = self.content()
         report = markdown_report(content)
-        assert "## Live: fr1, 30 Hz" in report
+        assert report.startswith("# Live: fr1, 30 Hz")
         assert content["cpu"] in report
         (tmp_path / "live.png").write_bytes(picture(content))
         assert np.ptp(imread(tmp_path / "live.png")) > 0
