@@ -4,18 +4,20 @@ jaxlie (1.5) multiplies quaternions with integer signs and relies on both promot
 allowed while it works. Where float64 is enabled it also turns float32 into it; here results keep the type they had.
 """
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import reduce
 from typing import Annotated
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxlie import SE3
+from jaxlie import SE3, SO3
 from jaxtyping import Array, Float
 
 from jaxslam_kernels.checks import checked
-from jaxslam_kernels.types import Points
+from jaxslam_kernels.types import Points, Scalar
 
 
 @contextmanager
@@ -28,8 +30,14 @@ def lenient_promotion() -> Iterator[None]:
 @checked
 def retract(T_a_b: SE3, tangent_b: Float[Array, "6"]) -> SE3:
     """`T_a_b @ exp(tangent_b)`: a pose moved in its own axes, translation first."""
+    v, w = tangent_b[:3], tangent_b[3:]
+    first, second = _exponential_series(jnp.sum(jnp.square(w)))
+    turned = jnp.cross(w, v)
+    # jaxlie takes `R v` for small angles, which is off by half of `w x v`, in value and derivative.
+    shift = v + first * turned + second * jnp.cross(w, turned)
     with lenient_promotion():
-        return _typed(T_a_b @ SE3.exp(tangent_b), T_a_b)
+        moved = SE3.from_rotation_and_translation(SO3.exp(w), shift)
+        return _typed(T_a_b @ moved, T_a_b)
 
 
 @checked
@@ -53,6 +61,8 @@ def displacement(T_world_a: SE3, T_world_b: SE3) -> Float[Array, "6"]:
         return between(T_world_a, T_world_b).log().astype(T_world_b.wxyz_xyz.dtype)
 
 
+_SMALL_ANGLE_SQUARED = 0.25
+"""Below this squared angle the exponential is a series: the closed forms cancel digits, and divide by zero at last."""
 _ROTATION = np.zeros((3, 3, 4, 4))
 """Entries of a rotation matrix as sums of products of two components `w, x, y, z` of the unit quaternion."""
 for _row, _column, _factors in (
@@ -101,6 +111,19 @@ def cross_matrix(v: Float[Array, "3"]) -> Float[Array, "3 3"]:
     x, y, z = v
     zero = jnp.zeros_like(x)
     return jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
+
+
+def _exponential_series(squared: Scalar) -> tuple[Scalar, Scalar]:
+    """`(1 - cos θ) / θ²` and `(θ - sin θ) / θ³` of a squared angle, with right derivatives of any order at 0 too."""
+    small = squared < _SMALL_ANGLE_SQUARED
+    x = jnp.where(small, squared, 0)
+    terms = lambda first: [(-1) ** k / math.factorial(2 * k + first) for k in reversed(range(8))]
+    series = [reduce(lambda value, term: value * x + term, terms(first), jnp.zeros_like(x)) for first in (2, 3)]
+    large = jnp.where(small, 1, squared)
+    angle = jnp.sqrt(large)
+    exact = (1 - jnp.cos(angle)) / large, (angle - jnp.sin(angle)) / (large * angle)
+    first, second = (jnp.where(small, near, far) for near, far in zip(series, exact, strict=True))
+    return first, second
 
 
 def _typed(T: SE3, like: SE3) -> SE3:

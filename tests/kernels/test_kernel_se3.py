@@ -43,6 +43,21 @@ class TestTransform:
         np.testing.assert_allclose(there.as_matrix(), np.asarray(A.as_matrix()) @ expm(hat(tangent)), atol=1e-12)
         np.testing.assert_allclose(displacement(A, there), tangent, atol=1e-12)
 
+    @pytest.mark.parametrize("angle", [0.0, 1e-6, 1e-3, 0.4, 0.6, 3.0])
+    def test_derivatives_of_retraction(self, angle):
+        """Both orders against differences of the matrix exponential, with a long translation."""
+        A, rng = random_pose(1), np.random.default_rng(3)
+        at, direction = np.concatenate([[3.0, -2.0, 5.0], angle * np.array([0.6, 0.0, 0.8])]), rng.normal(size=6)
+        moved = lambda t: retract(A, jnp.asarray(at) + t * direction).as_matrix()
+        along = lambda f: lambda t: jax.jvp(f, (t,), (jnp.ones_like(t),))[1]
+        h, here = 1e-3, jnp.zeros(())
+        known = {k: np.asarray(A.as_matrix()) @ expm(hat(at + k * h * direction)) for k in (-2, -1, 0, 1, 2)}
+        first = (8 * (known[1] - known[-1]) - (known[2] - known[-2])) / (12 * h)
+        second = (16 * (known[1] + known[-1]) - (known[2] + known[-2]) - 30 * known[0]) / (12 * h**2)
+        np.testing.assert_allclose(moved(here), known[0], atol=1e-12)
+        np.testing.assert_allclose(along(moved)(here), first, atol=1e-9)
+        np.testing.assert_allclose(along(along(moved))(here), second, atol=1e-7)
+
     def test_rotation_matrix(self):
         """Equal to jaxlie's, also in its derivatives and for a quaternion that is not of unit length."""
         for factor in (1.0, 0.5):
