@@ -15,8 +15,8 @@ Failure: nothing raises inside compiled code. Results are finite, and a status c
 for no points at all too. While tracing, an argument of another type (`TypeError`) or another shape (`ValueError`) than
 annotated raises, see `checks`.
 
-Derivatives: by a weight of exactly 0 the derivative is the one-sided limit from above. Where second derivatives would
-be wrong, asking for one raises `NotImplementedError` while tracing, see `first_order`.
+Derivatives: by a weight of exactly 0 the derivative is the one-sided limit from above. Those of what a solver finds are
+right to any order where it has converged to a strict minimum, see `derivative_rules`.
 
 Precision: float32 in the real-time path; every kernel follows the type of its inputs, so float64 works too.
 """

@@ -8,7 +8,7 @@ A camera may have a lens to be found with its pose, three numbers more (`bundle_
 The result is differentiable, forward and reverse, by the implicit function theorem at the optimum, with one more
 elimination of the exact Hessian, however many steps the solver took. Where a solve starts has no derivative, apart
 from what is held fixed. Of a weight that is exactly 0 the derivative is the one-sided limit from above; see
-`bundle_idle` for points that have no weight at all. Second derivatives raise `NotImplementedError`.
+`zero_weight_points` for points that have no weight at all. Higher derivatives are right as well.
 
 Source: Triggs et al., "Bundle Adjustment: A Modern Synthesis", 2000, section 6.
 """
@@ -41,7 +41,7 @@ from jaxslam_kernels.bundle.lens import Cameras, Lenses, move_cameras, shift_cam
 from jaxslam_kernels.bundle.schur import Reduced, eliminate, is_determined, points_determined, solve_reduced
 from jaxslam_kernels.bundle.zero_weight_points import idle_points
 from jaxslam_kernels.checks import checked
-from jaxslam_kernels.first_order import first_order
+from jaxslam_kernels.derivative_rules import implicit_shift, only_derivative
 from jaxslam_kernels.pose.pose_cost import UNKNOWN_CHI2
 from jaxslam_kernels.pose.pose_refine import usable_pose
 from jaxslam_kernels.pose_graph.cost import PoseGraphEdges, graph_problem
@@ -158,13 +158,16 @@ def bundle_adjust(
     )
     solution = solve_bundle(cameras, X_world, problem, loss, jnp.asarray(tolerance, dtype), max_steps)
     # What is fixed keeps its derivative, what is free gets that of the optimum.
-    start = _where_free(problem, solution.cameras, cameras)
-    start_points = jnp.where(fixed_points[None, :], X_world, solution.X_world)
     relative = _on_grid(clean_weights(observations.weights), slot, problem)
-    tangents, shifts, more_cost = _optimum_shift(start, start_points, problem, relative, loss)
-    optimum = shift_cameras(start, tangents)
+    inputs = _Inputs(cameras, X_world, problem, relative)
+    start, start_points = _start(solution, inputs)
+    c = 6 if lenses is None else 9
+    like = jnp.zeros((poses.shape[0], c), dtype), jnp.zeros_like(X_world)
+    tangents, shifts = implicit_shift(partial(_slope, loss), partial(_solve_exact, loss), like, solution, inputs)
+    optimum, optimal_points = shift_cameras(start, tangents), start_points + shifts
     initial_cost = _cost(cameras, bundle_views(cameras, X_world, problem, loss), problem, loss)
-    result = _report(optimum, start_points + shifts, problem, slot, loss, initial_cost, solution)
+    result = _report(optimum, optimal_points, problem, slot, loss, initial_cost, solution)
+    more_cost = only_derivative(partial(_idle_cost, loss), optimum, optimal_points, inputs)
     return result._replace(cost=result.cost + more_cost)
 
 
@@ -261,43 +264,61 @@ def _on_grid(values: Float[Array, " m"], slot: Int[Array, " m"], problem: Bundle
     return jnp.zeros(k * n + 1, values.dtype).at[slot].set(values)[:-1].reshape(k, n)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(4,))
-def _optimum_shift(
-    cameras: Cameras, X_world: Points, problem: BundleProblem, relative: Plane, loss: Loss
-) -> tuple[Float[Array, "k c"], Points, Scalar]:
-    """Zeros, with the derivative of the optimum with respect to the problem and to what is fixed.
+class _Inputs(NamedTuple):
+    """Inputs of the cost at the optimum.
 
-    At the optimum the gradient g of the cost vanishes whatever the problem θ, so dξ = -H⁻¹ (∂g/∂θ) dθ with H the
-    exact Hessian. Points without weight count where they would go, see `bundle_idle`; the last zero has the derivative
-    that the cost lacks because they are not there.
+    Attributes:
+        cameras: Initial cameras, of which those that are fixed count.
+        X_world: Initial points, of which those that are fixed count.
+        problem: The problem.
+        relative: Weights of the observations on the grid, without those of the points.
     """
-    del problem, relative, loss
-    c = 6 if cameras.lenses is None else 9
-    return jnp.zeros((cameras.poses.shape[0], c), X_world.dtype), jnp.zeros_like(X_world), jnp.zeros((), X_world.dtype)
+
+    cameras: Cameras
+    X_world: Points
+    problem: BundleProblem
+    relative: Plane
 
 
-@_optimum_shift.defjvp
-def _optimum_shift_jvp(loss: Loss, primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
-    cameras, X_world, problem, relative = first_order(primals, "bundle_adjust")
-    idle = idle_points(cameras, X_world, problem, relative, loss)
-    change, silent = tangents[2], idle.mask & ~idle.rising
-    heard = change._replace(weights=jnp.where(silent[None, :], 0.0, change.weights))
+def _start(solution: Solution, inputs: _Inputs) -> tuple[Cameras, Points]:
+    """Return the solution, with what is fixed as it was given."""
+    problem = inputs.problem
+    cameras = _where_free(problem, solution.cameras, inputs.cameras)
+    return cameras, jnp.where(problem.free_point[None, :], solution.X_world, inputs.X_world)
 
-    def gradients(cameras: Cameras, X_world: Points, problem: BundleProblem) -> tuple[Array, Array]:
-        equations = _equations(cameras, bundle_views(cameras, X_world, problem, loss), problem)
-        return equations.camera_gradient, equations.point_gradient
 
-    _, changes = jax.jvp(gradients, (cameras, idle.X_world, problem), (*tangents[:2], heard))
-    reduced, determined = lax.stop_gradient(_at_optimum(cameras, X_world, problem, loss))
-    keep = lambda change: jnp.where(determined, change, 0.0)
-    shifts = solve_reduced(reduced, *map(keep, changes))
+@partial(jax.jit, static_argnums=0)  # traced once: derivatives need it many times
+def _slope(
+    loss: Loss, steps: tuple[Float[Array, "k c"], Points], solution: Solution, inputs: _Inputs
+) -> tuple[Float[Array, "k c"], Points]:
+    """Gradient of the cost a step away from the solution. Points without weight count where they would go."""
+    start, points = _start(solution, inputs)
+    cameras, X_world = shift_cameras(start, steps[0]), points + steps[1]
+    idle = idle_points(cameras, X_world, inputs.problem, inputs.relative, loss)
+    heard = idle.heard(inputs.problem)
+    equations = _equations(cameras, bundle_views(cameras, idle.X_world, heard, loss), heard)
+    return equations.camera_gradient, equations.point_gradient
 
-    def cost_at(X_world: Points, weights: Plane) -> Scalar:  # linear in the weights
-        counted = jnp.where(idle.mask[None, :], weights, 0.0)
-        return bundle_cost(bundle_views(cameras, X_world, problem, loss), problem._replace(weights=counted), loss)
 
-    more_cost = cost_at(idle.X_world, heard.weights) - cost_at(X_world, change.weights)
-    return _optimum_shift(cameras, X_world, problem, relative, loss), (*shifts, more_cost)
+def _solve_exact(
+    loss: Loss, solution: Solution, inputs: _Inputs, right: tuple[Float[Array, "k c"], Points]
+) -> tuple[Float[Array, "k c"], Points]:
+    """Solve for a step with the exact Hessian; zero if that does not determine the cameras."""
+    reduced, determined = _at_optimum(*_start(solution, inputs), inputs.problem, loss)
+    camera_step, point_step = solve_reduced(reduced, *(jnp.where(determined, part, 0.0) for part in right))
+    return -camera_step, -point_step
+
+
+def _idle_cost(loss: Loss, cameras: Cameras, X_world: Points, inputs: _Inputs) -> Scalar:
+    """What a rising weight of points without any would add to the cost: where they would go, not where they are."""
+    problem = inputs.problem
+    idle = idle_points(cameras, X_world, problem, inputs.relative, loss)
+
+    def cost_at(X_world: Points, weights: Plane) -> Scalar:
+        counted = problem._replace(weights=jnp.where(idle.mask[None, :], weights, 0.0))
+        return bundle_cost(bundle_views(cameras, X_world, problem, loss), counted, loss)
+
+    return cost_at(idle.X_world, idle.heard(problem).weights) - cost_at(X_world, problem.weights)
 
 
 def _at_optimum(cameras: Cameras, X_world: Points, problem: BundleProblem, loss: Loss) -> tuple[Reduced, Flag]:

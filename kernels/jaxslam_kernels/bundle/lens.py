@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxlie import SE3
 from jaxtyping import Array, Bool, Float
 
-from jaxslam_kernels.pose.pose_cost import retract, tangent_basis
+from jaxslam_kernels.pose.pose_cost import retract, shifted
 
 Lenses = Float[Array, "k 3"]
 """Focal length, k1 and k2, one row a camera."""
@@ -88,9 +88,9 @@ def lens_hessian(part: LensPart) -> Float[Array, "k 3 3"]:
 
 
 def shift_cameras(cameras: Cameras, tangents: Float[Array, "k c"]) -> Cameras:
-    """Move cameras by small steps, correct to first order: for derivatives."""
-    moved = jax.vmap(lambda pose, tangent: tangent_basis(SE3(pose)) @ tangent)(cameras.poses, tangents[:, :6])
-    return _with_lenses(cameras, cameras.poses + moved, tangents)
+    """Move cameras by steps that are zero but for their derivatives; they stay as they are, to the last bit."""
+    poses = jax.vmap(lambda pose, tangent: shifted(SE3(pose), tangent).wxyz_xyz)(cameras.poses, tangents[:, :6])
+    return _with_lenses(cameras, poses, tangents)
 
 
 def move_cameras(cameras: Cameras, tangents: Float[Array, "k c"]) -> Cameras:

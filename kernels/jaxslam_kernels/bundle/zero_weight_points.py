@@ -5,16 +5,19 @@ the cameras, and the cameras feel `w c(cameras, X*)`. At exactly 0 the point sta
 by a weight of 0, as the limit from above, is taken at X*. The forward computation does not come here.
 """
 
+from functools import partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxslam_kernels.bundle.cost import BundleProblem, Plane, bundle_views
-from jaxslam_kernels.bundle.equations import normal_equations
+from jaxslam_kernels.bundle.equations import exact_blocks, normal_equations
 from jaxslam_kernels.bundle.lens import Cameras
 from jaxslam_kernels.bundle.schur import inverse_root
+from jaxslam_kernels.derivative_rules import implicit_shift
 from jaxslam_kernels.pose.pose_cost import FARTHEST_M
 from jaxslam_kernels.robust import Loss, loss_value
 from jaxslam_kernels.types import Mask, Points, Weights
@@ -37,6 +40,11 @@ class Idle(NamedTuple):
     rising: Mask
     X_world: Points
 
+    def heard(self, problem: BundleProblem) -> BundleProblem:
+        """Return the problem in which a weight that would rise alone has no derivative."""
+        silent = self.mask & ~self.rising
+        return problem._replace(weights=jnp.where(silent[None, :], 0.0, problem.weights))
+
 
 class _Search(NamedTuple):
     X_world: Points
@@ -46,8 +54,9 @@ class _Search(NamedTuple):
     num_steps: Array
 
 
+@partial(jax.jit, static_argnames="loss")  # traced once: derivatives need it several times
 def idle_points(cameras: Cameras, X_world: Points, problem: BundleProblem, relative: Plane, loss: Loss) -> Idle:
-    """Finds the idle points and their own optimum, the cameras held; constant for differentiation.
+    """Find the idle points and their own optimum, given the cameras.
 
     Args:
         cameras: The adjusted cameras.
@@ -56,11 +65,28 @@ def idle_points(cameras: Cameras, X_world: Points, problem: BundleProblem, relat
         relative: Weights of the observations on the grid, without those of the points.
         loss: The robust loss, static.
     """
-    cameras, X_world, problem, relative = lax.stop_gradient((cameras, X_world, problem, relative))
-    idle = problem.free_point & (problem.weights == 0).all(axis=0)
-    rising = idle & (relative > 0).any(axis=0)
+    mask = problem.free_point & (problem.weights == 0).all(axis=0)
+    rising = mask & (relative > 0).any(axis=0)
     alone = problem._replace(weights=jnp.where(rising[None, :], relative, 0.0))
-    return Idle(idle, rising, _settled(cameras, X_world, alone, rising, loss))
+    settled = _settled(*lax.stop_gradient((cameras, X_world, alone)), rising, loss)
+    shift = implicit_shift(
+        partial(_slope, loss), partial(_solve, loss), jnp.zeros_like(X_world), (settled, rising), (cameras, alone)
+    )
+    return Idle(mask, rising, jnp.where(rising[None, :], settled + shift, X_world))
+
+
+def _slope(loss: Loss, shift: Points, optimum: tuple[Points, Mask], inputs: tuple[Cameras, BundleProblem]) -> Points:
+    """Gradient of each idle point's own cost a step away from its optimum; of other points, the step."""
+    (settled, rising), (cameras, alone) = optimum, inputs
+    views = bundle_views(cameras, settled + jnp.where(rising[None, :], shift, 0.0), alone, loss)
+    return jnp.where(rising[None, :], normal_equations(views).point_gradient, shift)
+
+
+def _solve(loss: Loss, optimum: tuple[Points, Mask], inputs: tuple[Cameras, BundleProblem], right: Points) -> Points:
+    """Solve for a step with the exact Hessian of each idle point; zero where that is not positive definite."""
+    (settled, rising), (cameras, alone) = optimum, inputs
+    hessian = exact_blocks(cameras, settled, alone, loss).point.sum(axis=2)
+    return -_step(hessian, right, rising, jnp.zeros_like(right[0]))
 
 
 def _settled(cameras: Cameras, X_world: Points, problem: BundleProblem, free: Mask, loss: Loss) -> Points:

@@ -149,6 +149,17 @@ def retract(T_world_cam: SE3, tangent: Float[Array, "6"]) -> SE3:
     return SE3(jnp.concatenate([q * jax.lax.rsqrt(jnp.sum(q * q)), parameters[4:]]))
 
 
+def shifted(T_world_cam: SE3, tangent: Float[Array, "6"]) -> SE3:
+    """`retract` for steps that are zero but for their derivatives: the pose stays as it is, to the last bit.
+
+    To second order and beyond, quaternions keep their length: a pose on the tangent plane is none.
+    """
+    change = tangent_basis(T_world_cam) @ tangent
+    q, lift = T_world_cam.wxyz_xyz[:4], change[:4]
+    q = q * jnp.sqrt(1.0 - jnp.sum(jnp.square(lift))) + lift
+    return SE3(jnp.concatenate([q, T_world_cam.wxyz_xyz[4:] + change[4:]]))
+
+
 class PoseCost(NamedTuple):
     """The cost at one pose.
 

@@ -3,9 +3,9 @@
 The solver is optimistix's loop around fused normal equations (`levenberg_marquardt`); the cost is `pose_cost`'s. The
 result is differentiable, forward and reverse, by the implicit function theorem at the optimum: its derivative with
 respect to points, pixels, weights, depths, deviations, intrinsics, scale and prior costs one 6 x 6 solve, however
-many steps the solver took. The initial pose has no derivative, since the optimum does not depend on it. Of a weight
-that is exactly 0 the derivative is the one-sided limit from above: what letting the point back in would do. Second
-derivatives raise `NotImplementedError`.
+many steps the solver took. Higher derivatives are right as well. The initial pose has no derivative, since the optimum
+does not depend on it. Of a weight that is exactly 0 the derivative is the one-sided limit from above: what letting the
+point back in would do.
 """
 
 from enum import IntEnum
@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxslam_kernels.camera import Intrinsics
 from jaxslam_kernels.checks import checked
-from jaxslam_kernels.first_order import first_order
+from jaxslam_kernels.derivative_rules import implicit_shift
 from jaxslam_kernels.levenberg_marquardt import ManifoldLevenbergMarquardt, NormalEquations
 from jaxslam_kernels.pose.pose_cost import (
     PoseCost,
@@ -30,7 +30,7 @@ from jaxslam_kernels.pose.pose_cost import (
     pose_cost,
     pose_problem,
     retract,
-    tangent_basis,
+    shifted,
     with_idle,
 )
 from jaxslam_kernels.positive_definite import is_determined, solve_determined
@@ -152,7 +152,10 @@ def refine_problem(
     """`refine_pose` on a problem that is already clean; the idle points matter to derivatives only."""
     initial, finite_initial = usable_pose(T_world_cam)
     optimum, solver = solve_pose(initial, problem, loss, max_steps, tolerance)
-    optimum = SE3(optimum.wxyz_xyz + tangent_basis(optimum) @ _optimum_shift(optimum, problem, idle, loss))
+    step = implicit_shift(
+        partial(_slope, loss), partial(_solve, loss), jnp.zeros(6, problem.xy.dtype), optimum, (problem, idle)
+    )
+    optimum = shifted(optimum, step)
     status = jnp.select(
         [
             ~finite_initial,
@@ -193,38 +196,23 @@ def solve_pose(
     return solution.value, SolverReport(hessian, solution.stats["num_steps"].astype(jnp.int32), converged)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(3,))
-def _optimum_shift(optimum: SE3, problem: PoseProblem, idle: PoseProblem, loss: Loss) -> Float[Array, "6"]:
-    """Zero, with the derivative of the optimum with respect to the problem, in the right tangent.
+def _slope(loss: Loss, step: Float[Array, "6"], optimum: SE3, inputs: tuple[PoseProblem, PoseProblem]) -> Array:
+    """Gradient of the cost a step away from the optimum. Points of weight zero take part with their weights."""
+    everything = with_idle(*inputs, optimum, loss)
+    return pose_cost(shifted(optimum, step), everything, loss).equations.gradient
 
-    At the optimum the gradient g of the cost vanishes whatever the problem θ, so dξ = -H⁻¹ (∂g/∂θ) dθ with H the
-    exact Hessian. Points of weight zero take part with their weights.
+
+def _solve(loss: Loss, optimum: SE3, inputs: tuple[PoseProblem, PoseProblem], right: Array) -> Array:
+    """Solve for a step with the exact Hessian.
+
+    That is positive definite at a strict minimum. Where the solver stopped short of one the reweighted one stands in,
+    and where the pose is undetermined the step is zero.
     """
-    del problem, idle, loss
-    return jnp.zeros(6, optimum.wxyz_xyz.dtype)
-
-
-@_optimum_shift.defjvp
-def _optimum_shift_jvp(loss: Loss, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    optimum, problem, idle = first_order(primals, "refine_pose")
-
-    basis = tangent_basis(optimum)
-
-    def gradient(tangent: Array, problem: PoseProblem, idle: PoseProblem) -> Array:
-        moved = SE3(optimum.wxyz_xyz + basis @ tangent)
-        return pose_cost(moved, with_idle(problem, idle, optimum, loss), loss).equations.gradient
-
-    zero = jnp.zeros(6, optimum.wxyz_xyz.dtype)
-    _, gradient_change = jax.jvp(partial(gradient, zero), (problem, idle), tuple(tangents[1:]))
-    exact = jax.jacfwd(gradient)(zero, problem, idle)
+    exact = jax.jacfwd(partial(_slope, loss))(jnp.zeros_like(right), optimum, inputs)
     exact = 0.5 * (exact + exact.T)
-    reweighted = pose_cost(optimum, problem, loss).equations.hessian
-    # The exact Hessian is positive definite at a strict minimum. Where the solver stopped short of one the
-    # reweighted one stands in, and where the pose is undetermined the derivative is zero.
-    hessian = jnp.where(is_determined(exact), exact, reweighted)
+    hessian = jnp.where(is_determined(exact), exact, pose_cost(optimum, inputs[0], loss).equations.hessian)
     determined = is_determined(hessian)
-    shift = -solve_determined(hessian, determined, jnp.where(determined, gradient_change, 0.0))
-    return zero, shift
+    return solve_determined(hessian, determined, jnp.where(determined, right, 0.0))
 
 
 class _Figures(NamedTuple):

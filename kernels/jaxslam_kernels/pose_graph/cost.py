@@ -20,7 +20,8 @@ from jax import lax
 from jaxlie import SE3
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam_kernels.pose.pose_cost import retract, tangent_basis
+from jaxslam_kernels.derivative_rules import only_derivative
+from jaxslam_kernels.pose.pose_cost import retract, shifted
 from jaxslam_kernels.robust import LARGEST_SQUARED, Loss, loss_value, loss_weight
 from jaxslam_kernels.se3 import between, cross_matrix
 from jaxslam_kernels.types import Scalar
@@ -176,20 +177,15 @@ def idle_gradient(nodes: Nodes, idle: GraphProblem, change: Float[Array, " e"], 
     return jax.jvp(of_weights, (heard,), (jnp.where(heard > 0, change, 0.0),))[1]
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(2,))
 def idle_cost(nodes: Nodes, idle: GraphProblem, loss: Loss) -> Scalar:
-    """The cost of the idle edges: zero, with its derivative by their weights."""
-    del idle, loss
-    return jnp.zeros((), nodes.dtype)
+    """The cost of the idle edges: zero, with its derivatives by their weights."""
+    return only_derivative(partial(_idle_cost, loss), nodes, idle)
 
 
-@idle_cost.defjvp
-def _idle_cost_jvp(loss: Loss, primals: tuple, tangents: tuple) -> tuple[Scalar, Scalar]:
-    nodes, idle = primals
+def _idle_cost(loss: Loss, nodes: Nodes, idle: GraphProblem) -> Scalar:
     heard = _heard(nodes, idle, loss)
     _, chi2, _ = graph_cost(nodes, idle._replace(weights=heard), loss)
-    change = jnp.where(heard > 0, tangents[1].weights, 0.0)
-    return idle_cost(nodes, idle, loss), 0.5 * jnp.sum(change * loss_value(chi2, idle.loss_scale, loss))
+    return 0.5 * jnp.sum(jnp.where(heard > 0, idle.weights, 0.0) * loss_value(chi2, idle.loss_scale, loss))
 
 
 def _heard(nodes: Nodes, idle: GraphProblem, loss: Loss) -> Float[Array, " e"]:
@@ -218,8 +214,8 @@ def move_nodes(nodes: Nodes, steps: Steps) -> Nodes:
 
 
 def shift_nodes(nodes: Nodes, steps: Steps) -> Nodes:
-    """`move_nodes` to first order: for derivatives."""
-    poses = jax.vmap(lambda node, step: node[:7] + tangent_basis(SE3(node[:7])) @ step[:6])(nodes, steps)
+    """`move_nodes` for steps that are zero but for their derivatives: the nodes stay as they are, to the last bit."""
+    poses = jax.vmap(lambda node, step: shifted(SE3(node[:7]), step[:6]).wxyz_xyz)(nodes, steps)
     return _with_log_scale(poses, nodes, steps)
 
 

@@ -5,7 +5,7 @@ gradients of `block_band` or, much faster for graphs of thousands of nodes, on t
 result is differentiable, forward and reverse, by the implicit function theorem at the optimum, with respect to measured
 poses, scales, information, weights and loss scale: one sparse solve with the exact Hessian. The initial poses have no
 derivative, but for nodes that are fixed or otherwise stay where they were. Of a weight that is exactly 0 the derivative
-is the one-sided limit from above. Second derivatives raise `NotImplementedError`.
+is the one-sided limit from above. Higher derivatives are right as well.
 
 Source: Grisetti et al., "A Tutorial on Graph-Based SLAM", 2010; Strasdat et al., "Scale Drift-Aware Large Scale
 Monocular SLAM", 2010, for Sim(3); Madsen, Nielsen and Tingleff, "Methods for Non-Linear Least Squares Problems", 2004,
@@ -15,7 +15,7 @@ section 3.2, for the damping.
 from collections.abc import Callable
 from enum import IntEnum
 from functools import partial
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ from jaxlie import SE3
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam_kernels.checks import checked
-from jaxslam_kernels.first_order import first_order
+from jaxslam_kernels.derivative_rules import implicit_shift
 from jaxslam_kernels.pose_graph.block_tridiagonal_cg import (
     GraphMatrix,
     Vector,
@@ -183,9 +183,12 @@ def optimize_pose_graph(
     bad_initial = (mask & ~usable).any()
     graph = _Graph(problem, anchored & ~fixed & ~bad_initial, jnp.arange(fixed.size) if rank is None else rank)
     end = _solve(lax.stop_gradient(initial), lax.stop_gradient(graph), solver)
-    optimum = jnp.where(graph.free[:, None], end.nodes, initial)
     idle = _within_anchored(idle, anchored)
-    optimum = shift_nodes(optimum, _optimum_shift(solver, end.converged, optimum, graph, idle))
+    found, inputs = _Optimum(end.nodes, end.converged, graph), (initial, problem, idle)
+    like = jnp.zeros((fixed.size, problem.information.shape[1]), initial.dtype)
+    optimum = found.shifted(
+        implicit_shift(partial(_slope, solver), partial(_solve_exact, solver), like, found, inputs), initial
+    )
     status = _status(graph, bad_initial, end.converged, (mask & ~anchored).any())
     cost, chi2, robust_weights = graph_cost(optimum, problem, loss)
     return PoseGraph(
@@ -318,52 +321,49 @@ def _system(equations: GraphEquations, graph: _Graph, damping: Scalar | float) -
     return GraphMatrix(jnp.where(free[:, None, None], blocks, eye), coupling, problem.source, problem.target)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _optimum_shift(solver: _Solver, converged: Flag, optimum: Nodes, graph: _Graph, idle: GraphProblem) -> Steps:
-    """Zero, with the derivative of the optimum with respect to the problem and to the nodes that stay.
+class _Optimum(NamedTuple):
+    """The optimum that was found, a constant.
 
-    At the optimum the gradient g of the cost vanishes whatever the problem θ, so dξ = -H⁻¹ (∂g/∂θ) dθ with H the
-    exact Hessian. Zero where the solver did not converge.
+    Attributes:
+        nodes: The nodes at the end of the search.
+        converged: Whether the search converged.
+        graph: The graph.
     """
-    del solver, converged, idle
-    return jnp.zeros((optimum.shape[0], graph.problem.information.shape[1]), optimum.dtype)
+
+    nodes: Nodes
+    converged: Flag
+    graph: _Graph
+
+    def shifted(self, steps: Steps, initial: Nodes) -> Nodes:
+        """Return the free nodes a step from the optimum, and the others as they are given."""
+        free = self.graph.free[:, None]
+        return shift_nodes(jnp.where(free, self.nodes, initial), jnp.where(free, steps, 0.0))
 
 
-@_optimum_shift.defjvp
-def _optimum_shift_jvp(solver: _Solver, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    converged, optimum, graph, idle = first_order(primals, "optimize_pose_graph")
-    free = graph.free[:, None]
-    value = _optimum_shift(solver, converged, optimum, graph, idle)
-    still = jnp.where(free, 0.0, tangents[1])  # the initial values of the free nodes do not matter
-
-    def gradient(nodes: Nodes, problem: GraphProblem) -> Steps:
-        return graph_gradient(nodes, problem, solver.loss)
-
-    _, change = jax.jvp(gradient, (optimum, graph.problem), (still, tangents[2].problem))
-    change = change + idle_gradient(optimum, idle, tangents[3].weights, solver.loss)
-    constant = lax.stop_gradient((optimum, graph))
-    shift = -_solve_exact(solver, *constant, jnp.where(free & converged, change, 0.0))
-    return value, jnp.where(free & converged, shift, 0.0)
+_Inputs: TypeAlias = tuple[Nodes, GraphProblem, GraphProblem]
+"""Initial nodes, of which those that stay count; the problem; and its idle edges."""
 
 
-def _solve_exact(solver: _Solver, optimum: Nodes, graph: _Graph, right: Steps) -> Steps:
-    """`H⁻¹ right` with the exact Hessian, preconditioned by the reweighted one; itself differentiable in `right`."""
-    free, zero = graph.free[:, None], jnp.zeros_like(right)
+def _slope(solver: _Solver, steps: Steps, optimum: _Optimum, inputs: _Inputs) -> Steps:
+    """Gradient of the cost a step away from the optimum; of nodes that stay, the step."""
+    initial, problem, idle = inputs
+    nodes = optimum.shifted(steps, initial)
+    gradient = graph_gradient(nodes, problem, solver.loss) + idle_gradient(nodes, idle, idle.weights, solver.loss)
+    return jnp.where(optimum.graph.free[:, None], gradient, steps)
 
-    def gradient(steps: Steps) -> Steps:
-        return graph_gradient(shift_nodes(optimum, steps), graph.problem, solver.loss)
+
+def _solve_exact(solver: _Solver, optimum: _Optimum, inputs: _Inputs, right: Steps) -> Steps:
+    """Solve with the exact Hessian, preconditioned by the reweighted one; zero where the search did not converge."""
+    graph, zero = optimum.graph, jnp.zeros_like(right)
 
     def hessian(steps: Steps) -> Steps:
-        moved = jax.jvp(gradient, (zero,), (jnp.where(free, steps, 0.0),))[1]
-        return jnp.where(free, moved, steps)
+        return jax.jvp(lambda steps: _slope(solver, steps, optimum, inputs), (zero,), (steps,))[1]
 
     epsilon = float(jnp.finfo(right.dtype).eps)
-    matrix = _system(graph_equations(optimum, graph.problem, solver.loss), graph, _MIN_DAMPING)
+    nodes = optimum.shifted(zero, inputs[0])
+    matrix = _system(graph_equations(nodes, graph.problem, solver.loss), graph, _MIN_DAMPING)
     precondition = _preconditioner(matrix, graph, solver)
-
-    def solve(_: object, b: Steps) -> Steps:
-        return conjugate_gradients(
-            hessian, precondition, b, tolerance=epsilon**0.75, max_steps=4 * solver.max_iterations
-        )[0]
-
-    return lax.custom_linear_solve(hessian, right, solve, symmetric=True)
+    right = jnp.where(graph.free[:, None] & optimum.converged, right, 0.0)
+    return conjugate_gradients(
+        hessian, precondition, right, tolerance=epsilon**0.75, max_steps=4 * solver.max_iterations
+    )[0]

@@ -2,8 +2,8 @@
 
 All hypotheses are drawn, solved from seven points and scored at once. The best few are improved on all points under a
 redescending loss that is a smooth form of the score, and the best of these is refined on its inliers. Which points are
-inliers is a constant for differentiation; the last refinement carries the gradient, and second derivatives raise
-`NotImplementedError`. Views that do not determine the matrix are told apart (see `homography`).
+inliers is a constant for differentiation; the last refinement carries derivatives of any order. Views that do not
+determine the matrix are told apart (see `homography`).
 """
 
 from enum import IntEnum

@@ -18,7 +18,7 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxslam_kernels.first_order import first_order
+from jaxslam_kernels.derivative_rules import implicit_shift
 from jaxslam_kernels.levenberg_marquardt import ManifoldLevenbergMarquardt, NormalEquations
 from jaxslam_kernels.positive_definite import is_determined, solve_determined
 from jaxslam_kernels.robust import Loss, loss_value, loss_weight
@@ -70,8 +70,9 @@ def refine_matrix(
     The idle points, all of weight 0, matter to the derivative by their weights only.
     """
     optimum, hessian, converged = solve_matrix(F, views, loss, scale, max_steps)
-    refined = _retract(optimum, _optimum_shift(optimum, views, idle, loss, scale))
-    return refined.matrix(), converged, is_determined(hessian)
+    rules = partial(_slope, loss, scale), partial(_solve, loss, scale)
+    step = implicit_shift(*rules, jnp.zeros(7, F.dtype), optimum, (views, idle))
+    return _retract(optimum, step).matrix(), converged, is_determined(hessian)
 
 
 def solve_matrix(
@@ -175,37 +176,33 @@ def _completed(axis: Float[Array, "3"]) -> Matrix:
     return jnp.stack([jnp.stack(row) for row in rows])
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(3, 4))
-def _optimum_shift(
-    optimum: FramedMatrix, views: TwoViews, idle: TwoViews, loss: Loss, scale: float
+def _gradient(
+    loss: Loss, scale: float, step: Float[Array, "7"], optimum: FramedMatrix, views: TwoViews
 ) -> Float[Array, "7"]:
-    """Zero, with the derivative of the optimum by the points, in the tangent of `_retract`.
+    """Gradient of the cost a step away from the optimum."""
+    return jax.grad(lambda step: _cost(_retract(optimum, step), views, loss, scale))(step)
 
-    At the optimum the gradient g of the cost vanishes whatever the points θ, so dξ = -H⁻¹ (∂g/∂θ) dθ with H the
-    exact Hessian.
+
+def _slope(
+    loss: Loss, scale: float, step: Float[Array, "7"], optimum: FramedMatrix, inputs: tuple[TwoViews, TwoViews]
+) -> Float[Array, "7"]:
+    """The gradient with that of the idle points, which is zero but for its derivatives."""
+    views, idle = inputs
+    return _gradient(loss, scale, step, optimum, views) + _gradient(loss, scale, step, optimum, idle)
+
+
+def _solve(
+    loss: Loss, scale: float, optimum: FramedMatrix, inputs: tuple[TwoViews, TwoViews], right: Float[Array, "7"]
+) -> Float[Array, "7"]:
+    """Solve for a step with the exact Hessian.
+
+    Where the solver stopped short of a minimum the reweighted one stands in; undetermined, nothing moves.
     """
-    del views, idle, loss, scale
-    return jnp.zeros(7, optimum.S.dtype)
-
-
-@_optimum_shift.defjvp
-def _optimum_shift_jvp(loss: Loss, scale: float, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    optimum, views, idle = first_order((lax.stop_gradient(primals[0]), *primals[1:]), "ransac_fundamental")
-    zero = jnp.zeros(7, optimum.S.dtype)
-
-    def gradient(tangent: Array, views: TwoViews) -> Array:
-        return jax.grad(lambda t: _cost(_retract(optimum, t), views, loss, scale))(tangent)
-
-    of_idle = lambda weights: gradient(zero, idle._replace(weights=weights))
-    _, change = jax.jvp(partial(gradient, zero), (views,), (tangents[1],))
-    change = change + jax.jvp(of_idle, (idle.weights,), (tangents[2].weights,))[1]
-    exact = jax.jacfwd(gradient)(zero, views)
+    exact = jax.jacfwd(partial(_gradient, loss, scale))(jnp.zeros_like(right), optimum, inputs[0])
     exact = 0.5 * (exact + exact.T)
-    reweighted = _equations(optimum, views, loss, scale)[1].hessian
-    # Where the solver stopped short of a minimum the reweighted Hessian stands in; undetermined, nothing moves.
-    hessian = jnp.where(is_determined(exact), exact, reweighted)
+    hessian = jnp.where(is_determined(exact), exact, _equations(optimum, inputs[0], loss, scale)[1].hessian)
     determined = is_determined(hessian)
-    return zero, -solve_determined(hessian, determined, jnp.where(determined, change, 0.0))
+    return solve_determined(hessian, determined, jnp.where(determined, right, 0.0))
 
 
 def _cost(F: FramedMatrix, views: TwoViews, loss: Loss, scale: float) -> Scalar:
