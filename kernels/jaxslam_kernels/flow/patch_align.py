@@ -6,7 +6,7 @@ and SVO do), and aligned by Lucas-Kanade steps on one level, whatever the bright
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,7 @@ from jaxslam_kernels.types import Mask, Pixels, Scalar, Weights
 DEFAULT_PLAN = LevelPlan(21, 8, 0.05)
 _GAIN_SQUARED = (0.25, 4.0)
 """Smallest and largest."""
+_Rows: TypeAlias = tuple[Float[Array, "n l"], Float[Array, "n l"], Float[Array, "n l"]]
 
 
 class PatchMatch(NamedTuple):
@@ -135,17 +136,17 @@ def _matched(
 
     Source: Hager and Belhumeur, Efficient Region Tracking With Parametric Models of Geometry and Illumination, 1998.
     """
-    (centered, _), (centered_there, mean_there) = (
-        _centered(smooth[:, _middle(window)], counts),
-        _centered(there, counts),
-    )
-    area, power = _area(counts), _dot(centered, centered)
-    gain = jnp.sqrt(jnp.clip((_dot(centered_there, centered_there) + area) / (power + area), *_GAIN_SQUARED))
+    rows = _rows(counts, smooth[:, _middle(window)], there)
+    area, mean, power = _moments(rows)
+    gain = jnp.sqrt(jnp.clip((power[1] + area) / (power[0] + area), *_GAIN_SQUARED))[:, None]
     gradient = patches.gradients(smooth, window) * counts[:, None, :]
-    mean = jnp.sum(gradient, axis=2, keepdims=True) / area[:, :, None]
-    share = jnp.einsum("nkl,nl->nk", gradient, centered) / jnp.maximum(power, 1)
-    free = gradient - mean * counts[:, None, :] - share[:, :, None] * centered[:, None, :]
-    return gain * centered + mean_there, gain[:, :, None] * free
+    total, along = _products(gradient, rows[0], rows[1])
+    share = (along - total * mean[0][:, None]) / jnp.maximum(power[0], 1)[:, None]
+    centered = rows[1] - mean[0][:, None] * counts
+    free = (
+        gradient - (total / area[:, None])[:, :, None] * counts[:, None, :] - share[:, :, None] * centered[:, None, :]
+    )
+    return gain * centered + mean[1][:, None] + _level(there), gain[:, :, None] * free
 
 
 def _there(position: Pixels, inputs: _Inputs, window: Window, border: int) -> Float[Array, "n l"]:
@@ -155,25 +156,53 @@ def _there(position: Pixels, inputs: _Inputs, window: Window, border: int) -> Fl
     return patches.bilinear(flat, sight.fraction, window.stride, window.length)
 
 
-def _dot(a: Float[Array, "n l"], b: Float[Array, "n l"]) -> Float[Array, "n 1"]:
-    return jnp.einsum("nl,nl->n", a, b)[:, None]
+def _rows(counts: Float[Array, "n l"], patch: Float[Array, "n l"], there: Float[Array, "n l"]) -> _Rows:
+    """Which pixels count, and the intensities of two patches above their levels where they do, else 0."""
+    above = lambda flat: (flat - _level(flat)) * counts
+    return counts, above(patch), above(there)
 
 
-def _area(counts: Float[Array, "n l"]) -> Float[Array, "n 1"]:
-    return jnp.maximum(jnp.sum(counts, axis=1, keepdims=True), 1)
+def _level(flat: Float[Array, "n l"]) -> Float[Array, "n 1"]:
+    """The intensity of one pixel near the middle; squares of what is above it do not swallow the contrast."""
+    middle = flat.shape[1] // 2
+    return lax.stop_gradient(flat[:, middle : middle + 1])
 
 
-def _centered(
-    patch: Float[Array, "n l"], counts: Float[Array, "n l"]
-) -> tuple[Float[Array, "n l"], Float[Array, "n 1"]]:
-    """Patches less their mean, 0 where a pixel does not count, and the mean."""
-    mean = _dot(patch, counts) / _area(counts)
-    return (patch - mean) * counts, mean
+class _Moments(NamedTuple):
+    """Sums over the pixels of two patches that count.
+
+    Attributes:
+        area: `(n,)` number of pixels, at least 1.
+        mean: `(2, n)` mean intensity of each patch, above its level.
+        power: `(3, n)` sum of squares about the mean of the first patch, of the second, and of their product.
+    """
+
+    area: Float[Array, " n"]
+    mean: Float[Array, "2 n"]
+    power: Float[Array, "3 n"]
+
+
+def _moments(rows: _Rows) -> _Moments:
+    gram = jnp.stack([product.T for product in _products(jnp.stack(rows, axis=1), *rows)])
+    area = jnp.maximum(gram[0, 0], 1)
+    mean = gram[0, 1:] / area[None]
+    about_mean = lambda i, j: gram[i, j] - area * mean[i - 1] * mean[j - 1]
+    powers = (jnp.maximum(about_mean(i, i), 0) for i in (1, 2))  # rounding takes them below zero in flat patches
+    return _Moments(area, mean, jnp.stack([*powers, about_mean(1, 2)]))
+
+
+def _products(matrix: Float[Array, "n k l"], *vectors: Float[Array, "n l"]) -> list[Float[Array, "n k"]]:
+    """Batched products of matrices and vectors.
+
+    In this form XLA's CPU backend takes 2 us for 17,000 multiplications; as products of two vectors 8 us for half of
+    them, as products of two matrices with three rows 69 us.
+    """
+    return [jnp.einsum("nkl,nl->nk", matrix, vector) for vector in vectors]
 
 
 def _correlation(patch: Float[Array, "n l"], there: Float[Array, "n l"], counts: Float[Array, "n l"]) -> Weights:
-    first, second = (_centered(array, counts)[0] for array in (patch, there))
-    return (_dot(first, second) / jnp.sqrt(_dot(first, first) * _dot(second, second) + 1))[:, 0]
+    first, second, product = _moments(_rows(counts, patch, there)).power
+    return product / jnp.sqrt(first * second + 1)
 
 
 def _solve(inputs: _Inputs, *, plan: LevelPlan, border: int, chunk: int) -> ConvergedPositions:

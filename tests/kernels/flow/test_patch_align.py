@@ -317,7 +317,8 @@ class TestAlignPatches:
     def test_pictures_of_any_type(self):
         scene = _scene(20)
         same = scene._replace(pictures=np.float32(scene.pictures))
-        np.testing.assert_array_equal(_align(*same[:-1]).points, _align(*scene[:-1]).points)
+        # Up to rounding: XLA fuses what follows the conversion of integers in another way.
+        np.testing.assert_allclose(_align(*same[:-1]).points, _align(*scene[:-1]).points, rtol=3e-7)
 
     def test_masked(self):
         """A masked point says so and does not touch the others."""
