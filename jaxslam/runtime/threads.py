@@ -2,11 +2,13 @@
 
 import logging
 import os
+import sys
 
 _log = logging.getLogger(__name__)
 
 _chosen_here: int | None = None
 """Number that this module wrote to `NPROC`; `None` while that is the user's, or not set."""
+_SWITCH_S = 2e-4
 _told = False
 """Whether this process has been told that XLA has other threads than were asked for."""
 
@@ -39,6 +41,16 @@ def prefer_one_thread() -> None:
     With more threads XLA splits work that is too small for it, and waits for the parts; `bound_threads` has figures.
     """
     _bound_xla(1)
+
+
+def shorten_switch_interval() -> None:
+    """Have Python's threads give way to each other after 0.2 ms instead of 5, in the whole process; never later.
+
+    Tracking waits for the interpreter after every compiled program, while mapping computes in NumPy. With 5 ms frames
+    of a turning camera take 20.2 ms in the median and 31.4 at the 95th percentile, with 0.2 ms 18.9 and 29.4 (fr1_rpy
+    at 30 Hz, means of three runs in turn, AMD EPYC, two cores).
+    """
+    sys.setswitchinterval(min(sys.getswitchinterval(), _SWITCH_S))
 
 
 def threads() -> int:

@@ -16,7 +16,7 @@ from jaxslam.masks.depth_instances import InstanceFinder
 from jaxslam.runtime.compile_cache import enable_compile_cache
 from jaxslam.runtime.platform_choice import warn_unless_cpu
 from jaxslam.runtime.stage_timer import StageTimes
-from jaxslam.runtime.threads import bound_threads
+from jaxslam.runtime.threads import bound_threads, shorten_switch_interval
 from jaxslam.semantics import Detector
 from jaxslam.semantics.checked_detector import CheckedDetector
 from jaxslam.semantics.from_config import detector_of, key_detector_of, why_no_network
@@ -118,6 +118,8 @@ class Slam:
             localize_only,
         )
         bound_threads(self.config.run.threads)
+        if not self.config.run.in_turn:
+            shorten_switch_interval()
         warn_unless_cpu()
         enable_compile_cache()
         self._tracker = Tracker(camera, self.config)

@@ -88,7 +88,7 @@ def _moved(T_world_last: SE3, motion: _KnownMotion, own: SE3) -> SE3:
     return SE3(jnp.where(motion.has_rotation, compose(T_world_last, SE3(parts)).wxyz_xyz, own.wxyz_xyz))
 
 
-@compiled(when="warm-up", static="plan", donate="state", options=FAST_COMPILE)
+@compiled(when="warm-up", static="plan", donate="state", options=FAST_COMPILE | SINGLE_THREAD)
 def _track_followed(
     state: TrackState, frame: FrameArrays, followed: FlowResult, params: TrackParams, plan: TrackPlan
 ) -> tuple[TrackState, TrackOutput]:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import tiny_models
 
-from jaxslam import load_config
+from jaxslam import Camera, Slam, load_config
 from jaxslam.config.schema import SemanticsConfig
 from jaxslam.errors import ConfigError
 from jaxslam.semantics import OnnxDetector
@@ -77,6 +77,21 @@ def test_a_rendered_recording_may_be_opened_first(opened: str) -> None:
     """As in the README: the recording, then the tracker of its camera."""
     name = "'flat'" if "worlds" in opened else ""
     assert said(f"from jaxslam.{opened}; Opened({name}); begin(1)") == ["threads 1 1 False"]
+
+
+@pytest.mark.parametrize(
+    ("before", "deterministic", "expected"),
+    [(0.005, "false", 0.0002), (0.0001, "false", 0.0001), (0.005, "true", 0.005)],
+)
+def test_live_threads_give_way_soon(
+    monkeypatch: pytest.MonkeyPatch, before: float, deterministic: str, expected: float
+) -> None:
+    now = [before]
+    monkeypatch.setattr(sys, "getswitchinterval", lambda: now[0])
+    monkeypatch.setattr(sys, "setswitchinterval", now.append)
+    camera = Camera("small", width=64, height=64, fx=60.0, fy=60.0, cx=31.5, cy=31.5)
+    Slam(camera, load_config(overrides=["semantics.model=null", f"run.deterministic={deterministic}"])).close()
+    assert now[-1] == expected
 
 
 def test_must_be_positive() -> None:
