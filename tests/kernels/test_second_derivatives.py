@@ -1,5 +1,7 @@
 """Second derivatives of everything that is found by iteration: equal to central differences of the first."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,6 +29,7 @@ from small_problems import (
 )
 
 pytestmark = pytest.mark.usefixtures("float64")
+slow = partial(pytest.param, marks=pytest.mark.slow)
 
 
 def _varied(n, seed=0):
@@ -127,7 +130,9 @@ def _directions(t):
     return normalize(moved, jnp.array([[20.0, 150, 80], [30.0, 100, 61]]) + 10 * t).ravel()
 
 
-@pytest.mark.parametrize("kernel", [_flow, _patches, _directions, _pose, _consensus, _bundle, _graph, _match])
+@pytest.mark.parametrize(
+    "kernel", [_flow, _patches, _directions, _pose, _bundle, *(slow(k) for k in (_consensus, _graph, _match))]
+)
 def test_right(kernel):
     along = lambda f, t: jax.jvp(f, (t,), (jnp.ones_like(t),))[1]
     first = lambda t: along(kernel, t)
@@ -149,7 +154,7 @@ SOLVERS = {
 }
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("solver", ["refine_pose", slow("bundle_adjust"), slow("optimize_pose_graph")])
 def test_of_weights_of_zero(solver):
     """The limit from above, as the first derivatives are."""
     solve, n = SOLVERS[solver]
