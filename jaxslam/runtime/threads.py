@@ -1,4 +1,4 @@
-"""Number of threads that XLA and OpenCV compute with in this process."""
+"""Threads of this process: how many XLA and OpenCV compute with, and how soon those of Python give way."""
 
 import logging
 import os

@@ -55,16 +55,18 @@ def _implicit_shift_jvp(slope: Callable, solve: Callable, primals: tuple, tangen
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def only_derivative(function: Callable[..., T], *arguments: Any) -> T:
-    """Return zeros with the derivatives of a function, which is computed for those only.
+def only_derivative(function: Callable[..., T], like: T, *arguments: Any) -> T:
+    """Return zeros with the derivatives of a function, which is traced and computed for those only.
 
     Args:
         function: Function whose value is zero at the arguments; it must close over nothing that is traced.
+        like: Any value of the function, for its structure and types.
         arguments: Its arguments, pytrees of arrays.
     """
-    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(function, *arguments))
+    del function, arguments
+    return jax.tree.map(jnp.zeros_like, like)
 
 
 @only_derivative.defjvp
 def _only_derivative_jvp(function: Callable, primals: tuple, tangents: tuple) -> tuple[Any, Any]:
-    return only_derivative(function, *primals), jax.jvp(function, primals, tangents)[1]
+    return only_derivative(function, *primals), jax.jvp(function, primals[1:], tangents[1:])[1]

@@ -39,6 +39,23 @@ def is_determined(hessian: Float[Array, "d d"]) -> Flag:
     return (inflation < float(jnp.finfo(root.dtype).eps) ** -0.75).all()  # NaN compares false
 
 
+def solve_exact(exact: Float[Array, "d d"], reweighted: Float[Array, "d d"], right: Float[Array, " d"]) -> Array:
+    """Solve `H x = right` with the exact Hessian of a cost at its minimum.
+
+    Args:
+        exact: Exact Hessian, of which the symmetric part counts. It is positive definite at a strict minimum.
+        reweighted: Hessian that stands in where a solver stopped short of one.
+        right: Right-hand side.
+
+    Returns:
+        `(d,)` the solution; zero where neither determines every unknown.
+    """
+    exact = 0.5 * (exact + exact.T)
+    hessian = jnp.where(is_determined(exact), exact, reweighted)
+    determined = is_determined(hessian)
+    return solve_determined(hessian, determined, jnp.where(determined, right, 0.0))
+
+
 def solve_determined(hessian: Float[Array, "d d"], determined: Flag, right: Array) -> Array:
     """Solve `H x = right` for a positive definite H.
 

@@ -31,7 +31,7 @@ def lenient_promotion() -> Iterator[None]:
 def retract(T_a_b: SE3, tangent_b: Float[Array, "6"]) -> SE3:
     """`T_a_b @ exp(tangent_b)`: a pose moved in its own axes, translation first."""
     v, w = tangent_b[:3], tangent_b[3:]
-    first, second = _exponential_series(jnp.sum(jnp.square(w)))
+    first, second = _exponential_factors(jnp.sum(jnp.square(w)))
     turned = jnp.cross(w, v)
     # jaxlie takes `R v` for small angles, which is off by half of `w x v`, in value and derivative.
     shift = v + first * turned + second * jnp.cross(w, turned)
@@ -113,7 +113,7 @@ def cross_matrix(v: Float[Array, "3"]) -> Float[Array, "3 3"]:
     return jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
 
 
-def _exponential_series(squared: Scalar) -> tuple[Scalar, Scalar]:
+def _exponential_factors(squared: Scalar) -> tuple[Scalar, Scalar]:
     """`(1 - cos θ) / θ²` and `(θ - sin θ) / θ³` of a squared angle, with right derivatives of any order at 0 too."""
     small = squared < _SMALL_ANGLE_SQUARED
     x = jnp.where(small, squared, 0)
@@ -122,8 +122,7 @@ def _exponential_series(squared: Scalar) -> tuple[Scalar, Scalar]:
     large = jnp.where(small, 1, squared)
     angle = jnp.sqrt(large)
     exact = (1 - jnp.cos(angle)) / large, (angle - jnp.sin(angle)) / (large * angle)
-    first, second = (jnp.where(small, near, far) for near, far in zip(series, exact, strict=True))
-    return first, second
+    return jnp.where(small, series[0], exact[0]), jnp.where(small, series[1], exact[1])
 
 
 def _typed(T: SE3, like: SE3) -> SE3:

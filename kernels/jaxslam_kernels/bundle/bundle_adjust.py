@@ -167,7 +167,7 @@ def bundle_adjust(
     optimum, optimal_points = shift_cameras(start, tangents), start_points + shifts
     initial_cost = _cost(cameras, bundle_views(cameras, X_world, problem, loss), problem, loss)
     result = _report(optimum, optimal_points, problem, slot, loss, initial_cost, solution)
-    more_cost = only_derivative(partial(_idle_cost, loss), optimum, optimal_points, inputs)
+    more_cost = only_derivative(partial(_idle_cost, loss), result.cost, optimum, optimal_points, inputs)
     return result._replace(cost=result.cost + more_cost)
 
 
@@ -310,7 +310,7 @@ def _solve_exact(
 
 
 def _idle_cost(loss: Loss, cameras: Cameras, X_world: Points, inputs: _Inputs) -> Scalar:
-    """What a rising weight of points without any would add to the cost: where they would go, not where they are."""
+    """Cost that a rising weight of points without any would add where they would go, less that where they are."""
     problem = inputs.problem
     idle = idle_points(cameras, X_world, problem, inputs.relative, loss)
 

@@ -157,7 +157,7 @@ def _there(position: Pixels, inputs: _Inputs, window: Window, border: int) -> Fl
 
 
 def _rows(counts: Float[Array, "n l"], patch: Float[Array, "n l"], there: Float[Array, "n l"]) -> _Rows:
-    """Which pixels count, and the intensities of two patches above their levels where they do, else 0."""
+    """Rows of 1 for pixels that count, and of the intensities of two patches above their levels; else 0."""
     above = lambda flat: (flat - _level(flat)) * counts
     return counts, above(patch), above(there)
 

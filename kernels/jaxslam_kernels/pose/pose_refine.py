@@ -33,7 +33,7 @@ from jaxslam_kernels.pose.pose_cost import (
     shifted,
     with_idle,
 )
-from jaxslam_kernels.positive_definite import is_determined, solve_determined
+from jaxslam_kernels.positive_definite import is_determined, solve_determined, solve_exact
 from jaxslam_kernels.robust import Loss
 from jaxslam_kernels.types import Code, Flag, Pixels, Points, Scalar, Weights
 
@@ -203,16 +203,9 @@ def _slope(loss: Loss, step: Float[Array, "6"], optimum: SE3, inputs: tuple[Pose
 
 
 def _solve(loss: Loss, optimum: SE3, inputs: tuple[PoseProblem, PoseProblem], right: Array) -> Array:
-    """Solve for a step with the exact Hessian.
-
-    That is positive definite at a strict minimum. Where the solver stopped short of one the reweighted one stands in,
-    and where the pose is undetermined the step is zero.
-    """
+    """Solve for a step."""
     exact = jax.jacfwd(partial(_slope, loss))(jnp.zeros_like(right), optimum, inputs)
-    exact = 0.5 * (exact + exact.T)
-    hessian = jnp.where(is_determined(exact), exact, pose_cost(optimum, inputs[0], loss).equations.hessian)
-    determined = is_determined(hessian)
-    return solve_determined(hessian, determined, jnp.where(determined, right, 0.0))
+    return solve_exact(exact, pose_cost(optimum, inputs[0], loss).equations.hessian, right)
 
 
 class _Figures(NamedTuple):

@@ -179,7 +179,7 @@ def idle_gradient(nodes: Nodes, idle: GraphProblem, change: Float[Array, " e"], 
 
 def idle_cost(nodes: Nodes, idle: GraphProblem, loss: Loss) -> Scalar:
     """The cost of the idle edges: zero, with its derivatives by their weights."""
-    return only_derivative(partial(_idle_cost, loss), nodes, idle)
+    return only_derivative(partial(_idle_cost, loss), jnp.zeros((), nodes.dtype), nodes, idle)
 
 
 def _idle_cost(loss: Loss, nodes: Nodes, idle: GraphProblem) -> Scalar:

@@ -336,8 +336,11 @@ class _Optimum(NamedTuple):
 
     def shifted(self, steps: Steps, initial: Nodes) -> Nodes:
         """Return the free nodes a step from the optimum, and the others as they are given."""
-        free = self.graph.free[:, None]
-        return shift_nodes(jnp.where(free, self.nodes, initial), jnp.where(free, steps, 0.0))
+        return shift_nodes(self.where_free(self.nodes, initial), self.where_free(steps, jnp.zeros_like(steps)))
+
+    def where_free(self, of_free: Array, of_others: Array) -> Array:
+        """Return one array for the free nodes, and another for those that stay."""
+        return jnp.where(self.graph.free[:, None], of_free, of_others)
 
 
 _Inputs: TypeAlias = tuple[Nodes, GraphProblem, GraphProblem]
@@ -349,15 +352,18 @@ def _slope(solver: _Solver, steps: Steps, optimum: _Optimum, inputs: _Inputs) ->
     initial, problem, idle = inputs
     nodes = optimum.shifted(steps, initial)
     gradient = graph_gradient(nodes, problem, solver.loss) + idle_gradient(nodes, idle, idle.weights, solver.loss)
-    return jnp.where(optimum.graph.free[:, None], gradient, steps)
+    return optimum.where_free(gradient, steps)
 
 
 def _solve_exact(solver: _Solver, optimum: _Optimum, inputs: _Inputs, right: Steps) -> Steps:
     """Solve with the exact Hessian, preconditioned by the reweighted one; zero where the search did not converge."""
     graph, zero = optimum.graph, jnp.zeros_like(right)
 
+    def gradient(steps: Steps) -> Steps:  # without the idle edges, whose weights are zero
+        return graph_gradient(optimum.shifted(steps, inputs[0]), graph.problem, solver.loss)
+
     def hessian(steps: Steps) -> Steps:
-        return jax.jvp(lambda steps: _slope(solver, steps, optimum, inputs), (zero,), (steps,))[1]
+        return optimum.where_free(jax.jvp(gradient, (zero,), (steps,))[1], steps)
 
     epsilon = float(jnp.finfo(right.dtype).eps)
     nodes = optimum.shifted(zero, inputs[0])

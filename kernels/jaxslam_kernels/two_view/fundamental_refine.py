@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from jaxslam_kernels.derivative_rules import implicit_shift
 from jaxslam_kernels.levenberg_marquardt import ManifoldLevenbergMarquardt, NormalEquations
-from jaxslam_kernels.positive_definite import is_determined, solve_determined
+from jaxslam_kernels.positive_definite import is_determined, solve_exact
 from jaxslam_kernels.robust import Loss, loss_value, loss_weight
 from jaxslam_kernels.two_view.epipolar import MIN_SLOPE, adjugate, sampson_squared
 from jaxslam_kernels.types import Flag, Pixels, Scalar, Weights
@@ -194,15 +194,9 @@ def _slope(
 def _solve(
     loss: Loss, scale: float, optimum: FramedMatrix, inputs: tuple[TwoViews, TwoViews], right: Float[Array, "7"]
 ) -> Float[Array, "7"]:
-    """Solve for a step with the exact Hessian.
-
-    Where the solver stopped short of a minimum the reweighted one stands in; undetermined, nothing moves.
-    """
+    """Solve for a step."""
     exact = jax.jacfwd(partial(_gradient, loss, scale))(jnp.zeros_like(right), optimum, inputs[0])
-    exact = 0.5 * (exact + exact.T)
-    hessian = jnp.where(is_determined(exact), exact, _equations(optimum, inputs[0], loss, scale)[1].hessian)
-    determined = is_determined(hessian)
-    return solve_determined(hessian, determined, jnp.where(determined, right, 0.0))
+    return solve_exact(exact, _equations(optimum, inputs[0], loss, scale)[1].hessian, right)
 
 
 def _cost(F: FramedMatrix, views: TwoViews, loss: Loss, scale: float) -> Scalar:
