@@ -290,8 +290,8 @@ class RunConfig(ValidatedConfig):
     prefetch_frames: Annotated[int, Range(at_least=1, at_most=64)] = 4
     """Number of frames of a recording decoded ahead of the tracker."""
     threads: Annotated[int, Range(at_least=1, at_most=64)] = 1
-    """Number of threads that XLA, OpenCV and the network may each use. XLA takes it at the first array of the process,
-    and `NPROC` in the environment outranks it there. One is fastest for the tracker."""
+    """Number of threads that XLA, OpenCV, BLAS and the network may each use. XLA takes it at the first array of the
+    process, and `NPROC` in the environment outranks it there. One is fastest for the tracker."""
 
     @property
     def in_turn(self) -> bool:

@@ -159,7 +159,7 @@ class BackEnd:
             The steps after which `begin` may be called, and those after which that of `dense` may be called too.
         """
         steps: list[_Step] = [
-            import_scipy,
+            partial(import_scipy, self._config.run.threads),
             partial(self._writer.compile, frame, self._num_tracks),
             partial(self._link.compile, state, drops_points=self._semantics is not None),
             partial(compile_view_matching, self._sensor, self._plan.features),

@@ -1,4 +1,4 @@
-"""Threads of XLA, OpenCV and networks: one number for all, whatever a program did before its first `Slam`."""
+"""Threads of XLA, OpenCV, BLAS and networks: one number for all, whatever a program did before its first `Slam`."""
 
 import os
 import subprocess
@@ -45,6 +45,17 @@ def said(body: str, **environment: str) -> list[str]:
 @pytest.mark.parametrize("number", [1, 2])
 def test_set_by_the_first_tracker(number: int) -> None:
     assert said(f"begin({number})") == [f"threads {number} {number} False"]
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_of_blas(number: int) -> None:
+    """Of NumPy, and of SciPy, which is loaded for the map."""
+    found = said(
+        f"slam = begin({number}); from jaxslam.runtime.preload import import_scipy; import_scipy({number})\n"
+        "from threadpoolctl import threadpool_info\n"
+        "print(sorted({library['num_threads'] for library in threadpool_info() if library['user_api'] == 'blas'}))"
+    )
+    assert found[0] == f"[{number}]"
 
 
 def test_environment_outranks_it() -> None:
