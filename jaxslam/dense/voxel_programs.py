@@ -30,7 +30,6 @@ from jaxslam_kernels.types import Points, Weights
 from jaxtyping import Array, Float, Float16, Float32, Int, Int16, Int32, UInt8
 
 from jaxslam.runtime.compiled import compiled
-from jaxslam.runtime.compiler_options import SINGLE_THREAD
 
 ROWS = 1024
 """Rows of the grid in a block: small, so that few rows of a block in view are out of view."""
@@ -77,7 +76,7 @@ def cloud_size(points: int) -> int:
     return -(-points // _POINTS) * _POINTS
 
 
-@compiled(when="warm-up", static="capacity", options=SINGLE_THREAD)
+@compiled(when="warm-up", static="capacity")
 def reduced(
     X_cam: Float32[Array, "3 n"],
     color: UInt8[Array, "3 n"],
@@ -94,7 +93,7 @@ def reduced(
     return (X, jnp.round(voxels.color).astype(jnp.uint8), voxels.counts.astype(jnp.float16)), voxels.num
 
 
-@compiled(when="warm-up", donate="grid", options=SINGLE_THREAD)
+@compiled(when="warm-up", donate="grid")
 def put(
     grid: VoxelGrid, cloud: Cloud, evidence: Float[Array, " m"], pose: Float[Array, "7"], voxel_m: Float[Array, ""]
 ) -> tuple[VoxelGrid, Int[Array, " m"]]:
@@ -110,7 +109,7 @@ def put(
     return _over_blocks(cloud, add, (grid, jnp.full(cloud.size, NO_ROW, jnp.int32)))
 
 
-@compiled(when="warm-up", donate="grid", options=SINGLE_THREAD)
+@compiled(when="warm-up", donate="grid")
 def taken_out(
     grid: VoxelGrid,
     rows: Int[Array, " m"],
@@ -129,7 +128,7 @@ def taken_out(
     return _over_blocks(cloud, take, grid)
 
 
-@compiled(when="warm-up", donate="grid", options=SINGLE_THREAD)
+@compiled(when="warm-up", donate="grid")
 def looked(
     grid: VoxelGrid,
     blocks: Int[Array, " b"],
@@ -158,7 +157,7 @@ def looked(
     return grid._replace(sums=lax.fori_loop(0, num, look, grid.sums))
 
 
-@compiled(when="warm-up", options=SINGLE_THREAD)
+@compiled(when="warm-up")
 def num_past(
     cloud: Cloud,
     pose: Float[Array, "7"],

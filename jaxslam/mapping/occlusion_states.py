@@ -27,7 +27,6 @@ from jaxslam.map.partial_map import extract_around, merge_back
 from jaxslam.map.point_records import NONE, rows
 from jaxslam.map.types import Map, visibility
 from jaxslam.runtime.compiled import committed, compiled
-from jaxslam.runtime.compiler_options import SINGLE_THREAD
 from jaxslam.runtime.padding import padded
 from jaxslam.sensors.frame_arrays import FrameArrays
 from jaxslam.sensors.measurement import depth_sigma, expected_pixels, surface_depth
@@ -225,7 +224,7 @@ def occluded_shares(slam_map: Map) -> Float64[np.ndarray, " k"]:
     return (seen @ (slam_map.points.state == PointState.OCCLUDED)) / np.maximum(seen.sum(axis=1), 1)
 
 
-@compiled(when="warm-up", static="guard", options=SINGLE_THREAD)
+@compiled(when="warm-up", static="guard")
 def _after_frame(
     columns: _Columns,
     T_keyframe_cam: Float[Array, "7"],

@@ -20,7 +20,6 @@ from jaxslam.map.point_records import rows
 from jaxslam.map.types import Map
 from jaxslam.mapping.view_coverage import in_view
 from jaxslam.runtime.compiled import compiled
-from jaxslam.runtime.compiler_options import SINGLE_THREAD
 from jaxslam.runtime.padding import padded
 from jaxslam.sensors.frame_arrays import FrameArrays
 from jaxslam.sensors.measurement import depth_sigma, expected_pixels, surface_depth
@@ -119,7 +118,7 @@ def vanished_points(slam_map: Map, keyframe_ids: Ids, T_world_cam: Pose, seen: F
     return VanishedPoints(ids[gone], confirmed[gone], ids[there], int(confirmed.sum()), int(num_there))
 
 
-@compiled(when="warm-up", options=SINGLE_THREAD)
+@compiled(when="warm-up")
 def _compared(
     X_cam: Points,
     twist: Float[Array, "6"],

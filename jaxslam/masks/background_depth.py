@@ -19,7 +19,6 @@ from jaxtyping import Array, Bool, Float
 from jaxslam.geometry.se3 import between, compose
 from jaxslam.runtime.aligned_memory import aligned_array
 from jaxslam.runtime.compiled import compiled
-from jaxslam.runtime.compiler_options import SINGLE_THREAD
 from jaxslam.sensors.downscale import Downscaler, ImageGrid
 
 _COARSE_WIDTH = 160
@@ -209,7 +208,7 @@ def new_surfaces(seen: BackgroundSurfaces, mask: Bool[np.ndarray, "h w"]) -> Boo
     return coming
 
 
-@compiled(when="warm-up", options=SINGLE_THREAD)
+@compiled(when="warm-up")
 def _compared(
     depth: Float[Array, "h w"],
     depths_then: Float[Array, "k h w"],

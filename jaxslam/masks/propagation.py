@@ -31,7 +31,6 @@ from jaxtyping import Array, Bool, Float, Float32, Int, Int32, UInt8
 from jaxslam.masks.point_sampling import sample_mask
 from jaxslam.runtime.aligned_memory import aligned_array
 from jaxslam.runtime.compiled import compiled
-from jaxslam.runtime.compiler_options import SINGLE_THREAD
 
 CAPACITY = 128
 """Largest number of points: for a person who fills a fifth of the image, one in about every other cell."""
@@ -293,10 +292,10 @@ def _flow(before: Pyramid, now: Pyramid, uv: Pixels, ok: Mask) -> tuple[Pixels, 
     return flow.points, flow.ok
 
 
-_follow_between = compiled(when="warm-up", options=SINGLE_THREAD)(_flow)
+_follow_between = compiled(when="warm-up")(_flow)
 
 
-@compiled(when="warm-up", options=SINGLE_THREAD)
+@compiled(when="warm-up")
 def _follow_last(
     before: Pyramid,
     gray: UInt8[Array, "h w"],

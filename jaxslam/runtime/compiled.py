@@ -9,7 +9,7 @@ from typing import Any, Literal, TypeAlias, TypeVar, cast
 
 import jax
 
-from jaxslam.runtime.compiler_options import known_options
+from jaxslam.runtime.compiler_options import SINGLE_THREAD, known_options
 from jaxslam.runtime.garbage import collector_paused
 from jaxslam.runtime.trace_cache import cached_trace
 
@@ -119,7 +119,8 @@ def compiled(
         when: Time at which it is compiled. `Slam.warm_up` must call every program marked `warm-up`; a test checks it.
         static: Names of the arguments that are no arrays: each value is compiled by itself.
         donate: Names of the arguments whose memory the result may take over; the caller must not use them again.
-        options: Compiler options, one of the sets of `jaxslam.runtime.compiler_options`.
+        options: Compiler options, sets of `jaxslam.runtime.compiler_options`. A program for the warm-up runs beside
+            those of other threads, and so has `SINGLE_THREAD` in any case.
     """
 
     def decorate(function: Callable[..., R]) -> Callable[..., R]:
@@ -135,8 +136,9 @@ def compiled(
             with collector_paused():
                 return cached(*args, **kwargs)
 
+        chosen = {**(SINGLE_THREAD if when == "warm-up" else {}), **(options or {})}
         jit: Any = partial(jax.jit, static_argnames=static or None, donate_argnames=donate or None)
-        jitted: Any = jit(traced) if options is None else _WithOptions(traced, options, jit)
+        jitted: Any = _WithOptions(traced, chosen, jit) if chosen else jit(traced)
         return jitted
 
     return decorate

@@ -24,13 +24,17 @@ in 17 s instead of 35 (AMD EPYC, two cores), and a frame takes as long, within 3
 of memory to compile instead of 1.8, and three quarters of the time.
 """
 
-SINGLE_THREAD: dict[str, bool | str] = {"xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"}
-"""Options of `jax.jit` for a program that runs beside another: one part after the other, all in the calling thread.
+SINGLE_THREAD: dict[str, bool | str] = {
+    "xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED",
+    "xla_cpu_multi_thread_eigen": False,
+}
+"""Options of `jax.jit` for a program that runs beside another: one part after the other, nearly all in the calling
+thread, and so at its priority.
 
 XLA else hands parts that do not depend on each other to a pool of threads, even if that has one thread only, and they
-wait there behind those of other programs: beside optical flow, 0.3 ms of work for masks took 2.1 ms. With nothing
-beside, both take as long. A live frame of fr1_rpy takes 4.6 % less with both parts of the tracker in the calling thread
-(median, four runs of each in turn, AMD EPYC, two cores); of Bonn crowd, 2 %.
+wait there behind those of other programs. Beside optical flow, 0.3 ms of work for masks took 2.1 ms; beside bundle
+adjustment, the pose of a frame took 11.5 ms in the median, and 5.5 with both options (fr1_rpy live, AMD EPYC). With
+nothing beside, programs take as long. Loops whose bodies have many parts still go to the pool now and then.
 """
 
 FUSION_EMITTERS: dict[str, bool | str] = {"xla_cpu_use_fusion_emitters": True} if _HAS_OLDER_GENERATOR else {}

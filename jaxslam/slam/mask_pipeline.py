@@ -18,7 +18,6 @@ from jaxslam.masks.box_to_mask import dilated
 from jaxslam.masks.propagation import PYRAMID_LEVELS, follow, make_origin, predicted_mask
 from jaxslam.runtime.aligned_memory import aligned_array
 from jaxslam.runtime.compiled import committed, compiled
-from jaxslam.runtime.compiler_options import SINGLE_THREAD
 from jaxslam.runtime.stage_timer import StageTimes
 from jaxslam.semantics import Detector
 from jaxslam.sensors.camera import Camera
@@ -36,7 +35,7 @@ _DEPTH_FRAMES = 15
 WIDTH_PX = 320
 """Masks are made at about so many columns: one of a third of the image is carried on in 1.5 ms, at 640 in 5.4."""
 
-_pyramid = compiled(when="warm-up", options=SINGLE_THREAD)(partial(build_pyramid, num_levels=PYRAMID_LEVELS))
+_pyramid = compiled(when="warm-up")(partial(build_pyramid, num_levels=PYRAMID_LEVELS))
 
 
 class MaskSource(enum.IntEnum):

@@ -255,6 +255,7 @@ class Slam:
         covariance = self._uncertainty.of_pose(result, output, self._tracker.state.keyframes)
         self._masks.submit_for_detection(self._frame, frame.image)
         self._frame += 1
+        self._back.dispatch_jobs()
         watch.ends("hand over")
         track_ms = (time.perf_counter() - began) * 1e3
         return replace(result, covariance=covariance, track_ms=track_ms, warnings=self._warnings.taken())

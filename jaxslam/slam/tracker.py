@@ -18,7 +18,7 @@ from jaxslam.config.schema import Config
 from jaxslam.geometry.se3 import IDENTITY
 from jaxslam.geometry.types import Pose
 from jaxslam.runtime.compiled import committed, compiled, lower
-from jaxslam.runtime.compiler_options import FAST_COMPILE, SINGLE_THREAD
+from jaxslam.runtime.compiler_options import FAST_COMPILE
 from jaxslam.runtime.garbage import collector_paused
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame_arrays import FrameArrays
@@ -57,7 +57,7 @@ def _known_motion(T_last_cam: Pose | None, *, translation: bool = True) -> _Know
     return _KnownMotion(motion, *known)
 
 
-@compiled(when="warm-up", static="plan", options=FAST_COMPILE | SINGLE_THREAD)
+@compiled(when="warm-up", static="plan", options=FAST_COMPILE)
 def _follow_points(
     state: TrackState,
     frame: FrameArrays,
@@ -88,7 +88,7 @@ def _moved(T_world_last: SE3, motion: _KnownMotion, own: SE3) -> SE3:
     return SE3(jnp.where(motion.has_rotation, compose(T_world_last, SE3(parts)).wxyz_xyz, own.wxyz_xyz))
 
 
-@compiled(when="warm-up", static="plan", donate="state", options=FAST_COMPILE | SINGLE_THREAD)
+@compiled(when="warm-up", static="plan", donate="state", options=FAST_COMPILE)
 def _track_followed(
     state: TrackState, frame: FrameArrays, followed: FlowResult, params: TrackParams, plan: TrackPlan
 ) -> tuple[TrackState, TrackOutput]:
