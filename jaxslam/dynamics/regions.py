@@ -13,7 +13,7 @@ from jax import lax
 from jaxslam_kernels.camera import Intrinsics, back_project
 from jaxslam_kernels.clustering.kmeans import kmeans
 from jaxslam_kernels.types import DepthImage, Mask, Points, Weights
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key, Shaped
 
 from jaxslam.config.cue_sections import ClusterCueConfig
 from jaxslam.runtime.filled_arrays import filled
@@ -191,8 +191,15 @@ def moving_pixels(
 ) -> Bool[Array, "h w"]:
     """Return `(height, width)` the pixels of regions that are more likely moving."""
     moving = (weight < 0.5)[jnp.maximum(regions.of_pixel, 0)] & (regions.of_pixel >= 0)
-    whole = jnp.repeat(jnp.repeat(moving, plan.step_px, axis=0), plan.step_px, axis=1)
-    return whole[:height, :width]
+    return _of_blocks(moving, height, width, plan)
+
+
+def moving_shares(
+    regions: Regions, weight: Float[Array, " k"], height: int, width: int, plan: RegionPlan
+) -> Float[Array, "h w"]:
+    """Return `(height, width)` one minus the weight of each pixel's region; 0 where depth is missing."""
+    share = jnp.where(regions.of_pixel >= 0, 1 - weight[jnp.maximum(regions.of_pixel, 0)], 0)
+    return _of_blocks(share, height, width, plan)
 
 
 def mean_of_regions(values: Weights, counts: Mask, regions: Regions) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
@@ -221,6 +228,14 @@ def balance_regions(weights: Weights, regions: Regions) -> Weights:
 def of_points(per_region: Array, regions: Regions, otherwise: Array) -> Array:
     """Return `(n,)` the value of each point's region; `otherwise` for points in none."""
     return jnp.where(regions.of_point >= 0, per_region[jnp.maximum(regions.of_point, 0)], otherwise)
+
+
+def _of_blocks(
+    values: Shaped[Array, "rows columns"], height: int, width: int, plan: RegionPlan
+) -> Shaped[Array, "h w"]:
+    """Give all pixels of a block its value."""
+    whole = jnp.repeat(jnp.repeat(values, plan.step_px, axis=0), plan.step_px, axis=1)
+    return whole[:height, :width]
 
 
 def _nearest(X_cam: Points, centers: Centers) -> Int[Array, " n"]:

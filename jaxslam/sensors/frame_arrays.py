@@ -18,7 +18,9 @@ class FrameArrays(NamedTuple):
     Attributes:
         image: `(h, w)` gray values, 0 to 255: `uint8`, or floating point to differentiate with respect to them.
         depth: `(h, w)` floating-point depth in meters; 0 or not finite where missing.
-        ignore: `(h, w)` mask, true where no pixel is to be trusted (people, the robot itself).
+        ignore: `(h, w)` mask of the pixels that are not to be trusted (people, the robot itself): `bool`, or floating
+            point from 0 (trusted) to 1 (ignored) to differentiate with respect to it. A point has one minus that of its
+            pixel of its weight in the pose; corners are detected where it is at most one half.
         dt_s: Time since the previous frame in seconds.
         depth_delay_s: Time from the image to the depth image in seconds.
         right: `(h, w)` right image of a rectified pair, of the type of `image`; `None` where depth is measured. With a
@@ -31,7 +33,7 @@ class FrameArrays(NamedTuple):
 
     image: Num[Array, "*time h w"]
     depth: Float[Array, "*time h w"]
-    ignore: Bool[Array, "*time h w"]
+    ignore: Bool[Array, "*time h w"] | Float[Array, "*time h w"]
     dt_s: Float[Array, "*time"]
     depth_delay_s: Float[Array, "*time"]
     right: Num[Array, "*time h w"] | None = None
@@ -73,6 +75,22 @@ def check_gray_range(name: str, image: ArrayLike, error: type[Exception] = Value
     least, most = float(values.min()), float(values.max())
     if least >= 0 and 0 < most <= 1:
         raise error(f"{name}: expected gray values from 0 to 255, got {least:.3g} to {most:.3g}; multiply them by 255")
+
+
+def check_mask_range(name: str, ignore: ArrayLike, error: type[Exception] = ValueError) -> None:
+    """Refuse a floating-point mask whose values are not all from 0 to 1.
+
+    Args:
+        name: Name of the mask in the message.
+        ignore: Mask of any shape and type, not a tracer.
+        error: Class of the error to raise.
+    """
+    values = np.asarray(ignore)
+    if values.dtype == np.bool_ or not values.size:
+        return
+    least, most = float(values.min()), float(values.max())
+    if not (least >= 0 and most <= 1):  # NaN is refused too
+        raise error(f"{name}: expected values from 0 (trusted) to 1 (ignored), got {least:.3g} to {most:.3g}")
 
 
 def own_copy(arrays: FrameArrays) -> FrameArrays:

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
+from jax import lax
 from jaxlie import SE3
 from jaxslam_kernels.camera import distort, normalize, to_pixels
 from jaxslam_kernels.depth.sampling import sample_depth, valid_depth
@@ -58,9 +59,37 @@ class PreparedFrame(NamedTuple):
         dtype, border = self.pyramid.levels[0].dtype, self.pyramid.border
         return self._replace(right=build_pyramid(self.frame.right, num_levels=RIGHT_LEVELS, border=border, dtype=dtype))
 
-    def without(self, pixels: Bool[Array, "h w"]) -> "PreparedFrame":
-        """The same frame with these pixels to be ignored too."""
-        return self._replace(frame=self.frame._replace(ignore=self.frame.ignore | pixels))
+    def is_softly_masked(self) -> bool:
+        """Return whether the mask of ignored pixels is floating point, from 0 to 1; static."""
+        return self.frame.ignore.dtype != jnp.bool_
+
+    def without(self, pixels: Bool[Array, "h w"] | Float[Array, "h w"]) -> "PreparedFrame":
+        """The same frame with these pixels to be ignored too; by a soft mask, as far as they are above it."""
+        ignore = self.frame.ignore
+        both = jnp.maximum(ignore, pixels.astype(ignore.dtype)) if self.is_softly_masked() else ignore | pixels
+        return self._replace(frame=self.frame._replace(ignore=both))
+
+    def ignored(self, uv: Pixels) -> Mask:
+        """Return the `(n,)` mask of the pixels that count for nothing; those outside the image do not either."""
+        ignore = self._ignore_at(uv)
+        return ignore >= 1 if self.is_softly_masked() else ignore
+
+    def weighed(self, uv: Pixels, weights: Weights) -> Weights:
+        """Multiply the `(n,)` weights of points by those of their pixels: one minus a soft mask.
+
+        The nearest pixel counts, a constant of derivatives; those by the mask are exact. Under a mask of `bool`, points
+        are left out by `ignored`, and weights stay as they are.
+        """
+        return weights * (1 - self._ignore_at(uv)) if self.is_softly_masked() else weights
+
+    def may_hold_corners(self) -> Bool[Array, "h w"]:
+        """Return the mask of the pixels at which new points may be detected: those that are rather trusted."""
+        return self.frame.ignore <= 0.5 if self.is_softly_masked() else ~self.frame.ignore
+
+    def _ignore_at(self, uv: Pixels) -> Mask | Weights:
+        """Return the `(n,)` mask at the nearest pixels, of its own type; true or 1 outside the image."""
+        column, row = jnp.round(lax.stop_gradient(uv)).astype(jnp.int32)
+        return self.frame.ignore.at[row, column].get(mode="fill", fill_value=True)
 
 
 class Measurements(NamedTuple):

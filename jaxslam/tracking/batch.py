@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 from jaxslam.errors import ConfigError, FrameError
 from jaxslam.runtime.compiled import compiled
 from jaxslam.runtime.compiler_options import FAST_COMPILE, SINGLE_THREAD
-from jaxslam.sensors.frame_arrays import FrameArrays, check_gray_range
+from jaxslam.sensors.frame_arrays import FrameArrays, check_gray_range, check_mask_range
 from jaxslam.tracking.initial_state import DEFAULT_PLAN, init_state
 from jaxslam.tracking.state import TrackParams, TrackPlan, TrackState
 from jaxslam.tracking.step import track_step
@@ -145,6 +145,7 @@ def _check_clips(clips: Sequence[FrameArrays]) -> None:
                 raise FrameError(f"clips: {name}: expected {one} as in the first clip, got {other} in clip {index}")
     for index, clip in enumerate(clips):
         check_gray_range(f"clips: image of clip {index}", clip.image, FrameError)
+        check_mask_range(f"clips: ignore of clip {index}", clip.ignore, FrameError)
 
 
 def _check_settings(batch: _Batch, at_once: int, threads: int) -> None:

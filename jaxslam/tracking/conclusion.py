@@ -193,7 +193,7 @@ def _new_state(step: StepContext, estimate: FrameEstimate, motion: _Motion, endi
     state, view, params, plan = step
     lost, points, moved = estimate.outcome.lost, ending.points, estimate.rejection.motion
     held, make = lost & ~ending.started, ending.keyframe > 0
-    trust = jnp.where(ending.at_rest, probation_weights(points, params), 0)
+    trust = view.weighed(points.uv, jnp.where(ending.at_rest, probation_weights(points, params), 0))
     image, pose = view.frame.image, motion.T_world_cam
     velocity = updated_statistics(state.velocity, state.twist, motion.twist, view.elapsed_s)
     still_to_start = held & (state.phase == TrackPhase.START)
@@ -223,6 +223,7 @@ def _output(step: StepContext, estimate: FrameEstimate, motion: _Motion, ending:
     lost, points, dtype = outcome.lost, ending.points, motion.twist.dtype
     statuses = (TrackStatus.STARTED, TrackStatus.LOST, TrackStatus.WEAK)
     matches = matches._replace(weight=jnp.where(lost, 0, matches.weight))
+    weights = step.view.weighed(points.uv, points.weight)
     variance = jnp.where(ending.started, _NO_VARIANCE, _UNKNOWN_VARIANCE)
     return TrackOutput(
         T_world_cam=motion.T_world_cam,
@@ -234,7 +235,7 @@ def _output(step: StepContext, estimate: FrameEstimate, motion: _Motion, ending:
         num_keyframe_matches=jnp.sum(matches.weight > 0),
         residual_px=refined.residual_scale * step.params.pixel_sigma,
         uv=points.uv,
-        weights=jnp.where(points.has_position() & ending.at_rest & (~lost | motion.start), points.weight, 0),
+        weights=jnp.where(points.has_position() & ending.at_rest & (~lost | motion.start), weights, 0),
         tracked=kept.tracked & ~lost,
         X_world=points.X_world,
         id=points.id,

@@ -18,6 +18,7 @@ from jaxslam.dynamics.regions import (
     Regions,
     lasting_weights,
     moving_pixels,
+    moving_shares,
     of_points,
     region_weights,
 )
@@ -63,6 +64,8 @@ class DynamicRejection(NamedTuple):
         memory: Memory of the regions for the next frame.
         remembered: `(n,)` factor on the weights: 0 for points in regions that moved a moment ago, 1 elsewhere.
         moving: `(h, w)` mask of the moving regions and objects.
+        ignored: `(h, w)` part in which each pixel is to be ignored, from 0 to 1: 1 for what moved a moment ago, and one
+            minus the weight that cues with a temperature give its region. `None` where the frame's mask is not soft.
         applied: Whether the results are applied to the points: not if tracking would be lost by it.
         motion: Motion estimates of the movable objects.
     """
@@ -72,6 +75,7 @@ class DynamicRejection(NamedTuple):
     memory: RegionMemory | None = None
     remembered: Weights | None = None
     moving: Bool[Array, "h w"] | None = None
+    ignored: Float[Array, "h w"] | None = None
     applied: Flag | bool = True
     motion: MotionState | None = None
 
@@ -86,14 +90,18 @@ class DynamicRejection(NamedTuple):
         return self.weights(jnp.ones(())) > 0
 
     def without_moving_pixels(self, view: PreparedFrame) -> PreparedFrame:
-        """Return the frame with the moving pixels ignored."""
-        return view if self.moving is None else view.without(self.moving)
+        """Return the frame with the moving pixels ignored, by a soft mask in part."""
+        if self.moving is None:
+            return view
+        return view.without(self.moving if self.ignored is None else self.ignored)
 
     def with_motion(self, motion: MotionState, view: PreparedFrame) -> "DynamicRejection":
         """Add the motion estimates of movable objects, and their moving pixels."""
         assert view.frame.movable is not None
         moving = motion.moving_pixels(view.frame.movable)
-        return self._replace(motion=motion, moving=moving if self.moving is None else self.moving | moving)
+        ignored = None if self.ignored is None else jnp.maximum(self.ignored, moving.astype(self.ignored.dtype))
+        moving = moving if self.moving is None else self.moving | moving
+        return self._replace(motion=motion, moving=moving, ignored=ignored)
 
     def monitor_points(self, uv: Pixels, age: Int[Array, " n"], points: Mask) -> Mask:
         """Return the `(n,)` mask of the monitored points: tracked on moving objects to see whether they go on moving.
@@ -232,8 +240,12 @@ def _with_regions(
     weight = lasting_weights(regions, of_regions, before, agreeing, plan.regions)
     remembered = of_points((weight >= 0.5).astype(weight.dtype), regions, jnp.ones_like(weight[0]))
     height, width = view.depth.shape
-    moving = moving_pixels(regions, jnp.minimum(weight, region_weights(of_regions)), height, width, plan.regions)
-    return DynamicRejection(cue_results, regions, RegionMemory(regions.centers, weight), remembered, moving)
+    now = region_weights(of_regions)
+    moving = moving_pixels(regions, jnp.minimum(weight, now), height, width, plan.regions)
+    ignored = None
+    if view.is_softly_masked():
+        ignored = moving_shares(regions, jnp.where(weight < 0.5, 0, now), height, width, plan.regions)
+    return DynamicRejection(cue_results, regions, RegionMemory(regions.centers, weight), remembered, moving, ignored)
 
 
 def _cue_results(step: StepContext, seen: FramePoints, regions: Regions | None, coarse: SE3) -> tuple[CueResult, ...]:

@@ -47,7 +47,7 @@ def align_keyframe_points(step: StepContext, T_world_cam: SE3, twist: Float[Arra
     """Align points of the keyframes that overlap the frame most with it, by their patches.
 
     Args:
-        step: Context of the step; pixels that its frame ignores match nothing.
+        step: Context of the step; pixels that its frame ignores match nothing, or with less weight.
         T_world_cam: Pose of the frame, good to a few pixels.
         twist: `(6,)` velocity of the camera in its own axes, m/s, then rad/s, for the rolling shutter.
     """
@@ -70,8 +70,6 @@ def align_keyframe_points(step: StepContext, T_world_cam: SE3, twist: Float[Arra
     take = lambda array: jnp.take(array, index, axis=-1, mode="clip")
     guess, X_there = take(predicted), take(X_cam)
     seen_depth = sample_depth(view.depth, jax.lax.stop_gradient(guess), reach=0)
-    column, row = jnp.round(jax.lax.stop_gradient(guess)).astype(jnp.int32)
-    ignored = view.frame.ignore.at[row, column].get(mode="fill", fill_value=True)
     covered = (seen_depth > 0) & (jnp.abs(seen_depth - X_there[2]) > _COVERED * X_there[2])
     # 3. Alignment of their patches.
     source = index // n
@@ -83,12 +81,12 @@ def align_keyframe_points(step: StepContext, T_world_cam: SE3, twist: Float[Arra
         _warp(X_there, T_world_cam, keyframes.T_world_cam, source, params.sensor.intrinsics),
         view.pyramid,
         guess,
-        real & ~covered & ~ignored,
+        real & ~covered & ~view.ignored(guess),
         plan=plan.look_up,
     )
     shift = jnp.sum(jnp.square(match.points - guess), axis=0)
     found = match.converged & (match.correlation > params.min_correlation) & (shift < _MAX_SHIFT_PX**2)
-    weight = jnp.where(found, take(keyframes.weight.reshape(-1)), 0)
+    weight = jnp.where(found, view.weighed(match.points, take(keyframes.weight.reshape(-1))), 0)
     num_sought = jnp.sum(real, dtype=overlap.dtype)
     return KeyframeMatches(X_world, match.points, weight, take(keyframes.id.reshape(-1)), overlap, num_sought)
 

@@ -124,8 +124,8 @@ def _candidates(
     v, u = jnp.mgrid[: image.shape[0], : image.shape[1]]
     edge = _EDGE_PX // 2
     inside = (u >= edge) & (v >= edge) & (u < image.shape[1] - edge) & (v < image.shape[0] - edge)
-    ignore = view.frame.ignore[::2, ::2][: image.shape[0], : image.shape[1]]
-    corners = grid_corners(corner_score(image), inside & ~ignore, cell=cell)
+    trusted = view.may_hold_corners()[::2, ::2][: image.shape[0], : image.shape[1]]
+    corners = grid_corners(corner_score(image), inside & trusted, cell=cell)
     taken = occupied_cells(points.uv / 2, points.valid, (image.shape[0], image.shape[1]), cell=cell)
     uv = corners.points * 2
     rough = sample_depth(depth, uv, reach=2, noise=sensor.depth_step_m())

@@ -5,7 +5,7 @@ import numpy as np
 from jax import lax
 from jax.core import Tracer
 
-from jaxslam.sensors.frame_arrays import FrameArrays, check_gray_range
+from jaxslam.sensors.frame_arrays import FrameArrays, check_gray_range, check_mask_range
 from jaxslam.tracking.initial_state import DEFAULT_PLAN
 from jaxslam.tracking.state import TrackOutput, TrackParams, TrackPlan, TrackState
 from jaxslam.tracking.step import track_step
@@ -38,6 +38,8 @@ def rollout(
         raise ValueError(f"clip.image: expected gray images (frames, h, w) of stack_frames, got {np.shape(clip.image)}")
     if not isinstance(clip.image, Tracer):
         check_gray_range("clip.image", clip.image)  # the steps see a tracer
+    if not isinstance(clip.ignore, Tracer):
+        check_mask_range("clip.ignore", clip.ignore)
     # The scan separates the two computations already; barriers against their merging would only take time.
     step = jax.checkpoint(lambda state, frame: track_step(state, frame, params, plan), prevent_cse=False)
     return lax.scan(step, state, clip)

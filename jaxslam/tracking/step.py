@@ -137,6 +137,7 @@ def follow_points(
         TypeError: In the same cases as `track_step`.
     """
     _check(state, frame, params, plan)
+    frame = _in_jax(frame)
     params = _for_readout(params, frame)
     height, width = frame.image.shape
     pyramid = build_pyramid(frame.image, num_levels=plan.num_levels, dtype=state.twist.dtype)
@@ -182,6 +183,7 @@ def track_followed(
         TypeError: In the same cases as `track_step`.
     """
     _check_followed(state, frame, followed_points, params, plan)
+    frame = _in_jax(frame)
     params = _for_readout(params, frame)
     pyramid, predicted, uv, found, prior = followed_points
     # 1. Prepare the frame: depth that can be believed, and the right image of a stereo pair.
@@ -189,14 +191,14 @@ def track_followed(
     # 2. Rays of the tracked points, without distortion: the same for every pose below.
     rays = _tracked_rays(step, uv, found, predicted)
     # 3. Background points: those outside the mask and on no movable object. Points of unknown depth wait.
-    masked, objects = _masked(frame, uv), _object_ids(step, uv)
+    masked, objects = step.view.ignored(uv), _object_ids(step, uv)
     found, waiting = found & state.points.has_position(), found & ~masked & ~state.points.has_position()
     background = _background(step, found & ~masked, objects)
     step = step._replace(params=_widened(params, state.points.uv, uv, background))
     # 4. Coarse pose: RANSAC PnP, in which no region of the depth image has more than an even share of the votes.
     seen = step.measured(rays, X_world, predicted, state.twist)
     regions = _regions(step, seen, predicted)
-    trust = probation_weights(state.points, params)
+    trust = step.view.weighed(uv, probation_weights(state.points, params))
     coarse, agreeing, coarse_status = coarse_pose(
         step, seen, _votes(step, trust, background, regions), predicted, prior
     )
@@ -252,6 +254,11 @@ def _check_followed(
         check_prior(followed_points.prior, jax.typeof(state.twist).dtype)
 
 
+def _in_jax(frame: FrameArrays) -> FrameArrays:
+    """Return the frame with arrays of JAX; those of NumPy come where nothing is traced."""
+    return jax.tree.map(jnp.asarray, frame)
+
+
 def _for_readout(params: TrackParams, frame: FrameArrays) -> TrackParams:
     """Return the settings with the direction in which the frame's rolling shutter reads the rows."""
     return params._replace(sensor=params.sensor.for_readout(frame.readout_sign))
@@ -272,12 +279,6 @@ def _tracked_rays(step: StepContext, uv: Pixels, found: Mask, predicted: SE3) ->
     X_world = state.points.X_world
     matched = match_depth(view, uv, to_camera(predicted, X_world)[2], found, sensor, plan=step.plan.pair_flow)
     return pixel_rays(uv, sensor, matched)
-
-
-def _masked(frame: FrameArrays, uv: Pixels) -> Mask:
-    """Return the `(n,)` mask of the pixels that are to be ignored; pixels outside the image are too."""
-    column, row = jnp.round(lax.stop_gradient(uv)).astype(jnp.int32)
-    return frame.ignore.at[row, column].get(mode="fill", fill_value=True)
 
 
 def _object_ids(step: StepContext, uv: Pixels) -> Int[Array, " n"]:

@@ -16,7 +16,7 @@ from jaxslam_kernels.pose.pose_cost import PosePrior
 
 from jaxslam.dynamics.cue import CueResult
 from jaxslam.dynamics.object_motion import MotionParams
-from jaxslam.sensors.frame_arrays import FrameArrays, check_gray_range
+from jaxslam.sensors.frame_arrays import FrameArrays, check_gray_range, check_mask_range
 from jaxslam.tracking.state import TrackParams, TrackPlan, TrackState
 
 if TYPE_CHECKING:
@@ -159,9 +159,9 @@ def _check_like(name: str, given: Any, expected: Any) -> None:
 
 def _check_frame(frame: FrameArrays, dtype: jnp.dtype) -> None:
     image = _checked_image(frame)
-    for name, of in (("depth", dtype), ("ignore", np.bool_)):
-        check_array(f"frame.{name}", getattr(frame, name), image.shape, None, " as frame.image")
-        check_array(f"frame.{name}", getattr(frame, name), image.shape, of, _STATE_DTYPE if name == "depth" else "")
+    check_array("frame.depth", frame.depth, image.shape, None, " as frame.image")
+    check_array("frame.depth", frame.depth, image.shape, dtype, _STATE_DTYPE)
+    _check_ignore(frame, image.shape, dtype)
     scalars = ("dt_s", "depth_delay_s", *(() if frame.readout_sign is None else ("readout_sign",)))
     for name in scalars:
         check_array(f"frame.{name}", getattr(frame, name), (), dtype, _STATE_DTYPE)
@@ -170,6 +170,16 @@ def _check_frame(frame: FrameArrays, dtype: jnp.dtype) -> None:
     if frame.movable is not None:
         check_array("frame.movable", frame.movable, image.shape, None, " as frame.image")
         check_array("frame.movable", frame.movable, image.shape, np.uint8)
+
+
+def _check_ignore(frame: FrameArrays, shape: tuple[int, ...], dtype: jnp.dtype) -> None:
+    """Check that the mask of ignored pixels is `bool`, or floating point from 0 to 1."""
+    check_array("frame.ignore", frame.ignore, shape, None, " as frame.image")
+    got = jax.typeof(frame.ignore).dtype
+    if got not in (np.bool_, dtype):
+        raise TypeError(f"frame.ignore: expected bool, or {dtype}{_STATE_DTYPE} from 0 to 1, got {got}")
+    if not isinstance(frame.ignore, Tracer):
+        check_mask_range("frame.ignore", frame.ignore)
 
 
 def _checked_image(frame: FrameArrays) -> Any:

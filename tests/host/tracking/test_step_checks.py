@@ -13,7 +13,7 @@ from jax import lax
 from jaxlie import SE3
 from small_scene import HEIGHT, PLAN, TRACK, WIDTH, clip, new_state, params, stacked
 
-from jaxslam import FlowPlan, LevelPlan, TrackParams, follow_points, init_state, track_clips, track_followed
+from jaxslam import FlowPlan, LevelPlan, TrackParams, follow_points, init_state, rollout, track_clips, track_followed
 from jaxslam.config.loading import load_config
 from jaxslam.dynamics import CueResult
 from jaxslam.dynamics.object_motion import MotionPlan
@@ -71,7 +71,12 @@ class TestFrame:
             ("image", None, "image: expected an array (h, w), got NoneType"),
             ("depth", np.zeros(SIZE, np.uint16), "depth: expected float32 as the state, got uint16"),
             ("depth", np.zeros(SIZE, np.float16), "depth: expected float32 as the state, got float16"),
-            ("ignore", np.zeros(SIZE, np.uint8), "ignore: expected bool, got uint8"),
+            (
+                "ignore",
+                np.zeros(SIZE, np.uint8),
+                "ignore: expected bool, or float32 as the state from 0 to 1, got uint8",
+            ),
+            ("ignore", np.zeros(SIZE, np.float16), "ignore: expected bool, or float32 as the state from 0 to 1, got"),
             ("ignore", None, "ignore: expected an array as frame.image, got NoneType"),
             ("right", np.zeros(SIZE, np.float32), "right: expected uint8 as frame.image, got float32"),
             ("movable", np.zeros(SIZE, np.float32), "movable: expected uint8, got float32"),
@@ -113,6 +118,23 @@ class TestGrayValues:
         arrays: Any = jax.device_get(dim._replace(image=dim.image / 255))
         with pytest.raises(FrameError, match="clips: image of clip 1: expected gray values from 0 to 255, got"):
             track_clips([arrays._replace(image=arrays.image * 255), arrays], params(), PLAN)
+
+
+class TestSoftMasks:
+    @pytest.mark.parametrize(("value", "got"), [(255.0, "0 to 255"), (-0.5, "-0.5 to 0"), (np.nan, "nan to nan")])
+    def test_outside_0_to_1(self, frame: FrameArrays, value: float, got: str) -> None:
+        ignore = np.zeros(SIZE, np.float32)
+        ignore[3, 4] = value
+        message = f"frame.ignore: expected values from 0 (trusted) to 1 (ignored), got {got}"
+        refused(ValueError, message, frame._replace(ignore=jnp.asarray(ignore)))
+
+    def test_of_clips(self) -> None:
+        soft = stacked(clip().frames[:2])
+        arrays: Any = jax.device_get(soft._replace(ignore=jnp.full(soft.ignore.shape, 2.0)))
+        with pytest.raises(FrameError, match=r"clips: ignore of clip 0: expected values from 0 \(trusted\) to 1"):
+            track_clips([arrays], params(), PLAN)
+        with pytest.raises(ValueError, match=r"clip\.ignore: expected values from 0 \(trusted\) to 1"):
+            rollout(new_state(), arrays, params(), PLAN)
 
 
 class TestState:

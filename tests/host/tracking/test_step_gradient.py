@@ -23,7 +23,7 @@ EXACT = PLAN.exact()
 
 
 class Inputs(NamedTuple):
-    """What the loss is differentiated by; `image` scales one random change of all pictures."""
+    """What the loss is differentiated by; `image` and `ignore` scale one random change of all images and masks each."""
 
     camera: Array
     weight: Array
@@ -32,6 +32,7 @@ class Inputs(NamedTuple):
     pixel_sigma: Array
     readout_s: Array
     image: Array
+    ignore: Array
 
 
 DIFFERENCE = Inputs(
@@ -42,6 +43,7 @@ DIFFERENCE = Inputs(
     pixel_sigma=jnp.asarray(1e-3),
     readout_s=jnp.asarray(1e-4),
     image=jnp.asarray(1e-2),
+    ignore=jnp.asarray(1e-2),
 )
 """Steps that change the loss by 2e-7 or more: the tolerances of searches and solvers change it by up to 2e-11."""
 
@@ -78,7 +80,9 @@ def _problem(recording: Clip) -> Problem:
         state, _ = step(state, at(frames, index), given, EXACT)
     given = given._replace(detect_below=jnp.zeros(()), keyframe_below=jnp.zeros(()))
     window = jax.tree.map(lambda array: array[BEFORE:], frames)
-    change = jnp.asarray(np.random.default_rng(0).normal(size=window.image.shape))
+    random = np.random.default_rng(0)
+    change = jnp.asarray(random.normal(size=window.image.shape))
+    ignore, other = (jnp.asarray(random.uniform(size=window.image.shape)) for _ in range(2))
     truth = jnp.asarray(truth_from_start(recording.source.ground_truth)[BEFORE : BEFORE + STEPS, :3, 3])
 
     def loss(inputs: Inputs) -> Array:
@@ -89,7 +93,8 @@ def _problem(recording: Clip) -> Problem:
         changed = given._replace(sensor=sensor, loss_scale=inputs.loss_scale, pixel_sigma=inputs.pixel_sigma)
 
         points = state.points._replace(weight=inputs.weight, X_world=inputs.X_world)
-        seen = window._replace(image=window.image + inputs.image * change)
+        mask = 0.8 * ignore + inputs.ignore * (other - ignore)
+        seen = window._replace(image=window.image + inputs.image * change, ignore=mask)
         _, outputs = rollout(state._replace(points=points), seen, changed, EXACT)
         return jnp.sum(jnp.square(outputs.T_world_cam.translation() - truth))
 
@@ -102,6 +107,7 @@ def _problem(recording: Clip) -> Problem:
         pixel_sigma=given.pixel_sigma,
         readout_s=given.sensor.readout_s,
         image=jnp.zeros(()),
+        ignore=jnp.zeros(()),
     )
     gradient = quick_compile(jax.grad(loss))(inputs)
     forward = quick_compile(lambda direction: jax.jvp(loss, (inputs,), (direction,))[1])
