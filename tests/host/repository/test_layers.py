@@ -20,6 +20,7 @@ LAYERS = [
     "datasets",
     "worlds",
     "tracking",
+    "learning",
     "features",
     "masks",
     "map",
