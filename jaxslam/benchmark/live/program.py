@@ -1,32 +1,15 @@
-"""A program that is timed: how it is started, what it prints, how much memory it takes."""
+"""A program that is timed live: its command line, and the figures that it prints of itself."""
 
-import shlex
-import subprocess
 import sys
-import threading
+import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import BinaryIO
 
-import psutil
-
+from jaxslam.benchmark.external_program import Program, command_words, named_value, run_to_its_end
 from jaxslam.benchmark.live.figures import LiveFigures, parse_figures
 from jaxslam.benchmark.process_ending import last_words
 from jaxslam.errors import BenchmarkError
-
-_LOOK_EVERY_S = 0.1
-
-
-@dataclass(frozen=True)
-class Program:
-    """A program that tracks a recording live and prints its figures.
-
-    Attributes:
-        name: Name in the table.
-        command: Words of its command line.
-    """
-
-    name: str
-    command: tuple[str, ...]
 
 
 def parse_program(text: str, values: Mapping[str, str]) -> Program:
@@ -39,15 +22,8 @@ def parse_program(text: str, values: Mapping[str, str]) -> Program:
     Raises:
         BenchmarkError: If there is no name, no command, or an unknown name in braces.
     """
-    name, _, command = text.partition("=")
-    if not name.strip() or not command.strip():
-        raise BenchmarkError(f"--with: expected NAME=COMMAND, got '{text}'")
-    try:
-        words = tuple(word.format_map(values) for word in shlex.split(command))
-    except (KeyError, ValueError, IndexError) as problem:
-        known = ", ".join(f"{{{value}}}" for value in values)
-        raise BenchmarkError(f"--with: expected a command with {known} at most, got '{command}': {problem}") from None
-    return Program(name.strip(), words)
+    name, command = named_value("--with", text, "COMMAND")
+    return Program(name, command_words(command, values, "--with"))
 
 
 def run_program(program: Program) -> LiveFigures:
@@ -56,21 +32,11 @@ def run_program(program: Program) -> LiveFigures:
     Raises:
         BenchmarkError: If it cannot be started, fails, or prints no figures.
     """
-    try:
-        process = subprocess.Popen(program.command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    except OSError as problem:
-        raise BenchmarkError(f"{program.name}: '{program.command[0]}' cannot be run: {problem.strerror}") from None
-    memory = _PeakMemory(process.pid)
-    try:
-        printed, errors = process.communicate()
-    except BaseException:
-        process.kill()
-        raise
-    finally:
-        memory.stop()
-    if process.returncode:
-        raise BenchmarkError(f"{program.name}: exit code {process.returncode}: {last_words(errors)}")
-    return replace(parse_figures(program.name, printed), peak_mb=memory.peak_mb)
+    with tempfile.TemporaryFile() as printed, tempfile.TemporaryFile() as errors:
+        ended = run_to_its_end(program, printed, errors)
+        if ended.exit_code:
+            raise BenchmarkError(f"{program.name}: exit code {ended.exit_code}: {last_words(_text(errors))}")
+        return replace(parse_figures(program.name, _text(printed)), peak_mb=ended.peak_mb)
 
 
 def ours(options: Mapping[str, str], settings: Sequence[str]) -> Program:
@@ -84,30 +50,6 @@ def ours(options: Mapping[str, str], settings: Sequence[str]) -> Program:
     return Program("jaxslam", (sys.executable, "-m", "jaxslam.benchmark.live.own_run", *words))
 
 
-class _PeakMemory:
-    """Watches the resident memory of a process, in a thread.
-
-    Attributes:
-        peak_mb: Peak so far, megabytes.
-    """
-
-    def __init__(self, pid: int) -> None:
-        self.peak_mb = 0.0
-        self._pid, self._stopped = pid, threading.Event()
-        self._thread = threading.Thread(target=self._watch, daemon=True)
-        self._thread.start()
-
-    def stop(self) -> None:
-        """End the thread."""
-        self._stopped.set()
-        self._thread.join()
-
-    def _watch(self) -> None:
-        try:
-            process = psutil.Process(self._pid)
-            while True:
-                self.peak_mb = max(self.peak_mb, process.memory_info().rss / 1e6)
-                if self._stopped.wait(_LOOK_EVERY_S):
-                    return
-        except psutil.Error:  # it has ended
-            return
+def _text(file: BinaryIO) -> str:
+    file.seek(0)
+    return file.read().decode(errors="replace")

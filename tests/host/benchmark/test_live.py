@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from jaxslam.benchmark.external_program import Program
 from jaxslam.benchmark.live.figures import LiveFigures, parse_figures
-from jaxslam.benchmark.live.program import Program, ours, parse_program, run_program
+from jaxslam.benchmark.live.program import ours, parse_program, run_program
 from jaxslam.benchmark.reports.live import COLUMNS, markdown_report, picture, ratio_rows, rows
 from jaxslam.cli.entry_point import main
 from jaxslam.errors import BenchmarkError
