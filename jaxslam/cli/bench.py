@@ -1,7 +1,7 @@
 """`jaxslam bench`: options that run a suite of recordings with presets and write a report."""
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,6 +12,7 @@ from jaxslam.cli.shared_options import Settings, WithJson
 from jaxslam.errors import BenchmarkError
 
 if TYPE_CHECKING:
+    from jaxslam.benchmark.suites.suite import Suite
     from jaxslam.cli.suite_run import SuitePlan
 
 LOCAL = "local"
@@ -76,6 +77,19 @@ class RunsOfSuite(WithJson):
 
         return run_suite(self, name, rows)
 
+    def with_systems(self, suite: "Suite") -> "Suite":
+        """The suite with the other systems that are judged by this command.
+
+        Args:
+            suite: Suite as in its file.
+
+        Raises:
+            BenchmarkError: If the suite has other systems, of which this command knows nothing.
+        """
+        if suite.systems:
+            raise BenchmarkError(f"{suite.name}: systems: expected none for this command, got {suite.systems[0].name}")
+        return suite
+
     @property
     def runs_here(self) -> bool:
         """Whether runs are made on this machine and not on a cluster."""
@@ -88,6 +102,20 @@ class Bench(RunsOfSuite):
 
     suite: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="SUITE")] = None
     """Name of a known suite, a YAML file, or a folder of recordings."""
+    others: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(name="with", metavar="NAME=DIR")] = ()
+    """Another system and the folder of its trajectories, which are judged beside ours: SEQUENCE.txt, or a file a run in
+    SEQUENCE/0.txt, ..., in the format of TUM, KITTI or EuRoC; or an experiment of VSLAM-LAB. Repeatable. A suite can
+    also name commands, under `systems`."""
+
+    def with_systems(self, suite: "Suite") -> "Suite":
+        """The suite with the systems of `--with` too.
+
+        Raises:
+            BenchmarkError: If a system is given in another form, has no folder, or is named twice.
+        """
+        from jaxslam.benchmark.suites.system import parse_system  # noqa: PLC0415
+
+        return replace(suite, systems=(*suite.systems, *map(parse_system, self.others)))
 
     def main(self) -> None:
         """Run the command."""

@@ -96,7 +96,7 @@ COMMANDS = (
         ("bench",),
         "bench:Bench",
         "Run a suite: recordings or rendered rooms, presets, several seeds.",
-        "Without a suite, list those there are.",
+        "Other systems are judged beside the presets. Without a suite, list those there are.",
     ),
     Command(
         ("bench", "accuracy"),
@@ -156,8 +156,8 @@ COMMANDS = (
         ("eval",),
         "eval:Eval",
         "Compare an estimated trajectory with the truth: ATE, RPE and KITTI's figures.",
-        "KITTI's t_rel and r_rel are for paths of 100 m or more. Formats (TUM, KITTI, EuRoC's ground truth) are"
-        " recognized.",
+        "KITTI's t_rel and r_rel are for paths of 100 m or more. Formats (TUM, KITTI, EuRoC's ground truth,"
+        " VSLAM-LAB) are recognized.",
     ),
     Command(
         ("doctor",),

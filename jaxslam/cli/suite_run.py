@@ -15,10 +15,10 @@ from jaxslam.benchmark.reports.markdown import markdown_report
 from jaxslam.benchmark.suites.aggregate import row_name
 from jaxslam.benchmark.suites.collected_results import RESULTS, Collected, read_results
 from jaxslam.benchmark.suites.job import DONE, FAILED, NOT_RUN, Job, about
-from jaxslam.benchmark.suites.plan import missing, plan, replaced_settings, swept
+from jaxslam.benchmark.suites.plan import missing, not_judged, plan, replaced_settings, swept
 from jaxslam.benchmark.suites.runner import Executor, local, run_jobs
 from jaxslam.benchmark.suites.suite import Suite, check_masks, checked_presets, load_suite, suites
-from jaxslam.cli.bench import RunsOfSuite
+from jaxslam.cli.bench import LOCAL, RunsOfSuite
 from jaxslam.cli.command_table import COMMANDS
 from jaxslam.cli.console import console, make_table, plain_console, print_json, progress_bar
 from jaxslam.cli.shared_options import ALLOW_MISSING_MODEL, flat
@@ -51,12 +51,16 @@ def plan_suite(options: RunsOfSuite, name: str) -> SuitePlan:
         if value is not None and value < 1:
             raise BenchmarkError(f"{option}: expected at least 1, got {value}")
     allowed = (ALLOW_MISSING_MODEL,) if options.allow_missing_model else ()
-    known, settings, sweeps = load_suite(name), (*allowed, *flat(options.set)), flat(options.sweep)
+    known = options.with_systems(load_suite(name))
+    settings, sweeps = (*allowed, *flat(options.set)), flat(options.sweep)
     replaced = replaced_settings(known, settings, sweeps)
     suite = swept(known, sweeps)
     chosen = checked_presets(options.presets) if options.presets else ()
+    if suite.systems and not options.runs_here:
+        raise BenchmarkError(f"--executor: expected {LOCAL} for other systems, got {options.executor}")
     jobs = plan(suite, presets=chosen, runs=options.runs, settings=settings)
-    for preset, overrides in dict.fromkeys((job.preset, job.settings) for job in jobs):  # an error now, not after hours
+    ours = dict.fromkeys((job.preset, job.settings) for job in jobs if job.system is None)
+    for preset, overrides in ours:  # an error now, not after hours
         config = load_config(preset, overrides=overrides)
         check_masks([job.clip for job in jobs], config)
         if options.runs_here:
@@ -73,13 +77,14 @@ def run_suite(options: RunsOfSuite, name: str, rows: Collection[str] | None = No
     out = options.out or Path("results") / "bench" / suite.name
     with _executor(options, _root(options, name)) as executor:
         absent = missing(suite, executor.recordings)
+        not_run = not_judged(suite, absent) | absent
         earlier = _prepare(out, resume=options.resume)
-        for why in dict.fromkeys(absent.values()):
-            names = ", ".join(name for name in absent if absent[name] == why)
+        for why in dict.fromkeys(not_run.values()):
+            names = "; ".join(name for name in not_run if not_run[name] == why)
             plain_console.print(f"Not run: {names}: {why}")
         present = [job for job in jobs if job.clip.source not in absent]
         collected = Collected(present, earlier)
-        report = _Report(suite, collected, absent, out)
+        report = _Report(suite, collected, absent, not_run, out)
         try:
             _make_runs(present, executor, report)
         finally:  # after an interruption too, so that the finished runs can be seen
@@ -148,24 +153,26 @@ class _Report:
         suite: Suite with one variant for each combination of swept values.
         collected: Results, including those of earlier calls.
         absent: For each missing recording, its name and how to get it.
+        not_run: The same, and for each row of another system without a trajectory its name and why.
         out: Folder of the results.
     """
 
     suite: Suite
     collected: Collected
     absent: Mapping[str, str]
+    not_run: Mapping[str, str]
     out: Path
 
     def write_text(self) -> None:
         """Write the results and the Markdown report, which take almost no time."""
         self.collected.write(self.out)
-        text = markdown_report(self.suite, self.collected.every, self.absent)
+        text = markdown_report(self.suite, self.collected.every, self.not_run)
         write_atomically(self.out / _REPORT, text.encode(), BenchmarkError)
 
     def write(self) -> None:
         """Write the results and both reports."""
         self.write_text()
-        page = html_report(self.suite, self.collected.every, self.absent, self.out)
+        page = html_report(self.suite, self.collected.every, self.not_run, self.out)
         write_atomically(self.out / _PAGE, page.encode(), BenchmarkError)
 
     def print_outcome(self) -> None:

@@ -62,8 +62,8 @@ def read_pair(
     elif any(side.timestamps_ns is None for side in rows):
         rows, listed, more = _with_frames(rows, listed)
         notes += more
-    estimated, on_estimate = _in_order("estimate", rows[0])
-    true, on_reference = _in_order("reference", rows[1])
+    estimated, on_estimate = in_order("estimate", rows[0])
+    true, on_reference = in_order("reference", rows[1])
     frames_ns = None if listed is None else listed.timestamps_ns
     return TrajectoryPair(estimated, true, frames_ns, notes + on_estimate + on_reference)
 
@@ -77,6 +77,27 @@ def read_frames(path: Path) -> Int[np.ndarray, " f"]:
     """
     rows = text_rows(path, TrajectoryError)
     return read_file_list(path).timestamps_ns if rows and len(rows[0][1]) > 1 else read_times(path)
+
+
+def in_order(name: str, side: PoseRows) -> tuple[Trajectory, tuple[str, ...]]:
+    """Return the trajectory of the rows of a file, sorted by time, and a note if that changed their order.
+
+    Args:
+        name: What the file holds, for the note.
+        side: Rows of the file.
+
+    Raises:
+        TrajectoryError: If a row cannot be right; the message names file and line.
+    """
+    if side.timestamps_ns is None:
+        return of_rows(side), ()
+    back = int((np.diff(side.timestamps_ns) < 0).sum())
+    order = np.argsort(side.timestamps_ns, kind="stable")
+    ordered = replace(
+        side, lines=side.lines[order], timestamps_ns=side.timestamps_ns[order], T_world_cam=side.T_world_cam[order]
+    )
+    note = f"the rows of the {name} were not in the order of time ({back} steps back) and have been sorted"
+    return of_rows(ordered), (note,) if back else ()
 
 
 class _Frames(NamedTuple):
@@ -153,16 +174,3 @@ def _with_frames(
         )
     unused = f"; {frames.path} lists {len(frames.timestamps_ns)} frames and is not used" if frames is not None else ""
     return list(rows), None, (f"rows of KITTI have no stamps: matched by row, as if 0.1 s apart{unused}; {_HOW}",)
-
-
-def _in_order(name: str, side: PoseRows) -> tuple[Trajectory, tuple[str, ...]]:
-    """Return the trajectory of these rows, sorted by time, and a note if the order changed."""
-    if side.timestamps_ns is None:
-        return of_rows(side), ()
-    back = int((np.diff(side.timestamps_ns) < 0).sum())
-    order = np.argsort(side.timestamps_ns, kind="stable")
-    ordered = replace(
-        side, lines=side.lines[order], timestamps_ns=side.timestamps_ns[order], T_world_cam=side.T_world_cam[order]
-    )
-    note = f"the rows of the {name} were not in the order of time ({back} steps back) and have been sorted"
-    return of_rows(ordered), (note,) if back else ()

@@ -16,13 +16,14 @@ from jaxslam.io.atomic_files import write_atomically
 from jaxslam.map.export import write_keyframe_trajectory
 from jaxslam.mapping.occlusion_states import occluded_shares
 from jaxslam.results.dense_results import DENSE_FILES, write_dense
+from jaxslam.results.evaluated_run import EvaluatedRun, evaluate_run
 from jaxslam.results.frame_table import write_errors, write_frames
 from jaxslam.runtime.machine import machine, peak_rss_mb
 from jaxslam.slam.frame_result import FrameRecord
 from jaxslam.slam.slam import Slam
 from jaxslam.tracking.state import TrackStatus
 from jaxslam.trajectory.consistency import RelativePoses, evaluate_consistency
-from jaxslam.trajectory.evaluation import Evaluation, evaluate
+from jaxslam.trajectory.evaluation import Evaluation
 from jaxslam.trajectory.trajectory import Trajectory, write_kitti_frames, write_tum
 from jaxslam.visualization.consistency_plot import plot_consistency
 from jaxslam.visualization.mask_gallery import write_mask_pictures
@@ -87,15 +88,10 @@ def write_results(
     """
     folder.mkdir(parents=True, exist_ok=True)
     truth, trajectory = info.dataset.ground_truth, slam.trajectory  # made anew at each call
-    evaluation, problem = None, None if truth is not None else "no ground truth"
-    if truth is not None:
-        try:
-            evaluation = evaluate(trajectory, truth, frames_ns=info.dataset.timestamps_ns)
-        except TrajectoryError as error:
-            problem = str(error)
+    evaluated = evaluate_run(trajectory, info.dataset)
+    evaluation = evaluated.evaluation
     dense, dense_files = write_dense(folder, slam.dense_mapping, trajectory, slam.times.ms)
-    summary = _summary(slam, records, info, evaluation) | {
-        "evaluation_problem": problem,
+    summary = _summary(slam, records, info, evaluated) | {
         **_write_consistency(folder / _CONSISTENCY, truth, poses, _title(slam, info)),
         "dense": dense,
         "poses_in_other_submaps": _write_other_submaps(folder, slam),
@@ -199,12 +195,8 @@ def _worst(dataset: Dataset, evaluation: Evaluation | None) -> list[Snapshot]:
     return [Snapshot(title, dataset[frame].image, *nothing)]
 
 
-def _summary(
-    slam: Slam, records: Sequence[FrameRecord], info: RunInfo, evaluation: Evaluation | None
-) -> dict[str, Any]:
-    figures = evaluation.summary() if evaluation is not None else {}
+def _summary(slam: Slam, records: Sequence[FrameRecord], info: RunInfo, evaluated: EvaluatedRun) -> dict[str, Any]:
     keyframe_reasons = Counter(record.keyframe.name for record in records if record.is_keyframe)
-    wanted = ("ate_rmse_m", "ate_sim3_rmse_m", "sim3_scale", "rpe_trans_m_per_s", "rpe_rot_deg_per_s")
     return {
         "dataset": info.dataset.name,
         "camera": info.dataset.camera.name,
@@ -222,8 +214,7 @@ def _summary(
         "map_points": len(slam.map.points.ids),
         "loops_closed": slam.loops_closed,
         "submaps": len(set(slam.map.submap.tolist())),
-        **{name: figures.get(name) for name in wanted},
-        "evaluation": figures or None,
+        **evaluated.figures,
         "occluded_share": _distribution(_occluded_shares(slam)),
         "mask_sources": dict(sorted(Counter(record.mask_source.name for record in records).items())),
         "mask_age_frames": _distribution([record.mask_age for record in records if record.mask_age >= 0]),

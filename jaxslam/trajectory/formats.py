@@ -1,7 +1,8 @@
-"""Read the rows of trajectory files: TUM, KITTI, and the ground truth of EuRoC."""
+"""Read the rows of trajectory files: TUM, KITTI, the ground truth of EuRoC, and the trajectories of VSLAM-LAB."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
 from typing import Literal, TypeAlias
 
@@ -20,6 +21,9 @@ _Rows: TypeAlias = Sequence[tuple[int, list[str]]]
 
 _LONGEST_YEARS = 30
 _TUM_COLUMNS, _KITTI_COLUMNS, _EUROC_COLUMNS = 8, 12, 8
+_VSLAMLAB_HEADINGS = ("ts (ns)", "tx (m)", "ty (m)", "tz (m)", "qx", "qy", "qz", "qw")
+_VSLAMLAB_TIMES = ("ts (ns)", "timestamp")
+"""Headings of the first column: of its datasets and C++ baselines, and of some baselines in Python."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +39,7 @@ class PoseRows:
     """
 
     path: Path
-    kind: Literal["TUM", "KITTI", "EuRoC"]
+    kind: Literal["TUM", "KITTI", "EuRoC", "VSLAM-LAB"]
     lines: Int[np.ndarray, " n"]
     timestamps_ns: Int[np.ndarray, " n"] | None
     T_world_cam: Float[np.ndarray, "n 7"]
@@ -45,13 +49,16 @@ class PoseRows:
 
 
 def read_rows(path: PathLike) -> PoseRows:
-    """Read a file in the TUM format (8 columns), the KITTI format (12) or EuRoC's (commas), whichever it is.
+    """Read a file in the TUM format (8 columns), the KITTI format (12), EuRoC's or VSLAM-LAB's (commas).
 
-    A file is EuRoC's if it is separated by commas and either begins with a `#` line that is, too, or is named `.csv`.
+    A file is VSLAM-LAB's if its first line begins with the heading `ts (ns)`. It is EuRoC's if it is separated
+    by commas and either begins with a `#` line that is, too, or is named `.csv`.
 
     Raises:
         TrajectoryError: If the file is missing, unreadable, empty, or in none of these formats.
     """
+    if _is_vslamlab(path):
+        return read_vslamlab_rows(path)
     if _is_euroc(path):
         return read_euroc_rows(path)
     rows = _pose_rows(path)
@@ -107,6 +114,25 @@ def read_euroc_rows(path: PathLike) -> PoseRows:
     return PoseRows(Path(path), "EuRoC", _lines(rows), np.array(stamps, np.int64), np.array(poses))
 
 
+def read_vslamlab_rows(path: PathLike) -> PoseRows:
+    """Read rows of `ts (ns),tx (m),ty (m),tz (m),qx,qy,qz,qw`, below a line of headings or not.
+
+    Source: what the baselines and `create_groundtruth_csv` of the datasets of github.com/VSLAM-LAB/VSLAM-LAB write. Its
+    evaluation sorts rows that are not in the order of time, and writes them with spaces and without headings
+    (`Evaluate/evo_functions.py`).
+
+    Raises:
+        TrajectoryError: If the file is missing, unreadable or empty, or a row is malformed.
+    """
+    rows = _pose_rows(path, commas="," in _first_line(path))
+    rows = rows[1:] if rows[0][1][0] in _VSLAMLAB_TIMES else rows
+    if not rows:
+        raise TrajectoryError(f"{path}: holds no poses")
+    numbers = _table(path, rows, _TUM_COLUMNS, " ".join(_VSLAMLAB_HEADINGS))
+    stamps = np.array([_integer_ns(words[0], f"{path}:{number}") for number, words in rows], np.int64)
+    return PoseRows(Path(path), "VSLAM-LAB", _lines(rows), stamps, numbers[:, [7, 4, 5, 6, 1, 2, 3]])
+
+
 def read_times(path: PathLike) -> Int[np.ndarray, " n"]:
     """Read a file of one timestamp in seconds per line, such as KITTI's `times.txt`; return `(n,)` int64 nanoseconds.
 
@@ -116,6 +142,22 @@ def read_times(path: PathLike) -> Int[np.ndarray, " n"]:
     rows = _pose_rows(path)
     _table(path, rows, 1, "timestamp")
     return _stamps(path, rows)
+
+
+def _is_vslamlab(path: PathLike) -> bool:
+    return _first_line(path).partition(",")[0].strip() == _VSLAMLAB_HEADINGS[0]
+
+
+def _first_line(path: PathLike) -> str:
+    return read_text(path, TrajectoryError).partition("\n")[0]
+
+
+def _integer_ns(text: str, place: str) -> int:
+    """Convert a number of nanoseconds, with decimals or an exponent or not, to an integer that int64 holds."""
+    number = int(Decimal(text))
+    if abs(number) > np.iinfo(np.int64).max:
+        raise TrajectoryError(f"{place}: expected a timestamp in nanoseconds, got '{text:.80}'")
+    return number
 
 
 def _is_euroc(path: PathLike) -> bool:

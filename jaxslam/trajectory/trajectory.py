@@ -140,7 +140,7 @@ def associate(
 
 
 def read(path: PathLike) -> Trajectory:
-    """Read a trajectory in the TUM format (8 columns), the KITTI format (12) or EuRoC's (commas), whichever it is.
+    """Read a trajectory in the format of TUM (8 columns), KITTI (12), EuRoC or VSLAM-LAB (commas), whichever it is.
 
     Raises:
         TrajectoryError: If the file is missing, unreadable, empty, or in none of these formats.

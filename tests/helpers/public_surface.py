@@ -33,7 +33,7 @@ from jaxslam.cli import command_table
 from jaxslam.cli import main as main_command
 from jaxslam.config import Config, presets
 from jaxslam.map import save_map
-from jaxslam.results import run_results
+from jaxslam.results import evaluated_run, run_results
 from jaxslam.slam import FrameRecord
 from jaxslam.slam.dense_thread import DenseMapping
 from jaxslam.trajectory import RelativePoses
@@ -241,8 +241,7 @@ def _write_made_up_run(folder: Path) -> None:
     frame = jaxslam.Frame(10**9, np.zeros(size, np.uint8), np.zeros(size, np.float32))
     frames: Any = mock.MagicMock(camera=map.camera, ground_truth=path, timestamps_ns=path.timestamps_ns)
     frames.name, frames.__getitem__.return_value = "made up", frame
-    comparison = [name for name, value in vars(run_results).items() if value is jaxslam.evaluate]
-    with mock.patch.object(run_results, comparison[0], return_value=_evaluation(path)):
+    with mock.patch.object(evaluated_run, "evaluate", return_value=_evaluation(path)):
         poses = RelativePoses(
             path.timestamps_ns[1:],
             path.timestamps_ns[:-1],

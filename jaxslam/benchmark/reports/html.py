@@ -42,7 +42,7 @@ def html_report(suite: Suite, results: Sequence[Mapping[str, Any]], missing: Map
 
 def _images(sequence: str, done: Sequence[Mapping[str, Any]], out: Path) -> list[Image]:
     """Draw all plots of a sequence, and collect the pictures of its median runs, of runs whose files still exist."""
-    done = [run for run in done if (folder_of(run, out) / "frames.csv").is_file()]
+    done = [run for run in done if (folder_of(run, out) / "trajectory.txt").is_file()]
     if not done:
         return []
     drawn = (

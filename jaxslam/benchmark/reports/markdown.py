@@ -273,8 +273,9 @@ def how(results: Sequence[Mapping[str, Any]]) -> str:
         f" not of the whole recording. `better` than a published figure if all runs are, `in range` if it lies between"
         f" them, however far apart they are; no verdict without all planned runs, the whole recording, and 95 % of its"
         f" frames tracked. A system of several figures counts once, with its best. RPE: over 1 s."
-        f" First loss: the earliest of the runs; memory: the most. LK: OpenCV's optical flow of 1000 points in one"
-        f" thread, on the same machine."
+        f" First loss: the earliest of the runs; memory: the most. Wall and processor time: of the whole process of a"
+        f" run, from its start to its trajectory, with loading and compiling. LK: OpenCV's optical flow of 1000 points"
+        f" in one thread, on the same machine."
         f"{_INLINE if any(result['deterministic'] for result in done) else ''}"
         f" Runs: {'; '.join(modes)}. Machine: {'; '.join(machines)}. jaxslam: {', '.join(_versions(done))}."
     )
@@ -326,6 +327,8 @@ def _versions(done: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _mode(result: Mapping[str, Any]) -> str:
+    if result["deterministic"] is None:
+        return "another system, as it is"
     if result["realtime"]:
         return "at the rate of the recording, late frames dropped"
     return "deterministic, all frames" if result["deterministic"] else "all frames, each module in its thread"

@@ -19,6 +19,7 @@ _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#0
 """Told apart by the color-blind too (Okabe and Ito)."""
 _STAGES = ("take over", "flow", "wait for mask", "pose", "match with map", "hand over")
 _ROOM = 0.15
+_FRAMES = "frames.csv"
 _LONGEST = 29
 """Letters of a label."""
 
@@ -105,8 +106,14 @@ def plot_errors(done: Sequence[Mapping[str, Any]], out: Path) -> Figure | None:
     return figure
 
 
-def plot_times(done: Sequence[Mapping[str, Any]], out: Path) -> Figure:
-    """Times of the frames of all runs as histograms, and the mean time of each stage, for every label."""
+def plot_times(done: Sequence[Mapping[str, Any]], out: Path) -> Figure | None:
+    """Times of the frames of all runs as histograms, and the mean time of each stage, for every label.
+
+    Runs of other systems keep no times of single frames; `None` if there are no others.
+    """
+    done = [run for run in done if (folder_of(run, out) / _FRAMES).is_file()]
+    if not done:
+        return None
     labels = _labels(done)
     figure = Figure(dpi=_DPI, figsize=(_WIDTH_IN, 0.3 * len(labels) + 4.2), layout="constrained")
     frames, stages = figure.subplots(2, height_ratios=(2.4, 0.3 * len(labels) + 1))
@@ -218,7 +225,7 @@ def _errors(done: Sequence[Mapping[str, Any]], label: str, out: Path) -> Errors 
 
 
 def _track_ms(run: Mapping[str, Any], out: Path) -> np.ndarray:
-    return read_track_ms(folder_of(run, out) / "frames.csv")
+    return read_track_ms(folder_of(run, out) / _FRAMES)
 
 
 def _rmse(errors: Errors) -> float:

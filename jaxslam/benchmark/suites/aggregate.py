@@ -53,6 +53,8 @@ RUNNING = (
     Column("time / LK", "flow_ratio_median", 2),
     Column("p95 / LK", "flow_ratio_p95", 2),
     Column("max / LK", "flow_ratio_max", 2),
+    Column("wall, s", "process_wall_s", 1),
+    Column("processor, s", "process_cpu_s", 1),
     Column("memory, MB", "peak_rss_mb", 0, "most"),
 )
 """How they came about."""

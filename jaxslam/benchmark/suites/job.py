@@ -1,7 +1,7 @@
 """One run of a suite, in a process of its own: whatever it does to itself, the others and the report go on.
 
-`python -m jaxslam.benchmark.suites.job FOLDER [--root ROOT] [--rooms ROOMS]` runs the one that is written in a
-folder, as long as its input lasts.
+`python -m jaxslam.benchmark.suites.job FOLDER [--root ROOT] [--rooms ROOMS] [--began SECONDS]` runs the one that is
+written in a folder, as long as its input lasts.
 """
 
 import argparse
@@ -18,39 +18,26 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import psutil
 
+from jaxslam.benchmark.external_program import kill_with_children
+from jaxslam.benchmark.process_clock import ProcessClock
 from jaxslam.benchmark.process_ending import how_it_ended, last_words
-from jaxslam.benchmark.reference_flow import flow_time_ms
-from jaxslam.benchmark.suites.provenance import (
-    camera_sha256,
-    data_sha256,
-    networks_sha256,
-    sources_sha256,
-    world_sha256,
-)
+from jaxslam.benchmark.suites.opened_clip import OpenedClip, opened
+from jaxslam.benchmark.suites.provenance import sources_sha256, system_sha256
 from jaxslam.benchmark.suites.run_names import flattened, run_folder
 from jaxslam.benchmark.suites.suite import Sequence as Clip
+from jaxslam.benchmark.suites.system import System
 from jaxslam.config.loading import load_config, to_yaml
 from jaxslam.config.schema import Config
-from jaxslam.datasets import Associated, Dataset, Subset, imu_sheet, open_dataset
-from jaxslam.datasets.catalog import find_recording
-from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset, with_true_masks
-from jaxslam.datasets.synthetic.cached_dataset import StoredRoom
+from jaxslam.datasets.synthetic import SyntheticConfig
 from jaxslam.datasets.synthetic.sensor_noise import SensorConfig
 from jaxslam.errors import BenchmarkError, JaxSlamError
 from jaxslam.io.atomic_files import write_atomically
 from jaxslam.io.yaml_files import parse_yaml
-from jaxslam.results.run_results import RunInfo, write_results
 from jaxslam.runtime.compile_cache import enable_compile_cache
+from jaxslam.runtime.machine import machine
 from jaxslam.runtime.threads import bound_threads
-from jaxslam.semantics.from_config import preset_needs_network
-from jaxslam.sensors.frame import Frame
-from jaxslam.slam.frame_result import FrameResult, Rejected
-from jaxslam.slam.relative_pose_log import RelativePoseLog
-from jaxslam.slam.slam import Slam
-from jaxslam.visualization.snapshots import RunPictures
-from jaxslam.worlds.stored_world import StoredWorld
 
 RESULT = "result.json"
 """The last file of a run to be written: where it is, the run is done."""
@@ -66,10 +53,11 @@ class Job:
 
     Attributes:
         clip: Sequence to track.
-        preset: Preset to track with.
+        preset: Preset to track with, or the name of another system.
         variant: Name of further settings; empty for none.
         settings: Settings `key=value`, in the order in which they are applied.
-        seed: Seed of every random choice.
+        seed: Seed of every random choice; for another system, the number of the run.
+        system: Other system whose trajectory is judged; `None` for a run of jaxslam.
     """
 
     clip: Clip
@@ -77,6 +65,7 @@ class Job:
     variant: str
     settings: tuple[str, ...]
     seed: int
+    system: System | None = None
 
     @property
     def label(self) -> str:
@@ -90,7 +79,7 @@ class Job:
 
     @property
     def config(self) -> Config:
-        """Every setting of it."""
+        """Every setting of a run of jaxslam; that of another system has none."""
         return load_config(self.preset, overrides=(*self.settings, f"run.seed={self.seed}"))
 
     def to_json(self) -> str:
@@ -101,56 +90,12 @@ class Job:
     def of_json(cls, text: str) -> "Job":
         """The job of which this is the text."""
         fields = json.loads(text)
-        clip = fields.pop("clip")
+        clip, system = fields.pop("clip"), fields.pop("system")
         room = clip.pop("room")
         if room is not None:
             room = SyntheticConfig(**room | {"sensor": SensorConfig(**room["sensor"])})
-        return cls(Clip(room=room, **clip), **fields | {"settings": tuple(fields["settings"])})
-
-
-def opened(clip: Clip, root: Path | None, rooms: Path | None = None) -> tuple[Dataset, Path | None]:
-    """Open the sequence of a job, and find its folder if it is a recording.
-
-    Args:
-        clip: Sequence to open.
-        root: Folder in which recordings are looked for first.
-        rooms: Folder in which rendered frames are kept; all are rendered before anything is timed. `None` to render
-            them as they are asked for.
-
-    Raises:
-        BenchmarkError: If its recording is not on this machine, or of another sensor than it says.
-    """
-    folder = None
-    if clip.room is not None and rooms is not None:
-        dataset: Dataset = StoredRoom(clip.room, rooms / clip.name)
-        dataset.render_all()
-    elif clip.room is not None:
-        dataset = SyntheticDataset(clip.room)
-    elif clip.world:
-        dataset = _world(clip)
-    else:
-        folder = find_recording(clip.recording, root)
-        if folder is None:
-            raise BenchmarkError(f"{clip.recording}: not on this machine; to get it: jaxslam data get {clip.recording}")
-        dataset = open_dataset(folder, camera=clip.camera)
-    taken_with = "stereo" if dataset.camera.is_stereo else "rgbd"
-    if clip.sensor not in (None, taken_with):
-        raise BenchmarkError(f"{clip.name}: sensor: expected {clip.sensor}, got a recording of {taken_with}")
-    return (dataset if clip.whole else Subset(dataset, clip.start, clip.stop, clip.every)), folder
-
-
-def _world(clip: Clip) -> StoredWorld:
-    """The world of a clip, whose frames are in the user's cache before anything is timed.
-
-    Raises:
-        BenchmarkError: If it cannot be opened.
-    """
-    try:
-        world = StoredWorld(clip.world)
-    except JaxSlamError as error:
-        raise BenchmarkError(f"{clip.name}: {error}") from None
-    world.render_all(range(len(world))[clip.start : clip.stop : clip.every])
-    return world
+        other = None if system is None else System(**system)
+        return cls(Clip(room=room, **clip), **fields | {"settings": tuple(fields["settings"]), "system": other})
 
 
 def stored(job: Job, out: Path) -> tuple[dict[str, Any], list[str]] | None:
@@ -163,17 +108,26 @@ def stored(job: Job, out: Path) -> tuple[dict[str, Any], list[str]] | None:
     Raises:
         BenchmarkError: If the files of the run cannot be read.
     """
+    found = _left_by_a_run(job, out)
+    return None if found is None or found[0]["status"] != DONE else found
+
+
+def _left_by_a_run(job: Job, out: Path) -> tuple[dict[str, Any], list[str]] | None:
+    """Return what `stored` does, also for a run that failed."""
     folder = out / job.folder
     try:
         result = json.loads((folder / RESULT).read_text())
-        clip = json.loads((folder / _JOB).read_text())["clip"]
-        config = _read_config((folder / _CONFIG).read_text())
+        before = json.loads((folder / _JOB).read_text())
+        clip = before["clip"]
+        config = None if job.system is not None else _read_config((folder / _CONFIG).read_text())
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, BenchmarkError) as problem:
         raise BenchmarkError(f"{folder}: expected the results of a run, got something unreadable: {problem}") from None
-    different = _differences(clip, json.loads(job.to_json())["clip"])
-    different += _differences(config, _read_config(to_yaml(job.config)))
+    now = json.loads(job.to_json())
+    different = _differences(clip, now["clip"]) + _differences(before.get("system"), now["system"])
+    if config is not None:
+        different += _differences(config, _read_config(to_yaml(job.config)))
     if _CHECKSUM not in result:
         different.append(f"{RESULT} is of an older jaxslam, which did not say what it depends on")
     elif result[_CHECKSUM] != _checksum(result):
@@ -185,7 +139,7 @@ def _read_config(text: str) -> dict[str, Any]:
     return parse_yaml(text, _CONFIG, BenchmarkError)
 
 
-def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+def _differences(before: Mapping[str, Any] | None, now: Mapping[str, Any] | None) -> list[str]:
     old, new = flattened(before), flattened(now)
     return [
         f"{key} was {old.get(key)}, is {new.get(key)}"
@@ -217,7 +171,7 @@ def run_in_process(job: Job, out: Path, root: Path | None, rooms: Path | None = 
     folder.mkdir(parents=True, exist_ok=True)
     (folder / RESULT).unlink(missing_ok=True)
     write_atomically(folder / _JOB, job.to_json().encode(), BenchmarkError)
-    command = [sys.executable, "-m", "jaxslam.benchmark.suites.job", str(folder)]
+    command = [sys.executable, "-m", "jaxslam.benchmark.suites.job", str(folder), f"--began={time.time()}"]
     for name, path in (("--root", root), ("--rooms", rooms)):
         command += [] if path is None else [name, str(path)]
     reading, writing = os.pipe()  # which closes if this process ends, however it does
@@ -227,11 +181,13 @@ def run_in_process(job: Job, out: Path, root: Path | None, rooms: Path | None = 
         os.close(reading)
         os.close(writing)
     (folder / "log.txt").write_text(done.stdout + done.stderr)
-    result = stored(job, out)
-    if result is not None and not result[1] and done.returncode == 0:
-        return result[0]
-    (folder / RESULT).unlink(missing_ok=True)
-    other = "; ".join(result[1]) if result is not None and done.returncode == 0 else ""
+    left = _left_by_a_run(job, out)
+    made = left is not None and not left[1] and done.returncode == 0
+    if left is None or not made or left[0]["status"] != DONE:
+        (folder / RESULT).unlink(missing_ok=True)
+    if left is not None and made:
+        return left[0]
+    other = "; ".join(left[1]) if left is not None and done.returncode == 0 else ""
     return failed(job, f"it was run otherwise than planned: {other}" if other else _problem(done))
 
 
@@ -245,67 +201,44 @@ def not_run(job: Job) -> dict[str, Any]:
     return about(job) | {"status": NOT_RUN, "problem": None}
 
 
-def run_here(folder: Path, root: Path | None, rooms: Path | None) -> None:
+def run_here(folder: Path, root: Path | None, rooms: Path | None, clock: ProcessClock) -> None:
     """Run the job that is written in a folder; its results go there.
+
+    Args:
+        folder: Folder of the job.
+        root: Folder in which recordings are looked for first.
+        rooms: Folder in which rendered frames are kept.
+        clock: Clock of this process.
 
     Raises:
         JaxSlamError: If its recording is not there or not fit to be tracked, or a file cannot be written.
     """
     job, sources = Job.of_json((folder / _JOB).read_text()), sources_sha256()
-    bound_threads(job.config.run.threads)
+    if job.system is None:
+        bound_threads(job.config.run.threads)
     enable_compile_cache()
-    whole, recording = opened(job.clip, root, rooms)
-    dataset, truth = with_true_masks(whole, job.config.semantics)
-    flow_ms = flow_time_ms(dataset)
-    pictures, poses = RunPictures(len(dataset)), RelativePoseLog()
-
-    def watch(frame: Frame | None, result: FrameResult | Rejected) -> None:
-        pictures(frame, result)
-        poses(frame, result)
-
-    slam = Slam(dataset.camera, job.config, detector=truth, imu=imu_sheet(dataset))
-    slam.warm_up()
-    began = time.perf_counter()
-    with slam:
-        records = slam.run(dataset, watch)
-    info = RunInfo(dataset, job.preset, time.perf_counter() - began)
-    summary, _ = write_results(folder, slam, records, info, pictures, poses.poses())
-    times = summary["track_ms"]
-    ratios = {} if flow_ms is None else {f"flow_ratio_{name}": round(times[name] / flow_ms, 4) for name in times or ()}
-    result = about(job) | {
-        "status": DONE,
-        "problem": None,
-        **summary,
-        "images": _num_images(whole),
-        "rate_hz": _rate_hz(dataset),
-        "flow_ms": None if flow_ms is None else round(flow_ms, 4),
-        **ratios,
-        "sources_sha256": sources,
-        "data_sha256": _data_sha256(job.clip, recording),
-        "camera_sha256": camera_sha256(job.clip),
-        "lacks_network": slam.without_network is not None and preset_needs_network(job.preset),
-        "networks_sha256": networks_sha256(job.config.semantics),
-        "config": dataclasses.asdict(job.config),
-    }
+    has_frames = job.system is None or bool(job.system.command)  # of a trajectory, frames have been tracked elsewhere
+    with clock.stopped():
+        given = opened(job.clip, root, rooms if has_frames else None, rendered=has_frames)
+    made = _ours(job, given, folder, clock) if job.system is None else _another(job, job.system, given, folder)
+    result = about(job) | {"status": DONE, "problem": None} | made | given.figures() | {"sources_sha256": sources}
     result |= {_CHECKSUM: _checksum(result)}
     write_atomically(folder / RESULT, (json.dumps(result, indent=2) + "\n").encode(), BenchmarkError)
 
 
-def _data_sha256(clip: Clip, recording: Path | None) -> str | None:
-    if clip.world:
-        return world_sha256(clip.world)
-    return None if recording is None else data_sha256(recording)
+def _ours(job: Job, given: OpenedClip, folder: Path, clock: ProcessClock) -> dict[str, Any]:
+    from jaxslam.benchmark.suites.tracked_run import track  # noqa: PLC0415 - nothing else needs the tracker
+
+    return track(given, job.preset, job.config, folder, clock)
 
 
-def _num_images(whole: Dataset) -> int:
-    """Count the color images, or pairs, of the recording, including those without a depth image."""
-    return len(whole) + (whole.unmatched.color if isinstance(whole, Associated) else 0)
+def _another(job: Job, system: System, given: OpenedClip, folder: Path) -> dict[str, Any]:
+    from jaxslam.benchmark.suites.external_run import run_system  # noqa: PLC0415 - nothing else needs to evaluate
 
-
-def _rate_hz(dataset: Dataset) -> float:
-    """Frames a second; that of the camera if there is one frame only."""
-    steps_ns = np.diff(dataset.timestamps_ns)
-    return round(1e9 / float(np.median(steps_ns)), 3) if len(steps_ns) else dataset.camera.fps
+    run = run_system(system, job.seed, given, folder)
+    known = {"system_sha256": system_sha256(system, job.clip, job.seed), "lacks_network": False, "networks_sha256": {}}
+    figures = machine() | known | run.figures
+    return figures if run.problem is None else figures | {"status": FAILED, "problem": run.problem}
 
 
 def about(job: Job) -> dict[str, Any]:
@@ -329,6 +262,8 @@ def _end_with_parent() -> None:
     def wait() -> None:
         while os.read(0, 1):  # not through `sys.stdin`, whose lock would be held when the process ends
             pass
+        for child in psutil.Process().children():  # the program of another system
+            kill_with_children(child.pid)
         os._exit(1)
 
     threading.Thread(target=wait, name="jaxslam-parent", daemon=True).start()
@@ -340,9 +275,10 @@ def _main(arguments: Sequence[str]) -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--root", type=Path)
     parser.add_argument("--rooms", type=Path)
+    parser.add_argument("--began", type=float, default=time.time())
     chosen = parser.parse_args(arguments)
     try:
-        run_here(chosen.folder, chosen.root, chosen.rooms)
+        run_here(chosen.folder, chosen.root, chosen.rooms, ProcessClock(chosen.began))
     except JaxSlamError as error:
         sys.exit(f"error: {error}")
 

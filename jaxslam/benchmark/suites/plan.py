@@ -12,6 +12,7 @@ from jaxslam.benchmark.suites.job import Job
 from jaxslam.benchmark.suites.run_names import flattened
 from jaxslam.benchmark.suites.suite import Sequence as Clip
 from jaxslam.benchmark.suites.suite import Suite
+from jaxslam.benchmark.suites.trajectory_folders import lacking_trajectories, trajectories_of
 from jaxslam.datasets.catalog import known_recordings
 from jaxslam.errors import BenchmarkError
 from jaxslam.worlds.library import load_world
@@ -23,7 +24,7 @@ _OPENING, _CLOSING, _QUOTES = "([{", ")]}", "'\""
 def plan(
     suite: Suite, *, presets: Sequence[str] = (), runs: int | None = None, settings: Sequence[str] = ()
 ) -> list[Job]:
-    """All runs of a suite.
+    """All runs of a suite; of a system whose trajectories are there, as many as it has.
 
     Args:
         suite: Suite to run.
@@ -31,15 +32,24 @@ def plan(
         runs: Number of runs of each, instead of the number that the suite and its sequences give.
         settings: `key=value` each, applied last: they beat those of the suite and of its variants.
     """
+    chosen = dict.fromkeys(presets or suite.presets)
     variants = suite.variants or {"": ()}
-    return [
-        # Without `runs`: a run is the same run, however many others there are.
-        Job(replace(clip, runs=None), preset, variant, (*suite.settings, *of_variant, *settings), seed)
-        for clip in suite.sequences
-        for preset in dict.fromkeys(presets or suite.presets)
-        for variant, of_variant in variants.items()
-        for seed in range(runs or clip.runs or suite.runs)
-    ]
+    jobs = []
+    for clip in suite.sequences:
+        once = replace(clip, runs=None)  # a run is the same run, however many others there are
+        numbers = range(runs or clip.runs or suite.runs)
+        jobs += [
+            Job(once, preset, variant, (*suite.settings, *of_variant, *settings), seed)
+            for preset in chosen
+            for variant, of_variant in variants.items()
+            for seed in numbers
+        ]
+        jobs += [
+            Job(once, system.name, "", (), number, system)
+            for system in suite.systems
+            for number in (numbers if system.command else range(len(trajectories_of(Path(system.trajectories), clip))))
+        ]
+    return jobs
 
 
 def missing(suite: Suite, found: Collection[str]) -> dict[str, str]:
@@ -55,6 +65,24 @@ def missing(suite: Suite, found: Collection[str]) -> dict[str, str]:
     absent = {name: f"not there{way(name)}" for name in names}
     worlds = dict.fromkeys(clip.world for clip in suite.sequences if clip.world)
     return absent | {world: why for world in worlds if (why := why_not_here(load_world(world))) is not None}
+
+
+def not_judged(suite: Suite, absent: Collection[str]) -> dict[str, str]:
+    """Rows of other systems that have no trajectory of a sequence, and why.
+
+    Args:
+        suite: Suite to run.
+        absent: Recordings and worlds that are not there, whose sequences are left out.
+
+    Raises:
+        BenchmarkError: If a system has no trajectory of any sequence, or several for a run.
+    """
+    present = [clip for clip in suite.sequences if clip.source not in absent]
+    rows: dict[str, str] = {}
+    for system in suite.systems:
+        if system.trajectories:
+            rows |= lacking_trajectories(system.name, Path(system.trajectories), present)
+    return rows
 
 
 def swept(suite: Suite, sweeps: Iterable[str]) -> Suite:

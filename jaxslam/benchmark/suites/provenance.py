@@ -5,11 +5,14 @@ Each result keeps it, so that a later call knows whether the run would be the sa
 
 import functools
 import hashlib
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
 from jaxslam.benchmark.suites.suite import Sequence as Clip
+from jaxslam.benchmark.suites.system import System
+from jaxslam.benchmark.suites.trajectory_folders import trajectories_of
 from jaxslam.config.loading import configs_dir
 from jaxslam.config.schema import Config, SemanticsConfig
 from jaxslam.datasets.catalog import find_recording
@@ -36,7 +39,17 @@ class Run(Protocol):
 
     @property
     def config(self) -> Config:
-        """Every setting of it."""
+        """Every setting of a run of jaxslam."""
+        ...
+
+    @property
+    def system(self) -> System | None:
+        """Other system whose trajectory is judged; `None` for a run of jaxslam."""
+        ...
+
+    @property
+    def seed(self) -> int:
+        """Number of the run."""
         ...
 
 
@@ -49,20 +62,23 @@ def identities(runs: Sequence[Run], root: Path | None) -> list[dict[str, Any]]:
 
     Returns:
         For each: `commit` and `versions` of jaxslam and its libraries, `sources_sha256`, `data_sha256` of the
-        recording, `camera_sha256` of a camera file, and `networks_sha256`; `None` for what a run has not.
+        recording, `camera_sha256` of a camera file, `networks_sha256`, and `system_sha256` of another system; `None`
+        for what a run has not.
     """
     here = {key: value for key, value in machine().items() if key in _COMPUTED_BY}
     sources = sources_sha256()
     known = _Known(root)
     found = []
     for run in runs:
+        system = run.system
         found.append(
             here
             | {
                 "sources_sha256": sources,
                 "data_sha256": known.input(run.clip),
                 "camera_sha256": camera_sha256(run.clip),
-                "networks_sha256": known.networks(run.config.semantics),
+                "networks_sha256": known.networks(run.config.semantics) if system is None else {},
+                "system_sha256": None if system is None else system_sha256(system, run.clip, run.seed),
             }
         )
     return found
@@ -91,6 +107,8 @@ def changes(result: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
         found.append("the recording has changed, or is another one")
     if result.get("camera_sha256") != now["camera_sha256"]:
         found.append("the camera file has changed")
+    if result.get("system_sha256") != now.get("system_sha256"):
+        found.append("the trajectory, or a file that the command names, has changed")
     had, has = result.get("networks_sha256") or {}, now["networks_sha256"]
     for name in dict.fromkeys((*had, *has)):
         if had.get(name) != has.get(name):
@@ -137,6 +155,25 @@ def world_sha256(world: str) -> str:
 def camera_sha256(clip: Clip) -> str | None:
     """Hash of the camera file of a sequence; `None` if it names none, or a known camera."""
     return sha256_of(Path(clip.camera)) if clip.camera is not None and Path(clip.camera).is_file() else None
+
+
+def system_sha256(system: System, clip: Clip, number: int) -> str:
+    """Hash of the trajectory of another system, or of the files that its command names, such as a script.
+
+    Args:
+        system: The other system.
+        clip: Sequence that it tracks.
+        number: Number of the run.
+    """
+    digest = hashlib.sha256()
+    if system.trajectories:
+        files = trajectories_of(Path(system.trajectories), clip)[number : number + 1]
+    else:
+        named = (Path(system.folder, word) for word in shlex.split(system.command))
+        files = [file for file in named if file.is_file()]
+    for file in files:
+        digest.update(f"{file.name} {sha256_of(file)}\n".encode())
+    return digest.hexdigest()
 
 
 def networks_sha256(config: SemanticsConfig) -> dict[str, str | None]:

@@ -16,6 +16,12 @@ sequences:
   - recording: kitti_00
     sensor: stereo                   # or rgbd: what the recording must be; whichever it is if not given
     runs: 20                         # how often this one, if not as often as the others
+systems:                             # other systems, judged as presets are
+  other-slam:
+    command: my_slam {recording} {calibration} {out}    # see `System`; run where the suite's file is, without a shell
+    limit_s: 600                     # then it is killed
+  third-slam:
+    trajectories: results/third      # a folder with crowd.txt, ..., see `trajectories_of`
 ablation: false                      # true shows published figures of parts of systems too
 variants:                            # every preset with each of these settings too
   few-points: [track.num_points=256]
@@ -29,6 +35,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
+from jaxslam.benchmark.suites.system import System, systems_of_file
 from jaxslam.config.loading import configs_dir, load_config, presets
 from jaxslam.config.schema import Config
 from jaxslam.config.validation import Range, ValidatedConfig, from_mapping
@@ -109,9 +116,10 @@ class Suite(ValidatedConfig):
         settings: Settings `key=value` of all runs.
         variants: Further settings by name. Every preset is run with each variant, and not without one.
         ablation: Whether reports also show published figures of parts of systems.
+        systems: Other systems that are judged beside the presets.
 
     Raises:
-        BenchmarkError: If a field has the wrong type, or two sequences have the same name.
+        BenchmarkError: If a field has the wrong type, or two sequences or systems have the same name.
     """
 
     _error: ClassVar[type[JaxSlamError]] = BenchmarkError
@@ -124,12 +132,17 @@ class Suite(ValidatedConfig):
     settings: tuple[str, ...] = ()
     variants: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     ablation: bool = False
+    systems: tuple[System, ...] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
         for name, count in Counter(sequence.name for sequence in self.sequences).items():
             if count > 1:
                 raise BenchmarkError(f"sequences: '{name}' is listed twice; give one of them another `name`")
+        for name, count in Counter(system.name for system in self.systems).items():
+            if count > 1 or name in presets():
+                used = "is listed twice" if count > 1 else "is a preset"
+                raise BenchmarkError(f"systems: '{name}' {used}; expected another name")
 
 
 @dataclass(frozen=True)
@@ -145,6 +158,7 @@ class _SuiteFile(ValidatedConfig):
     set: tuple[str, ...] = ()
     variants: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     ablation: bool = False
+    systems: Mapping[str, Any] = field(default_factory=dict)
 
 
 def suites() -> dict[str, Path]:
@@ -172,8 +186,9 @@ def load_suite(name_or_path: str) -> Suite:
         raise BenchmarkError(f"suite: expected a known one, a YAML file or a folder, got '{name_or_path}'{hint}")
     file = from_mapping(_SuiteFile, read_mapping(path, BenchmarkError), str(path))
     sequences = [_sequence(entry, f"{path}: sequences[{index}]", path) for index, entry in enumerate(file.sequences)]
+    systems = systems_of_file(file.systems, path)
     try:
-        return _suite(file, path.stem, tuple(sequences))
+        return _suite(file, path.stem, tuple(sequences), systems)
     except JaxSlamError as error:
         raise BenchmarkError(f"{path}: {error}") from None
 
@@ -207,11 +222,11 @@ def _suite_of_folder(folder: Path) -> Suite:
     )
 
 
-def _suite(file: _SuiteFile, name: str, sequences: tuple[Sequence, ...]) -> Suite:
+def _suite(file: _SuiteFile, name: str, sequences: tuple[Sequence, ...], systems: tuple[System, ...]) -> Suite:
     if not sequences:
         raise BenchmarkError("sequences: expected a list of at least one")
-    chosen = checked_presets(file.presets)
-    suite = Suite(name, file.about, sequences, chosen, file.runs, file.set, file.variants, file.ablation)
+    chosen = checked_presets(file.presets) if file.presets or not systems else ()
+    suite = Suite(name, file.about, sequences, chosen, file.runs, file.set, file.variants, file.ablation, systems)
     for variant in suite.variants.values() or [()]:
         for preset in suite.presets:
             check_masks(sequences, load_config(preset, overrides=(*suite.settings, *variant)))  # now, not after hours

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from jaxslam.benchmark.suites.job import Job, opened
+from jaxslam.benchmark.suites.job import Job
+from jaxslam.benchmark.suites.opened_clip import opened
 from jaxslam.benchmark.suites.plan import fingerprint, missing, plan, plan_differences, replaced_settings, swept
 from jaxslam.benchmark.suites.suite import Sequence, checked_presets, load_suite, suites
 from jaxslam.datasets.catalog import known_recordings
@@ -69,7 +70,7 @@ class TestSuite:
     def test_room_as_pairs(self, tmp_path: Path) -> None:
         text = "sequences: [{name: room, sensor: stereo, room: {frames: 1, people: 0, baseline_m: 0.1}}]"
         (job,) = plan(load_suite(suite_file(tmp_path, text)))
-        dataset, _ = opened(Job.of_json(job.to_json()).clip, None)
+        dataset = opened(Job.of_json(job.to_json()).clip, None).dataset
         assert dataset.camera.is_stereo
         assert dataset[0].right is not None
 

@@ -1,6 +1,7 @@
 """The pages in `docs` are true: blocks run, links lead somewhere, tables are complete, generated ones up to date."""
 
 import importlib.util
+import json
 import re
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -86,6 +87,8 @@ def _check_gradients(folder: Path, printed: str) -> None:
 def _check_benchmarks(folder: Path, printed: str) -> None:
     names = {path.name for path in (folder / "results" / "bench" / "my_suite").iterdir()}
     assert names >= {"report.html", "report.md", "results.json"}
+    others = json.loads((folder / "results" / "bench" / "with_others" / "results.json").read_text())
+    assert {run["label"]: run["status"] for run in others} == dict.fromkeys(("static", "my-slam", "their-slam"), "done")
 
 
 def _check_worlds(folder: Path, printed: str) -> None:
