@@ -255,10 +255,12 @@ def _absolute_figures(errors: _Errors, align: AlignmentKind) -> dict[str, float 
 
 def _relative_figures(errors: _Errors, later: PosePairs, successive: PosePairs) -> dict[str, Any]:
     translations, rotations = np.asarray(errors.per_second.translations), np.asarray(errors.per_second.rotations)
-    per_frame = errors.per_frame
+    translations, rotations, per_frame = translations[later.first], np.degrees(rotations[later.first]), errors.per_frame
     return {
-        "rpe_trans_m_per_s": later.rmse_per_second(translations[later.first]),
-        "rpe_rot_deg_per_s": later.rmse_per_second(np.degrees(rotations[later.first])),
+        "rpe_trans_m_per_s": later.rmse_per_second(translations),
+        **{f"rpe_trans_{name}_m_per_s": value for name, value in later.statistics_per_second(translations).items()},
+        "rpe_rot_deg_per_s": later.rmse_per_second(rotations),
+        **{f"rpe_rot_{name}_deg_per_s": value for name, value in later.statistics_per_second(rotations).items()},
         "rpe_trans_m_per_frame": float(per_frame.translation.rmse) if len(successive) else None,
         "rpe_rot_deg_per_frame": float(np.degrees(per_frame.rotation.rmse)) if len(successive) else None,
         "rpe_pairs": len(later),

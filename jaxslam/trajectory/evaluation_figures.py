@@ -57,7 +57,13 @@ class Evaluation:
         rpe_trans_m_per_s: Translational RPE per second, m/s: the error of the motion between the poses of a pair,
             divided by the time between them. That time is longer than `rpe_delta_s` if poses are sparse or missing.
             `None` without pairs.
+        rpe_trans_mean_m_per_s: Mean of the same errors per second, m/s; `None` without pairs.
+        rpe_trans_median_m_per_s: Median of the same errors per second, m/s; `None` without pairs.
+        rpe_trans_std_m_per_s: Standard deviation of the same errors per second, m/s; `None` without pairs.
         rpe_rot_deg_per_s: Rotational RPE per second, degrees/s; `None` without pairs.
+        rpe_rot_mean_deg_per_s: Mean of the same errors per second, degrees/s; `None` without pairs.
+        rpe_rot_median_deg_per_s: Median of the same errors per second, degrees/s; `None` without pairs.
+        rpe_rot_std_deg_per_s: Standard deviation of the same errors per second, degrees/s; `None` without pairs.
         rpe_pairs: Number of pairs of the RPE per second.
         rpe_pair_s_median: Median time between the poses of a pair of the RPE per second, seconds; `None` without
             pairs.
@@ -109,7 +115,13 @@ class Evaluation:
     ate_sim3_rmse_m: float | None
     sim3_scale: float | None
     rpe_trans_m_per_s: float | None
+    rpe_trans_mean_m_per_s: float | None
+    rpe_trans_median_m_per_s: float | None
+    rpe_trans_std_m_per_s: float | None
     rpe_rot_deg_per_s: float | None
+    rpe_rot_mean_deg_per_s: float | None
+    rpe_rot_median_deg_per_s: float | None
+    rpe_rot_std_deg_per_s: float | None
     rpe_pairs: int
     rpe_pair_s_median: float | None
     rpe_pair_s_min: float | None

@@ -52,6 +52,14 @@ class PosePairs(NamedTuple):
         """Compute the RMSE of `(m,)` errors, each divided by the time of its pair; `None` without pairs."""
         return float(np.sqrt(np.mean(np.square(errors / self.seconds)))) if len(self) else None
 
+    def statistics_per_second(self, errors: Float[np.ndarray, " m"]) -> dict[str, float | None]:
+        """Compute the `mean`, `median` and `std` of `(m,)` errors, each divided by the time of its pair.
+
+        The standard deviation is that of the population, about the mean. Each is `None` without pairs.
+        """
+        measures, rates = {"mean": np.mean, "median": np.median, "std": np.std}, errors / self.seconds
+        return {name: float(measure(rates)) if len(self) else None for name, measure in measures.items()}
+
     def times(self) -> dict[str, float | None]:
         """Return the `median`, `min` and `max` of the times of the pairs, seconds; each `None` without pairs."""
         measures = {"median": np.median, "min": np.min, "max": np.max}

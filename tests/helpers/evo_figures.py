@@ -30,11 +30,11 @@ class Evo:
         metric.process_data((self.reference, self.estimate))
         return metric.get_all_statistics()
 
-    def rpe(self, relation: str, delta: int = 1, *, all_pairs: bool = False) -> float:
-        """RMSE over pairs so many frames apart, in meters (`translation_part`) or degrees (`rotation_angle_deg`)."""
+    def rpe(self, relation: str, delta: int = 1, *, all_pairs: bool = False, statistic: str = "rmse") -> float:
+        """Errors over pairs so many frames apart, in meters (`translation_part`) or degrees (`rotation_angle_deg`)."""
         metric = metrics.RPE(getattr(metrics.PoseRelation, relation), delta, metrics.Unit.frames, all_pairs=all_pairs)
         metric.process_data((self.reference, self.estimate))
-        return metric.get_statistic(metrics.StatisticsType.rmse)
+        return metric.get_statistic(metrics.StatisticsType(statistic))
 
     def rpe_of(self, first: np.ndarray, second: np.ndarray, seconds: np.ndarray) -> tuple[float, float]:
         """RMSE in meters and in degrees a second over given pairs, so many seconds apart.

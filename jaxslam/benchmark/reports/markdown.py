@@ -15,6 +15,7 @@ from jaxslam.benchmark.suites.aggregate import (
     rows_of,
     with_shown_labels,
 )
+from jaxslam.benchmark.suites.protocol import Protocol
 from jaxslam.benchmark.suites.published import load_published
 from jaxslam.benchmark.suites.published_comparison import (
     ATE,
@@ -69,6 +70,10 @@ def suite_report(
     yield Heading(suite.name, 1)
     yield Paragraph(suite.about)
     yield Table(overview_table(suite, rows))
+    if suite.protocol is not None:
+        yield Heading("Table of the paper")
+        yield Paragraph(suite.protocol.about)
+        yield Table(protocol_table(suite.protocol, rows))
     yield Bullets(summary_lines(suite, rows))
     yield Bullets(warnings(suite, results), is_warning=True)
     yield Table(kitti_means(suite, rows))
@@ -104,6 +109,31 @@ def overview_table(suite: Suite, rows: Sequence[Mapping[str, Any]]) -> list[list
         least = (_least(of_it, "frames", 0), _least(of_it, "tracked_percent", 1), _least(of_it, "num_matched", 0))
         lines.append([sequence, *ours, *theirs, *least, runs])
     return lines if rows else []
+
+
+def protocol_table(protocol: Protocol, rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """Figures of all rows as a protocol takes them, and their means over the sequences; headings first.
+
+    A mean is there for what every sequence of a label has.
+    """
+    columns = protocol.shown()
+    lines = [["sequence", "preset", "runs", *(column.heading for column in columns)]]
+    for row in rows:
+        runs = f"{row['done']} of {row['runs']}"
+        lines.append([row["sequence"], row["label"], runs, *(cell(row, column) for column in columns)])
+    of_label: dict[str, list[Mapping[str, Any]]] = {}
+    for row in rows:
+        of_label.setdefault(row["label"], []).append(row)
+    for label, group in of_label.items():
+        if len(group) > 1:
+            lines.append(["mean of the sequences", label, "", *(_mean_cell(group, column) for column in columns)])
+    return lines if rows else []
+
+
+def _mean_cell(rows: Sequence[Mapping[str, Any]], column: Column) -> str:
+    values = [(row[column.figure] or {}).get(column.which) for row in rows]
+    known = [value for value in values if value is not None]
+    return f"{sum(known) / len(known):.{column.digits}f}" if len(known) == len(values) else "-"
 
 
 def summary_lines(suite: Suite, rows: Sequence[Mapping[str, Any]]) -> list[str]:

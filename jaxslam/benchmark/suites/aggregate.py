@@ -2,11 +2,17 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
 from jaxslam.benchmark.suites.run_names import run_folder
+from jaxslam.errors import BenchmarkError, nearest
+
+Statistic: TypeAlias = Literal["median", "least", "most", "mean", "trimmed_mean"]
+"""Statistic of the runs of a sequence; the last is the mean without the smallest and the largest, of three or more."""
+FEWEST_TO_TRIM = 3
+"""Least number of runs of which a `trimmed_mean` is taken."""
 
 
 class Column(NamedTuple):
@@ -16,13 +22,13 @@ class Column(NamedTuple):
         heading: Heading of the column.
         figure: Name of the figure in `figures_of`.
         digits: Number of decimals.
-        which: Statistic of the runs: `median`, `least`, `most`, or `range` for the last two.
+        which: Statistic of the runs, or `range` for the least and the most.
     """
 
     heading: str
     figure: str
     digits: int
-    which: str = "median"
+    which: Statistic | Literal["range"] = "median"
 
 
 ACCURACY = (
@@ -58,10 +64,35 @@ RUNNING = (
     Column("memory, MB", "peak_rss_mb", 0, "most"),
 )
 """How they came about."""
+_OF_PROTOCOLS = (
+    Column("ATE mean, m", "ate_mean_m", 4),
+    Column("ATE median, m", "ate_median_m", 4),
+    Column("ATE S.D., m", "ate_std_m", 4),
+    Column("RPE mean, m/s", "rpe_trans_mean_m_per_s", 4),
+    Column("RPE median, m/s", "rpe_trans_median_m_per_s", 4),
+    Column("RPE S.D., m/s", "rpe_trans_std_m_per_s", 4),
+    Column("RPE mean, deg/s", "rpe_rot_mean_deg_per_s", 3),
+    Column("RPE median, deg/s", "rpe_rot_median_deg_per_s", 3),
+    Column("RPE S.D., deg/s", "rpe_rot_std_deg_per_s", 3),
+    Column("mean, ms", "track_ms_mean", 1),
+)
+"""What tables of papers show besides."""
 COVERAGE = ("images", "tracked_of_all_percent", "matched_percent", "span_percent")
 """What else decides whether figures may be compared with published ones: images of the whole recording, and shares of
 the frames, dropped ones too, that were tracked, and that were matched with ground truth; and of its time."""
-_FIGURES = (*(column.figure for column in (*ACCURACY, *RUNNING)), *COVERAGE)
+_COLUMNS = {column.figure: column for column in (*ACCURACY, *RUNNING, *_OF_PROTOCOLS) if column.which != "range"}
+_FIGURES = (*_COLUMNS, *COVERAGE)
+
+
+def column_of(figure: str, statistic: Statistic) -> Column:
+    """Return the column of a figure, with a statistic of the runs.
+
+    Raises:
+        BenchmarkError: If there is no such figure.
+    """
+    if figure not in _COLUMNS:
+        raise BenchmarkError(f"columns: unknown figure '{figure}'{nearest(figure, _COLUMNS)}")
+    return _COLUMNS[figure]._replace(which=statistic)
 
 
 def row_name(sequence: str, label: str) -> str:
@@ -74,8 +105,7 @@ def rows_of(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
     A row has `sequence`, `label`, `runs` (planned), `done`, `failed`, `problems` of those that failed, `unevaluated`
     (why runs that are done have no ATE, with how many), `notes` of the evaluations, `lacks_network` (whether they went
-    without the network that their preset needs), and by the name of each figure its `median`, `least` and `most`, or
-    `None`.
+    without the network that their preset needs), and by the name of each figure its statistics, or `None`.
     """
     groups: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
     for result in results:
@@ -126,11 +156,13 @@ def columns_of(rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]) -> 
 
 
 def cell(row: Mapping[str, Any], column: Column) -> str:
-    """The text of a row in a column, `-` if no run has the figure."""
+    """The text of a row in a column, `-` if no run has the figure, or too few for the statistic."""
     spread = row[column.figure]
     if spread is None:
         return "-"
     which = ("least", "most") if column.which == "range" else (column.which,)
+    if any(name not in spread for name in which):
+        return "-"
     return " - ".join(f"{spread[name]:.{column.digits}f}" for name in which)
 
 
@@ -163,7 +195,10 @@ def _row(sequence: str, label: str, group: Sequence[Mapping[str, Any]]) -> dict[
 
 
 def _spread(values: Sequence[float]) -> dict[str, float] | None:
-    """Median and range."""
+    """Statistics by the names of `Statistic`."""
     if not values:
         return None
-    return {"median": float(np.median(values)), "least": float(min(values)), "most": float(max(values))}
+    least, *between, most = sorted(values) if len(values) > 1 else (*values, *values)
+    found = {"median": float(np.median(values)), "least": float(least), "most": float(most)}
+    found["mean"] = float(np.mean(values))
+    return found | ({"trimmed_mean": float(np.mean(between))} if len(values) >= FEWEST_TO_TRIM else {})

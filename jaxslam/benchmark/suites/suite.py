@@ -22,6 +22,7 @@ systems:                             # other systems, judged as presets are
     limit_s: 600                     # then it is killed
   third-slam:
     trajectories: results/third      # a folder with crowd.txt, ..., see `trajectories_of`
+protocol: rts                        # table of a paper, see `Protocol`: it gives runs, variants and columns
 ablation: false                      # true shows published figures of parts of systems too
 variants:                            # every preset with each of these settings too
   few-points: [track.num_points=256]
@@ -31,10 +32,11 @@ Settings of the command line beat those of a suite and its variants.
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
+from jaxslam.benchmark.suites.protocol import Protocol, load_protocol
 from jaxslam.benchmark.suites.system import System, systems_of_file
 from jaxslam.config.loading import configs_dir, load_config, presets
 from jaxslam.config.schema import Config
@@ -117,6 +119,7 @@ class Suite(ValidatedConfig):
         variants: Further settings by name. Every preset is run with each variant, and not without one.
         ablation: Whether reports also show published figures of parts of systems.
         systems: Other systems that are judged beside the presets.
+        protocol: Table of a paper that reports show too; `None` for none.
 
     Raises:
         BenchmarkError: If a field has the wrong type, or two sequences or systems have the same name.
@@ -133,6 +136,7 @@ class Suite(ValidatedConfig):
     variants: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     ablation: bool = False
     systems: tuple[System, ...] = ()
+    protocol: Protocol | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -154,11 +158,12 @@ class _SuiteFile(ValidatedConfig):
     sequences: tuple[Any, ...]
     about: str = ""
     presets: tuple[str, ...] = ("default",)
-    runs: Annotated[int, _Positive] = 1
+    runs: Annotated[int, _Positive] | None = None
     set: tuple[str, ...] = ()
     variants: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     ablation: bool = False
     systems: Mapping[str, Any] = field(default_factory=dict)
+    protocol: Any = None
 
 
 def suites() -> dict[str, Path]:
@@ -187,8 +192,9 @@ def load_suite(name_or_path: str) -> Suite:
     file = from_mapping(_SuiteFile, read_mapping(path, BenchmarkError), str(path))
     sequences = [_sequence(entry, f"{path}: sequences[{index}]", path) for index, entry in enumerate(file.sequences)]
     systems = systems_of_file(file.systems, path)
+    protocol = None if file.protocol is None else load_protocol(file.protocol, f"{path}: protocol")
     try:
-        return _suite(file, path.stem, tuple(sequences), systems)
+        return _suite(_by_protocol(file, protocol), path.stem, tuple(sequences), systems, protocol)
     except JaxSlamError as error:
         raise BenchmarkError(f"{path}: {error}") from None
 
@@ -222,11 +228,41 @@ def _suite_of_folder(folder: Path) -> Suite:
     )
 
 
-def _suite(file: _SuiteFile, name: str, sequences: tuple[Sequence, ...], systems: tuple[System, ...]) -> Suite:
+def _by_protocol(file: _SuiteFile, protocol: Protocol | None) -> _SuiteFile:
+    """Return the file with the runs and variants of its protocol, where it gives none itself.
+
+    Raises:
+        BenchmarkError: If both have variants.
+    """
+    if protocol is None:
+        return file
+    if file.variants and protocol.variants:
+        raise BenchmarkError(f"variants: expected none beside those of the protocol ({', '.join(protocol.variants)})")
+    return replace(file, runs=file.runs or protocol.runs, variants=file.variants or protocol.variants)
+
+
+def _suite(
+    file: _SuiteFile,
+    name: str,
+    sequences: tuple[Sequence, ...],
+    systems: tuple[System, ...],
+    protocol: Protocol | None,
+) -> Suite:
     if not sequences:
         raise BenchmarkError("sequences: expected a list of at least one")
     chosen = checked_presets(file.presets) if file.presets or not systems else ()
-    suite = Suite(name, file.about, sequences, chosen, file.runs, file.set, file.variants, file.ablation, systems)
+    suite = Suite(
+        name,
+        file.about,
+        sequences,
+        chosen,
+        file.runs or 1,
+        file.set,
+        file.variants,
+        file.ablation,
+        systems,
+        protocol,
+    )
     for variant in suite.variants.values() or [()]:
         for preset in suite.presets:
             check_masks(sequences, load_config(preset, overrides=(*suite.settings, *variant)))  # now, not after hours

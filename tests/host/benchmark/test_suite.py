@@ -96,7 +96,7 @@ class TestSuite:
             ("sequences: []", "sequences: expected a list of at least one"),
             (SUITE + "seqences: []", "unknown key 'seqences' .did you mean 'sequences'"),
             (SUITE + "ablation: 3", "ablation: expected true or false, got 3"),
-            (SUITE.replace("runs: 3", "runs: 0"), "runs: expected an integer >= 1, got 0"),
+            (SUITE.replace("runs: 3", "runs: 0"), "runs: expected an integer >= 1 or null, got 0"),
             (SUITE.replace("static, default", "statik"), "unknown preset 'statik' .did you mean 'static'"),
             (SUITE.replace("static, default", ""), "presets: expected at least one"),
             (

@@ -110,6 +110,14 @@ class TestAgainstEvo:
         evo = Evo(estimate, reference, "se3")
         assert result.rpe_trans_m_per_s == pytest.approx(evo.rpe("translation_part", 20, all_pairs=True), abs=1e-9)
         assert result.rpe_rot_deg_per_s == pytest.approx(evo.rpe("rotation_angle_deg", 20, all_pairs=True), abs=1e-9)
+        figures = result.summary()
+        for name in ("mean", "median", "std"):
+            trans, rot = (
+                evo.rpe(relation, 20, all_pairs=True, statistic=name)
+                for relation in ("translation_part", "rotation_angle_deg")
+            )
+            assert figures[f"rpe_trans_{name}_m_per_s"] == pytest.approx(trans, abs=1e-9)
+            assert figures[f"rpe_rot_{name}_deg_per_s"] == pytest.approx(rot, abs=1e-9)
 
 
 class TestRpe:
@@ -145,6 +153,7 @@ class TestRpe:
         estimate, reference = make_pair(5)
         result = evaluate(estimate, reference)
         assert result.rpe_trans_m_per_s is result.rpe_rot_deg_per_s is None
+        assert result.rpe_trans_std_m_per_s is result.rpe_rot_median_deg_per_s is None
         assert result.rpe_pairs == 0
         assert result.rpe_trans_m_per_frame is not None
         assert "m/s" not in str(result)
