@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 from rich.progress import TimeRemainingColumn
 
 from jaxslam.benchmark.reports.html import html_report
-from jaxslam.benchmark.reports.markdown import markdown_report
-from jaxslam.benchmark.suites.aggregate import row_name
+from jaxslam.benchmark.reports.markdown import markdown_report, suite_report
+from jaxslam.benchmark.reports.table_files import write_tables
+from jaxslam.benchmark.suites.aggregate import row_name, with_shown_labels
 from jaxslam.benchmark.suites.collected_results import RESULTS, Collected, read_results
 from jaxslam.benchmark.suites.job import DONE, FAILED, NOT_RUN, Job, about
 from jaxslam.benchmark.suites.plan import missing, not_judged, plan, replaced_settings, swept
@@ -27,7 +28,7 @@ from jaxslam.errors import BenchmarkError, nearest
 from jaxslam.io.atomic_files import make_folder, write_atomically
 from jaxslam.semantics.from_config import network_files
 
-_REPORT, _PAGE = "report.md", "report.html"
+_REPORT, _PAGE, _TABLES = "report.md", "report.html", "tables"
 _DASK = re.compile(r"dask://((?:\[[0-9A-Fa-f:.]+\]|[^\s/:@\[\]]+):[0-9]+)")
 
 
@@ -170,10 +171,13 @@ class _Report:
         write_atomically(self.out / _REPORT, text.encode(), BenchmarkError)
 
     def write(self) -> None:
-        """Write the results and both reports."""
+        """Write the results, both reports, and each table in files of its own."""
         self.write_text()
         page = html_report(self.suite, self.collected.every, self.not_run, self.out)
         write_atomically(self.out / _PAGE, page.encode(), BenchmarkError)
+        write_tables(
+            self.out / _TABLES, suite_report(self.suite, with_shown_labels(self.collected.every), self.not_run)
+        )
 
     def print_outcome(self) -> None:
         """Print how many runs were made and where the files are."""
@@ -184,7 +188,8 @@ class _Report:
         if (kept := len(self.collected.every) - len(planned)) > 0:
             plain_console.print(f"Also in the report: {kept} runs of earlier calls.")
         plain_console.print(
-            f"Report: {out / _PAGE}, {out / _REPORT}; figures: {out / RESULTS}; each run in {out}/SEQUENCE/PRESET/SEED"
+            f"Report: {out / _PAGE}, {out / _REPORT}; tables as CSV and LaTeX: {out / _TABLES};"
+            f" figures: {out / RESULTS}; each run in {out}/SEQUENCE/PRESET/SEED"
         )
 
 

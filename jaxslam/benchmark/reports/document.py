@@ -73,6 +73,8 @@ class Table:
 
     lines: Sequence[Sequence[str]]
     """Texts of each row; the first row holds the headings of the columns."""
+    name: str = ""
+    """Name of the files that hold the table alone; empty for none."""
 
 
 @dataclass(frozen=True)

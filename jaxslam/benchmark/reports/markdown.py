@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from jaxslam.benchmark.reports.document import Block, Bullets, Heading, Image, Paragraph, Table, to_markdown
+from jaxslam.benchmark.reports.published_tables import protocols, published_tables, rank_table
 from jaxslam.benchmark.suites.aggregate import (
     ACCURACY,
     RUNNING,
@@ -16,12 +17,8 @@ from jaxslam.benchmark.suites.aggregate import (
     with_shown_labels,
 )
 from jaxslam.benchmark.suites.protocol import Protocol
-from jaxslam.benchmark.suites.published import load_published
 from jaxslam.benchmark.suites.published_comparison import (
-    ATE,
-    METRICS,
     VERDICTS,
-    PublishedMetric,
     best_of_systems,
     clip_of,
     counted,
@@ -29,7 +26,6 @@ from jaxslam.benchmark.suites.published_comparison import (
     length_is_known,
     published_of,
     reservations,
-    verdict_on,
 )
 from jaxslam.benchmark.suites.suite import Suite
 
@@ -69,19 +65,22 @@ def suite_report(
     rows, images = rows_of(results), images or {}
     yield Heading(suite.name, 1)
     yield Paragraph(suite.about)
-    yield Table(overview_table(suite, rows))
+    yield Table(overview_table(suite, rows), "overview")
     if suite.protocol is not None:
         yield Heading("Table of the paper")
         yield Paragraph(suite.protocol.about)
-        yield Table(protocol_table(suite.protocol, rows))
+        yield Table(protocol_table(suite.protocol, rows), "protocol")
     yield Bullets(summary_lines(suite, rows))
+    yield Table(rank_table(suite, rows), "ranks")
     yield Bullets(warnings(suite, results), is_warning=True)
-    yield Table(kitti_means(suite, rows))
+    yield Table(kitti_means(suite, rows), "kitti_means")
     yield from images.get("", ())
     for sequence, of_it in by_sequence(rows).items():
         yield Heading(sequence)
-        tables = (figure_table(of_it, ACCURACY), figure_table(of_it, RUNNING))
-        yield from map(Table, (*tables, *published_tables(suite, sequence, of_it)))
+        yield Table(figure_table(of_it, ACCURACY), f"{sequence}-accuracy")
+        yield Table(figure_table(of_it, RUNNING), f"{sequence}-running")
+        for figure, lines in published_tables(suite, sequence, of_it).items():
+            yield Table(lines, f"{sequence}-published-{figure}")
         yield Bullets(list(failures(of_it)), is_warning=True)
         yield from images.get(sequence, ())
     if missing:
@@ -226,60 +225,6 @@ def figure_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]) -
     lines = [["preset", "runs", *(column.heading for column in shown)]]
     return lines + [
         [row["label"], f"{row['done']} of {row['runs']}", *(cell(row, column) for column in shown)] for row in rows
-    ]
-
-
-def published_tables(suite: Suite, sequence: str, rows: Sequence[Mapping[str, Any]]) -> list[list[list[str]]]:
-    """Tables of published figures of a sequence, one for each of `METRICS` that papers have.
-
-    Args:
-        suite: Suite that was run.
-        sequence: Its name in the suite; of a part of a recording nothing has been published.
-        rows: Those of `rows_of` that are of the sequence.
-    """
-    found = [published_table(suite, sequence, rows, metric) for metric in METRICS]
-    return [lines for lines in found if lines]
-
-
-def published_table(
-    suite: Suite, sequence: str, rows: Sequence[Mapping[str, Any]], metric: PublishedMetric = ATE
-) -> list[list[str]]:
-    """List the published figures of a sequence, best first, and how each of our rows compares; headings first.
-
-    Args:
-        suite: Suite that was run.
-        sequence: Its name in the suite.
-        rows: Those of `rows_of` that are of the sequence.
-        metric: Name of the figure.
-
-    Returns:
-        Lines of as many texts; none if nothing has been published.
-    """
-    figures = published_of(suite, sequence, metric.figure)
-    fit = [row for row in rows if row[metric.figure] is not None and not row["lacks_network"]]
-    ours = [(row, reservations(suite, row)) for row in fit]
-    beside = [f"{row['label']} is" for row, _ in ours]
-    lines = [[f"published {metric.name}", metric.unit, *beside, "aligned", "source", "note"]]
-    for figure in figures:
-        name = figure.system if figure.variant is None else f"{figure.system}, {figure.variant}"
-        stated = figure.alignment if figure.alignment_stated else f"{figure.alignment}, not stated"
-        whose = figure.source if figure.reported_by is None else f"{figure.source} of {figure.reported_by}"
-        verdicts = (verdict_on(row, metric.figure, figure.value, reasons) for row, reasons in ours)
-        lines.append([name, f"{figure.value:g}", *verdicts, stated, whose, figure.note])
-    return lines if figures and (ours or not any(row["lacks_network"] for row in rows)) else []
-
-
-def protocols(suite: Suite, rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Note for every paper with figures next to ours: its frames, and which statistic of how many runs."""
-    sequences = by_sequence(rows)
-    figures = [f for name in sequences for metric in METRICS for f in published_of(suite, name, metric.figure)]
-    names = {name for figure in figures for name in (figure.reported_by or figure.system).split(", ")}
-    names |= {line[1] for line in kitti_means(suite, rows)[1:]}
-    return [
-        f"{paper.name} ({paper.authors}; {paper.venue}{'' if paper.year is None else f', {paper.year}'}):"
-        f" {paper.protocol} {paper.link or ''}".rstrip()
-        for paper in load_published()
-        if paper.name in names
     ]
 
 

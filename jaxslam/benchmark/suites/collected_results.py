@@ -14,7 +14,7 @@ ALWAYS = (
     *("frames", "images", "tracked", "tracked_percent", "dropped", "dropped_percent", "status_counts", "relocalized"),
     *("first_loss_s", "ate_rmse_m", "ate_sim3_rmse_m", "rpe_trans_m_per_s", "rpe_rot_deg_per_s", "evaluation"),
     *("evaluation_problem", "track_ms", "stage_ms", "mask_age_frames", "rate_hz", "flow_ms", "wall_s", "peak_rss_mb"),
-    *("process_wall_s", "process_cpu_s", "exit_code", "timed_out", "command", "system_sha256"),
+    *("process_wall_s", "process_cpu_s"),
     *("cpu", "cores", "versions", "commit", "deterministic", "realtime", "model", "networks_sha256", "data_sha256"),
     *("without_network", "lacks_network"),
 )

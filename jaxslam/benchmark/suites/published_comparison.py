@@ -28,14 +28,23 @@ class PublishedMetric(NamedTuple):
     """A figure that papers report of a sequence.
 
     Attributes:
-        figure: Its name, of ours and of theirs.
+        figure: Its name, of theirs, and of ours too if those have no other.
         name: Name in tables.
         unit: Unit of its numbers.
+        other_name: Its name in our rows, if it is another one.
+        depends_on_machine: Whether there is no verdict, because it was measured on another machine.
     """
 
     figure: Metric
     name: str
     unit: str
+    other_name: str | None = None
+    depends_on_machine: bool = False
+
+    @property
+    def of_ours(self) -> str:
+        """Its name in our rows."""
+        return self.other_name or self.figure
 
 
 METRICS = (
@@ -44,6 +53,7 @@ METRICS = (
     PublishedMetric("rpe_rot_deg_per_s", "RPE", "deg/s"),
     PublishedMetric("kitti_trans_percent", "t_rel", "%"),
     PublishedMetric("kitti_rot_deg_per_100m", "r_rel", "deg/100 m"),
+    PublishedMetric("frame_ms", "time of a frame", "ms", "track_ms_mean", depends_on_machine=True),
 )
 ATE = METRICS[0]
 _KITTI = tuple(f"kitti_{number:02d}" for number in range(11))
@@ -105,7 +115,12 @@ def length_is_known(recording: str) -> bool:
     return _length(recording) is not None
 
 
-def verdict_on(row: Mapping[str, Any], metric: Metric, published: float, reasons: Sequence[str]) -> str:
+def rank_among(value: float, others: Iterable[Figure]) -> int:
+    """Rank of a figure of which smaller is better: 1 if none of the others is smaller."""
+    return 1 + sum(other.value < value for other in others)
+
+
+def verdict_on(row: Mapping[str, Any], metric: PublishedMetric, published: float, reasons: Sequence[str]) -> str:
     """Compare the runs of a row with a published figure: one of `VERDICTS`, or `NO_VERDICT`.
 
     Args:
@@ -114,8 +129,8 @@ def verdict_on(row: Mapping[str, Any], metric: Metric, published: float, reasons
         published: The figure of others.
         reasons: From `reservations`; with one there is no verdict.
     """
-    spread = row[metric]
-    if spread is None or reasons or (metric.startswith("rpe") and any("RPE" in note for note in row["notes"])):
+    spread, says_nothing = row[metric.of_ours], metric.name == "RPE" and any("RPE" in note for note in row["notes"])
+    if spread is None or reasons or metric.depends_on_machine or says_nothing:
         return NO_VERDICT
     return verdict(spread["least"], spread["most"], published)
 
@@ -127,7 +142,7 @@ def counted(suite: Suite, rows: Sequence[Mapping[str, Any]]) -> tuple[Counter[st
     for row in rows:
         systems = best_of_systems(published_of(suite, row["sequence"]))
         reasons = reservations(suite, row)
-        verdicts = [verdict_on(row, ATE.figure, figure.value, reasons) for figure in systems]
+        verdicts = [verdict_on(row, ATE, figure.value, reasons) for figure in systems]
         best.update(verdicts[:1])
         every.update(verdicts)
     return best, every

@@ -11,16 +11,17 @@ from jaxslam.benchmark.reports.html import html_report
 from jaxslam.benchmark.reports.markdown import (
     markdown_report,
     overview_table,
-    protocols,
-    published_table,
-    published_tables,
+    suite_report,
     summary_lines,
     warnings,
     without_network,
 )
 from jaxslam.benchmark.reports.plots import plot_spread
+from jaxslam.benchmark.reports.published_tables import protocols, published_table, published_tables, rank_table
+from jaxslam.benchmark.reports.table_files import to_csv, to_latex, write_tables
 from jaxslam.benchmark.suites.aggregate import rows_of
-from jaxslam.benchmark.suites.published import Figure, published_for
+from jaxslam.benchmark.suites.protocol import Protocol
+from jaxslam.benchmark.suites.published import Figure, load_published, published_for
 from jaxslam.benchmark.suites.published_comparison import (
     METRICS,
     NO_VERDICT,
@@ -88,8 +89,8 @@ class TestReservations:
     def test_of_a_row(self, runs: list[dict[str, Any]], reason: str | None) -> None:
         (row,) = rows_of(runs)
         assert "; ".join(reservations(CROWD, row)) == (reason or "")
-        (ate, *_) = published_tables(CROWD, "crowd", [row])
-        verdicts = {line[2] for line in ate[1:]}
+        ate = published_tables(CROWD, "crowd", [row])["ate_rmse_m"]
+        verdicts = {line[2] for line in ate[1:] if line[0] != "static"}
         assert (verdicts == {NO_VERDICT}) == (reason is not None)
         best = f"1 {NO_VERDICT.replace('no ', 'without a ')}"
         assert (best in summary_lines(CROWD, [row])[0]) == (reason is not None)
@@ -134,11 +135,53 @@ class TestPublished:
 
     def test_beside_ours(self) -> None:
         head, *lines = self.lines(Sequence("crowd", "rgbd_bonn_crowd"), (0.020, 0.025))
-        assert head[:4] == ["published ATE", "m", "ours is", "aligned"]
+        assert head[:6] == ["published ATE", "m", "ours is", "ratio", "rank", "aligned"]
         found = {line[0]: (float(line[1]), line[2]) for line in lines}
         assert found["NGD-SLAM"] == (0.024, "in range")
         assert {verdict for value, verdict in found.values() if value < 0.020} == {"worse"}
         assert {verdict for value, verdict in found.values() if value > 0.025} == {"better"}
+
+    def test_ratio_and_rank(self) -> None:
+        """Ours stands where its median belongs, as one more than the systems that are better."""
+        _, *lines = self.lines(Sequence("crowd", "rgbd_bonn_crowd"), (0.020, 0.025))
+        values = [float(line[1]) for line in lines]
+        assert values == sorted(values)
+        known = [figure.value for figure in best_of_systems(published_for("rgbd_bonn_crowd"))]
+        (ours,) = (line for line in lines if line[0] == "ours")
+        assert ours == [
+            *("ours", "0.0225", "-", f"{0.0225 / known[0]:.2f}", str(1 + sum(value < 0.0225 for value in known))),
+            *("se3", "here, median of 2 runs", ""),
+        ]
+        best = next(line for line in lines if float(line[1]) == known[0])
+        assert best[3:5] == ["1.00", "1"]
+
+    def test_ranks_over_sequences(self) -> None:
+        systems = len(best_of_systems(published_for("rgbd_bonn_crowd")))
+        rows = rows_of([done("crowd", "first", ate_rmse_m=1e-4), done("crowd", "last", ate_rmse_m=9.0), done("mine")])
+        head, first, last = rank_table(CROWD, rows)
+        assert head == ["against published ATE", "sequences", "ratio to the best", "mean rank", "of systems"]
+        assert first == ["first", "1", "0.01", "1.0", f"{systems + 1}.0"]
+        assert (last[0], last[3]) == ("last", f"{systems + 1}.0")
+        assert rank_table(CROWD, rows_of([done(tracked=464)])) == []
+
+    def test_another_statistic(self) -> None:
+        """That of the protocol, if there are runs enough."""
+        suite = Suite("any", "", CROWD.sequences, protocol=Protocol("x", ("ate_rmse_m",), "trimmed_mean"))
+        runs = [done(seed=seed, ate_rmse_m=ate) for seed, ate in enumerate((0.01, 0.02, 0.06))]
+        lines = published_table(suite, "crowd", rows_of(runs))
+        assert ["static", "0.02", "here, trimmed mean of 3 runs"] in [[line[0], line[1], line[-2]] for line in lines]
+        assert all(line[0] != "static" for line in published_table(suite, "crowd", rows_of(runs[:2])))
+
+    def test_times_of_other_machines(self) -> None:
+        """Beside ours, without a verdict."""
+        (time,) = (metric for metric in METRICS if metric.depends_on_machine)
+        name = next(f.sequence for paper in load_published() for f in paper.figures if f.metric == time.figure)
+        suite = Suite("any", "", (Sequence("any", name),))
+        run = done("any", track_ms={"mean": 12.5, "median": 12.0, "p95": 20.0, "max": 30.0})
+        head, *lines = published_table(suite, "any", rows_of([run]), time)
+        assert head[:3] == ["published time of a frame", "ms", "static is"]
+        assert ["static", "12.5", "-"] in [line[:3] for line in lines]
+        assert {line[2] for line in lines if line[0] != "static"} == {NO_VERDICT}
 
     def test_parts_of_systems_in_an_ablation(self) -> None:
         clip = Sequence("w", W)
@@ -268,6 +311,39 @@ class TestRemarks:
         assert '<td class="worse">worse</td>' in page
         assert '<details><summary>&quot;g&quot;</summary><figure><img alt="&quot;g&quot;" src="data:image/jpeg' in page
         assert to_html("t", empty) == to_html("t", [])
+
+
+class TestTableFiles:
+    LINES = (("preset", "t_rel, %", "> 5"), ("a_b & c", "1,5", r"{x}\y"))
+
+    def test_csv(self) -> None:
+        assert to_csv(self.LINES) == 'preset,"t_rel, %",> 5\na_b & c,"1,5",{x}\\y\n'
+
+    def test_latex(self) -> None:
+        """Rules of booktabs, and no letter that LaTeX takes for a command."""
+        assert to_latex(self.LINES).splitlines() == [
+            r"\begin{tabular}{lrr}",
+            r"\toprule",
+            r"preset & t\_rel, \% & \textgreater{} 5 \\",
+            r"\midrule",
+            r"a\_b \& c & 1,5 & \{x\}\textbackslash{}y \\",
+            r"\bottomrule",
+            r"\end{tabular}",
+        ]
+
+    def test_of_a_report(self, tmp_path: Path) -> None:
+        """Named tables alone; what an earlier report has left goes."""
+        (tmp_path / "gone.csv").touch()
+        (tmp_path / "mine.txt").touch()
+        write_tables(tmp_path, [Heading("x"), Table(self.LINES, "room 1/2"), Table([["a"]]), Table([], "empty")])
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.txt", "room_1_2.csv", "room_1_2.tex"]
+
+    def test_names_in_the_report_of_a_suite(self) -> None:
+        blocks = suite_report(CROWD, [done(), done("mine")], {})
+        assert [block.name for block in blocks if isinstance(block, Table) and block.lines] == [
+            *("overview", "ranks", "crowd-accuracy", "crowd-running", "crowd-published-ate_rmse_m"),
+            *("crowd-published-frame_ms", "mine-accuracy", "mine-running"),
+        ]
 
 
 def test_long_labels_leave_room() -> None:

@@ -1,5 +1,6 @@
 """`jaxslam bench`: runs in processes of their own, reports, and going on where it was broken off."""
 
+import csv
 import html
 import json
 import re
@@ -93,7 +94,7 @@ def times_of(files: list[Path]) -> dict[Path, int]:
 @pytest.mark.slow
 class TestResults:
     def test_of_every_run(self, out: Path) -> None:
-        assert {path.name for path in out.iterdir()} == {"results.json", "report.md", "report.html", "room"}
+        assert {path.name for path in out.iterdir()} == {"results.json", "report.md", "report.html", "room", "tables"}
         results = json.loads((out / "results.json").read_text())
         assert [(run["label"], run["seed"]) for run in results] == [
             ("static", 0), ("static", 1), ("default", 0), ("default", 1)
@@ -130,6 +131,16 @@ class TestResults:
         times = sorted(run["track_ms"]["p95"] for run in results if run["label"] == "static")
         assert float(running[1][running[0].index("p95, ms")]) == pytest.approx(sum(times) / 2, abs=0.06)
         assert "deterministic, all frames" in text
+
+    def test_tables(self, out: Path) -> None:
+        """Those of the report, each as CSV and LaTeX."""
+        names = {path.name for path in (out / "tables").iterdir()}
+        assert names == {
+            f"{name}.{kind}" for name in ("overview", "room-accuracy", "room-running") for kind in ("csv", "tex")
+        }
+        _, accuracy, _ = tables((out / "report.md").read_text())
+        with (out / "tables" / "room-accuracy.csv").open(newline="") as file:
+            assert list(csv.reader(file)) == accuracy
 
     def test_page(self, out: Path) -> None:
         """It needs nothing from elsewhere."""
