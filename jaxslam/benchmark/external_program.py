@@ -15,6 +15,7 @@ from typing import BinaryIO
 import psutil
 
 from jaxslam.errors import BenchmarkError
+from jaxslam.runtime.platform_choice import environment_of_user
 
 _LOOK_EVERY_S = 0.1
 _LOOKS_PER_SEARCH = 10
@@ -28,10 +29,13 @@ class Program:
     Attributes:
         name: Name in tables.
         command: Words of its command line.
+        is_ours: Whether it is of jaxslam, and takes the platform of JAX that a command of jaxslam chose; others have
+            the environment of the user.
     """
 
     name: str
     command: tuple[str, ...]
+    is_ours: bool = False
 
 
 @dataclass(frozen=True)
@@ -119,6 +123,7 @@ def run_to_its_end(
             stdout=printed,
             stderr=errors,
             cwd=folder,
+            env=None if program.is_ours else environment_of_user(),
             start_new_session=True,
         )
     except (OSError, ValueError) as problem:

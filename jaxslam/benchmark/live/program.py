@@ -47,7 +47,7 @@ def ours(options: Mapping[str, str], settings: Sequence[str]) -> Program:
         settings: Settings as `key=value`.
     """
     words = [*(f"--{name}={value}" for name, value in options.items()), *(f"--set={setting}" for setting in settings)]
-    return Program("jaxslam", (sys.executable, "-m", "jaxslam.benchmark.live.own_run", *words))
+    return Program("jaxslam", (sys.executable, "-m", "jaxslam.benchmark.live.own_run", *words), is_ours=True)
 
 
 def _text(file: BinaryIO) -> str:

@@ -2,7 +2,6 @@
 
 import csv
 import io
-import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -19,7 +18,6 @@ _LATEX = {
     "|": r"\textbar{}",
     **{letter: f"\\{letter}" for letter in "&%$#_{}"},
 }
-_UNSAFE = re.compile(r"[^A-Za-z0-9._-]+")
 
 
 def write_tables(folder: Path, blocks: Iterable[Block]) -> None:
@@ -32,7 +30,7 @@ def write_tables(folder: Path, blocks: Iterable[Block]) -> None:
     Raises:
         BenchmarkError: If a file cannot be written.
     """
-    tables = {_UNSAFE.sub("_", block.name): block.lines for block in blocks if isinstance(block, Table) and block.name}
+    tables = {block.name: block.lines for block in blocks if isinstance(block, Table) and block.name}
     make_folder(folder, BenchmarkError)
     texts = {f"{name}.csv": to_csv(lines) for name, lines in tables.items() if lines}
     texts |= {f"{name}.tex": to_latex(lines) for name, lines in tables.items() if lines}

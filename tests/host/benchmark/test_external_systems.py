@@ -272,6 +272,15 @@ class TestPrograms:
         assert "'rgb.txt'" in (tmp_path / PRINTED).read_text()
         assert not (tmp_path / "recording").exists()
 
+    def test_platform_of_jax_is_not_ours(
+        self, whole: OpenedClip, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """A command of jaxslam computes on the CPU; another program may have a GPU."""
+        monkeypatch.setenv("JAX_PLATFORMS", "cpu")
+        monkeypatch.setenv("JAXSLAM_CHOSE_PLATFORM", "1")
+        problem_of(python("import os; print(os.environ.get('JAX_PLATFORMS'))"), whole, tmp_path)
+        assert (tmp_path / PRINTED).read_text() == "None\n"
+
     def test_exit_code(self, whole: OpenedClip, tmp_path: Path) -> None:
         problem, run = problem_of(python("raise SystemExit('no vocabulary')"), whole, tmp_path)
         assert problem == "other: ended with 1: no vocabulary"

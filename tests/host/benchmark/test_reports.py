@@ -335,8 +335,8 @@ class TestTableFiles:
         """Named tables alone; what an earlier report has left goes."""
         (tmp_path / "gone.csv").touch()
         (tmp_path / "mine.txt").touch()
-        write_tables(tmp_path, [Heading("x"), Table(self.LINES, "room 1/2"), Table([["a"]]), Table([], "empty")])
-        assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.txt", "room_1_2.csv", "room_1_2.tex"]
+        write_tables(tmp_path, [Heading("x"), Table(self.LINES, "room 1"), Table([["a"]]), Table([], "empty")])
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.txt", "room 1.csv", "room 1.tex"]
 
     def test_names_in_the_report_of_a_suite(self) -> None:
         blocks = suite_report(CROWD, [done(), done("mine")], {})

@@ -9,7 +9,7 @@ import jax
 import pytest
 
 from jaxslam.cli.command_table import COMMANDS
-from jaxslam.runtime.platform_choice import prefer_cpu, warn_unless_cpu
+from jaxslam.runtime.platform_choice import environment_of_user, prefer_cpu, warn_unless_cpu
 
 CHOOSE = "import jaxslam.runtime.platform_choice as p, os; p.prefer_cpu(); print(os.environ['JAX_PLATFORMS'])"
 
@@ -19,6 +19,19 @@ def test_cpu_is_chosen_unless_the_environment_names_a_platform(chosen: dict[str,
     environment = {name: value for name, value in os.environ.items() if name != "JAX_PLATFORMS"} | chosen
     done = subprocess.run([sys.executable, "-c", CHOOSE], env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == expected
+
+
+@pytest.mark.parametrize(("chosen", "expected"), [(None, None), ("cuda", "cuda")])
+def test_other_programs_have_the_platform_of_the_user(
+    monkeypatch: pytest.MonkeyPatch, chosen: str | None, expected: str | None
+) -> None:
+    """Also those that a process of ours starts, which has the choice from its parent."""
+    monkeypatch.setattr(os, "environ", {"OTHER": "1"} | ({} if chosen is None else {"JAX_PLATFORMS": chosen}))
+    monkeypatch.delitem(sys.modules, "jax")
+    prefer_cpu()
+    assert os.environ["JAX_PLATFORMS"] == (chosen or "cpu")
+    prefer_cpu()
+    assert environment_of_user() == {"OTHER": "1"} | ({} if expected is None else {"JAX_PLATFORMS": expected})
 
 
 def test_a_process_that_has_jax_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
