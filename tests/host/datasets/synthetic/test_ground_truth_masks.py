@@ -125,7 +125,9 @@ class TestSuite:
     def test_recording_in_it(self, tmp_path: Path) -> None:
         path = tmp_path / "mine.yaml"
         path.write_text(SUITE + "  - recording: rgbd_bonn_crowd\n")
-        with pytest.raises(BenchmarkError, match="'scene' expected rendered rooms or worlds, got the recording rgbd_bonn_crowd"):
+        with pytest.raises(
+            BenchmarkError, match="'scene' expected rendered rooms or worlds, got the recording rgbd_bonn_crowd"
+        ):
             load_suite(str(path))
 
     def test_runs(self, tmp_path: Path) -> None:
