@@ -16,7 +16,7 @@ from jaxslam.cli.shared_options import WithJson
 from jaxslam.config.schema import SemanticsConfig
 from jaxslam.errors import ConfigError
 from jaxslam.io.atomic_files import write_atomically
-from jaxslam.semantics import Detections, Detector, load_detector
+from jaxslam.semantics import Detections, Detector, OnnxDetector, load_detector
 from jaxslam.semantics.model_zoo import find_model
 from jaxslam.visualization.draw_detections import draw_detections
 
@@ -36,7 +36,8 @@ class CheckModel(WithJson):
     out: Path = Path("detections.png")
     """PNG to draw to."""
     labels: str = "person"
-    """What to look for, separated by commas."""
+    """Classes to look for, separated by commas: names of COCO, of PASCAL VOC or of the network's own, or groups such as
+    `vehicles`."""
     adapter: str | None = None
     """What reads the outputs of the network; recognized from them if not given."""
     min_score: float = 0.3
@@ -67,6 +68,8 @@ class CheckModel(WithJson):
             print_json({**_figures(found), **times, "files": list(map(str, files)), "picture": str(self.out)})
         else:
             _print_found(found, labels, self.min_score)
+        if isinstance(detector, OnnxDetector) and detector.missing_labels:
+            plain_console.print(f"The network does not know: {', '.join(detector.missing_labels)}.")
         plain_console.print(f"{median_ms:.1f} ms an image, the first {first_ms:.1f} ms ({', '.join(map(str, files))})")
         bgr = cv2.cvtColor(draw_detections(image, found), cv2.COLOR_RGB2BGR)
         write_atomically(self.out, cv2.imencode(".png", bgr)[1].tobytes())

@@ -167,7 +167,9 @@ class SemanticsConfig(ValidatedConfig):
     every output says so. If not set, only the default network may be missing. Presets of systems that are built around
     a network say `error`."""
     labels: tuple[str, ...] = ("person",)
-    """Classes of movable objects, as the network names them; in a rendered room, `person` and `box`."""
+    """Classes of movable objects: names of COCO, of PASCAL VOC or of the network's own, and groups of classes.
+    `people`, `vehicles` and `animals` move by themselves; `furniture`, `bags` and `handheld` do not, which matters to
+    `dynamics.motion`. In a rendered room, also `box`."""
     min_score: Annotated[float, Share] = 0.3
     """Detections below this score are dropped."""
     prompt_encoder: str | None = None

@@ -19,7 +19,10 @@ from jaxslam.dynamics.regions import RegionCueResult
 from jaxslam.runtime.filled_arrays import filled
 
 Labels = UInt8[Array, "h w"]
-"""Number of the movable object at each pixel, from 1; 0 where there is none."""
+"""Number of the movable object at each pixel, from 1; 0 where there is none. `INERT` is added to the number of an
+object that does not move by itself."""
+INERT = 128
+"""Flag in `Labels` of an object that only moves if someone moves it, such as a chair or a bag."""
 
 
 _SETTINGS = MotionConfig()  # the only place of defaults
@@ -108,8 +111,10 @@ class MotionState(NamedTuple):
         return jnp.concatenate([jnp.zeros(1, bool), ~self.at_rest])
 
     def moving_pixels(self, labels: Labels) -> Bool[Array, "h w"]:
-        """Return the pixels of objects that move or could not be classified."""
-        return self.moves()[labels.astype(jnp.int32)]
+        """Return the pixels of objects that move or could not be classified; inert ones without points do not move."""
+        numbers, moves = object_numbers(labels), self.moves()
+        has_points = jnp.zeros_like(moves).at[jnp.where(self.there, self.of_point, 0)].set(True)
+        return moves[numbers] & ((labels < INERT) | has_points[numbers])
 
     def joining(self) -> Mask:
         """Return `(n,)` which points are on static objects."""
@@ -142,11 +147,27 @@ def no_motion(plan: MotionPlan | None, num_points: int, dtype: jnp.dtype) -> Mot
     return MotionMemory(filled(num_points, jnp.int32), filled(num, dtype), filled(num, bool))
 
 
+def object_numbers(labels: Int[Array, "*shape"] | UInt8[Array, "*shape"]) -> Int[Array, "*shape"]:
+    """Return the numbers of the objects in labels, without the flag `INERT`."""
+    return labels.astype(jnp.int32) & (INERT - 1)
+
+
 def labels_at(labels: Labels, uv: Pixels) -> Int[Array, " n"]:
     """Return `(n,)` the labels at pixels `(2, n)`; 0 outside the image."""
     column, row = jnp.round(lax.stop_gradient(uv)).astype(jnp.int32)
     there = labels.at[row, column].get(mode="fill", fill_value=0).astype(jnp.int32)
     return jnp.where((row >= 0) & (column >= 0), there, 0)  # negative indices count from the end
+
+
+def inert_objects(of_point: Int[Array, " n"], num: int) -> Bool[Array, " k"]:
+    """Return `(num,)` which objects do not move by themselves.
+
+    Args:
+        of_point: `(n,)` label of each point, from `labels_at`.
+        num: Largest number of an object.
+    """
+    numbers = jnp.where(of_point >= INERT, object_numbers(of_point), 0)
+    return jnp.zeros(num + 1, bool).at[numbers].set(True)[1:]
 
 
 def classify_motion(
@@ -157,6 +178,7 @@ def classify_motion(
     before: MotionMemory,
     params: MotionParams,
     *,
+    inert: Bool[Array, " k"] | None = None,
     as_published: bool = False,
 ) -> MotionState:
     """Classify the movable objects as moving or static, given the pose estimated from the background.
@@ -173,6 +195,8 @@ def classify_motion(
         T_world_cam: Camera pose.
         before: Memory of the previous frame.
         params: Thresholds.
+        inert: `(k,)` objects that do not move by themselves, which are static until they are seen to move; `None` if
+            all objects may move by themselves.
         as_published: Whether to follow the paper, see `MotionPlan`; static.
     """
     flow = scene_flow(points.X_world, points.X_cam, T_world_cam)
@@ -189,13 +213,17 @@ def classify_motion(
     evidence = by_share if as_published else jnp.maximum(by_share, groups.mean / mean_limit)
     known = (groups.number >= params.fewest) & (limit > 0)
     verdict = RegionCueResult(*threshold_evidence(evidence, known, params.temperature)[:3])
-    return MotionState(points.there, verdict, _remembered(verdict, of_point, before, params))
+    return MotionState(points.there, verdict, _remembered(verdict, of_point, before, params, inert))
 
 
 def _remembered(
-    verdict: RegionCueResult, of_point: Int[Array, " n"], before: MotionMemory, params: MotionParams
+    verdict: RegionCueResult,
+    of_point: Int[Array, " n"],
+    before: MotionMemory,
+    params: MotionParams,
+    inert: Bool[Array, " k"] | None,
 ) -> MotionMemory:
-    """Update the memory of each object after this frame; a new object starts as moving.
+    """Update the memory of each object after this frame; a new object that moves by itself starts as moving.
 
     An object is matched to the object of the previous frame that most of its points were on.
     """
@@ -203,8 +231,9 @@ def _remembered(
     was, now = before.of_point, of_point
     votes = jnp.zeros((num + 1, num + 1), jnp.int32).at[now, was].add(1)[1:, 1:]
     parent, known_before = jnp.argmax(votes, axis=1), jnp.max(votes, axis=1) > 0
-    stillness = jnp.where(known_before, before.stillness[parent], 0)
-    at_rest = known_before & before.at_rest[parent]
+    starts_at_rest = jnp.zeros(num, bool) if inert is None else inert
+    stillness = jnp.where(known_before, before.stillness[parent], starts_at_rest.astype(before.stillness.dtype))
+    at_rest = jnp.where(known_before, before.at_rest[parent], starts_at_rest)
     step = jnp.where(verdict.weight >= 0.5, 1 / params.still_frames, -1 / params.moving_frames)
     stillness = jnp.clip(stillness + jnp.where(verdict.known, step, 0), 0, 1)
     nearly = 1e-3  # tolerance for a sum of thirds

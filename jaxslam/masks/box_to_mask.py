@@ -8,9 +8,11 @@ from collections.abc import Iterable
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 
+from jaxslam.dynamics.object_motion import INERT
 from jaxslam.semantics import Detections
+from jaxslam.semantics.class_names import moves_by_itself
 from jaxslam.sensors.downscale import Downscaler
 
 _MIN_SIDE_PX = 4
@@ -53,6 +55,29 @@ def mask_of_detections(
     for box in boxes:
         add_box(mask, depth, box, focal_px)
     return dilated(mask, dilate_px)
+
+
+def instance_labels(
+    detections: Detections, depth: Float[np.ndarray, "h w"], focal_px: float
+) -> UInt8[np.ndarray, "h w"]:
+    """Return the number of the detected object at each pixel, from 1; 0 where there is none.
+
+    Where objects overlap, the one with the higher score is numbered. `INERT` is added to the number of an object that
+    does not move by itself. Pixels of a class map have no number, because it does not tell objects.
+
+    Args:
+        detections: Detections in the image; only the first 126 are numbered.
+        depth: `(h, w)` depth image, meters; 0 where depth is missing.
+        focal_px: Horizontal focal length of the depth image, pixels.
+    """
+    labels = np.zeros(depth.shape, np.uint8)
+    for row in reversed(range(min(len(detections.labels), INERT - 2))):
+        one = slice(row, row + 1)
+        mask = None if detections.masks is None else detections.masks[one]
+        alone = detections._replace(boxes=detections.boxes[one], masks=mask, class_mask=None)
+        flag = 0 if moves_by_itself(detections.labels[row]) else INERT
+        labels[mask_of_detections(alone, depth, focal_px, dilate_px=0)] = row + 1 + flag
+    return labels
 
 
 def reduced_detections(detections: Detections, reduced: Downscaler) -> Detections:

@@ -1,9 +1,10 @@
 """Names of the classes of public data sets, and of the classes of a network."""
 
 import ast
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
+from typing import NamedTuple
 
-from jaxslam.errors import ModelError
+from jaxslam.errors import ConfigError, ModelError, nearest
 
 # The 91 categories of COCO by id, as its annotations number them. The second version of the data set leaves eleven
 # of them without an object; the id 0 is no category.
@@ -36,6 +37,46 @@ _SYNONYMS = {
     "sofa": "couch",
     "tvmonitor": "tv",
 }
+
+GROUPS: Mapping[str, tuple[str, ...]] = {
+    "people": ("person",),
+    "vehicles": ("bicycle", "car", "motorcycle", "airplane", "bus", "train", "truck", "boat"),
+    "animals": ("bird", "cat", "dog", "horse", "sheep", "cow", "elephant", "bear", "zebra", "giraffe"),
+    "furniture": ("chair", "couch", "potted plant", "bed", "dining table"),
+    "bags": ("backpack", "handbag", "suitcase"),
+    "handheld": (
+        *("umbrella", "frisbee", "sports ball", "kite", "baseball bat", "baseball glove", "skateboard"),
+        *(
+            "tennis racket",
+            "bottle",
+            "wine glass",
+            "cup",
+            "fork",
+            "knife",
+            "spoon",
+            "bowl",
+            "laptop",
+            "mouse",
+            "remote",
+        ),
+        *("keyboard", "cell phone", "book", "vase", "scissors", "teddy bear", "hair drier", "toothbrush"),
+    ),
+}
+"""Classes of COCO by group. The first three groups move by themselves; the others are moved by someone."""
+
+_MOVE_BY_THEMSELVES = frozenset(name for group in ("people", "vehicles", "animals") for name in GROUPS[group])
+
+
+class FoundClasses(NamedTuple):
+    """Classes that someone wants a network to find.
+
+    Attributes:
+        known: Those that the network knows, by COCO's names.
+        missing: Those that it does not know, by COCO's names.
+    """
+
+    known: tuple[str, ...]
+    missing: tuple[str, ...]
 
 
 def one_name(name: str) -> str:
@@ -90,3 +131,35 @@ def stored_names(metadata: Mapping[str, str]) -> tuple[str, ...] | None:
 def valid_labels(names: Iterable[str]) -> list[str]:
     """Return the names that a caller may ask for, sorted."""
     return sorted({name for name in names if name})
+
+
+def find_classes(labels: Collection[str], names: Iterable[str]) -> FoundClasses:
+    """Look up the classes that a list of labels names.
+
+    Args:
+        labels: Names of classes, as the network, COCO or PASCAL VOC names them, or of groups in `GROUPS`. The network's
+            own names go first: if it has a class `animals`, that class alone is meant.
+        names: Classes of the network.
+
+    Raises:
+        ConfigError: If there is no label, or one names neither a class nor a group.
+    """
+    own = valid_labels(names)
+    if isinstance(labels, str) or not labels:
+        raise ConfigError(f"labels: expected one or more names in a list, got {labels!r}")
+    wanted: list[str] = []
+    for label in labels:
+        name = one_name(label) if isinstance(label, str) else ""
+        valid = {*own, *COCO, *GROUPS}
+        if name not in valid:
+            expected = "classes of the network, of COCO or of PASCAL VOC, or groups of classes"
+            raise ConfigError(f"labels: expected {expected}, got {label!r}{nearest(str(label), valid)}")
+        wanted += [name] if name in own else GROUPS.get(name, (name,))
+    known, missing = ([n for n in dict.fromkeys(wanted) if (n in own) == there] for there in (True, False))
+    return FoundClasses(tuple(known), tuple(missing))
+
+
+def moves_by_itself(label: str) -> bool:
+    """Return whether an object of a class can move by itself; a class that COCO does not have may."""
+    name = one_name(label)
+    return name in _MOVE_BY_THEMSELVES or name not in COCO

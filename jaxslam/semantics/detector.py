@@ -9,7 +9,7 @@ from jaxtyping import UInt8
 
 from jaxslam.errors import ConfigError, FrameError, ModelError, nearest
 from jaxslam.semantics.adapters import ADAPTERS, Adapter
-from jaxslam.semantics.class_names import one_name, valid_labels
+from jaxslam.semantics.class_names import FoundClasses, find_classes, valid_labels
 from jaxslam.semantics.detections import Detections
 from jaxslam.semantics.onnx_session import Network, check_outputs
 from jaxslam.semantics.onnx_signature import Graph
@@ -19,14 +19,25 @@ from jaxslam.semantics.postprocess import Wanted
 class OnnxDetector:
     """Detector of objects of chosen classes. Results for equal images are equal to the byte."""
 
-    def __init__(self, network: Network, adapter: Adapter, wanted: Wanted) -> None:
+    def __init__(self, network: Network, adapter: Adapter, wanted: Wanted, classes: FoundClasses) -> None:
         """Combine a network with its adapter and the wanted classes; call `load_detector` instead."""
         self._network, self._adapter, self._wanted = network, adapter, wanted
+        self._classes = classes
 
     @property
     def adapter(self) -> str:
         """Name of the network's adapter."""
         return self._adapter.name
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Classes that it looks for, by COCO's names."""
+        return self._classes.known
+
+    @property
+    def missing_labels(self) -> tuple[str, ...]:
+        """Wanted classes that the network does not know, by COCO's names."""
+        return self._classes.missing
 
     @property
     def path(self) -> Path:
@@ -68,7 +79,9 @@ def load_detector(
 
     Args:
         path: ONNX file.
-        labels: Classes to find, by COCO's names ("person", "car", ...) or VOC's names for the same classes.
+        labels: Classes to find, as COCO ("person", "car", ...), PASCAL VOC or the network names them, and groups of
+            classes: "people", "vehicles", "animals", "furniture", "bags", "handheld". Those that the network does not
+            know are left out; see `OnnxDetector.missing_labels`.
         min_score: Lowest score of results, 0 to 1.
         nms_iou: Intersection over union, 0 to 1, above which the box with the lower score of two boxes of a class is
             dropped.
@@ -76,7 +89,7 @@ def load_detector(
         num_threads: Number of threads of the network.
 
     Raises:
-        ConfigError: If the network has no class of a label, or a number is out of range.
+        ConfigError: If a label is unknown, the network knows none of the classes, or a number is out of range.
         ModelError: If the file is missing or damaged, or fits no adapter or not the named one.
     """
     check_share("min_score", min_score)
@@ -88,8 +101,10 @@ def load_detector(
     kind = _family(network, adapter)
     assert network.graph.image is not None  # it fits
     fitted = kind(network.graph, network.graph.image)
-    classes = _wanted_classes(labels, fitted.names)
-    return OnnxDetector(network, fitted, Wanted(fitted.names, classes, float(min_score), float(nms_iou)))
+    classes = _known_classes(labels, fitted.names, network.path)
+    flags = np.array([name in classes.known for name in fitted.names])
+    wanted = Wanted(fitted.names, flags, float(min_score), float(nms_iou))
+    return OnnxDetector(network, fitted, wanted, classes)
 
 
 def _family(network: Network, adapter: str | None) -> type[Adapter]:
@@ -119,16 +134,13 @@ def _fitting_hint(graph: Graph) -> str:
     return f" (it fits {' and '.join(fitting)})" if fitting else ""
 
 
-def _wanted_classes(labels: Collection[str], names: tuple[str, ...]) -> np.ndarray:
-    """Return a mask `(c,)` of the wanted classes."""
-    valid = valid_labels(names)
-    if isinstance(labels, str) or not labels:
-        raise ConfigError(f"labels: expected one or more names in a list, got {labels!r}")
-    for label in labels:
-        if not isinstance(label, str) or one_name(label) not in valid:
-            raise ConfigError(f"labels: expected names of {', '.join(valid)}; got {label!r}")
-    wanted = {one_name(label) for label in labels}
-    return np.array([name in wanted for name in names])
+def _known_classes(labels: Collection[str], names: tuple[str, ...], path: Path) -> FoundClasses:
+    """Look up the wanted classes of a network, of which it must know one."""
+    classes = find_classes(labels, names)
+    if not classes.known:
+        valid = ", ".join(valid_labels(names))
+        raise ConfigError(f"labels: expected classes of {path} ({valid}), got {', '.join(labels)}")
+    return classes
 
 
 def check_share(field: str, value: float) -> None:

@@ -58,8 +58,17 @@ def detector_of(config: SemanticsConfig, num_threads: int = 1) -> Detector | Non
         raise ConfigError(f"{config.examples}: expected all examples with an image, or all without, got both")
     if any(shown):
         return _like_examples(config, path, segmenter, examples, threads)
-    detector = path and load_detector(path, labels=config.labels, min_score=config.min_score, num_threads=threads)
-    return _prompted(config, detector or None, segmenter, [each for one in examples for each in one.prompts])
+    detector = None if path is None else _with_labels(config, path, threads)
+    return _prompted(config, detector, segmenter, [each for one in examples for each in one.prompts])
+
+
+def _with_labels(config: SemanticsConfig, path: Path, threads: int) -> OnnxDetector:
+    """Load the detector of the wanted classes, and log those that the network does not know."""
+    detector = load_detector(path, labels=config.labels, min_score=config.min_score, num_threads=threads)
+    if detector.missing_labels:
+        missing, known = ", ".join(detector.missing_labels), ", ".join(detector.labels)
+        _log.warning("%s does not know these classes: %s. It looks for: %s", path.name, missing, known)
+    return detector
 
 
 def _like_examples(

@@ -25,8 +25,9 @@ class FrameArrays(NamedTuple):
         depth_delay_s: Time from the image to the depth image in seconds.
         right: `(h, w)` right image of a rectified pair, of the type of `image`; `None` where depth is measured. With a
             right image, `depth` is only the start value of stereo matching.
-        movable: `(h, w)` number of the movable object at each pixel, from 1; 0 where there is none. Needed by a plan
-            with `motion`, which finds out which objects do move; `None` without.
+        movable: `(h, w)` number of the movable object at each pixel, from 1, plus 128 for an object that does not move
+            by itself; 0 where there is none. Needed by a plan with `motion`, which finds out which objects do move;
+            `None` without.
         readout_sign: 1, or -1 where a rolling shutter reads the last row first, as in a recording that is played
             backward; `None` for 1.
     """

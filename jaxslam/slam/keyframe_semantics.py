@@ -14,14 +14,14 @@ from jaxtyping import Float
 from jaxslam.config.schema import Config
 from jaxslam.map.dynamic_removal import DynamicObservations, under
 from jaxslam.mapping.local_mapping import TrackedObservations
-from jaxslam.masks.box_to_mask import dilated
+from jaxslam.masks.box_to_mask import dilated, mask_of_detections, reduced_detections
 from jaxslam.runtime.stage_timer import StageTimes
 from jaxslam.runtime.worker import Worker, make_worker
 from jaxslam.semantics import Detector
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.downscale import Downscaler, ImageGrid
 from jaxslam.slam.mask_pipeline import WIDTH_PX
-from jaxslam.slam.semantic_thread import ErrorLog, detect_mask, rgb_copy
+from jaxslam.slam.semantic_thread import ErrorLog, rgb_copy
 
 _log = logging.getLogger(__name__)
 
@@ -117,8 +117,9 @@ class KeyframeSemantics:
         return self._collected(self.worker.flush)
 
     def _look(self, shown: _KeyframeImage) -> DynamicObservations:
-        found = detect_mask(self._detector, self._reduced, shown.image, shown.depth)
-        mask = dilated(self._reduced.whole(found), self._dilate_px)
+        found = reduced_detections(self._detector(shown.image), self._reduced)
+        small = mask_of_detections(found, shown.depth, float(self._reduced.raster.intrinsics.fx), dilate_px=0)
+        mask = dilated(self._reduced.whole(small), self._dilate_px)
         return DynamicObservations(shown.keyframe, mask, shown.id[under(mask, shown.uv_raw)])
 
     def _collected(self, take: Callable[[], list[DynamicObservations]]) -> tuple[list[DynamicObservations], str]:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxslam_kernels.image.pyramid import Pyramid, build_pyramid
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 
 from jaxslam.config.schema import Config
 from jaxslam.masks.background_depth import SurfaceMemory
@@ -63,12 +63,15 @@ class FrameMask(NamedTuple):
         source: Origin of the mask.
         age: Frames since the one the detector looked at; 0 for that frame, -1 where it has no part in the mask.
         error: Error of the detector, reported once; empty if there is none.
+        labels: `(h', w')` number of the object at each pixel, as in `instance_labels`, at the size of masks and in the
+            frame that the detector looked at; `None` if it found nothing since the frame before.
     """
 
     mask: Bool[np.ndarray, "h w"]
     source: MaskSource
     age: int
     error: str
+    labels: UInt8[np.ndarray, "_h _w"] | None = None
 
 
 class _BufferedFrame:
@@ -155,7 +158,8 @@ class MaskPipeline:
         if not self._mask.any():  # and so nothing is carried on
             self._detected_in, source = None, MaskSource.NONE
         age = -1 if self._detected_in is None else frame - self._detected_in
-        return FrameMask(dilated(self._reduced.whole(self._mask), self._dilate_px), source, age, error)
+        labels = found.labels if found is not None and source is MaskSource.DETECTOR else None
+        return FrameMask(dilated(self._reduced.whole(self._mask), self._dilate_px), source, age, error, labels)
 
     def frame_tracked(
         self, frame: int, time_s: float, T_world_cam: Float[np.ndarray, "7"], turn_rad_per_s: float

@@ -101,7 +101,7 @@ class MaskStage:
         if self._matches_pair(frame):
             depth: Any = self._memory.matched_depth
             arrays = arrays._replace(depth=depth)
-        return self._with_ignored(arrays, self._found.mask, frame.dynamic_mask), self._found
+        return self._with_ignored(arrays, self._found, frame.dynamic_mask), self._found
 
     def exclude_moving(
         self, arrays: FrameArrays, mask: FrameMask, flow: FlowResult, output: TrackOutput
@@ -197,12 +197,14 @@ class MaskStage:
         self._found = mask
 
     def _with_ignored(
-        self, arrays: FrameArrays, mask: Bool[np.ndarray, "h w"], given: Bool[np.ndarray, "h w"] | None
+        self, arrays: FrameArrays, found: FrameMask, given: Bool[np.ndarray, "h w"] | None
     ) -> FrameArrays:
         """Ignore masked pixels; where the tracker classifies movable objects, number those instead."""
+        mask = found.mask
         if self._instances is None:
             return self._memory.ignoring(arrays, mask)
-        objects = self._instances.divided(mask if given is None else mask & ~given, np.asarray(arrays.depth))
+        by_detector = mask if given is None else mask & ~given
+        objects = self._instances.divided(by_detector, np.asarray(arrays.depth), found.labels, found.age)
         arrays = self._memory.with_movable(arrays, objects.labels)
         return self._memory.ignoring(arrays, objects.rest if given is None else objects.rest | given)
 

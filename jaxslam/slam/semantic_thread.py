@@ -9,10 +9,10 @@ import time
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import UInt8
 
 from jaxslam.config.schema import Config
-from jaxslam.masks.box_to_mask import mask_of_detections, reduced_detections
+from jaxslam.masks.box_to_mask import instance_labels, mask_of_detections, reduced_detections
 from jaxslam.masks.propagation import TrackedMask, make_origin
 from jaxslam.runtime.stage_timer import StageTimes
 from jaxslam.runtime.worker import InlineWorker, Worker, make_worker
@@ -47,10 +47,13 @@ class DetectedMask(NamedTuple):
     Attributes:
         frame: The frame it looked at.
         origin: The mask, and the points it is followed by.
+        labels: `(h', w')` number of the object at each pixel, as in `instance_labels`; `None` for a mask that is
+            carried on, and where the motion of objects is not classified.
     """
 
     frame: int
     origin: TrackedMask
+    labels: UInt8[np.ndarray, "_h _w"] | None = None
 
 
 class ErrorLog:
@@ -71,14 +74,6 @@ class ErrorLog:
 def rgb_copy(image: np.ndarray) -> np.ndarray:
     """`(h, w, 3)` of `(h, w, 3)` or of gray `(h, w)`, as a detector takes it; a copy."""
     return image.copy() if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
-
-
-def detect_mask(
-    detector: Detector, reduced: Downscaler, rgb: UInt8[np.ndarray, "h w 3"], depth: Float[np.ndarray, "_h _w"]
-) -> Bool[np.ndarray, "_h _w"]:
-    """Run a detector on an image and return its undilated mask, at the size of masks."""
-    found, focal_px = reduced_detections(detector(rgb), reduced), float(reduced.raster.intrinsics.fx)
-    return mask_of_detections(found, depth, focal_px, dilate_px=0)
 
 
 class SemanticThread:
@@ -107,6 +102,7 @@ class SemanticThread:
         self.looking_at: int | None = None
         self._offered: int | None = None
         self._detector, self._reduced, self._seed = detector, reduced, config.run.seed
+        self._focal_px, self._numbers_objects = float(reduced.raster.intrinsics.fx), config.dynamics.motion.enabled
         latency_frames = config.semantics.latency_frames
         self._all_wait, self._begun, self._failures = latency_frames == 0, False, ErrorLog()
         self._worker: Worker[DetectionJob, DetectedMask] = make_worker(
@@ -144,8 +140,10 @@ class SemanticThread:
         self._worker.close()
 
     def _look(self, job: DetectionJob) -> DetectedMask:
-        mask = detect_mask(self._detector, self._reduced, job.image, job.depth)
-        return DetectedMask(job.frame, make_origin(mask, job.gray, self._seed + job.frame))
+        found, focal_px = reduced_detections(self._detector(job.image), self._reduced), self._focal_px
+        mask = mask_of_detections(found, job.depth, focal_px, dilate_px=0)
+        labels = instance_labels(found, job.depth, focal_px) if self._numbers_objects else None
+        return DetectedMask(job.frame, make_origin(mask, job.gray, self._seed + job.frame), labels)
 
     def _newest(self, frame: int) -> tuple[DetectedMask | None, str]:
         try:

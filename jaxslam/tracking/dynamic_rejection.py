@@ -12,7 +12,14 @@ from jaxslam_kernels.types import Flag, Mask, Pixels, Weights
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.dynamics.cue import CueInput, CueResult, combine_cues
-from jaxslam.dynamics.object_motion import MeasuredPoints, MotionState, classify_motion
+from jaxslam.dynamics.object_motion import (
+    MeasuredPoints,
+    MotionState,
+    classify_motion,
+    inert_objects,
+    labels_at,
+    object_numbers,
+)
 from jaxslam.dynamics.regions import (
     RegionMemory,
     Regions,
@@ -151,7 +158,7 @@ class DynamicRejection(NamedTuple):
     def _in_objects(self, chosen: Bool[Array, " k"], view: PreparedFrame) -> Bool[Array, "h w"]:
         assert view.frame.movable is not None
         by_label = jnp.concatenate([jnp.zeros(1, bool), chosen])
-        return by_label[view.frame.movable.astype(jnp.int32)]
+        return by_label[object_numbers(view.frame.movable)]
 
     def _in_regions(self, points: Mask) -> Bool[Array, "k n"]:
         """Return the mask of the points in each region, followed by those on each movable object."""
@@ -218,8 +225,12 @@ def _motion(step: StepContext, seen: FramePoints, coarse: SE3, *, as_published: 
         X_world = to_world(state.T_world_cam, before)
     measured = MeasuredPoints(X_world, observed.in_camera(), sigma, there)
     background = seen.agreeing.astype(sigma.dtype)
+    assert step.view.frame.movable is not None
+    inert = inert_objects(labels_at(step.view.frame.movable, seen.uv), state.motion.at_rest.shape[0])
     return classify_motion(
-        measured, seen.object_id, background, coarse, state.motion, params.motion, as_published=as_published
+        *(measured, seen.object_id, background, coarse, state.motion, params.motion),
+        inert=inert,
+        as_published=as_published,
     )
 
 

@@ -22,7 +22,7 @@ from jaxslam_kernels.se3 import to_camera
 from jaxslam_kernels.types import Flag, Mask, Pixels, Scalar, Weights
 from jaxtyping import Array, Int
 
-from jaxslam.dynamics.object_motion import labels_at
+from jaxslam.dynamics.object_motion import labels_at, object_numbers
 from jaxslam.dynamics.regions import Regions, balance_regions, find_regions
 from jaxslam.sensors.frame_arrays import FrameArrays
 from jaxslam.sensors.measurement import (
@@ -286,7 +286,7 @@ def _object_ids(step: StepContext, uv: Pixels) -> Int[Array, " n"]:
     if step.plan.motion is None:
         return jnp.zeros(uv.shape[1], jnp.int32)
     assert step.view.frame.movable is not None
-    return labels_at(step.view.frame.movable, uv)
+    return object_numbers(labels_at(step.view.frame.movable, uv))
 
 
 def _background(step: StepContext, found: Mask, objects: Int[Array, " n"]) -> Mask:

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import UInt8
 
 from jaxslam.datasets.synthetic.recording_folder import RenderedFrame, RenderedRecording
-from jaxslam.errors import ConfigError, DatasetError, nearest
+from jaxslam.errors import DatasetError
 from jaxslam.semantics import Detections, no_detections
-from jaxslam.semantics.class_names import COCO
+from jaxslam.semantics.class_names import FoundClasses, find_classes
 from jaxslam.sensors.frame import Frame
 
 _LABELS = ("person", "box")
@@ -62,16 +62,16 @@ class SceneDetector:
         Args:
             dataset: The recording.
             rendered: Frames of it that are rendered already: they need not be once more.
-            labels: Labels to find: `person` and others of COCO, which networks know, and `box`, carried boxes, which
-                they do not.
+            labels: Labels to find: `person` and other classes and groups of classes that networks know, and `box`,
+                carried boxes, which they do not.
 
         Raises:
             ConfigError: A label is none of those, and none of the recording.
         """
-        self._dataset, self._labels = dataset, frozenset(labels)
-        known = {*_LABELS, *COCO, *dataset.labels}
-        if unknown := sorted(self._labels - known):
-            raise ConfigError(f"labels: no actor is a '{unknown[0]}'{nearest(unknown[0], sorted(known))}")
+        self._dataset = dataset
+        wanted, of_scene = tuple(labels), {*_LABELS, *dataset.labels}
+        classes = find_classes(wanted, of_scene) if wanted else FoundClasses((), ())
+        self._labels = frozenset(classes.known)
         self._shape = dataset.camera.height, dataset.camera.width, 3
         self._actors: dict[bytes, bytes] = {}
         self._lock = threading.Lock()

@@ -125,7 +125,7 @@ def test_a_frozen_picture_has_the_masks_of_what_it_shows_and_a_black_one_none(wo
 
 
 def test_an_unknown_label_is_an_error(world):
-    with pytest.raises(ConfigError, match="no actor is a 'persn'"):
+    with pytest.raises(ConfigError, match=r"labels: expected classes .* got 'persn'"):
         SceneDetector(world, labels=("persn",))
 
 

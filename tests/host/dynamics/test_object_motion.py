@@ -11,13 +11,18 @@ from parked_object import WITHIN, verdicts
 
 from jaxslam import Slam, load_config
 from jaxslam.dynamics.object_motion import (
+    INERT,
     MeasuredPoints,
     MotionMemory,
     MotionState,
     classify_motion,
+    inert_objects,
     labels_at,
     no_motion,
+    object_numbers,
 )
+from jaxslam.dynamics.regions import RegionCueResult
+from jaxslam.masks.box_to_mask import dilated
 from jaxslam.masks.depth_instances import InstanceFinder, object_labels
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame
@@ -48,6 +53,7 @@ def _judged(
     of_point=ON,
     *,
     as_published: bool = False,
+    inert: jax.Array | None = None,
     **changes: Any,
 ) -> MotionState:
     """Two things of which each has gone so far to the side since the last frame."""
@@ -61,7 +67,9 @@ def _judged(
     )
     background = jnp.asarray((of_point == 0).astype(np.float32))
     limits, pose = _motion(**changes), SE3.identity()
-    return classify_motion(points, jnp.asarray(of_point), background, pose, before, limits, as_published=as_published)
+    return classify_motion(
+        *(points, jnp.asarray(of_point), background, pose, before, limits), inert=inert, as_published=as_published
+    )
 
 
 def _start() -> MotionMemory:
@@ -117,6 +125,27 @@ def test_a_thing_with_few_points_keeps_what_was_known() -> None:
     state = _judged({1: 0.05}, memory, 5, of_point=few)
     assert not state.verdict.known.any()
     assert np.asarray(state.at_rest[:2]).tolist() == [True, False]
+
+
+def test_what_does_not_move_by_itself_is_at_rest_until_it_moves() -> None:
+    """A chair is as good as the background at once, a person is not; both move when they are seen to."""
+    inert = jnp.zeros(PLAN.motion.num_objects, bool).at[0].set(True) if PLAN.motion else None
+    go = {1: 0.05, 2: 0.05}
+    said = _over([{}, go, go, go], _start(), inert=inert)
+    assert said == [[True, False], [True, False], [False, False], [False, False]]
+
+
+def test_labels_of_what_does_not_move_by_itself() -> None:
+    labels = np.zeros((4, 6), np.uint8)
+    labels[0], labels[1], labels[2] = 1, INERT + 2, INERT + 3
+    uv = jnp.array([[0.0, 5.0, 2.0], [0.0, 1.0, 3.0]], jnp.float32)
+    codes = labels_at(jnp.asarray(labels), uv)
+    assert np.asarray(object_numbers(codes)).tolist() == [1, 2, 0]
+    assert np.asarray(inert_objects(codes, 4)).tolist() == [False, True, False, False]
+    memory = MotionMemory(object_numbers(codes), jnp.zeros(4), jnp.zeros(4, bool))
+    state = MotionState(jnp.ones(3, bool), RegionCueResult(jnp.ones(4), jnp.zeros(4), jnp.zeros(4, bool)), memory)
+    moving = np.asarray(state.moving_pixels(jnp.asarray(labels)))
+    assert moving[:, 0].tolist() == [True, True, False, False]  # nothing is known of an object without points
 
 
 def test_share_of_points() -> None:
@@ -200,6 +229,37 @@ def test_what_is_in_no_object_is_left_out() -> None:
     assert found.rest[150, 275]
     with pytest.raises(Exception, match="h"):
         finder.divided(mask[:100], depth)
+
+
+def test_objects_stay_inert_between_detections() -> None:
+    finder = InstanceFinder(CAMERA, 4)
+    mask, depth = np.zeros((240, 320), bool), np.full((240, 320), 4.0, np.float32)
+    mask[60:200, 40:120], depth[60:200, 40:120] = True, 1.5  # a person
+    mask[60:200, 120:200], depth[60:200, 120:200] = True, 2.5  # a chair
+    mask[10:14, 10:14] = True  # a small part of it
+    detected = np.where(mask, INERT + 2, 0).astype(np.uint8)
+    detected[60:200, 40:116] = 1
+    found = finder.divided(mask, depth, detected, 2)
+    assert found.labels[100, 80] < INERT < found.labels[100, 160]
+    assert not found.rest[11, 11]
+    mask, depth = (np.roll(array, 8, axis=1) for array in (mask, depth))
+    later = finder.divided(mask, depth)
+    assert later.labels[100, 88] < INERT < later.labels[100, 168]
+    assert not (finder.divided(mask, depth, np.zeros_like(detected), 2).labels >= INERT).any()  # the detector says so
+
+
+def test_a_detection_of_the_frame_itself_divides_without_depth() -> None:
+    """Two cars one behind the other, in a frame in which stereo matching has found no depth on them."""
+    finder, depth = InstanceFinder(CAMERA, 4), np.zeros((240, 320), np.float32)
+    detected = np.zeros((240, 320), np.uint8)
+    detected[100:200, 50:150], detected[100:160, 150:200], detected[5:8, 5:8] = 2, 1, 3
+    mask = dilated(detected > 0, 3)
+    found = finder.divided(mask, depth, detected, 0)
+    assert (found.labels[100:200, 50:150] == 1).all()  # the largest first
+    assert (found.labels[100:160, 150:200] == 2).all()
+    assert ((found.labels > 0) ^ found.rest)[mask].all()
+    assert found.rest[6, 6]
+    assert not finder.divided(mask, depth, detected, 1).labels.any()
 
 
 def test_a_plan_with_motion_needs_labels() -> None:

@@ -11,7 +11,15 @@ from hypothesis import strategies as st
 from jaxslam_kernels.image.pyramid import Pyramid, build_pyramid
 
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
-from jaxslam.masks.box_to_mask import add_box, dilated, largest_parts, mask_of_detections, object_depth
+from jaxslam.dynamics.object_motion import INERT
+from jaxslam.masks.box_to_mask import (
+    add_box,
+    dilated,
+    instance_labels,
+    largest_parts,
+    mask_of_detections,
+    object_depth,
+)
 from jaxslam.masks.point_sampling import CELL_PX, sample_mask
 from jaxslam.masks.propagation import (
     CAPACITY,
@@ -57,6 +65,37 @@ def pyramid(gray: np.ndarray) -> Pyramid:
 
 def overlap(a: np.ndarray, b: np.ndarray) -> float:
     return np.count_nonzero(a & b) / max(np.count_nonzero(a | b), 1)
+
+
+class TestInstanceLabels:
+    """Which detection each pixel is of, and which do not move by themselves."""
+
+    BLIND = np.zeros((100, 120), np.float32)
+    FOUND = detections([[20, 20, 60, 90], [40, 30, 100, 80], [5, 5, 15, 15]])._replace(
+        labels=("person", "chair", "arm")
+    )
+
+    def test_a_person_before_a_chair(self):
+        labels = instance_labels(self.FOUND, self.BLIND, FOCAL_PX)
+        assert (labels[30:80, 60:100] == INERT + 2).all()
+        assert (labels[20:90, 20:60] == 1).all()
+        assert (labels[5:15, 5:15] == 3).all()
+        np.testing.assert_array_equal(labels > 0, mask_of_detections(self.FOUND, self.BLIND, FOCAL_PX, dilate_px=0))
+
+    def test_masks_of_the_detector(self):
+        masks = np.zeros((3, *self.BLIND.shape), bool)
+        masks[0, 50:60, 50:60] = masks[1, 55:70, 50:60] = True
+        masks[2, 0, 0] = True
+        labels = instance_labels(self.FOUND._replace(masks=masks), self.BLIND, FOCAL_PX)
+        assert np.bincount(labels.ravel())[[1, 3, INERT + 2]].tolist() == [100, 1, 100]
+
+    def test_a_class_map_does_not_tell_objects(self):
+        found = no_detections()._replace(class_mask=np.ones(self.BLIND.shape, bool))
+        assert not instance_labels(found, self.BLIND, FOCAL_PX).any()
+
+    def test_more_objects_than_numbers(self):
+        many = detections([[2, 2, 50, 50]] * 300)
+        assert set(np.unique(instance_labels(many, self.BLIND, FOCAL_PX))) == {0, 1}
 
 
 class TestWithoutDepth:

@@ -12,10 +12,12 @@ from hypothesis import strategies as st
 from onnx import TensorProto, helper
 from tiny_models import HEIGHT, WIDTH, Thing
 
+from jaxslam.config.schema import SemanticsConfig
 from jaxslam.errors import ConfigError, FrameError, JaxSlamError, ModelError
 from jaxslam.semantics import load_detector, no_detections
 from jaxslam.semantics.adapters import ADAPTERS
-from jaxslam.semantics.class_names import COCO, COCO_IDS, VOC
+from jaxslam.semantics.class_names import COCO, COCO_IDS, GROUPS, VOC, find_classes, moves_by_itself
+from jaxslam.semantics.from_config import detector_of
 from jaxslam.semantics.letterbox import place, plane_to_image
 from jaxslam.semantics.onnx_session import check_outputs
 from jaxslam.semantics.onnx_signature import Port
@@ -126,7 +128,7 @@ class TestFamily:
 
 class TestSettings:
     def test_unknown_label(self, yolox: Path) -> None:
-        with pytest.raises(ConfigError, match=r"labels: expected names of airplane, apple, .*zebra; got 'persn'"):
+        with pytest.raises(ConfigError, match=r"labels: expected classes .*, got 'persn'.*did you mean 'person'"):
             load_detector(yolox, labels=["person", "persn"])
 
     @pytest.mark.parametrize("labels", ["person", [], [3], [""]])
@@ -309,6 +311,49 @@ class TestNames:
 
     def test_words_of_voc(self, yolox: Path) -> None:
         assert load_detector(yolox, labels=["sofa", "tvmonitor", "person"])(IMAGE).labels == ("person",)
+
+    def test_groups_are_supercategories(self) -> None:
+        """COCO numbers its categories by supercategory."""
+        for group, first, last in (("people", 1, 1), ("vehicles", 2, 9), ("animals", 16, 25)):
+            assert set(GROUPS[group]) == set(COCO_IDS[first : last + 1]) - {""}
+        members = [name for group in GROUPS.values() for name in group]
+        assert len(set(members)) == len(members)
+        assert set(members) <= set(COCO)
+        assert not set(GROUPS) & set(COCO)
+
+    def test_what_moves_by_itself(self) -> None:
+        assert all(map(moves_by_itself, ("person", "car", "motorbike", "dog", "robot")))
+        assert not any(map(moves_by_itself, ("chair", "sofa", "suitcase", "book", "tv")))
+
+
+class TestClasses:
+    def test_a_group_is_its_classes(self, yolox: Path) -> None:
+        detector = load_detector(yolox, labels=["people", "vehicles", "person"])
+        assert detector.labels == ("person", *GROUPS["vehicles"])
+        assert detector.missing_labels == ()
+        assert detector(IMAGE).labels == ("person",)
+
+    def test_what_the_network_does_not_know_is_left_out(self) -> None:
+        """PASCAL VOC has no truck and no zebra."""
+        found = find_classes(["vehicles", "dog", "zebra", "sofa"], VOC)
+        assert found.known == ("bicycle", "car", "motorcycle", "airplane", "bus", "train", "boat", "dog", "couch")
+        assert found.missing == ("truck", "zebra")
+
+    def test_the_network_knows_none(self, tmp_path: Path) -> None:
+        output = np.zeros((1, 4 + 2, CELLS), np.float32)
+        path = tiny_models.save(tmp_path / "tiny.onnx", {"o": output}, metadata={"names": "['robot', 'person']"})
+        with pytest.raises(ConfigError, match=r"labels: expected classes of .*tiny.onnx .person, robot., got vehicles"):
+            load_detector(path, labels=["vehicles"])
+
+    def test_own_names_go_first(self) -> None:
+        """A network may have a class with the name of a group, and classes that no public data set has."""
+        assert find_classes(["animals", "robot"], ["robot", "animals", "dog"]).known == ("animals", "robot")
+
+    def test_missing_classes_are_told(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+        output = np.zeros((1, 4 + 2, CELLS), np.float32)
+        path = tiny_models.save(tmp_path / "tiny.onnx", {"o": output}, metadata={"names": "['car', 'person']"})
+        detector_of(SemanticsConfig(model=str(path), labels=("people", "car", "truck")))
+        assert caplog.messages == ["tiny.onnx does not know these classes: truck. It looks for: person, car"]
 
 
 def test_no_detections() -> None:

@@ -1,4 +1,4 @@
-"""Real networks on frames with people: what YOLOX finds, the others find too."""
+"""Real networks on frames with people, and on a street with a parked car: what YOLOX finds, the others find too."""
 
 from pathlib import Path
 
@@ -8,6 +8,8 @@ from real_networks import real_network
 
 from jaxslam.datasets import open_dataset
 from jaxslam.semantics import Detections, load_detector
+from jaxslam.semantics.class_names import GROUPS
+from jaxslam.slam.semantic_thread import rgb_copy
 
 FRAMES = (400, 600, 800)
 BOXES = {"nanodet_m_320": "nanodet", "FastestDet": "fastestdet", "yolov8n-seg_int8": "yolov8_seg"}
@@ -87,3 +89,37 @@ def test_same_image_same_bytes(images: list[np.ndarray]) -> None:
     first, second = (load_detector(real_network("yolox_nano"))(images[0]) for _ in range(2))
     assert first.boxes.tobytes() == second.boxes.tobytes()
     assert first.scores.tobytes() == second.scores.tobytes()
+
+
+class TestRoad:
+    """A gray image of KITTI 06, in which a parked car fills a quarter of the width."""
+
+    CAR = np.array([[805, 180, 1130, 356]], np.float32)
+    """Its box, by hand: left, top, right, bottom, pixels."""
+
+    @pytest.fixture
+    def road(self, data_dir: Path) -> np.ndarray:
+        folder = data_dir / "kitti" / "sequences" / "06"
+        if not folder.is_dir():
+            pytest.skip("JAXSLAM_DATA holds no KITTI 06")
+        return rgb_copy(open_dataset(folder)[25].image)
+
+    @pytest.mark.parametrize("name", ["yolox_nano", *BOXES])
+    def test_boxes_of_vehicles(self, road: np.ndarray, name: str) -> None:
+        detector = load_detector(real_network(name), labels=["vehicles"])
+        found = detector(road)
+        assert set(found.labels) <= set(detector.labels) == set(GROUPS["vehicles"])
+        best = int(iou(self.CAR, found.boxes)[0].argmax())
+        assert found.labels[best] == "car"
+        assert iou(self.CAR, found.boxes)[0, best] > 0.7  # as KITTI counts a car as found
+
+    @pytest.mark.parametrize("name", MAPS)
+    def test_pixels_of_vehicles(self, road: np.ndarray, name: str) -> None:
+        detector = load_detector(real_network(name), labels=["vehicles"])
+        assert detector.missing_labels == ("truck",)
+        mask = detector(road).class_mask
+        assert mask is not None
+        left, top, right, bottom = self.CAR[0].astype(int)
+        assert mask[top:bottom, left:right].mean() > 0.6
+        mask[top:bottom, left:right] = False
+        assert mask.mean() < 0.05

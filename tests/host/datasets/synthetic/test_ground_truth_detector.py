@@ -133,5 +133,5 @@ class TestOtherImages:
 
 
 def test_unknown_label(room: SyntheticDataset) -> None:
-    with pytest.raises(ConfigError, match=r"no actor is a 'persson'.*did you mean 'person'"):
+    with pytest.raises(ConfigError, match=r"labels: expected classes .*got 'persson'.*did you mean 'person'"):
         SceneDetector(room, labels=("persson",))

@@ -95,7 +95,7 @@ class TestWithTrueMasks:
             with_true_masks(dataset, TRUTH)
 
     def test_unknown_label(self, room: SyntheticDataset) -> None:
-        with pytest.raises(ConfigError, match=r"labels: no actor is a 'cart'"):
+        with pytest.raises(ConfigError, match=r"labels: expected classes .*got 'cart'"):
             with_true_masks(room, dataclasses.replace(TRUTH, labels=("cart",)))
 
     @pytest.mark.parametrize("key", ["prompt_encoder", "prompt_decoder", "examples"])
