@@ -13,7 +13,7 @@ from jaxslam.errors import ConfigError, nearest
 class Compare(OfRecording):
     """Options of `jaxslam compare`."""
 
-    presets: tuple[str, ...] = ("static", "ngd-detector", "ngd-propagation", "ngd")
+    presets: tuple[str, ...] = ("static", "ngd-detector", "ngd-propagation", "ngd-published")
     """What to compare."""
     runs: int = 1
     """How often to run each, with the seeds 0, 1, 2, ..."""

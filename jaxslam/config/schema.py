@@ -212,6 +212,9 @@ class DynamicsConfig(ValidatedConfig):
     objects."""
     cues: tuple[_CueName, ...] = ("clusters",)
     """Geometric cues that classify points as moving; each of them can reject a point."""
+    judge_masked: bool = False
+    """Whether points under masks are classified by `cues`, as in RTS-SLAM: those that a cue finds static and none finds
+    moving are used. Otherwise, all points under masks are left out."""
     reach_px: Annotated[int, Range(at_least=0, at_most=100)] = 12
     """Radius around a point that its cues classify as moving, pixels, within which surfaces at the same depth are not
     added to the map."""

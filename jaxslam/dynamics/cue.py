@@ -24,9 +24,10 @@ class CueInput(NamedTuple):
     Attributes:
         uv_before: `(2, n)` pixel positions in the previous frame, for the camera of `intrinsics`.
         uv: `(2, n)` pixel positions in the current frame.
-        followed: `(n,)` whether each point is tracked in both frames and outside every mask.
+        followed: `(n,)` whether each point is tracked in both frames and outside every mask; with
+            `TrackPlan.judge_masked`, also under masks.
         masked: `(n,)` whether each point is tracked in both frames and under a mask. These points have no weight,
-            whatever a cue returns for them.
+            whatever a cue returns for them, unless `TrackPlan.judge_masked` is set.
         agrees: `(n,)` which of the `followed` points are inliers of `T_world_cam`.
         weight: `(n,)` weight of each point before any cue is applied.
         depth_before: `(n,)` depth in the previous frame, in meters; 0 where not measured.

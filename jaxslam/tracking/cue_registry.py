@@ -44,6 +44,7 @@ def with_cues(plan: TrackPlan, config: DynamicsConfig, *, pairs: bool = False) -
         regions=regions if needed else None,
         balance_regions=config.balance_regions,
         motion=_motion_plan(config.motion),
+        judge_masked=config.judge_masked,
     )
 
 

@@ -1,5 +1,6 @@
 """Combine the dynamic cues of one frame into point weights and a mask of moving pixels."""
 
+from functools import reduce
 from typing import NamedTuple
 
 import jax
@@ -95,6 +96,11 @@ class DynamicRejection(NamedTuple):
     def counts(self) -> Mask | Flag:
         """Return the `(n,)` mask of the points that no cue rejects."""
         return self.weights(jnp.ones(())) > 0
+
+    def found_static(self) -> Mask | Flag:
+        """Return the `(n,)` mask of the points that a cue finds static and no cue rejects."""
+        known = [result.known for result in self.cue_results]
+        return reduce(jnp.logical_or, known) & self.counts() if known else jnp.zeros((), bool)
 
     def without_moving_pixels(self, view: PreparedFrame) -> PreparedFrame:
         """Return the frame with the moving pixels ignored, by a soft mask in part."""
@@ -270,7 +276,7 @@ def _cue_results(step: StepContext, seen: FramePoints, regions: Regions | None, 
     scene = CueInput(
         uv_before=to_pixels(ideal, points.xy),
         uv=to_pixels(ideal, observed.xy),
-        followed=seen.followed,
+        followed=seen.followed | seen.masked if plan.judge_masked else seen.followed,
         masked=seen.masked,
         agrees=seen.agreeing,
         weight=seen.trust,

@@ -138,6 +138,7 @@ class TrackPlan(NamedTuple):
         regions: Segmentation of the depth image for cues that classify whole surfaces; `None` if no cue needs it.
         balance_regions: Whether the votes of points are weighted so that no region has more than an even share.
         motion: Settings of the motion estimates of movable objects (`FrameArrays.movable`); `None` without estimates.
+        judge_masked: Whether points at ignored pixels are classified by the cues instead of being left out.
         keyframe_policy: Whether a keyframe is made as soon as there is a reason (`as_needed`), or only when it adds
             information (`sparing`).
         pose_steps: Largest number of cost evaluations in each refinement of the pose; `TrackOutput.pose_status` tells
@@ -162,6 +163,7 @@ class TrackPlan(NamedTuple):
     regions: RegionPlan | None = None
     balance_regions: bool = False
     motion: MotionPlan | None = None
+    judge_masked: bool = False
     keyframe_policy: Literal["as_needed", "sparing"] = _SETTINGS.keyframe_policy
     pose_steps: int = 25
     pose_tolerance: float | None = 0.01

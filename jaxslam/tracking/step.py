@@ -210,11 +210,16 @@ def track_followed(
     if rejection.motion is not None:
         joining = rejection.motion.joining()
         background, agreeing = background | joining, agreeing | (joining & fits(step, seen, coarse))
+    if plan.judge_masked:
+        joining = found & masked & rejection.found_static()
+        background, agreeing = background | joining, agreeing | (joining & fits(step, seen, coarse))
     # Not the votes: what carries the pose is out by now, and with even votes here the kitchen has 0.029 m, not 0.025.
     trust = rejection.weights(trust)
     agreeing &= trust > 0
     # 6. Keyframe points, aligned with the frame by their patches around where the coarse pose predicts them.
     static_view = rejection.without_moving_pixels(step.view)
+    if plan.judge_masked:
+        static_view = static_view.without(frame.ignore)
     matches = align_keyframe_points(step._replace(view=static_view), coarse, twist)
     # 7. Refinement of the pose by tracked points and keyframe points together.
     counting, matches_seen = jnp.where(agreeing, trust, 0), measure_matches(step, matches, coarse, twist)
@@ -269,6 +274,8 @@ def _prepared(
 ) -> StepContext:
     """Prepare the frame: depth that can be believed, and the right image of a stereo pair."""
     depth = valid_depth(frame.depth, params.sensor.min_depth_m, params.sensor.max_depth_m)
+    if plan.judge_masked:  # points are detected everywhere
+        frame = frame._replace(ignore=jnp.zeros_like(frame.ignore))
     view = PreparedFrame(frame, pyramid, depth, state.elapsed_s + frame.dt_s)
     return StepContext(state, view.with_right(), params, plan)
 

@@ -20,7 +20,7 @@ import readers_jax
 ROOT = Path(__file__).resolve().parents[2]
 README = ROOT / "README.md"
 DOCS = ROOT / "docs"
-PAGES = sorted(DOCS.glob("*.md"))
+PAGES = sorted([*DOCS.glob("*.md"), *DOCS.glob("systems/*.md")])
 SET_UP = re.compile(r"^python -m venv \.venv && \.venv/bin/pip install (?:\.|-e '\.\[dev\]') && ")
 
 _FENCED = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)

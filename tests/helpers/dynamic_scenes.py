@@ -30,7 +30,7 @@ class Scene(NamedTuple):
 
 
 class Errors(NamedTuple):
-    """ATE in meters: without masks (preset `static`), and with true masks (preset `ngd`)."""
+    """ATE in meters: without masks (preset `static`), and with true masks (preset `ngd-published`)."""
 
     static: float
     at_once: float
@@ -74,7 +74,9 @@ def errors(scene: Scene, overrides: Sequence[str] = (), dilations_px: Sequence[i
 
     def ate_m(latency_frames: int) -> float:
         late = [*overrides, f"semantics.latency_frames={latency_frames}"]
-        return float(np.median([_ate_m(scene, "ngd", [*late, f"semantics.dilate_px={px}"]) for px in dilations_px]))
+        return float(
+            np.median([_ate_m(scene, "ngd-published", [*late, f"semantics.dilate_px={px}"]) for px in dilations_px])
+        )
 
     return Errors(_ate_m(scene, "static", overrides), ate_m(0), ate_m(LATE_FRAMES))
 

@@ -19,11 +19,11 @@ from jaxslam.slam.slam import Slam
 refused = failing(code=2)
 
 NEEDED_BY = {
-    *("ngd", "ngd-detector", "ngd-propagation"),
-    *("occlusion", "occlusion-masks"),
+    *("ngd", "ngd-published", "ngd-detector", "ngd-propagation"),
+    *("occlusion", "occlusion-published", "occlusion-masks"),
     *("usd", "usd-published", "usd-segmentation"),
     *("rts", "rts-published", "rts-semantics", "rts-semantics-epipolar"),
-    "trs-semantics",
+    *("trs-published", "trs-semantics"),
 }
 pytestmark = pytest.mark.usefixtures("models_cache")
 

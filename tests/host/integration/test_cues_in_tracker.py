@@ -95,6 +95,22 @@ class TestOwnCue:
         assert traces == 1
 
 
+class TestMaskedPoints:
+    def test_cues_decide_where_masks_would(self) -> None:
+        """The left half is masked; a cue finds its left quarter moving, and the points between are used."""
+        frames, state, output = stacked(clip(0).frames[:FRAMES]), new_state(), None
+        ignore = jnp.zeros_like(frames.ignore).at[..., : WIDTH // 2].set(True)
+        given = params()._replace(cues=(jnp.asarray(WIDTH / 4),))
+        for index in range(FRAMES):
+            frame = at(frames._replace(ignore=ignore), index)
+            state, output = _step(state, frame, given, plan=PLAN._replace(cues=(left_of,), judge_masked=True))
+        assert output is not None
+        assert int(output.status) == TrackStatus.OK
+        column = np.asarray(output.uv)[0, np.asarray(output.tracked)]
+        assert (column > WIDTH / 4 - 2).all()
+        assert np.count_nonzero(column < WIDTH / 2 - 2) > 10
+
+
 class TestWitnesses:
     def test_some_of_each_region_that_moves(self) -> None:
         """Old ones first; none where nothing moves, and none of the points that are left out for another reason."""

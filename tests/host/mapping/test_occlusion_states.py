@@ -472,7 +472,7 @@ class TestAdjustment:
 
 class TestPresets:
     def test_differ_by_the_weights_alone(self) -> None:
-        with_them, without = load_config("occlusion"), load_config("occlusion-masks")
+        with_them, without = load_config("occlusion-published"), load_config("occlusion-masks")
         assert with_them.dynamics.occlusion == OcclusionConfig(enabled=True, weight=3.0, guard=False)
         assert without.dynamics.occlusion == OcclusionConfig()
         assert replace(with_them, dynamics=without.dynamics) == without
@@ -494,7 +494,7 @@ def _scene() -> tuple[Clip, SceneDetector]:
     return Clip(dataset, frames), SceneDetector(dataset, rendered)
 
 
-def settings(*overrides: str, preset: str = "occlusion") -> Config:
+def settings(*overrides: str, preset: str = "occlusion-published") -> Config:
     config = load_config(preset, overrides=overrides)
     sizes = ("num_points", "num_levels", "num_keyframes", "num_hypotheses", "cell_px")
     return replace(config, track=replace(config.track, **{name: getattr(TRACK, name) for name in sizes}))
@@ -669,20 +669,20 @@ class TestRoomWithPeople:
         clip, detector = _scene()
         clip = Clip(clip.source, clip.frames[:30])
         rows_of: dict[str, list[str]] = {}
-        for preset in ("occlusion", "occlusion-masks"):
+        for preset in ("occlusion-published", "occlusion-masks"):
             with Slam(clip.camera, settings(preset=preset), detector=detector) as slam:
                 records = slam.run(clip)
                 summary, _ = write_results(tmp_path / preset, slam, records, RunInfo(clip, preset, 1.0))
                 shares = occluded_shares(slam.map)
             table = csv.DictReader((tmp_path / preset / "frames.csv").read_text().splitlines())
             rows_of[preset] = [row["occluded_share"] for row in table]
-            if preset == "occlusion":
+            if preset == "occlusion-published":
                 assert summary["occluded_share"]["mean"] == pytest.approx(shares.mean(), abs=1e-3)
                 assert summary["occluded_share"]["mean"] > 0
             else:
                 assert summary["occluded_share"] is None
         assert set(rows_of["occlusion-masks"]) == {""}
-        assert max(float(share) for share in rows_of["occlusion"] if share) > 0
+        assert max(float(share) for share in rows_of["occlusion-published"] if share) > 0
 
 
 def test_changes_are_values() -> None:

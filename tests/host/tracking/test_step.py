@@ -491,7 +491,7 @@ class TestPresets:
             pytest.param("static", "always", None, marks=pytest.mark.slow),
             pytest.param("ngd-detector", "always", 1, marks=pytest.mark.slow),
             ("ngd-propagation", "always", 2),
-            ("ngd", "keyframes", 2),
+            ("ngd-published", "keyframes", 2),
         ],
     )
     def test_run(self, name: str, match_map: str, looks_every: int | None) -> None:
