@@ -69,6 +69,10 @@ class PreparedFrame(NamedTuple):
         both = jnp.maximum(ignore, pixels.astype(ignore.dtype)) if self.is_softly_masked() else ignore | pixels
         return self._replace(frame=self.frame._replace(ignore=both))
 
+    def without_mask(self) -> "PreparedFrame":
+        """The same frame with no pixel to be ignored."""
+        return self._replace(frame=self.frame._replace(ignore=jnp.zeros_like(self.frame.ignore)))
+
     def ignored(self, uv: Pixels) -> Mask:
         """Return the `(n,)` mask of the pixels that count for nothing; those outside the image do not either."""
         ignore = self._ignore_at(uv)

@@ -194,6 +194,8 @@ def track_followed(
     masked, objects = step.view.ignored(uv), _object_ids(step, uv)
     found, waiting = found & state.points.has_position(), found & ~masked & ~state.points.has_position()
     background = _background(step, found & ~masked, objects)
+    if plan.judge_masked:  # by the cues; and points are detected everywhere
+        step = step._replace(view=step.view.without_mask())
     step = step._replace(params=_widened(params, state.points.uv, uv, background))
     # 4. Coarse pose: RANSAC PnP, in which no region of the depth image has more than an even share of the votes.
     seen = step.measured(rays, X_world, predicted, state.twist)
@@ -274,8 +276,6 @@ def _prepared(
 ) -> StepContext:
     """Prepare the frame: depth that can be believed, and the right image of a stereo pair."""
     depth = valid_depth(frame.depth, params.sensor.min_depth_m, params.sensor.max_depth_m)
-    if plan.judge_masked:  # points are detected everywhere
-        frame = frame._replace(ignore=jnp.zeros_like(frame.ignore))
     view = PreparedFrame(frame, pyramid, depth, state.elapsed_s + frame.dt_s)
     return StepContext(state, view.with_right(), params, plan)
 
