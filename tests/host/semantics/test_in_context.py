@@ -17,7 +17,7 @@ from command_line import failing
 from tiny_models import Thing
 from tiny_segmenters import SURE
 
-from jaxslam.benchmark.suites.job import networks_sha256
+from jaxslam.benchmark.suites.provenance import networks_sha256
 from jaxslam.cli.entry_point import main
 from jaxslam.config.loading import load_config
 from jaxslam.config.schema import Config, SemanticsConfig
