@@ -166,6 +166,14 @@ COMMANDS = (
         "Scale of depth and quality of pictures too.",
     ),
     Command(
+        ("calibrate",),
+        "calibrate:Calibrate",
+        "Calibrate the camera of a recording from the recording itself, without a target.",
+        "Focal lengths, center, distortion, rolling shutter, and offset, delay and place of depth, each with its"
+        " standard deviation. A value changes only if frames that were not fitted to are explained better. What a"
+        " recording cannot tell, as the scale of depth, is called unobservable.",
+    ),
+    Command(
         ("export",),
         "export:Export",
         "Write a map for other programs.",

@@ -61,6 +61,15 @@ class ImagePairs(ABC):
     def _readers(self) -> tuple[Callable[[Path], np.ndarray], Callable[[Path], np.ndarray]]:
         """The functions that read the first and the second file of a frame."""
 
+    def image_size(self) -> tuple[int, int]:
+        """Read the width and height of the first image, pixels.
+
+        Raises:
+            DatasetError: If it cannot be read.
+        """
+        height, width = self._readers[0](self._files[0][0]).shape[:2]
+        return width, height
+
     def __len__(self) -> int:
         return len(self._files)
 

@@ -114,6 +114,8 @@ class Loader:
         open: Function that opens a folder with its camera.
         rectifies: Whether `open` also takes a stereo pair that is not rectified.
         files: Files and folders that a recording of this kind has, for the message about a folder without any.
+        reads_calibration: Whether `camera` reads calibration files in the folder, rather than the name of the folder.
+        depth_scale_per_m: Counts of the depth images per meter that the layout prescribes; `None` if it does not.
     """
 
     kind: str
@@ -122,3 +124,5 @@ class Loader:
     open: Callable[[Path, Any], Dataset]
     rectifies: bool = False
     files: str = ""
+    reads_calibration: bool = False
+    depth_scale_per_m: float | None = None

@@ -11,6 +11,8 @@ from jaxslam.errors import CameraError, DatasetError, nearest
 from jaxslam.sensors.camera import Camera, known_cameras
 from jaxslam.sensors.rectification import RectifiedPair, load_camera
 
+_CAMERA_FILE = "camera.yaml"
+
 
 def open_dataset(
     path: str | Path, kind: str = "auto", camera: Camera | RectifiedPair | str | Path | None = None
@@ -28,10 +30,7 @@ def open_dataset(
         DatasetError: If the folder is missing, of no known kind, incomplete or unreadable.
         CameraError: If the camera is unknown or cannot be loaded.
     """
-    folder = Path(path).expanduser().resolve()
-    if not folder.is_dir():
-        what = "a file (an archive must be unpacked first)" if folder.exists() else "nothing there"
-        raise DatasetError(f"{path}: expected the folder of a recording, got {what}")
+    folder = _folder(path)
     loader = _loader(folder, kind)
     chosen = _camera(folder, loader, camera)
     if isinstance(chosen, RectifiedPair) and not loader.rectifies:
@@ -39,6 +38,37 @@ def open_dataset(
             f"rig '{chosen.rig.name}': expected one camera, as recordings of kind {loader.kind} are rectified, got two"
         )
     return loader.open(folder, chosen)
+
+
+def layout_of(path: str | Path, kind: str = "auto") -> Loader:
+    """Return the loader that opens a folder.
+
+    Args:
+        path: Folder of the recording.
+        kind: One of `dataset_kinds()`, or `auto` to recognize it by its files and name.
+
+    Raises:
+        DatasetError: If the folder is missing, or of no known kind.
+    """
+    return _loader(_folder(path), kind)
+
+
+def calibration_in(path: str | Path, kind: str = "auto") -> Camera | RectifiedPair | None:
+    """Return the camera that a file in a folder describes; `None` if there is only the name of the folder to go by.
+
+    Args:
+        path: Folder of the recording.
+        kind: One of `dataset_kinds()`, or `auto` to recognize it by its files and name.
+
+    Raises:
+        DatasetError: If the folder is missing, or of no known kind.
+        CameraError: If its file cannot be loaded.
+    """
+    folder = _folder(path)
+    if (folder / _CAMERA_FILE).is_file():
+        return load_camera(folder / _CAMERA_FILE)
+    loader = _loader(folder, kind)
+    return loader.camera(folder) if loader.reads_calibration else None
 
 
 def dataset_kinds() -> list[str]:
@@ -51,6 +81,14 @@ def _loaders() -> dict[str, Loader]:
     modules = [module.name for module in pkgutil.iter_modules(loaders.__path__)]
     found = [getattr(importlib.import_module(f"{loaders.__name__}.{name}"), "LOADER", None) for name in modules]
     return {loader.kind: loader for loader in found if isinstance(loader, Loader)}
+
+
+def _folder(path: str | Path) -> Path:
+    folder = Path(path).expanduser().resolve()
+    if not folder.is_dir():
+        what = "a file (an archive must be unpacked first)" if folder.exists() else "nothing there"
+        raise DatasetError(f"{path}: expected the folder of a recording, got {what}")
+    return folder
 
 
 def _loader(folder: Path, kind: str) -> Loader:
@@ -73,8 +111,8 @@ def _camera(folder: Path, loader: Loader, camera: Camera | RectifiedPair | str |
         return camera
     if camera is not None:
         return load_camera(camera)
-    if (folder / "camera.yaml").is_file():
-        return load_camera(folder / "camera.yaml")
+    if (folder / _CAMERA_FILE).is_file():
+        return load_camera(folder / _CAMERA_FILE)
     told = loader.camera(folder)
     if told is None:
         raise CameraError(

@@ -33,6 +33,8 @@ _UNITS = {
     "far_depth_m": "meters; depth beyond it is not trusted on its own",
     "readout_s": "seconds from the first row to the last; 0 for a global shutter",
     "color_order": "of live images only; image files carry their own order",
+    "depth_offset_m": "meters by which every measured depth is too long",
+    "depth_delay_s": "seconds from a color image to its depth image, beyond what their timestamps say",
 }
 
 
@@ -59,6 +61,10 @@ class Camera(ValidatedConfig):
         readout_s: Time in seconds a rolling shutter takes from the first row of a color image to the last; 0 for a
             global shutter. `jaxslam.Slam` corrects for it.
         color_order: Channel order of the color images that the camera's driver delivers.
+        depth_offset_m: Length in meters by which every measured depth is too long; negative if it is too short.
+            `jaxslam.Slam` subtracts it. 0 for a stereo pair.
+        depth_delay_s: Time in seconds from a color image to its depth image beyond what their timestamps say; negative
+            if depth is earlier. `jaxslam.Slam` adds it. 0 for a stereo pair.
 
     Raises:
         CameraError: If a value has the wrong type or is impossible.
@@ -78,6 +84,8 @@ class Camera(ValidatedConfig):
     far_depth_m: Annotated[float, Range(above=0)] | None = None
     readout_s: Annotated[float, Range(at_least=0, at_most=0.1)] = 0.0
     color_order: Literal["rgb", "bgr"] = "rgb"
+    depth_offset_m: Annotated[float, Range(at_least=-1, at_most=1)] = 0.0
+    depth_delay_s: Annotated[float, Range(at_least=-0.5, at_most=0.5)] = 0.0
 
     _error: ClassVar[type[JaxSlamError]] = CameraError
 

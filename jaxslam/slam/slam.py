@@ -21,6 +21,7 @@ from jaxslam.semantics import Detector
 from jaxslam.semantics.checked_detector import CheckedDetector
 from jaxslam.semantics.from_config import detector_of, key_detector_of, why_no_network
 from jaxslam.sensors.camera import Camera
+from jaxslam.sensors.depth_correction import with_corrected_depth
 from jaxslam.sensors.frame import Frame, check_frame
 from jaxslam.sensors.frame_arrays import FrameArrays, FrameMemory
 from jaxslam.sensors.imu import ImuSheet
@@ -206,6 +207,7 @@ class Slam:
         check_frame(frame, self.camera.width, self.camera.height, pair=self.camera.is_stereo)
         self._clock.check(frame.timestamp_ns, frame.depth_timestamp_ns)
         check_prior(prior)
+        frame = with_corrected_depth(frame, self.camera)
         self._programs.prepare(self._frame)
         began, watch = time.perf_counter(), self.times.stopwatch()
         self._input_checks.look(frame)

@@ -6,7 +6,7 @@ Residuals", IROS 2019.
 
 from pathlib import Path
 
-from jaxslam.datasets.loaders.tum import TumDataset, has_layout
+from jaxslam.datasets.loaders.tum import DEPTH_SCALE_PER_M, TumDataset, has_layout
 from jaxslam.datasets.protocol import Fit, Loader
 from jaxslam.sensors.camera import Camera
 
@@ -21,4 +21,4 @@ def _camera(_: Path) -> Camera:
     return Camera.load("bonn")
 
 
-LOADER = Loader("bonn", _fit, _camera, TumDataset, files="rgb.txt and depth.txt")
+LOADER = Loader("bonn", _fit, _camera, TumDataset, files="rgb.txt and depth.txt", depth_scale_per_m=DEPTH_SCALE_PER_M)

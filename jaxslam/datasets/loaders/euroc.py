@@ -159,4 +159,6 @@ def _fit(folder: Path) -> Fit:
     return Fit.LAYOUT if there else Fit.NO
 
 
-LOADER = Loader("euroc", _fit, _camera, EurocDataset, rectifies=True, files="mav0/cam0 and mav0/cam1")
+LOADER = Loader(
+    "euroc", _fit, _camera, EurocDataset, rectifies=True, files="mav0/cam0 and mav0/cam1", reads_calibration=True
+)

@@ -159,4 +159,11 @@ def _fit(folder: Path) -> Fit:
     return Fit.LAYOUT if there and any((folder / pair.left).is_dir() for pair in _PAIRS) else Fit.NO
 
 
-LOADER = Loader("kitti", _fit, _camera, KittiDataset, files="calib.txt, times.txt, image_0 and image_1")
+LOADER = Loader(
+    "kitti",
+    _fit,
+    _camera,
+    KittiDataset,
+    files="calib.txt, times.txt, image_0 and image_1",
+    reads_calibration=True,
+)

@@ -22,6 +22,9 @@ from jaxslam.trajectory.trajectory import Trajectory, associate, read_tum
 MAX_GAP_S = 0.02
 """Largest gap in seconds between color and depth of a frame (as in the benchmark's own `associate.py`)."""
 
+DEPTH_SCALE_PER_M = 5000.0
+"""Counts of the depth images per meter, by the description of the benchmark."""
+
 _COLOR_LIST, _DEPTH_LIST, _GROUND_TRUTH = "rgb.txt", "depth.txt", "groundtruth.txt"
 _NAME = re.compile(r"rgbd_dataset_freiburg([123])_")
 
@@ -106,4 +109,4 @@ def _camera(folder: Path) -> Camera | None:
     return Camera.load(f"tum_fr{match[1]}") if match else None
 
 
-LOADER = Loader("tum", _fit, _camera, TumDataset, files="rgb.txt and depth.txt")
+LOADER = Loader("tum", _fit, _camera, TumDataset, files="rgb.txt and depth.txt", depth_scale_per_m=DEPTH_SCALE_PER_M)

@@ -70,6 +70,13 @@ def _check_cameras(folder: Path, printed: str) -> None:
     assert Camera.load(folder / "my_camera.yaml").depth_scale_per_m == 5000
 
 
+def _check_calibration(folder: Path, printed: str) -> None:
+    left = {path.name for path in (folder / "results" / "calibrated").iterdir()}
+    assert left == {"camera.yaml", "calibration.json", "residuals.png"}
+    assert Camera.load(folder / "results" / "calibrated" / "camera.yaml").depth_scale_per_m == 5000
+    assert "unobservable" in printed
+
+
 def _check_networks(folder: Path, printed: str) -> None:
     assert [example.label for example in read_examples(folder / "examples.yaml")] == ["arm", "arm"]
 
@@ -99,6 +106,7 @@ def _check_worlds(folder: Path, printed: str) -> None:
 _LEFT_BEHIND = {
     "getting-started": _check_started,
     "cameras-and-recordings": _check_cameras,
+    "calibration": _check_calibration,
     "networks": _check_networks,
     "dense-map": _check_dense,
     "gradients-and-batches": _check_gradients,

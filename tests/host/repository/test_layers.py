@@ -28,6 +28,7 @@ LAYERS = [
     "mapping",
     "dense",
     "slam",
+    "calibration",
     "visualization",
     "results",
     "benchmark",

@@ -1,0 +1,119 @@
+"""Which parameters may change: those with which frames that were not fitted to are explained better."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxslam.calibration.batch_solve import BatchProblem, BatchSolution, BlockState, solve_batch
+from jaxslam.calibration.parameters import CameraVector, group_mask
+
+_CONTINUED_STEPS = 6
+"""Steps of a solve that begins near its optimum."""
+_SURE, _CLEAR = 2.0, 5.0
+"""Standard errors by which held-out frames must be better for a group to stay, and by which it is not asked again."""
+
+Step = Callable[[str], None]
+"""Told what is done next."""
+
+
+class HeldOut(NamedTuple):
+    """Costs of frames that were not fitted to.
+
+    Attributes:
+        costs: `(b,)` cost of each block, with the camera fitted to the other half of the blocks.
+        cameras: Camera fitted to each half.
+    """
+
+    costs: Float[np.ndarray, " b"]
+    cameras: tuple[CameraVector, CameraVector]
+
+
+@dataclass(frozen=True, eq=False)
+class Gate:
+    """What held-out frames say.
+
+    Attributes:
+        accepted: Groups of parameters that may change.
+        gains: By how much the cost of held-out frames grows, as a share, if a group stays as it was and the others
+            follow; by group.
+        before: Costs of held-out frames with the camera as it was.
+        after: The same with the accepted groups fitted to other frames.
+    """
+
+    accepted: tuple[str, ...]
+    gains: dict[str, float]
+    before: HeldOut
+    after: HeldOut
+
+
+def gate(
+    problem: BatchProblem,
+    start: CameraVector,
+    fitted: BatchSolution,
+    groups: Sequence[str],
+    on_step: Step = lambda _: None,
+) -> Gate:
+    """Decide which groups of parameters may change.
+
+    Every other block is fitted to, and the rest is held out; then the other way round. On held-out blocks the camera is
+    fixed, and poses and points are found anew. Groups leave one after the other, the least useful first, while held-out
+    frames are not worse for it by more than two standard errors; the groups that stay are fitted again each time.
+
+    Args:
+        problem: The problem, with the noise as estimated.
+        start: Camera as it was.
+        fitted: Solution of the whole problem with all groups free, from which solves begin.
+        groups: Groups to decide on.
+        on_step: Told what is done next.
+    """
+    on_step("held-out frames, camera as it was")
+    before = _held_out(problem, start, fitted, ())
+    accepted, gains = tuple(groups), {}
+    on_step("held-out frames, all parameters")
+    after = _held_out(problem, start, fitted, accepted)
+    clear: set[str] = set()
+    while asked := [group for group in accepted if group not in clear]:
+        without, surety = {}, {}
+        for group in asked:
+            on_step(f"held-out frames without {group}")
+            without[group] = _held_out(problem, start, fitted, tuple(each for each in accepted if each != group))
+            gains[group] = float(without[group].costs.sum() / after.costs.sum() - 1)
+            surety[group] = _standard_errors(after.costs, without[group].costs)
+        clear |= {group for group in asked if surety[group] > _CLEAR}
+        worst = min(asked, key=lambda group: surety[group])
+        if surety[worst] > _SURE:
+            break
+        accepted, after = tuple(each for each in accepted if each != worst), without[worst]
+    return Gate(accepted, gains, before, after)
+
+
+def _held_out(problem: BatchProblem, start: CameraVector, fitted: BatchSolution, groups: tuple[str, ...]) -> HeldOut:
+    free = group_mask(groups)
+    costs, cameras = np.zeros(len(problem.blocks)), []
+    for half in (0, 1):
+        used, held = _part(problem, fitted.states, half), _part(problem, fitted.states, 1 - half)
+        first = np.where(free, fitted.camera, start)
+        camera = first if not groups else solve_batch(*_with(used, first), free, max_steps=_CONTINUED_STEPS).camera
+        nothing = np.zeros(len(free), bool)
+        costs[1 - half :: 2] = solve_batch(*_with(held, camera), nothing, max_steps=_CONTINUED_STEPS).costs
+        cameras.append(camera)
+    return HeldOut(costs, (cameras[0], cameras[1]))
+
+
+def _part(problem: BatchProblem, states: Sequence[BlockState], half: int) -> tuple[BatchProblem, Sequence[BlockState]]:
+    return replace(problem, blocks=problem.blocks[half::2]), states[half::2]
+
+
+def _with(
+    part: tuple[BatchProblem, Sequence[BlockState]], camera: CameraVector
+) -> tuple[BatchProblem, CameraVector, Sequence[BlockState]]:
+    return part[0], camera, part[1]
+
+
+def _standard_errors(costs: Float[np.ndarray, " b"], others: Float[np.ndarray, " b"]) -> float:
+    """Return by how many standard errors of the mean blocks cost less than with another camera."""
+    gained = others - costs
+    return float(gained.mean() / max(gained.std(ddof=1) / np.sqrt(len(gained)), 1e-9))
