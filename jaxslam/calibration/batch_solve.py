@@ -55,11 +55,11 @@ class BlockState(NamedTuple):
 
     Attributes:
         poses: `(f, 7)` poses, wxyz_xyz of T_world_cam.
-        X_world: `(3, p)` points, meters.
+        points: `(4, p)` points, meters, and the shared errors of their depth; see `linearize`.
     """
 
     poses: Float[np.ndarray, "f 7"]
-    X_world: Float[np.ndarray, "3 p"]
+    points: Float[np.ndarray, "4 p"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +81,7 @@ class BatchSolution:
 
 def first_states(blocks: Sequence[TrackBlock]) -> list[BlockState]:
     """Return poses and points as they were tracked."""
-    return [BlockState(block.poses, block.X_world) for block in blocks]
+    return [BlockState(block.poses, np.pad(block.X_world, ((0, 1), (0, 0)))) for block in blocks]
 
 
 def solve_batch(
@@ -136,7 +136,7 @@ def _equations(
     reduced = []
     for block, state in zip(problem.blocks, states, strict=True):
         linear = linearize(block, *state, camera, height=problem.height, pair_fx=problem.pair_fx)
-        parts = weighted(block, linear.residuals, problem.noise)
+        parts = weighted(block, state.points, linear.residuals, problem.noise)
         reduced.append(reduce_block(linear, parts, problem.noise, free, damping))
     return reduced
 
@@ -161,13 +161,15 @@ def _camera_step(
 
 def _moved(state: BlockState, pose_steps: np.ndarray, point_steps: np.ndarray) -> BlockState:
     poses = np.array([retract(pose, step) for pose, step in zip(state.poses, pose_steps, strict=True)])
-    return BlockState(poses, state.X_world + point_steps)
+    return BlockState(poses, state.points + point_steps)
 
 
 def _costs(problem: BatchProblem, camera: CameraVector, states: Sequence[BlockState]) -> Float[np.ndarray, " b"]:
-    return np.array(
-        [weighted(block, each, problem.noise).cost for block, each, _ in _residuals(problem, camera, states)]
-    )
+    costs = [
+        weighted(block, state.points, each, problem.noise).cost
+        for state, (block, each, _) in zip(states, _residuals(problem, camera, states), strict=True)
+    ]
+    return np.array(costs)
 
 
 def _residuals(

@@ -40,11 +40,13 @@ class Weighted(NamedTuple):
     Attributes:
         residuals: `(f, 3, p)` residuals in standard deviations, 0 where nothing is seen or measured.
         weights: `(f, 3, p)` weights of iteratively reweighted least squares.
+        shared: `(p,)` errors that all measurements of the depth of a point share, in standard deviations.
         cost: Cost of the block.
     """
 
     residuals: Float[np.ndarray, "f 3 p"]
     weights: Float[np.ndarray, "f 3 p"]
+    shared: Float[np.ndarray, " p"]
     cost: float
 
 
@@ -56,32 +58,35 @@ class Reduced(NamedTuple):
         gradient: `(q,)` gradient by them.
         pose_step: `(6 (f - 1),)` step of all poses but the first if the camera stays as it is.
         pose_by_camera: `(6 (f - 1), q)` derivative of that step by the step of the camera.
-        point_step: `(p, 3)` step of the points if nothing else moves.
-        point_by_rest: `(p, 3, d)` derivative of that step by the steps of the poses but the first and of the camera.
+        point_step: `(p, 4)` step of the points if nothing else moves.
+        point_by_rest: `(p, 4, d)` derivative of that step by the steps of the poses but the first and of the camera.
     """
 
     hessian: Float[np.ndarray, "q q"]
     gradient: Float[np.ndarray, " q"]
     pose_step: Float[np.ndarray, " c"]
     pose_by_camera: Float[np.ndarray, "c q"]
-    point_step: Float[np.ndarray, "p 3"]
-    point_by_rest: Float[np.ndarray, "p 3 d"]
+    point_step: Float[np.ndarray, "p 4"]
+    point_by_rest: Float[np.ndarray, "p 4 d"]
 
     def steps(self, camera_step: Float[np.ndarray, " q"]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the steps of the poses `(f, 6)` and of the points `(3, p)` that go with a step of the camera."""
+        """Return the steps of the poses `(f, 6)` and of the points `(4, p)` that go with a step of the camera."""
         poses = self.pose_step + self.pose_by_camera @ camera_step
         points = self.point_step + self.point_by_rest @ np.concatenate([poses, camera_step])
         return np.concatenate([np.zeros(6), poses]).reshape(-1, 6), points.T
 
 
-def weighted(block: TrackBlock, residuals: Float[np.ndarray, "f 3 p"], noise: Noise) -> Weighted:
+def weighted(
+    block: TrackBlock, points: Float[np.ndarray, "4 p"], residuals: Float[np.ndarray, "f 3 p"], noise: Noise
+) -> Weighted:
     """Whiten the residuals of a block and weigh them by the Cauchy loss; see `jaxslam_kernels.robust`."""
     scales = np.array([noise.pixel, noise.pixel, noise.depth])[:, None]
     seen = np.stack([block.seen, block.seen, block.measured], axis=1)
     white = np.where(seen, residuals / scales, 0.0)
     squares = np.stack([white[:, 0] ** 2 + white[:, 1] ** 2, white[:, 2] ** 2], axis=1) / LOSS_SCALE**2
     weights = (1 / (1 + squares))[:, [0, 0, 1]] * seen
-    return Weighted(white, weights, float(0.5 * LOSS_SCALE**2 * np.log1p(squares).sum()))
+    cost = 0.5 * LOSS_SCALE**2 * np.log1p(squares).sum() + 0.5 * np.square(points[3]).sum()
+    return Weighted(white, weights, points[3], float(cost))
 
 
 def reduce_block(
@@ -107,9 +112,11 @@ def reduce_block(
     rest_T, point_T = np.swapaxes(rest, -1, -2), np.swapaxes(point, -1, -2)
     hessian, gradient, cross = _assembled(rest, rest_T @ residuals, rest_T @ point)
     inner = (point_T @ point).sum(axis=0)
+    pull = (point_T @ residuals).sum(axis=0)
+    inner[:, -1, -1] += 1
+    pull[:, -1, 0] += parts.shared
     inner += _damped(inner, damping)
     inverse = np.linalg.inv(inner)
-    pull = (point_T @ residuals).sum(axis=0)
     point_by_rest = -inverse @ np.swapaxes(cross, -1, -2)
     point_step = -(inverse @ pull)[..., 0]
     num_poses = len(hessian) - int(free.sum())
@@ -132,7 +139,7 @@ def reduce_block(
 
 
 def _assembled(
-    rest: Float[np.ndarray, "f p 3 c"], pulls: Float[np.ndarray, "f p c 1"], crosses: Float[np.ndarray, "f p c 3"]
+    rest: Float[np.ndarray, "f p 3 c"], pulls: Float[np.ndarray, "f p c 1"], crosses: Float[np.ndarray, "f p c 4"]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Sum up Hessian, gradient, and the part between them and the points; the first pose is left out."""
     num_frames, num_points, _, c = rest.shape
@@ -155,5 +162,5 @@ def _damped(blocks: np.ndarray, damping: float) -> np.ndarray:
     """Return what is added to the diagonals of `(..., d, d)` matrices."""
     diagonal = np.diagonal(blocks, axis1=-2, axis2=-1)
     largest = diagonal.max(axis=-1, keepdims=True)
-    added = damping * diagonal + np.where(largest > 0, _FLOOR * largest, 1.0)
+    added = damping * diagonal + np.where(diagonal > 0, _FLOOR * largest, 1.0)
     return added[..., None] * np.eye(blocks.shape[-1])

@@ -21,8 +21,8 @@ from jaxslam.calibration.track_block import TrackBlock
 from jaxslam.runtime.compiled import compiled
 from jaxslam.runtime.compiler_options import FAST_COMPILE, SINGLE_THREAD
 
-NUM_POSE, NUM_POINT = 18, 3
-"""Numbers of tangents of the three poses that a frame depends on, and of a point."""
+NUM_POSE, NUM_POINT = 18, 4
+"""Numbers of tangents of the three poses that a frame depends on, and of a point with the error of its depth."""
 NUM_TANGENTS = NUM_POSE + NUM_POINT + len(PARAMETERS)
 _MIN_DEPTH_M = 1e-3
 
@@ -66,43 +66,45 @@ class Linearized(NamedTuple):
 
 
 def linearize(
-    block: TrackBlock, poses: np.ndarray, X_world: np.ndarray, camera: CameraVector, *, height: int, pair_fx: float
+    block: TrackBlock, poses: np.ndarray, points: np.ndarray, camera: CameraVector, *, height: int, pair_fx: float
 ) -> Linearized:
     """Compute the residuals of a block and their derivatives, in single precision.
 
     Args:
         block: The block.
         poses: `(f, 7)` poses of its frames.
-        X_world: `(3, p)` positions of its points.
+        points: `(4, p)` positions of its points, meters, and the error that all measurements of the inverse depth of a
+            point share, in standard deviations `DepthPlanes.sigma`: neighboring pixels and successive images have it in
+            common.
         camera: Parameters of the camera.
         height: Rows of the image.
         pair_fx: Focal length by which depth was computed from the disparity of a stereo pair; 0 for a depth sensor.
     """
-    arguments = _arguments(block, poses, X_world, camera, pair_fx)
+    arguments = _arguments(block, poses, points, camera, pair_fx)
     residuals, jacobian = _linearized(*arguments, height=height)
     # Out of the compiled function tangents come first, as that is how they are computed.
     return Linearized(np.asarray(residuals, np.float64), np.moveaxis(np.asarray(jacobian, np.float64), 1, -1))
 
 
 def residuals_of(
-    block: TrackBlock, poses: np.ndarray, X_world: np.ndarray, camera: CameraVector, *, height: int, pair_fx: float
+    block: TrackBlock, poses: np.ndarray, points: np.ndarray, camera: CameraVector, *, height: int, pair_fx: float
 ) -> tuple[Float[np.ndarray, "f 3 p"], Float[np.ndarray, "f 2 p"]]:
     """Compute the residuals of a block alone, and the pixels at which its depth images show the points.
 
     Args:
         block: The block.
         poses: See `linearize`.
-        X_world: See `linearize`.
+        points: See `linearize`.
         camera: See `linearize`.
         height: See `linearize`.
         pair_fx: See `linearize`.
     """
-    residuals, depth_uv = _residuals(*_arguments(block, poses, X_world, camera, pair_fx), height=height)
+    residuals, depth_uv = _residuals(*_arguments(block, poses, points, camera, pair_fx), height=height)
     return np.asarray(residuals, np.float64), np.asarray(depth_uv, np.float64)
 
 
 def _arguments(
-    block: TrackBlock, poses: np.ndarray, X_world: np.ndarray, camera: CameraVector, pair_fx: float
+    block: TrackBlock, poses: np.ndarray, points: np.ndarray, camera: CameraVector, pair_fx: float
 ) -> tuple[_Frame, np.ndarray, np.ndarray, np.ndarray]:
     last = block.num_frames - 1
     around = np.clip(np.arange(block.num_frames)[:, None] + np.array([-1, 0, 1]), 0, last)
@@ -116,21 +118,21 @@ def _arguments(
         plane_uv=block.depth.uv,  # pyright: ignore[reportArgumentType]
         plane_sigma=block.depth.sigma,  # pyright: ignore[reportArgumentType]
     )
-    single = jax.tree.map(lambda array: np.asarray(array, np.float32), (frames, X_world, camera, pair_fx))
+    single = jax.tree.map(lambda array: np.asarray(array, np.float32), (frames, points, camera, pair_fx))
     return single
 
 
 @compiled(when="first use", static="height", options=FAST_COMPILE | SINGLE_THREAD)
 def _linearized(
-    frames: _Frame, X_world: Points, camera: Array, pair_fx: Scalar, *, height: int
+    frames: _Frame, points: Float[Array, "4 p"], camera: Array, pair_fx: Scalar, *, height: int
 ) -> tuple[Float[Array, "f 3 p"], Float[Array, "f t 3 p"]]:
     def of_frame(frame: _Frame) -> tuple[Float[Array, "3 p"], Float[Array, "t 3 p"]]:
         def moved(tangents: Float[Array, " t"]) -> Float[Array, "3 p"]:
-            return _of_frame(tangents, frame, X_world, camera, pair_fx, height)[0]
+            return _of_frame(tangents, frame, points, camera, pair_fx, height)[0]
 
         # A tangent of a point moves all points of the frame: a residual depends on its own point alone.
-        basis = jnp.eye(NUM_TANGENTS, dtype=X_world.dtype)
-        value, derivative = jax.linearize(moved, jnp.zeros(NUM_TANGENTS, X_world.dtype))
+        basis = jnp.eye(NUM_TANGENTS, dtype=points.dtype)
+        value, derivative = jax.linearize(moved, jnp.zeros(NUM_TANGENTS, points.dtype))
         return value, jax.vmap(derivative)(basis)
 
     return jax.lax.map(of_frame, frames)
@@ -138,14 +140,19 @@ def _linearized(
 
 @compiled(when="first use", static="height", options=FAST_COMPILE | SINGLE_THREAD)
 def _residuals(
-    frames: _Frame, X_world: Points, camera: Array, pair_fx: Scalar, *, height: int
+    frames: _Frame, points: Float[Array, "4 p"], camera: Array, pair_fx: Scalar, *, height: int
 ) -> tuple[Float[Array, "f 3 p"], Float[Array, "f 2 p"]]:
-    still = jnp.zeros(NUM_TANGENTS, X_world.dtype)
-    return jax.lax.map(lambda frame: _of_frame(still, frame, X_world, camera, pair_fx, height), frames)
+    still = jnp.zeros(NUM_TANGENTS, points.dtype)
+    return jax.lax.map(lambda frame: _of_frame(still, frame, points, camera, pair_fx, height), frames)
 
 
 def _of_frame(
-    tangents: Float[Array, " t"], frame: _Frame, X_world: Points, camera: Array, pair_fx: Scalar, height: int
+    tangents: Float[Array, " t"],
+    frame: _Frame,
+    points: Float[Array, "4 p"],
+    camera: Array,
+    pair_fx: Scalar,
+    height: int,
 ) -> tuple[Float[Array, "3 p"], Pixels]:
     """Residuals of one frame, and where its depth image shows the points, with everything moved by tangents."""
     pose_tangents, point_tangent = tangents[:NUM_POSE], tangents[NUM_POSE : NUM_POSE + NUM_POINT]
@@ -153,7 +160,8 @@ def _of_frame(
     parameters = camera + tangents[NUM_POSE + NUM_POINT :]
     intrinsics = Intrinsics(*parameters[:4], distortion=parameters[4:9])
     offset_m, delay_s, readout_s = parameters[9:12]
-    X_cam = to_camera(now, X_world + point_tangent[:, None])
+    shared = points[3] + point_tangent[3]
+    X_cam = to_camera(now, points[:3] + point_tangent[:3, None])
     motions = displacement(now, before), displacement(now, after)
 
     def motion_until(elapsed_s: Weights) -> Float[Array, "6 p"]:
@@ -172,7 +180,7 @@ def _of_frame(
     # The disparity of a pair is fx / z in units of its baseline, whatever focal length made a depth of it before.
     ratio = jnp.where(pair_fx > 0, intrinsics.fx / jnp.where(pair_fx > 0, pair_fx, 1), 1)
     expected = ratio / jnp.maximum(X_depth[2] + offset_m, _MIN_DEPTH_M)
-    return jnp.concatenate([pixels, ((expected - measured) / frame.plane_sigma)[None, :]]), depth_uv
+    return jnp.concatenate([pixels, ((expected - measured) / frame.plane_sigma + shared)[None, :]]), depth_uv
 
 
 def _small_rotation(w: Float[Array, "3"]) -> Float[Array, "3 3"]:

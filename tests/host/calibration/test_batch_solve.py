@@ -45,11 +45,12 @@ def fitted() -> tuple[BatchProblem, BatchSolution]:
 
 def test_derivatives_are_those_of_differences() -> None:
     block, rng = problem().blocks[0], np.random.default_rng(0)
-    at_start = linearize(block, block.poses, block.X_world, START, **SETTINGS)
+    start = first_states([block])[0].points
+    at_start = linearize(block, block.poses, start, START, **SETTINGS)
     camera = 1e-2 * rng.normal(size=17) * prior_sigmas(CAMERA)
-    poses, points = 1e-3 * rng.normal(size=(len(block.poses), 6)), 1e-3 * rng.normal(size=block.X_world.shape)
+    poses, points = 1e-3 * rng.normal(size=(len(block.poses), 6)), 1e-3 * rng.normal(size=start.shape)
     moved = np.stack([retract(pose, step) for pose, step in zip(block.poses, poses, strict=True)])
-    later, _ = residuals_of(block, moved, block.X_world + points, START + camera, **SETTINGS)
+    later, _ = residuals_of(block, moved, start + points, START + camera, **SETTINGS)
     last = block.num_frames - 1
     around = np.clip(np.arange(block.num_frames)[:, None] + np.array([-1, 0, 1]), 0, last)
     by_pose = np.einsum("fkpt,ft->fkp", at_start.jacobian[..., :NUM_POSE], poses[around].reshape(-1, NUM_POSE))
@@ -96,8 +97,9 @@ def test_no_residual_knows_the_scale() -> None:
     poses[:, 4:] *= factor
     camera[[9, 15, 16]] *= factor
     depth = block.depth._replace(plane=block.depth.plane / factor, sigma=block.depth.sigma / factor)
-    larger, _ = residuals_of(block._replace(depth=depth), poses, factor * block.X_world, camera, **SETTINGS)
-    same, _ = residuals_of(block, block.poses, block.X_world, TRUTH, **SETTINGS)
+    points = first_states([block])[0].points
+    larger, _ = residuals_of(block._replace(depth=depth), poses, factor * points, camera, **SETTINGS)
+    same, _ = residuals_of(block, block.poses, points, TRUTH, **SETTINGS)
     seen = np.moveaxis(np.broadcast_to(block.seen, (3, *block.seen.shape)), 0, 1)
     np.testing.assert_allclose(larger[seen], same[seen], atol=2e-3)
 
