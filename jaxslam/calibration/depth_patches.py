@@ -104,7 +104,7 @@ def planes_at(patches: DepthPatches, uv: Float[np.ndarray, "*batch 2 n"], settin
     """
     near = np.nan_to_num(uv - patches.origin, nan=1e6) / settings.stride
     du, dv = (_OFFSETS[k] - near[..., k, :, None] for k in range(2))
-    reached = (np.abs(near) <= _REACH - _WINDOW).all(axis=-2)
+    reached = np.asarray((np.abs(near) <= _REACH - _WINDOW).all(axis=-2))
     window = (np.abs(du) <= _WINDOW + 0.5) & (np.abs(dv) <= _WINDOW + 0.5) & reached[..., None]
     weights = (window & (patches.counts > 0)).astype(np.float64)
     inverse = _COUNTS / settings.max_m / np.maximum(patches.counts, 1)
@@ -118,5 +118,5 @@ def planes_at(patches: DepthPatches, uv: Float[np.ndarray, "*batch 2 n"], settin
     plane = np.moveaxis(fitted[..., 0], -1, -2) / np.array([1, settings.stride, settings.stride])[:, None]
     least = 1 / settings.max_m
     sigma = settings.noise.sigma_m * np.maximum(plane[..., 0, :], least) ** 2 + settings.noise.sigma_per_m2
-    measured = np.asarray(enough & (spread < _FLAT * sigma) & (plane[..., 0, :] > least))
+    measured = enough & (spread < _FLAT * sigma) & (plane[..., 0, :] > least)
     return DepthPlanes(plane, uv, sigma, measured)

@@ -115,7 +115,7 @@ def _first_guess(turns: _Turns, stated: Rotation) -> Float[np.ndarray, "7"]:
     best, least = np.zeros(7), np.inf
     for delay_s in _TRIED_S:
         gyro = turns.of_gyro(delay_s).as_rotvec()
-        turn, _ = Rotation.align_vectors(gyro, camera)
+        turn = Rotation.align_vectors(gyro, camera)[0]
         cost = float(np.median(np.linalg.norm(gyro - turn.apply(camera), axis=1)))
         if cost < least:
             # From IMU axes to those of the camera, in which the turn is to be.

@@ -1,5 +1,6 @@
 """Result of a calibration: each parameter before and after, with its standard deviation, and why it is as it is."""
 
+import math
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any, NamedTuple
@@ -47,6 +48,9 @@ class Estimate(NamedTuple):
     found: float
     sigma: float
     verdict: Verdict
+
+
+_NUMBERS = ("before", "after", "found", "sigma")
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,9 +114,9 @@ class Calibration:
         raise KeyError(name)
 
     def summary(self) -> dict[str, Any]:
-        """Return all figures as plain values, for JSON."""
+        """Return all figures as plain values, for JSON; `None` where nothing tells a number."""
         return {
-            "parameters": [{**each._asdict(), "verdict": each.verdict.value} for each in self.estimates],
+            "parameters": [_plain(each) for each in self.estimates],
             "held_out_gain": self.held_out_gain,
             "pixel_sigma": self.pixel_sigma,
             "depth_sigma": self.depth_sigma,
@@ -120,3 +124,8 @@ class Calibration:
             "frames": self.num_frames,
             "rounds": self.rounds,
         }
+
+
+def _plain(estimate: Estimate) -> dict[str, Any]:
+    numbers = {name: None if math.isnan(getattr(estimate, name)) else getattr(estimate, name) for name in _NUMBERS}
+    return {"name": estimate.name, "unit": estimate.unit, **numbers, "verdict": estimate.verdict.value}

@@ -59,7 +59,7 @@ class Calibrate(WithJson):
         """Run the command."""
         from jaxslam.calibration import calibrate, open_with_start  # noqa: PLC0415
         from jaxslam.config.loading import load_config  # noqa: PLC0415
-        from jaxslam.io.atomic_files import make_folder  # noqa: PLC0415
+        from jaxslam.io.atomic_files import make_folder, write_atomically  # noqa: PLC0415
         from jaxslam.visualization.calibration_plot import plot_calibration  # noqa: PLC0415
 
         self._check()
@@ -80,7 +80,8 @@ class Calibrate(WithJson):
             found = calibrate(dataset, config, rounds=self.rounds, scale=self._scale(dataset), on_progress=on_progress)
         found.camera.save(folder / CAMERA_FILE)
         figures = {"start": source, **found.summary()}
-        (folder / FIGURES_FILE).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+        text = json.dumps(figures, indent=2, allow_nan=False) + "\n"
+        write_atomically(folder / FIGURES_FILE, text.encode(), ConfigError)
         plot_calibration(found, folder / PICTURE_FILE, title=dataset.name)
         if self.json:
             print_json({**figures, "camera_file": str(folder / CAMERA_FILE)})

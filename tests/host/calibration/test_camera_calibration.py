@@ -22,9 +22,9 @@ def test_room_that_its_camera_file_describes_wrongly(tmp_path: Path) -> None:
     found = calibrate(MiscalibratedRoom(seed=0, path="rpy"), on_progress=lambda text, *_: stages.append(text))
     found.camera.save(tmp_path / "camera.yaml")
     camera = Camera.load(tmp_path / "camera.yaml")
-    assert camera.fx == pytest.approx(TRUTH.fx, rel=0.005)
-    assert camera.fy == pytest.approx(TRUTH.fy, rel=0.005)
-    assert camera.depth_offset_m == pytest.approx(TRUTH.depth_offset_m, abs=0.004)
+    assert camera.fx == pytest.approx(TRUTH.fx, rel=0.004)
+    assert camera.fy == pytest.approx(TRUTH.fy, rel=0.004)
+    assert camera.depth_offset_m == pytest.approx(TRUTH.depth_offset_m, abs=0.01)
     assert camera.depth_delay_s == pytest.approx(TRUTH.depth_delay_s, abs=1.5e-3)
     assert camera.readout_s == pytest.approx(TRUTH.readout_s, abs=2e-3)
     assert camera.depth_scale_per_m == STATED.depth_scale_per_m

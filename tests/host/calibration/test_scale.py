@@ -1,8 +1,12 @@
 """The scale of a recording from a true path or a known length."""
 
+import json
+
 import numpy as np
 import pytest
 
+from jaxslam import Camera
+from jaxslam.calibration import Calibration, Estimate, ResidualField, Verdict
 from jaxslam.calibration.scale import scale_of
 from jaxslam.errors import DatasetError
 from jaxslam.trajectory.trajectory import Trajectory
@@ -28,6 +32,17 @@ def test_known_length_tells_the_scale() -> None:
     scale = scale_of(path(), 1.1 * float(np.linalg.norm(ends[1] - ends[0])))
     assert scale.factor == pytest.approx(1.1)
     assert np.isnan(scale.sigma)
+
+
+def test_report_is_json() -> None:
+    """What nothing tells is null there."""
+    unknown = Estimate("baseline_m", "m", 0.5, 0.5, np.nan, np.nan, Verdict.UNOBSERVABLE)
+    nothing = np.zeros((2, 0))
+    field = ResidualField(nothing, nothing, nothing, *3 * [np.zeros(0)])
+    camera = Camera("pair", 64, 48, 60.0, 60.0, 31.5, 23.5, baseline_m=0.5)
+    summary = Calibration(camera, camera, (unknown,), 0.0, 0.1, 1.0, 4, 40, 1, field).summary()
+    (parameter,) = json.loads(json.dumps(summary, allow_nan=False))["parameters"]
+    assert (parameter["found"], parameter["before"], parameter["verdict"]) == (None, 0.5, "unobservable")
 
 
 def test_errors() -> None:
