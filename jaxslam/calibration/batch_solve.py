@@ -37,7 +37,6 @@ class BatchProblem:
         prior_sigma: Their standard deviations.
         height: Rows of the image.
         noise: Standard deviations of what is measured.
-        pair_fx: Focal length by which the depth of a stereo pair was computed; 0 for a depth sensor.
         depth: Settings of the depth sensor, by which its depth is looked up; `None` if the depth of blocks is fixed.
     """
 
@@ -46,7 +45,6 @@ class BatchProblem:
     prior_sigma: CameraVector
     height: int
     noise: Noise
-    pair_fx: float = 0.0
     depth: DepthSettings | None = None
 
 
@@ -135,7 +133,7 @@ def _equations(
 ) -> list[Reduced]:
     reduced = []
     for block, state in zip(problem.blocks, states, strict=True):
-        linear = linearize(block, *state, camera, height=problem.height, pair_fx=problem.pair_fx)
+        linear = linearize(block, *state, camera, height=problem.height)
         parts = weighted(block, state.points, linear.residuals, problem.noise)
         reduced.append(reduce_block(linear, parts, problem.noise, free, damping))
     return reduced
@@ -176,7 +174,7 @@ def _residuals(
     problem: BatchProblem, camera: CameraVector, states: Sequence[BlockState]
 ) -> list[tuple[TrackBlock, np.ndarray, np.ndarray]]:
     """Return each block with its residuals, and with the pixels at which its depth images show its points."""
-    settings = {"height": problem.height, "pair_fx": problem.pair_fx}
+    settings = {"height": problem.height}
     return [
         (block, *residuals_of(block, *state, camera, **settings))
         for block, state in zip(problem.blocks, states, strict=True)

@@ -21,7 +21,6 @@ from jaxslam.calibration.gyro_calibration import calibrate_gyro
 from jaxslam.calibration.parameters import (
     EXTRINSICS,
     GROUPS,
-    PAIR_GROUPS,
     PARAMETERS,
     READOUT,
     CameraVector,
@@ -37,6 +36,7 @@ from jaxslam.calibration.track_recorder import TrackRecorder
 from jaxslam.calibration.uncertainty import standard_deviations
 from jaxslam.config.schema import Config
 from jaxslam.datasets import Dataset, imu_samples, imu_sheet
+from jaxslam.errors import CameraError
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.camera_difference import distance_of_projections_px
 from jaxslam.sensors.frame import Frame
@@ -105,16 +105,19 @@ def calibrate(
     """Calibrate the camera of a recording, beginning with the camera that it comes with.
 
     Args:
-        dataset: The recording; depth of a sensor, or rectified stereo pairs. Its `camera` is the start.
+        dataset: The recording, with depth of a sensor. Its `camera` is the start.
         config: Settings of the tracker; those of the default preset if not given.
         rounds: Number of times that the recording is tracked at most, each time with the camera found before.
         scale: Distance between the first and the last place of the camera, meters, or its true path: without it the
-            scale of depth, or the baseline of a pair, cannot be told.
+            scale of depth cannot be told.
         on_progress: Told what is being done.
 
     Raises:
         DatasetError: If too little of the recording is tracked, or `scale` does not tell the scale.
+        CameraError: If the recording is of stereo pairs.
     """
+    if dataset.camera.is_stereo:
+        raise CameraError(f"camera '{dataset.camera.name}': expected a camera with depth images, got a stereo pair")
     start = dataset.camera
     camera, done = start, 0
     while True:
@@ -148,14 +151,13 @@ def _track_and_fit(
 
         slam.run(dataset, on_frame)
         trajectory = slam.trajectory
-    free = group_mask(_groups_of(start))
+    free = group_mask(GROUPS)
     problem = BatchProblem(
         recorder.blocks(),
         vector_of(start),
         prior_sigmas(start),
         start.height,
         _FIRST_NOISE,
-        dataset.camera.fx if start.is_stereo else 0.0,
         recorder.depth,
     )
     camera, states = vector_of(dataset.camera), first_states(problem.blocks)
@@ -174,7 +176,7 @@ def _track_and_fit(
 def _gated(tracked: _Tracked, start: Camera, rounds: int, scale: Scale | None, on_progress: OnProgress) -> Calibration:
     """Decide what may change, and fit that to the whole recording."""
     problem, fitted = tracked.problem, tracked.fitted
-    before, groups = vector_of(start), _groups_of(start)
+    before, groups = vector_of(start), GROUPS
     free = group_mask(groups)
     all_sigmas = standard_deviations(problem, fitted, free)
     told = tuple(group for group in groups if _is_told(group, all_sigmas, problem.prior_sigma))
@@ -195,8 +197,6 @@ def _gated(tracked: _Tracked, start: Camera, rounds: int, scale: Scale | None, o
     camera = _possible(solution.camera, start)
     estimates = []
     for index, parameter in enumerate(PARAMETERS):
-        if parameter.group not in groups:
-            continue
         taken = parameter.group in accepted
         verdict = _verdict(parameter.group, told, accepted, impossible)
         found, sigma = (solution.camera, sigmas) if taken else (fitted.camera, all_sigmas)
@@ -234,10 +234,6 @@ def _fit_accepted(
     return solve_batch(problem, np.where(free, fitted.camera, before), fitted.states, free)
 
 
-def _groups_of(camera: Camera) -> tuple[str, ...]:
-    return PAIR_GROUPS if camera.is_stereo else GROUPS
-
-
 def _is_told(group: str, sigmas: CameraVector, prior: CameraVector) -> bool:
     own = group_mask((group,))
     return bool((sigmas[own] < _TOLD * prior[own]).any())
@@ -253,14 +249,11 @@ def _verdict(group: str, told: tuple[str, ...], accepted: tuple[str, ...], impos
 
 def _estimated_scale(start: Camera, scale: Scale | None) -> Estimate:
     """Return the length on which all others depend: no residual knows it, only what was measured outside."""
-    if start.is_stereo:
-        name, unit, before = "baseline_m", "m", start.baseline_m
-    else:
-        name, unit, before = "depth_scale_per_m", "1/m", start.depth_scale_per_m
+    name, unit, before = "depth_scale_per_m", "1/m", start.depth_scale_per_m
     value = np.nan if before is None else before
     if scale is None or before is None:
         return Estimate(name, unit, value, value, np.nan, np.nan, Verdict.UNOBSERVABLE)
-    found = value * scale.factor if start.is_stereo else value / scale.factor
+    found = value / scale.factor
     sigma = found * scale.sigma / scale.factor
     differs = not abs(scale.factor - 1) <= _SURE_OF_SCALE * scale.sigma  # a length by hand has no deviation
     verdict = Verdict.ACCEPTED if differs else Verdict.NO_GAIN
@@ -271,8 +264,6 @@ def _scaled(camera: Camera, scale: Estimate) -> Camera:
     """Return a camera with another scale; an offset of depth is a length too."""
     if scale.verdict is not Verdict.ACCEPTED:
         return camera
-    if camera.is_stereo:
-        return replace(camera, baseline_m=scale.after)
     factor = scale.before / scale.after
     return replace(camera, depth_scale_per_m=scale.after, depth_offset_m=factor * camera.depth_offset_m)
 

@@ -64,9 +64,6 @@ PARAMETERS = (
 The extrinsics lead from the color camera to the depth camera: `X_depth = R (X_color + shift)`. A shift along the
 optical axis is the same as a depth offset, and left to that."""
 
-PAIR_GROUPS = (FOCAL, CENTER, DISTORTION, READOUT)
-"""Groups of a stereo pair, which has no depth sensor."""
-
 
 def group_mask(groups: tuple[str, ...]) -> np.ndarray:
     """Return which of `PARAMETERS` belong to some groups, `(q,)` bool."""

@@ -66,7 +66,7 @@ class Linearized(NamedTuple):
 
 
 def linearize(
-    block: TrackBlock, poses: np.ndarray, points: np.ndarray, camera: CameraVector, *, height: int, pair_fx: float
+    block: TrackBlock, poses: np.ndarray, points: np.ndarray, camera: CameraVector, *, height: int
 ) -> Linearized:
     """Compute the residuals of a block and their derivatives, in single precision.
 
@@ -78,16 +78,15 @@ def linearize(
             common.
         camera: Parameters of the camera.
         height: Rows of the image.
-        pair_fx: Focal length by which depth was computed from the disparity of a stereo pair; 0 for a depth sensor.
     """
-    arguments = _arguments(block, poses, points, camera, pair_fx)
+    arguments = _arguments(block, poses, points, camera)
     residuals, jacobian = _linearized(*arguments, height=height)
     # Out of the compiled function tangents come first, as that is how they are computed.
     return Linearized(np.asarray(residuals, np.float64), np.moveaxis(np.asarray(jacobian, np.float64), 1, -1))
 
 
 def residuals_of(
-    block: TrackBlock, poses: np.ndarray, points: np.ndarray, camera: CameraVector, *, height: int, pair_fx: float
+    block: TrackBlock, poses: np.ndarray, points: np.ndarray, camera: CameraVector, *, height: int
 ) -> tuple[Float[np.ndarray, "f 3 p"], Float[np.ndarray, "f 2 p"]]:
     """Compute the residuals of a block alone, and the pixels at which its depth images show the points.
 
@@ -97,15 +96,14 @@ def residuals_of(
         points: See `linearize`.
         camera: See `linearize`.
         height: See `linearize`.
-        pair_fx: See `linearize`.
     """
-    residuals, depth_uv = _residuals(*_arguments(block, poses, points, camera, pair_fx), height=height)
+    residuals, depth_uv = _residuals(*_arguments(block, poses, points, camera), height=height)
     return np.asarray(residuals, np.float64), np.asarray(depth_uv, np.float64)
 
 
 def _arguments(
-    block: TrackBlock, poses: np.ndarray, points: np.ndarray, camera: CameraVector, pair_fx: float
-) -> tuple[_Frame, np.ndarray, np.ndarray, np.ndarray]:
+    block: TrackBlock, poses: np.ndarray, points: np.ndarray, camera: CameraVector
+) -> tuple[_Frame, np.ndarray, np.ndarray]:
     last = block.num_frames - 1
     around = np.clip(np.arange(block.num_frames)[:, None] + np.array([-1, 0, 1]), 0, last)
     frames = _Frame(
@@ -118,17 +116,17 @@ def _arguments(
         plane_uv=block.depth.uv,  # pyright: ignore[reportArgumentType]
         plane_sigma=block.depth.sigma,  # pyright: ignore[reportArgumentType]
     )
-    single = jax.tree.map(lambda array: np.asarray(array, np.float32), (frames, points, camera, pair_fx))
+    single = jax.tree.map(lambda array: np.asarray(array, np.float32), (frames, points, camera))
     return single
 
 
 @compiled(when="first use", static="height", options=FAST_COMPILE | SINGLE_THREAD)
 def _linearized(
-    frames: _Frame, points: Float[Array, "4 p"], camera: Array, pair_fx: Scalar, *, height: int
+    frames: _Frame, points: Float[Array, "4 p"], camera: Array, *, height: int
 ) -> tuple[Float[Array, "f 3 p"], Float[Array, "f t 3 p"]]:
     def of_frame(frame: _Frame) -> tuple[Float[Array, "3 p"], Float[Array, "t 3 p"]]:
         def moved(tangents: Float[Array, " t"]) -> Float[Array, "3 p"]:
-            return _of_frame(tangents, frame, points, camera, pair_fx, height)[0]
+            return _of_frame(tangents, frame, points, camera, height)[0]
 
         # A tangent of a point moves all points of the frame: a residual depends on its own point alone.
         basis = jnp.eye(NUM_TANGENTS, dtype=points.dtype)
@@ -140,10 +138,10 @@ def _linearized(
 
 @compiled(when="first use", static="height", options=FAST_COMPILE | SINGLE_THREAD)
 def _residuals(
-    frames: _Frame, points: Float[Array, "4 p"], camera: Array, pair_fx: Scalar, *, height: int
+    frames: _Frame, points: Float[Array, "4 p"], camera: Array, *, height: int
 ) -> tuple[Float[Array, "f 3 p"], Float[Array, "f 2 p"]]:
     still = jnp.zeros(NUM_TANGENTS, points.dtype)
-    return jax.lax.map(lambda frame: _of_frame(still, frame, points, camera, pair_fx, height), frames)
+    return jax.lax.map(lambda frame: _of_frame(still, frame, points, camera, height), frames)
 
 
 def _of_frame(
@@ -151,7 +149,6 @@ def _of_frame(
     frame: _Frame,
     points: Float[Array, "4 p"],
     camera: Array,
-    pair_fx: Scalar,
     height: int,
 ) -> tuple[Float[Array, "3 p"], Pixels]:
     """Residuals of one frame, and where its depth image shows the points, with everything moved by tangents."""
@@ -177,9 +174,7 @@ def _of_frame(
     depth_uv = project(intrinsics, X_depth)
     shift = depth_uv - frame.plane_uv
     measured = frame.plane[0] + jnp.sum(frame.plane[1:] * shift, axis=0)
-    # The disparity of a pair is fx / z in units of its baseline, whatever focal length made a depth of it before.
-    ratio = jnp.where(pair_fx > 0, intrinsics.fx / jnp.where(pair_fx > 0, pair_fx, 1), 1)
-    expected = ratio / jnp.maximum(X_depth[2] + offset_m, _MIN_DEPTH_M)
+    expected = 1 / jnp.maximum(X_depth[2] + offset_m, _MIN_DEPTH_M)
     return jnp.concatenate([pixels, ((expected - measured) / frame.plane_sigma + shared)[None, :]]), depth_uv
 
 

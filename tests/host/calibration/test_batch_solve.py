@@ -24,7 +24,7 @@ from jaxslam.geometry.se3 import retract
 TRUTH = true_vector()
 START = TRUTH * np.array([1.05, 1.05, *15 * [1.0]])
 ALL = group_mask(GROUPS)
-SETTINGS = {"height": CAMERA.height, "pair_fx": 0.0}
+SETTINGS = {"height": CAMERA.height}
 
 
 def problem(start: np.ndarray = START, truth: np.ndarray = TRUTH, seed: int = 0) -> BatchProblem:

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,10 +10,17 @@ from miscalibrated_room import STATED, TRUTH, MiscalibratedRoom
 
 from jaxslam import Camera
 from jaxslam.calibration import Verdict, calibrate, open_with_start
+from jaxslam.errors import CameraError
 from jaxslam.visualization.calibration_plot import plot_calibration
 
 _DATA = os.environ.get("JAXSLAM_DATA")
 _EXCERPT = Path(_DATA or "") / "tum" / "rgbd_dataset_freiburg1_rpy_excerpt"
+
+
+def test_stereo_pairs_are_refused() -> None:
+    pair = replace(STATED, depth_scale_per_m=None, baseline_m=0.1)
+    with pytest.raises(CameraError, match="expected a camera with depth images, got a stereo pair"):
+        calibrate(MiscalibratedRoom(seed=0, truth=TRUTH, stated=pair))
 
 
 @pytest.mark.slow
