@@ -126,7 +126,8 @@ def _print(found: "Calibration", name: str) -> None:
     console.print(table)
     console.print(
         f"Held-out frames cost {100 * found.held_out_gain:.1f} % less, in {found.num_blocks} parts of the recording"
-        f" with {found.num_frames} frames, tracked {found.rounds} times."
+        f" with {found.num_frames} frames, tracked {found.rounds} times. Standard deviations (sigma) are lower bounds:"
+        " errors that all of its parts share do not show in them."
     )
 
 

@@ -1,5 +1,7 @@
 """ORB features: where they are, how they are spread, and what is known of their place."""
 
+import inspect
+
 import cv2
 import equinox as eqx
 import jax
@@ -171,7 +173,9 @@ def test_rolling_shutter_is_removed():
 
 
 def test_compiles_once_however_many_features_there_are(monkeypatch):
-    monkeypatch.setattr(module, "_ideal", jax.jit(eqx.debug.assert_max_traces(module._ideal, max_traces=1)))
+    monkeypatch.setattr(
+        module, "_ideal", jax.jit(eqx.debug.assert_max_traces(inspect.unwrap(module._ideal), max_traces=1))
+    )
     sensor = sensor_model(Camera.load("tum_fr1"), TrackConfig())
     depth = np.ones((HEIGHT, WIDTH), np.float32)
     counts = []

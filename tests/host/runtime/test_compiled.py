@@ -18,8 +18,10 @@ ELSEWHERE = {
     "runtime/trace_cache.py",
     "benchmark/timing.py",
     "benchmark/compiling/parts.py",
+    "learning/fit.py",
 }
-"""Modules that may call `jax.jit`: what the decorator is made of, and benchmarks that compile a function anew."""
+"""Modules that may call `jax.jit`: what the decorator is made of, benchmarks that compile a function anew, and `fit`,
+whose program holds the loss of its caller."""
 
 
 @compiled(when="first use", static="times")
