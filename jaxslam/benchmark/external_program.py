@@ -40,7 +40,7 @@ class Program:
 
 @dataclass(frozen=True)
 class Ended:
-    """How a program ended, and what it took.
+    """Exit status, time and memory of a program that has ended.
 
     Attributes:
         exit_code: Exit status, the negative number of the signal if one ended it; `None` if the time limit did.

@@ -29,7 +29,7 @@ _SHORT = 0.05
 
 @dataclass(frozen=True, eq=False)
 class BatchProblem:
-    """What is known before the solve.
+    """Tracks, start and assumptions of a solve.
 
     Attributes:
         blocks: The blocks of frames, all of one size.

@@ -26,6 +26,7 @@ from jaxslam.calibration.parameters import (
     CameraVector,
     camera_of,
     group_mask,
+    index_of,
     prior_sigmas,
     vector_of,
 )
@@ -55,7 +56,8 @@ _TOLD = 0.5
 """Largest standard deviation of a parameter that a recording tells, in those assumed beforehand."""
 _SURE_OF_SCALE = 2.0
 """Standard deviations by which a scale must differ from 1."""
-_MAX_READOUT_S, _MAX_OFFSET_M, _MAX_DELAY_S = 0.1, 1.0, 0.5
+_LIMITS = {"depth_offset_m": (-1.0, 1.0), "depth_delay_s": (-0.5, 0.5), "readout_s": (0.0, 0.1)}
+"""Smallest and largest values that a camera file may hold."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +192,7 @@ def _gated(tracked: _Tracked, start: Camera, rounds: int, scale: Scale | None, o
     gate_result = gate(problem, before, fitted, told, on_step)
     accepted, impossible = gate_result.accepted, ()
     solution = _fit_accepted(problem, fitted, before, accepted)
-    if READOUT in accepted and solution.camera[11] < 0:
+    if READOUT in accepted and solution.camera[index_of("readout_s")] < 0:
         accepted, impossible = tuple(group for group in accepted if group != READOUT), (READOUT,)
         solution = _fit_accepted(problem, fitted, before, accepted)
     sigmas = standard_deviations(problem, solution, group_mask(accepted))
@@ -274,9 +276,8 @@ def _possible(vector: CameraVector, start: Camera) -> Camera:
     size = np.array([start.width, start.height])
     limited[:2] = np.clip(limited[:2], size / 10, size * 20)
     limited[2:4] = np.clip(limited[2:4], 0.05 * size, 0.95 * size)
-    limited[9] = np.clip(limited[9], -_MAX_OFFSET_M, _MAX_OFFSET_M)
-    limited[10] = np.clip(limited[10], -_MAX_DELAY_S, _MAX_DELAY_S)
-    limited[11] = np.clip(limited[11], 0.0, _MAX_READOUT_S)
+    for name, (least, most) in _LIMITS.items():
+        limited[index_of(name)] = np.clip(limited[index_of(name)], least, most)
     return camera_of(limited, start)
 
 

@@ -25,7 +25,7 @@ _OFFSETS = np.stack(np.meshgrid(*2 * [np.arange(-_REACH, _REACH + 1)])).reshape(
 
 
 class DepthSettings(NamedTuple):
-    """What is known of a depth sensor.
+    """Noise and range of a depth sensor.
 
     Attributes:
         noise: Standard deviation of its depth.

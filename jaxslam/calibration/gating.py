@@ -1,4 +1,4 @@
-"""Which parameters may change: those with which frames that were not fitted to are explained better."""
+"""Accept the parameters with which frames that were not fitted to are explained better."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -34,7 +34,7 @@ class HeldOut(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Gate:
-    """What held-out frames say.
+    """Accepted groups of parameters, and the costs of held-out frames.
 
     Attributes:
         accepted: Groups of parameters that may change.

@@ -65,6 +65,11 @@ The extrinsics lead from the color camera to the depth camera: `X_depth = R (X_c
 optical axis is the same as a depth offset, and left to that."""
 
 
+def index_of(name: str) -> int:
+    """Return the place of a parameter in `PARAMETERS` and in vectors."""
+    return [parameter.name for parameter in PARAMETERS].index(name)
+
+
 def group_mask(groups: tuple[str, ...]) -> np.ndarray:
     """Return which of `PARAMETERS` belong to some groups, `(q,)` bool."""
     return np.array([parameter.group in groups for parameter in PARAMETERS])
@@ -88,12 +93,7 @@ def camera_of(vector: CameraVector, start: Camera) -> Camera:
     Raises:
         CameraError: If the parameters are impossible.
     """
-    values = vector.tolist()
-    return replace(
-        start,
-        **dict(zip(("fx", "fy", "cx", "cy"), values[:4], strict=True)),
-        distortion=tuple(values[4:9]),
-        depth_offset_m=values[9],
-        depth_delay_s=values[10],
-        readout_s=values[11],
-    )
+    values = {parameter.name: value for parameter, value in zip(PARAMETERS, vector.tolist(), strict=True)}
+    fields = ("fx", "fy", "cx", "cy", "depth_offset_m", "depth_delay_s", "readout_s")
+    lens = tuple(values[name] for name in ("k1", "k2", "p1", "p2", "k3"))
+    return replace(start, **{name: values[name] for name in fields}, distortion=lens)

@@ -12,7 +12,7 @@ from jaxslam.sensors.camera import Camera
 
 
 class Verdict(Enum):
-    """What became of a parameter."""
+    """Outcome of a parameter."""
 
     ACCEPTED = "accepted"
     """Held-out frames are explained better with it."""

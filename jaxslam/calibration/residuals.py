@@ -1,4 +1,4 @@
-"""What a camera with given parameters should see of tracked points, beside what it sees, and all derivatives.
+"""Residuals of tracked points for given parameters of the camera, and all derivatives.
 
 A row of a rolling shutter, and a depth image of another time, are seen from where the camera is then: on the parabola
 through the poses of the frame and of its neighbors.

@@ -33,7 +33,7 @@ _MOST_POINTS, _FEWEST_POINTS = 384, 24
 
 
 class _Recorded(NamedTuple):
-    """What is kept of a frame. `n` points; those of the frame before are continued where `track` is the same.
+    """The `n` points of a frame; those of the frame before are continued where `track` is the same.
 
     Attributes:
         timestamp_ns: Its time.
@@ -78,7 +78,7 @@ class TrackRecorder:
 
     @property
     def depth(self) -> DepthSettings:
-        """What is known of the depth sensor."""
+        """Noise and range of the depth sensor."""
         limits = min_valid_depth(self.camera, self.config), max_valid_depth(self.camera, self.config)
         return DepthSettings.of(depth_noise(self.camera, self.config), limits, self.camera.width)
 

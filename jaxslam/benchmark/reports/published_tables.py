@@ -78,7 +78,7 @@ def published_table(
 
 
 def rank_table(suite: Suite, rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
-    """How each label stands against published ATE over all sequences that may be compared; headings first."""
+    """Rank each label by ATE beside published ones, over all sequences that may be compared; headings first."""
     lines = [["against published ATE", "sequences", "ratio to the best", "mean rank", "of systems"]]
     for label in dict.fromkeys(row["label"] for row in rows):
         found = [

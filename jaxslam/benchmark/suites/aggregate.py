@@ -76,7 +76,7 @@ _OF_PROTOCOLS = (
     Column("RPE S.D., deg/s", "rpe_rot_std_deg_per_s", 3),
     Column("mean, ms", "track_ms_mean", 1),
 )
-"""What tables of papers show besides."""
+"""More figures of tables of papers."""
 COVERAGE = ("images", "tracked_of_all_percent", "matched_percent", "span_percent")
 """What else decides whether figures may be compared with published ones: images of the whole recording, and shares of
 the frames, dropped ones too, that were tracked, and that were matched with ground truth; and of its time."""

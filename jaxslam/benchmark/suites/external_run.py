@@ -27,7 +27,7 @@ from jaxslam.trajectory.trajectory import write_tum as write_trajectory
 from jaxslam.visualization.plots import plot_trajectory
 
 PRINTED, ERRORS = "program_output.txt", "program_errors.txt"
-"""What a program wrote to its standard output and standard error."""
+"""Files of the standard output and the standard error of a program."""
 _ESTIMATE, _CALIBRATION, _RECORDING = "program_trajectory.txt", "calibration.yaml", "recording"
 _OF_AN_EARLIER_RUN = (PRINTED, ERRORS, _ESTIMATE, "trajectory.txt", "errors.csv", "plot.png")
 _MAX_GAP_S = 0.02
@@ -42,7 +42,7 @@ _UNKNOWN = (
 
 @dataclass
 class ExternalRun:
-    """What became of a run of another system.
+    """Outcome of a run of another system.
 
     Attributes:
         problem: Why there is no trajectory that can be judged; `None` if there is one.

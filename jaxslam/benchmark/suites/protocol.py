@@ -14,7 +14,7 @@ from jaxslam.io.yaml_files import read_mapping
 
 @dataclass(frozen=True)
 class Protocol(ValidatedConfig):
-    """How often a sequence is run, what is taken of the runs, and which figures are shown.
+    """Number of runs of a sequence, statistic over them, and figures of a table.
 
     Attributes:
         about: Description in one line, with the table of the paper.

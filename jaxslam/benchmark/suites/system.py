@@ -62,7 +62,7 @@ class System(ValidatedConfig):
 
     @property
     def chooses_part(self) -> bool:
-        """Whether the command is told which part of a recording to track."""
+        """True if the command is told which part of a recording to track."""
         return self._asks_for(_PART)
 
     def program(self, values: Mapping[str, str]) -> Program:

@@ -63,7 +63,7 @@ def lacking_trajectories(system: str, folder: Path, clips: Sequence[Clip]) -> di
 
 
 def is_of_vslamlab(file: Path) -> bool:
-    """Whether a trajectory has the name that VSLAM-LAB gives: its poses are those of keyframes."""
+    """Tell by its name whether a trajectory is one of VSLAM-LAB, whose poses are those of keyframes."""
     return _VSLAMLAB.fullmatch(file.name) is not None
 
 
