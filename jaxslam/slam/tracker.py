@@ -26,7 +26,7 @@ from jaxslam.slam.outside_motion import MeasuredMotion
 from jaxslam.tracking.cue_registry import with_cue_params, with_cues
 from jaxslam.tracking.from_config import track_params, track_plan, with_dense_keyframes
 from jaxslam.tracking.initial_state import init_state
-from jaxslam.tracking.state import TrackOutput, TrackParams, TrackPhase, TrackPlan, TrackState
+from jaxslam.tracking.state import TrackOutput, TrackParams, TrackPhase, TrackPlan, TrackState, TrackStatus
 from jaxslam.tracking.step import FlowResult, follow_points, predicted_pose, track_followed
 
 _PATIENT_S = 0.5
@@ -92,7 +92,17 @@ def _moved(T_world_last: SE3, motion: _KnownMotion, own: SE3) -> SE3:
 def _track_followed(
     state: TrackState, frame: FrameArrays, followed: FlowResult, params: TrackParams, plan: TrackPlan
 ) -> tuple[TrackState, TrackOutput]:
-    return track_followed(state, frame, followed, params, plan)
+    """Estimate the pose of a frame and update the state but for its pyramid, which neither state has.
+
+    The caller chooses that of the frame or the one before: the program would copy one of them, 0.1 ms.
+    """
+    state, output = track_followed(state._replace(pyramid=followed.pyramid), frame, followed, params, plan)
+    return _without_pyramid(state), output
+
+
+def _without_pyramid(state: TrackState) -> TrackState:
+    nothing: Any = None
+    return state._replace(pyramid=nothing)
 
 
 class KeyframeDemand(Enum):
@@ -186,11 +196,11 @@ class Tracker:
         # In two threads: XLA compiles one while Python traces the other, 1.2 s less from an empty cache. The step
         # takes longer: it is lowered before, as Python traces one program at a time.
         with collector_paused(), ThreadPoolExecutor(1, thread_name_prefix="jaxslam-compile-flow") as beside:
-            lower(_track_followed, state, frame, followed, self.params, self.plan)
+            lower(_track_followed, _without_pyramid(state), frame, followed, self.params, self.plan)
             nothing = _known_motion(None), _known_motion(None), _NO_INFORMATION
             flow = beside.submit(_follow_points, other, frame, *nothing, self.params, self.plan)
             beside.submit(gc.collect)  # while XLA compiles the step; the second frame would wait for it, 0.2 s
-            jax.block_until_ready(_track_followed(state, frame, followed, self.params, self.plan))
+            jax.block_until_ready(_track_followed(_without_pyramid(state), frame, followed, self.params, self.plan))
             jax.block_until_ready(flow.result())
 
     def follow(
@@ -243,5 +253,9 @@ class Tracker:
         if wishes.demand is not KeyframeDemand.NOW:
             views, changed = np.float32(wishes.num_views), np.float32(wishes.has_changed)
             params = params._replace(map_views=views, map_changed=changed)
-        self.state, output = _track_followed(self.state, frame, followed, params, self.plan)
+        pyramid = self.state.pyramid
+        state, output = _track_followed(_without_pyramid(self.state), frame, followed, params, self.plan)
+        # A lost frame is no image to follow points from.
+        lost = int(output.status) == TrackStatus.LOST
+        self.state = state._replace(pyramid=pyramid if lost else followed.pyramid)
         return jax.tree.map(np.asarray, output)  # as `device_get`, in a tenth of its time
