@@ -23,17 +23,17 @@ def moving_points(verdicts: Sequence[CueResult]) -> Bool[np.ndarray, " n"]:
 
 
 def mask_around(
-    uv: Float[np.ndarray, "2 n"], depth: Float[np.ndarray, "h w"], reach_px: int
-) -> Bool[np.ndarray, "h w"]:
-    """Return the pixels around some points that have a similar depth, or whose depth is missing.
+    mask: Bool[np.ndarray, "h w"], uv: Float[np.ndarray, "2 n"], depth: Float[np.ndarray, "h w"], reach_px: int
+) -> None:
+    """Mask the pixels around some points that have a similar depth, or whose depth is missing.
 
     Args:
+        mask: `(h, w)` mask in which they are set, contiguous.
         uv: Pixel positions; those outside the image are ignored.
         depth: Depth image in meters; 0 or NaN where missing.
         reach_px: Half the side of the square around each point, in pixels.
     """
     height, width = depth.shape
-    mask = np.zeros(depth.shape, bool)
     at = np.round(uv[:, np.isfinite(uv).all(axis=0)]).astype(np.int32)
     u, v = at[:, (at[0] >= 0) & (at[1] >= 0) & (at[0] < width) & (at[1] < height)]
     steps = np.arange(-reach_px, reach_px + 1, dtype=np.int32)
@@ -44,4 +44,3 @@ def mask_around(
     around, center = depth.reshape(-1)[pixels], depth[v, u][:, None, None]
     alike = np.abs(around - center) <= _DEPTH_STEP * center
     mask.reshape(-1)[pixels[alike | ~(center > 0) | ~(around > 0)]] = True
-    return mask

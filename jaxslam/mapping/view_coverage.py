@@ -1,5 +1,7 @@
 """What keyframes of the map show of what the camera sees."""
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -17,6 +19,20 @@ _MAX_TURN = 0.7
 _SCALES = (0.5, 2.0)
 """Bounds on the ratio of the earlier to the current distance of a point."""
 _MARGIN_PX = 8
+
+
+class _Samples(NamedTuple):
+    """Samples of the keyframes near a camera: the same from frame to frame, while map and keyframes are.
+
+    Attributes:
+        near: `(k,)` mask of the keyframes of the map that they belong to.
+        X_world: `(3, n)` positions of the samples, meters.
+        seen_from: `(3, n)` position from which each was seen, meters.
+    """
+
+    near: Bool[np.ndarray, " k"]
+    X_world: Float[np.ndarray, "3 n"]
+    seen_from: Float[np.ndarray, "3 n"]
 
 
 class ViewCoverage:
@@ -37,6 +53,7 @@ class ViewCoverage:
         self._ids = np.zeros(0, np.int64)
         self._X_cam = np.zeros((0, 3, _NUM_SAMPLES))
         self._reach_m = np.zeros(0)
+        self._samples: _Samples | None = None
 
     def num_views(self, slam_map: Map, T_world_cam: Pose, submap: int) -> int:
         """Count the keyframes of a map that show the view of a camera.
@@ -49,15 +66,21 @@ class ViewCoverage:
         if slam_map is not self._map:
             self._take(slam_map)
         apart_m2 = _squared_norm((slam_map.T_world_cam[:, 4:] - T_world_cam[4:]).T)
-        near = np.flatnonzero((slam_map.submap == submap) & (apart_m2 < np.square(self._reach_m)))
-        if not len(near):
+        near = (slam_map.submap == submap) & (apart_m2 < np.square(self._reach_m))
+        if not near.any():
             return 0
+        if self._samples is None or not np.array_equal(near, self._samples.near):
+            self._samples = self._samples_of(slam_map, near)
+        X_world, then = self._samples.X_world, self._samples.seen_from
+        seen = in_view(slam_map.camera, T_world_cam, X_world) & seen_alike(X_world, then, T_world_cam[4:, None])
+        return int((seen.reshape(-1, _NUM_SAMPLES).mean(axis=1) >= self._at_least).sum())
+
+    def _samples_of(self, slam_map: Map, near: Bool[np.ndarray, " k"]) -> "_Samples":
+        """Return the samples of some keyframes in the world."""
         T_world_keyframe = slam_map.T_world_cam[near]
         X_world = matrices(T_world_keyframe[:, :4]) @ self._X_cam[near] + T_world_keyframe[:, 4:, None]
-        X_world = X_world.transpose(1, 0, 2).reshape(3, -1)
-        then = T_world_keyframe[:, 4:].T.repeat(_NUM_SAMPLES, axis=1)
-        seen = in_view(slam_map.camera, T_world_cam, X_world) & seen_alike(X_world, then, T_world_cam[4:, None])
-        return int((seen.reshape(len(near), _NUM_SAMPLES).mean(axis=1) >= self._at_least).sum())
+        seen_from = T_world_keyframe[:, 4:].T.repeat(_NUM_SAMPLES, axis=1)
+        return _Samples(near, X_world.transpose(1, 0, 2).reshape(3, -1), seen_from)
 
     def _take(self, slam_map: Map) -> None:
         """Sample the keyframes of a map that are new."""
@@ -74,6 +97,7 @@ class ViewCoverage:
                 X_cam[new] = to_local(slam_map.T_world_cam[new], X_world)
                 reach_m[new] = np.median(np.linalg.norm(X_cam[new], axis=0))
         self._map, self._ids, self._X_cam, self._reach_m = slam_map, slam_map.ids, X_cam, reach_m
+        self._samples = None
 
 
 def in_view(camera: Camera, T_world_cam: Pose, X_world: Float[np.ndarray, "3 n"]) -> Bool[np.ndarray, " n"]:

@@ -118,12 +118,13 @@ class MaskStage:
             mask = mask._replace(mask=np.array(arrays.ignore))
         moving = None if output.moving is None else np.asarray(output.moving)
         points = moving_points(output.cue_results)
-        if self._reach_px and points.any():
-            around = mask_around(np.asarray(flow.uv)[:, points], np.asarray(arrays.depth), self._reach_px)
-            moving = around if moving is None else moving | around
-        if moving is None or not moving.any():
+        around_points = self._reach_px > 0 and points.any()
+        if not around_points and (moving is None or not moving.any()):
             return arrays, mask
-        mask = mask._replace(mask=mask.mask | moving, source=mask.source or MaskSource.CUES)
+        both = mask.mask.copy() if moving is None else mask.mask | moving
+        if around_points:
+            mask_around(both, np.asarray(flow.uv)[:, points], np.asarray(arrays.depth), self._reach_px)
+        mask = mask._replace(mask=both, source=mask.source or MaskSource.CUES)
         return self._memory.ignoring(arrays, mask.mask), mask
 
     def frame_tracked(
