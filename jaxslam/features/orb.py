@@ -7,7 +7,6 @@ import cv2
 import jax
 import numpy as np
 from jaxslam_kernels.camera import to_pixels
-from jaxslam_kernels.depth.sampling import sample_depth, valid_depth
 from jaxslam_kernels.image.pyramid import build_pyramid
 from jaxslam_kernels.types import Pixels, Weights
 from jaxtyping import Array, Bool, Float, Float32, Int64, Integer, UInt8
@@ -16,7 +15,7 @@ from jaxslam.config.schema import MappingConfig
 from jaxslam.runtime.compiled import compiled
 from jaxslam.runtime.padding import padded
 from jaxslam.sensors.frame_arrays import FrameArrays
-from jaxslam.sensors.measurement import RIGHT_LEVELS, PreparedFrame, match_depth, pixel_rays
+from jaxslam.sensors.measurement import RIGHT_LEVELS, PreparedFrame, believed_depth, match_depth, pixel_rays
 from jaxslam.sensors.sensor_model import SensorModel
 
 DESCRIPTOR_BYTES = 32
@@ -242,11 +241,10 @@ def _no_patches() -> Patches:
 def _ideal(uv_raw: Pixels, twist: Float[Array, "6"], frame: FrameArrays, sensor: SensorModel) -> tuple[Pixels, Weights]:
     """Convert pixels to those of the ideal camera and read depth; of a stereo pair by matching."""
     sensor = sensor.for_readout(frame.readout_sign)
-    believed = valid_depth(frame.depth, sensor.min_depth_m, sensor.max_depth_m)
-    rough, matched = sample_depth(believed, uv_raw, noise=sensor.depth_step_m()), None
+    rough, matched = believed_depth(frame.depth, uv_raw, sensor), None
     if frame.right is not None:
         pyramid = build_pyramid(frame.image, num_levels=RIGHT_LEVELS, dtype=uv_raw.dtype)
-        view = PreparedFrame(frame, pyramid, believed, frame.dt_s).with_right()
+        view = PreparedFrame(frame, pyramid, frame.dt_s).with_right()
         matched = match_depth(view, uv_raw, rough, rough > 0, sensor, known_point=False)
-    seen = pixel_rays(uv_raw, sensor, matched).measured(rough, twist, believed, frame.depth_delay_s, sensor)
+    seen = pixel_rays(uv_raw, sensor, matched).measured(rough, twist, frame.depth, frame.depth_delay_s, sensor)
     return to_pixels(sensor.intrinsics, seen.xy), seen.depth

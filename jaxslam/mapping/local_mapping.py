@@ -14,7 +14,6 @@ import cv2
 import jax
 import numpy as np
 from jaxslam_kernels.camera import to_pixels
-from jaxslam_kernels.depth.sampling import valid_depth
 from jaxslam_kernels.types import Pixels, Weights
 from jaxtyping import Array, Float, Float32, Int
 
@@ -375,8 +374,7 @@ def _ideal(
 ) -> tuple[Pixels, Weights]:
     """Convert pixels of the distorted image to pixels of the ideal camera, and measure their depth."""
     sensor = sensor.for_readout(frame.readout_sign)
-    believed = valid_depth(frame.depth, sensor.min_depth_m, sensor.max_depth_m)
-    seen = pixel_rays(uv_raw, sensor).measured(expected_depth, twist, believed, frame.depth_delay_s, sensor)
+    seen = pixel_rays(uv_raw, sensor).measured(expected_depth, twist, frame.depth, frame.depth_delay_s, sensor)
     return to_pixels(sensor.intrinsics, seen.xy), seen.depth
 
 

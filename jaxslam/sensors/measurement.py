@@ -37,20 +37,23 @@ class PreparedFrame(NamedTuple):
     Attributes:
         frame: Arrays of the frame.
         pyramid: Pyramid of its image.
-        depth: Its depth image, 0 where missing or not to be believed.
         elapsed_s: Seconds since the last good frame.
         right: Finest levels of the right image of a pair; `None` where depth is measured.
     """
 
     frame: FrameArrays
     pyramid: Pyramid
-    depth: DepthImage
     elapsed_s: Scalar
     right: Pyramid | None = None
 
-    def has_depth(self) -> Flag:
-        """Return whether the frame has depth at all; a sensor may have none for some frames."""
-        return jnp.any(self.depth[::_SPARSE_PX, ::_SPARSE_PX] > 0)
+    def has_depth(self, sensor: SensorModel) -> Flag:
+        """Return whether the frame has depth at all that `sensor` believes; it may have none for some frames."""
+        some = self.frame.depth[::_SPARSE_PX, ::_SPARSE_PX]
+        return jnp.any(valid_depth(some, sensor.min_depth_m, sensor.max_depth_m) > 0)
+
+    def depth_at(self, uv: Pixels, sensor: SensorModel, *, reach: int = 1, max_step: float = 0.05) -> Weights:
+        """Return the `(n,)` depth at pixels, meters; 0 where none is to be believed. See `believed_depth`."""
+        return believed_depth(self.frame.depth, uv, sensor, reach=reach, max_step=max_step)
 
     def with_right(self) -> "PreparedFrame":
         """The same frame with the right image of its pair, if it is one."""
@@ -146,9 +149,9 @@ class PixelRays(NamedTuple):
         Args:
             expected_depth: `(n,)` approximate depths, meters, which scale the image motion that translation causes.
             twist: `(6,)` velocity of the camera in its own axes, m/s, then rad/s.
-            depth: `(h, w)` depth image, meters; 0 where missing.
+            depth: `(h, w)` depth image as measured, meters; 0 or NaN where missing.
             depth_delay_s: Seconds from the time of the image to that of the depth.
-            sensor: Camera with its depth noise.
+            sensor: Camera with its depth noise, and the depths to be believed.
             reach: Reach of `sample_depth`, pixels, static.
         """
         velocity = image_velocity(self.xy, expected_depth, twist)
@@ -157,7 +160,7 @@ class PixelRays(NamedTuple):
         if measured is None:
             focal = jnp.stack([sensor.intrinsics.fx, sensor.intrinsics.fy])[:, None]
             there = self.uv + focal * velocity * depth_delay_s
-            measured = sample_depth(depth, there, reach=reach, noise=sensor.depth_step_m())
+            measured = believed_depth(depth, there, sensor, reach=reach)
         return Measurements(at_once, measured, depth_sigma(measured, sensor))
 
     def from_pose(
@@ -169,7 +172,23 @@ class PixelRays(NamedTuple):
         by 13 to 18 % with the presets `ngd`, `usd`, `rts` and `static`: its depth comes later than its images.
         """
         expected = _depth_from(X_world, pose, sensor)
-        return self.measured(expected, twist, view.depth, view.frame.depth_delay_s, sensor)
+        return self.measured(expected, twist, view.frame.depth, view.frame.depth_delay_s, sensor)
+
+
+def believed_depth(
+    depth: DepthImage, uv: Pixels, sensor: SensorModel, *, reach: int = 1, max_step: float = 0.05
+) -> Weights:
+    """Return the `(n,)` depth at pixels, meters, as `sample_depth`; 0 where there is none that a sensor believes.
+
+    Args:
+        depth: `(h, w)` depth image as measured, meters; 0 or NaN where missing.
+        uv: `(2, n)` pixel coordinates.
+        sensor: Camera with its depth noise, and the depths to be believed.
+        reach: Reach of `sample_depth`, pixels, static.
+        max_step: Largest difference of depth around a pixel, as a share of its depth; that of noise comes on top.
+    """
+    limits = {"nearest": sensor.min_depth_m, "farthest": sensor.max_depth_m}
+    return sample_depth(depth, uv, reach=reach, max_step=max_step, noise=sensor.depth_step_m(), **limits)
 
 
 def pixel_rays(uv: Pixels, sensor: SensorModel, matched: Weights | None = None) -> PixelRays:
@@ -212,7 +231,7 @@ def match_depth(
     if not uv.shape[1]:  # a plan that looks nothing up
         return jnp.zeros(0, expected_depth.dtype)
     focal_baseline = sensor.intrinsics.fx * sensor.baseline_m
-    rough = jnp.where(expected_depth > 0, expected_depth, sample_depth(view.depth, uv, reach=0))
+    rough = jnp.where(expected_depth > 0, expected_depth, view.depth_at(uv, sensor, reach=0))
     known = mask & (rough > 0)
     left = Pyramid(view.pyramid.levels[: len(view.right.levels)], view.pyramid.border)
     guess = focal_baseline / jnp.where(known, rough, 1)
@@ -296,7 +315,7 @@ def surface_depth(
     """
     rays = pixel_rays(uv, sensor)
     measured = rays.measured(expected_depth, twist, depth, depth_delay_s, sensor, reach=_SURFACE_PX).depth
-    return measured, (measured > sensor.min_depth_m) & (measured < sensor.max_depth_m)
+    return measured, measured > 0
 
 
 def depth_sigma(depth: Weights, sensor: SensorModel) -> Weights:

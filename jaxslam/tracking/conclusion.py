@@ -131,7 +131,7 @@ def _ending(step: StepContext, estimate: FrameEstimate, motion: _Motion) -> _End
         started=motion.start,
         since_keyframe_s=state.since_keyframe_s + jnp.maximum(step.view.frame.dt_s, 0),
         movable=_movable_share(step),
-        has_depth=step.view.has_depth(),
+        has_depth=step.has_depth(),
     )
     points, num_corners = _with_new_points(step, estimate, motion, candidate)
     num_started = jnp.sum(points.has_position(), dtype=state.twist.dtype)

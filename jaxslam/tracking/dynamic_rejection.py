@@ -146,10 +146,10 @@ class DynamicRejection(NamedTuple):
         if self.moving is None:
             return view
         watched = jnp.sum(self._in_regions(monitored), axis=1) >= _ENOUGH_MONITORED
-        height, width = view.depth.shape
+        height, width = view.frame.depth.shape
         if self.regions is not None and plan.regions is not None:
             num = self.regions.centers.shape[1]
-            weight = 1.0 - watched[:num].astype(view.depth.dtype)
+            weight = 1.0 - watched[:num].astype(view.frame.depth.dtype)
             view = view.without(moving_pixels(self.regions, weight, height, width, plan.regions))
             watched = watched[num:]
         return view if self.motion is None else view.without(self._in_objects(watched & ~self.motion.at_rest, view))
@@ -256,7 +256,7 @@ def _with_regions(
         return DynamicRejection(cue_results, regions, RegionMemory(regions.centers, before))
     weight = lasting_weights(regions, of_regions, before, agreeing, plan.regions)
     remembered = of_points((weight >= 0.5).astype(weight.dtype), regions, jnp.ones_like(weight[0]))
-    height, width = view.depth.shape
+    height, width = view.frame.depth.shape
     now = region_weights(of_regions)
     moving = moving_pixels(regions, jnp.minimum(weight, now), height, width, plan.regions)
     ignored = None

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxlie import SE3
-from jaxslam_kernels.robust import weighted_median
+from jaxslam_kernels.robust import masked_median
 from jaxslam_kernels.scene_flow import flow_length
 from jaxslam_kernels.se3 import to_camera
 from jaxslam_kernels.types import Code, Flag, Mask, Scalar
@@ -107,4 +107,4 @@ def _has_moved(keyframes: KeyframeRing, frame: KeyframeCandidate, params: TrackP
     last = SE3(keyframes.T_world_cam[(keyframes.made - 1) % plan.num_keyframes])
     then, now = (to_camera(pose, frame.points.X_world) for pose in (last, frame.T_world_cam))
     parts = flow_length(now - then) / jnp.maximum(now[2], params.sensor.min_depth_m)
-    return weighted_median(parts, frame.tracked.astype(parts.dtype)) >= params.keyframe_motion
+    return masked_median(parts, frame.tracked) >= params.keyframe_motion

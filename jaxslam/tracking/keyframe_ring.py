@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxlie import SE3
 from jaxslam_kernels.camera import Intrinsics
-from jaxslam_kernels.depth.sampling import sample_depth
 from jaxslam_kernels.flow.patch_align import align_patches
 from jaxslam_kernels.se3 import rotation_matrix, to_camera
 from jaxslam_kernels.types import Mask, Pixels, Points, Weights
@@ -69,7 +68,7 @@ def align_keyframe_points(step: StepContext, T_world_cam: SE3, twist: Float[Arra
     index, real = _chosen(visible, shown, plan)
     take = lambda array: jnp.take(array, index, axis=-1, mode="clip")
     guess, X_there = take(predicted), take(X_cam)
-    seen_depth = sample_depth(view.depth, jax.lax.stop_gradient(guess), reach=0)
+    seen_depth = view.depth_at(jax.lax.stop_gradient(guess), params.sensor, reach=0)
     covered = (seen_depth > 0) & (jnp.abs(seen_depth - X_there[2]) > _COVERED * X_there[2])
     # 3. Alignment of their patches.
     source = index // n
@@ -95,11 +94,13 @@ def _chosen(visible: Bool[Array, "k n"], shown: Int[Array, " k"], plan: TrackPla
     """Choose visible points of the keyframes that show most; return their indices, and which of them are points."""
     n = visible.shape[1]
     _, sources = jax.lax.top_k(shown, plan.num_sources)
-    # The first visible points of each: `jnp.nonzero` of a given size is a fifth of a hundred of the step's program.
-    from_last = jnp.where(visible[sources], n - jnp.arange(n, dtype=sources.dtype)[None], 0)
-    from_last, _ = jax.lax.top_k(from_last, min(plan.points_per_source, n))
-    index = sources[:, None] * n + jnp.minimum(n - from_last, n - 1)
-    return index.reshape(-1), (from_last > 0).reshape(-1)
+    # The first visible points of each, by counting: `top_k` takes 59 us for two times 512 points, this 7.
+    place = jnp.where(visible[sources], jnp.cumsum(visible[sources], axis=1, dtype=jnp.int32) - 1, n)
+    point = jnp.full((plan.num_sources, min(plan.points_per_source, n)), n, jnp.int32)
+    row = jnp.arange(plan.num_sources, dtype=jnp.int32)[:, None]
+    point = point.at[row, place].set(jnp.arange(n, dtype=jnp.int32)[None], mode="drop")
+    index = sources[:, None] * n + jnp.minimum(point, n - 1)
+    return index.reshape(-1), (point < n).reshape(-1)
 
 
 def _no_matches(overlap: Float[Array, " k"], keyframes: KeyframeRing) -> KeyframeMatches:
@@ -118,8 +119,9 @@ def _similar_views(keyframes: KeyframeRing, T_world_cam: SE3) -> Bool[Array, "k 
     """Tell which points are seen from about the same direction and distance as in their keyframe."""
     then = keyframes.X_world - keyframes.T_world_cam[:, 4:, None]
     now = keyframes.X_world - T_world_cam.translation()[None, :, None]
-    far_then, far_now = jnp.sum(jnp.square(then), axis=1), jnp.sum(jnp.square(now), axis=1)
-    along = jnp.sum(then * now, axis=1)
+    # Axis by axis: a sum over them is a loop inside the loop over points, 5 us instead of 0.2.
+    dot = lambda a, b: a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
+    far_then, far_now, along = dot(then, then), dot(now, now), dot(then, now)
     aligned = (along > 0) & (jnp.square(along) > _MAX_TURN**2 * far_then * far_now)
     return aligned & (far_now < _MAX_SCALE**2 * far_then) & (far_then < _MAX_SCALE**2 * far_now)
 

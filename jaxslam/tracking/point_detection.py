@@ -4,7 +4,6 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxlie import SE3
-from jaxslam_kernels.depth.sampling import sample_depth
 from jaxslam_kernels.image.corners import corner_score, grid_corners, occupied_cells
 from jaxslam_kernels.se3 import to_world
 from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Scalar, Weights
@@ -119,7 +118,7 @@ def _candidates(
         assumed: Depth to assume at corners of unknown depth, meters; 0 if there are to be none.
     """
     view, sensor = step.view, step.params.sensor
-    border, depth = view.pyramid.border, view.depth
+    border = view.pyramid.border
     image = view.pyramid.levels[1][border:-border, border:-border]
     v, u = jnp.mgrid[: image.shape[0], : image.shape[1]]
     edge = _EDGE_PX // 2
@@ -128,9 +127,9 @@ def _candidates(
     corners = grid_corners(corner_score(image), inside & trusted, cell=cell)
     taken = occupied_cells(points.uv / 2, points.valid, (image.shape[0], image.shape[1]), cell=cell)
     uv = corners.points * 2
-    rough = sample_depth(depth, uv, reach=2, noise=sensor.depth_step_m())
+    rough = view.depth_at(uv, sensor, reach=2)
     rough = jnp.where(rough > 0, rough, assumed)
-    seen = pixel_rays(uv, sensor).measured(rough, twist, depth, view.frame.depth_delay_s, sensor, reach=2)
+    seen = pixel_rays(uv, sensor).measured(rough, twist, view.frame.depth, view.frame.depth_delay_s, sensor, reach=2)
     good = (corners.score > _MIN_SCORE) & ~taken & ((assumed > 0) | ((rough > 0) & (seen.depth > 0)))
     return _Candidates(uv, corners.score, rough, seen, good)
 
@@ -140,8 +139,8 @@ def _order(
 ) -> tuple[Int[Array, " m"], Code]:
     """Order the candidates: those in `first`, then good ones on one surface, then by score; and count those used."""
     plan = step.plan
-    reach, noise = plan.flow.finest.window // 2, step.params.sensor.depth_step_m()
-    one_surface = sample_depth(step.view.depth, found.uv, reach=reach, max_step=_DEPTH_STEP, noise=noise) > 0
+    reach = plan.flow.finest.window // 2
+    one_surface = step.view.depth_at(found.uv, step.params.sensor, reach=reach, max_step=_DEPTH_STEP) > 0
     keys, room = (-found.score, ~one_surface, ~found.good), jnp.sum(found.good, dtype=jnp.int32)
     if first is not None and plan.motion is not None:
         column, row = jnp.round(found.uv).astype(jnp.int32)

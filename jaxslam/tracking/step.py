@@ -13,11 +13,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxlie import SE3
 from jaxslam_kernels.camera import without_distortion
-from jaxslam_kernels.depth.sampling import valid_depth
 from jaxslam_kernels.flow.lk_flow import lk_flow
 from jaxslam_kernels.image.pyramid import Pyramid, build_pyramid
 from jaxslam_kernels.pose.pose_cost import PosePrior
-from jaxslam_kernels.robust import weighted_median
+from jaxslam_kernels.robust import masked_median
 from jaxslam_kernels.se3 import to_camera
 from jaxslam_kernels.types import Flag, Mask, Pixels, Scalar, Weights
 from jaxtyping import Array, Int
@@ -275,8 +274,7 @@ def _prepared(
     state: TrackState, frame: FrameArrays, pyramid: Pyramid, params: TrackParams, plan: TrackPlan
 ) -> StepContext:
     """Prepare the frame: depth that can be believed, and the right image of a stereo pair."""
-    depth = valid_depth(frame.depth, params.sensor.min_depth_m, params.sensor.max_depth_m)
-    view = PreparedFrame(frame, pyramid, depth, state.elapsed_s + frame.dt_s)
+    view = PreparedFrame(frame, pyramid, state.elapsed_s + frame.dt_s)
     return StepContext(state, view.with_right(), params, plan)
 
 
@@ -318,7 +316,7 @@ def _widened(params: TrackParams, before: Pixels, after: Pixels, background: Mas
     """
     squared = jnp.sum(jnp.square(after - before), axis=0)
     length = jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1)), 0)
-    extra = params.error_per_flow * weighted_median(length, background.astype(length.dtype))
+    extra = params.error_per_flow * masked_median(length, background)
     return params._replace(ransac_px=params.ransac_px + extra, outlier_px=params.outlier_px + extra)
 
 
@@ -327,13 +325,15 @@ def _regions(step: StepContext, seen: Measurements, predicted: SE3) -> Regions |
 
     Without depth, points are where the map has them.
     """
-    state, plan = step.state, step.plan
+    state, plan, sensor = step.state, step.plan, step.params.sensor
     if plan.regions is None:
         return None
     key = jax.random.fold_in(state.random_key(), -1 - state.frame)
-    ideal = without_distortion(step.params.sensor.intrinsics)
-    X_cam = jnp.where(step.view.has_depth(), seen.in_camera(), to_camera(predicted, state.points.X_world))
-    return find_regions(key, step.view.depth, state.regions.centers, X_cam, ideal, plan.regions)
+    ideal = without_distortion(sensor.intrinsics)
+    X_cam = jnp.where(step.has_depth(), seen.in_camera(), to_camera(predicted, state.points.X_world))
+    limits_m = sensor.min_depth_m, sensor.max_depth_m
+    depth, before = step.view.frame.depth, state.regions.centers
+    return find_regions(key, depth, before, X_cam, ideal, plan.regions, limits_m=limits_m)
 
 
 def _votes(step: StepContext, trust: Weights, background: Mask, regions: Regions | None) -> Weights:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxlie import SE3
 from jaxslam_kernels.se3 import displacement
-from jaxslam_kernels.types import Points
+from jaxslam_kernels.types import Flag, Points
 from jaxtyping import Array, Float
 
 from jaxslam.sensors.measurement import Measurements, PixelRays, PreparedFrame
@@ -35,6 +35,10 @@ class StepContext(NamedTuple):
         elapsed_s = self.view.elapsed_s
         known = elapsed_s > _MIN_ELAPSED_S
         return jnp.where(known, displacement(self.state.T_world_cam, pose) / jnp.where(known, elapsed_s, 1), 0)
+
+    def has_depth(self) -> Flag:
+        """Return whether the frame has depth at all that is to be believed; a sensor may have none for some frames."""
+        return self.view.has_depth(self.params.sensor)
 
     def measured(self, rays: PixelRays, X_world: Points, pose: SE3, twist: Float[Array, "6"]) -> Measurements:
         """Return the measurements of map points `(3, n)`, in meters, that are seen along rays from about `pose`.

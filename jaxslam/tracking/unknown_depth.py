@@ -7,7 +7,7 @@ moved aside far enough for its rays to tell the depth.
 
 import jax.numpy as jnp
 from jaxlie import SE3
-from jaxslam_kernels.robust import weighted_median
+from jaxslam_kernels.robust import masked_median
 from jaxslam_kernels.se3 import to_camera, to_world
 from jaxslam_kernels.types import Mask, Pixels, Scalar
 
@@ -37,7 +37,7 @@ def assumed_depth(points: TrackedPoints, T_world_cam: SE3, nearest_m: Scalar) ->
     """
     depth = to_camera(T_world_cam, points.X_world)[2]
     known = points.has_position() & (depth > nearest_m)
-    return jnp.maximum(weighted_median(depth, known.astype(depth.dtype)), nearest_m)
+    return jnp.maximum(masked_median(depth, known), nearest_m)
 
 
 def with_located(
@@ -73,7 +73,7 @@ def with_located(
     follows = reprojects(T_world_cam, to_world(T_world_cam, X_cam), seen.xy, params)
     measured = waiting & (seen.depth > 0)
     triangulated = waiting & ~measured & ahead & follows & (sine_squared > jnp.square(sigma / _DEPTH_ERROR))
-    located, stays = measured | triangulated, measured | (waiting & follows & (triangulated | ~step.view.has_depth()))
+    located, stays = measured | triangulated, measured | (waiting & follows & (triangulated | ~step.has_depth()))
     X_world = to_world(T_world_cam, jnp.where(measured[None, :], seen.in_camera(), X_cam))
     by_parallax = sine_squared / jnp.square(jnp.where(triangulated, X_cam[2], 1) * sigma)
     information = jnp.where(measured, 1 / jnp.square(seen.sigma), by_parallax)

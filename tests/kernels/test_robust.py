@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from jaxslam_kernels.robust import Loss, loss_value, loss_weight, robust_scale, weighted_median
+from jaxslam_kernels.robust import Loss, loss_value, loss_weight, masked_median, robust_scale, weighted_median
 from scipy.optimize import least_squares
 
 LOSSES = get_args(Loss)
@@ -127,6 +127,21 @@ class TestMedianAndScale:
         assert scale == pytest.approx(1.482602218505602 * _numpy_median(np.abs(values - median), weights), rel=1e-12)
         assert plain == np.median(values)
 
+    @pytest.mark.parametrize("seed", range(5))
+    def test_of_a_mask_is_that_of_weights_zero_and_one(self, seed):
+        """With and without equal values, negative ones, zeros of both signs, and some that are not finite."""
+        rng = np.random.default_rng(seed)
+        values = np.round(rng.normal(size=60), rng.integers(0, 6)).astype(np.float32)
+        values[:3], values[3:5] = (np.nan, np.inf, -np.inf), (0.0, -0.0)
+        mask = rng.random(60) < rng.choice([0.0, 0.1, 0.5, 1.0])
+        expected = _median(values, mask.astype(np.float32))
+        np.testing.assert_array_equal(jax.jit(masked_median)(values, mask), expected)
+
+    def test_of_nothing(self):
+        values = jnp.asarray([1.0, jnp.nan])
+        assert masked_median(values, jnp.asarray([False, True])) == 0
+        assert masked_median(jnp.zeros(0), jnp.zeros(0, bool)) == 0
+
     def test_scale_withstands_outliers(self):
         rng = np.random.default_rng(0)
         residuals = rng.normal(0.0, 2.5, 4000).astype(np.float32)
@@ -141,7 +156,7 @@ class TestMedianAndScale:
             values = jnp.asarray(np.random.default_rng(1).normal(size=31))
             weights = jnp.ones(31)
             direction = jnp.asarray(np.random.default_rng(2).normal(size=31))
-            for f in (_median, _scale):
+            for f in (_median, _scale, lambda values, weights: masked_median(values, weights > 0)):
                 _, forward = jax.jvp(lambda v, f=f: f(v, weights), (values,), (direction,))
                 reverse = jax.grad(f)(values, weights) @ direction
                 numeric = (f(values + 1e-7 * direction, weights) - f(values - 1e-7 * direction, weights)) / 2e-7

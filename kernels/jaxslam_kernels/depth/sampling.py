@@ -23,7 +23,14 @@ def valid_depth(
 
 @checked
 def sample_depth(
-    depth: DepthImage, uv: Pixels, *, reach: int = 1, max_step: float = 0.05, noise: Scalar | float = 0.0
+    depth: DepthImage,
+    uv: Pixels,
+    *,
+    reach: int = 1,
+    max_step: float = 0.05,
+    noise: Scalar | float = 0.0,
+    nearest: Scalar | float = 0.0,
+    farthest: Scalar | float = float("inf"),
 ) -> Weights:
     """Depth at the nearest pixel, or 0 where its surroundings do not agree.
 
@@ -35,6 +42,9 @@ def sample_depth(
         reach: The surroundings are `2 * reach + 1` pixels a side, and all must have depth; static.
         max_step: Largest difference of depth in them, as a share of the depth in the middle,
         noise: and so much more, in the unit of the depth, which noise alone makes at any depth.
+        nearest: Depth at or below which there is none to believe, meters, 0 or more, and
+        farthest: depth from which on there is none: the same as of `valid_depth` of the whole image, which takes 0.2 ms
+            for one of 640x480.
     """
     side = 2 * reach + 1
     # Far outside where it is not a number, and never so far that the conversion to integers overflows.
@@ -42,7 +52,7 @@ def sample_depth(
     around = apart(lambda: _windows(depth, center[::-1].T - reach, side)).reshape(-1, side * side)
     low, high = jnp.min(around, axis=1), jnp.max(around, axis=1)
     middle = around[:, side * side // 2]
-    smooth = (low > 0) & jnp.isfinite(high) & (high - low <= max_step * middle + noise)
+    smooth = (low > nearest) & (high < farthest) & (high - low <= max_step * middle + noise)
     return jnp.where(smooth, middle, 0)
 
 

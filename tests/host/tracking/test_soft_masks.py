@@ -82,6 +82,6 @@ class TestMovingRegions:
     def test_soft_mask_takes_the_larger_part(self) -> None:
         shares, moving = (made(self.REGIONS, self.WEIGHT, 3, 20, self.PLAN) for made in (moving_shares, moving_pixels))
         frame = at(stacked(clip().frames[:1]), 0)._replace(ignore=jnp.full((3, 20), 0.5))
-        view = PreparedFrame(frame, new_state().pyramid, frame.depth, frame.dt_s)
+        view = PreparedFrame(frame, new_state().pyramid, frame.dt_s)
         left = DynamicRejection(moving=moving, ignored=shares).without_moving_pixels(view)
         np.testing.assert_allclose(left.frame.ignore[0, ::4], [0.5, 0.5, 0.7, 1.0, 0.5], atol=1e-7)

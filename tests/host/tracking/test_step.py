@@ -290,7 +290,7 @@ class TestPoseStatus:
 
         @quick_compile
         def status(state: TrackState, frame: FrameArrays, given: TrackParams) -> Any:
-            view = PreparedFrame(frame, state.pyramid, frame.depth, state.elapsed_s)
+            view = PreparedFrame(frame, state.pyramid, state.elapsed_s)
             nothing, overlap = jnp.zeros(0), jnp.zeros(state.keyframes.id.shape[0])
             none = KeyframeMatches(
                 jnp.zeros((3, 0)), jnp.zeros((2, 0)), nothing, jnp.zeros(0, jnp.int32), overlap, jnp.zeros(())

@@ -61,7 +61,7 @@ def located(
     xy = now[:2] / now[2] - np.array([[0], [shift_px / CAMERA.fy]])
     measured = array(np.zeros(N) if measured_m is None else measured_m)
     seen = Measurements(array(xy), measured, depth_sigma(measured, PARAMS.sensor))
-    view = PreparedFrame(frame, state.pyramid, depth, array(1 / 30))
+    view = PreparedFrame(frame, state.pyramid, array(1 / 30))
     step = StepContext(state._replace(points=points), view, PARAMS, PLAN)
     none = jnp.zeros(N, bool)
     kept = KeptPoints(points._replace(valid=none), none, none)
