@@ -61,10 +61,9 @@ def normal_equations(views: Views) -> BundleEquations:
         rows = rows + _lens_rows(views, views.lens)
     cross = jnp.stack([v for row in rows for v in row], axis=1)
     moments = jnp.einsum("kan,kbn->kab", cross, jnp.stack([X, Y, Z, jnp.ones_like(X)], axis=1))
-    to_point = lambda a, b, c: [
-        jnp.sum(column(0, j) * a + column(1, j) * b + column(2, j) * c, axis=0) for j in range(3)
-    ]
-    by_column = [to_point(a, b, c) for a, b, c in zip(first, second, third, strict=True)]
+    cross = cross.reshape(k, len(rows), 3, n)
+    # R M Rᵀ summed over the cameras: its rows but R are minus the first ones of `cross`.
+    point_hessian = -jnp.einsum("kia,kajn->ijn", R, cross[:, :3])
     along_pose = [-sum_ for sum_ in map(partial(jnp.sum, axis=1), pull)]
     turning = (pull[1] * Z - pull[2] * Y, pull[2] * X - pull[0] * Z, pull[0] * Y - pull[1] * X)
     gradient = jnp.stack([*along_pose, *(jnp.sum(t, axis=1) for t in turning)], axis=1)
@@ -76,9 +75,9 @@ def normal_equations(views: Views) -> BundleEquations:
     return BundleEquations(
         camera_gradient=gradient,
         camera_hessian=hessian,
-        point_gradient=jnp.stack(to_point(*pull)),
-        point_hessian=jnp.stack([jnp.stack(row) for row in by_column]),
-        cross=cross.reshape(k, len(rows), 3, n),
+        point_gradient=jnp.einsum("kia,kan->in", R, jnp.stack(pull, axis=1)),
+        point_hessian=point_hessian,
+        cross=cross,
     )
 
 

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from jaxslam_kernels.bundle.cost import BundleProblem, free_cameras
 from jaxslam_kernels.bundle.equations import BundleEquations
+from jaxslam_kernels.program_parts import apart
 from jaxslam_kernels.types import Flag, Mask, Points, Scalar, Weights
 
 
@@ -38,10 +39,11 @@ def eliminate(equations: BundleEquations, problem: BundleProblem, damping: Scala
     """Eliminates the points from equations whose diagonal is raised by the fraction `damping`."""
     (k, c, _), n = equations.camera_hessian.shape, equations.point_hessian.shape[2]
     units = _units(equations.camera_diagonal(), free_cameras(problem))
-    root = inverse_root(equations.point_hessian, problem.free_point, damping)
+    root = apart(lambda: inverse_root(equations.point_hessian, problem.free_point, damping))
     cross = equations.cross * units[:, :, None, None]
-    first, second, third = (cross[:, :, j, None, :] * root[:, j][None, None] for j in range(3))
-    coupling = (first + second + third).reshape(c * k, 3 * n)
+    # Row by row, and only below the diagonal: as sums over whole columns of the root, 0.5 ms instead of 0.2.
+    rows = [sum(cross[:, :, j] * root[i, j][None, None] for j in range(i + 1)) for i in range(3)]
+    coupling = jnp.stack(rows, axis=2).reshape(c * k, 3 * n)
     cameras = equations.camera_hessian * units[:, :, None] * units[:, None, :]
     diagonal = jnp.where(units > 0, damping, 1.0)  # and 1 for what does not move
     cameras = cameras + jnp.eye(c, dtype=units.dtype)[None] * diagonal[:, :, None]
@@ -91,7 +93,7 @@ def inverse_root(hessian: Float[Array, "3 3 n"], free: Mask, damping: Scalar | W
     A pivot within rounding of zero is a direction that nothing determines (along the ray of a single view): it is
     left out, which costs the poses nothing, since the cross terms have no part in it.
     """
-    units = _units(jnp.diagonal(hessian).T, free[None, :])
+    units = _units(jnp.stack([hessian[i, i] for i in range(3)]), free[None, :])  # `diagonal` would be a gather
     v = [[hessian[i, j] * units[i] * units[j] for j in range(3)] for i in range(3)]
     invert = lambda pivot: jnp.where(pivot > floor, lax.rsqrt(jnp.where(pivot > floor, pivot, 1.0)), 0.0)
     floor, raised = 16.0 * float(jnp.finfo(hessian.dtype).eps), 1.0 + damping
