@@ -13,6 +13,7 @@ from jaxslam.config.loading import to_yaml
 from jaxslam.datasets import Dataset
 from jaxslam.errors import TrajectoryError
 from jaxslam.io.atomic_files import write_atomically
+from jaxslam.io.download import sha256_of
 from jaxslam.map.export import write_keyframe_trajectory
 from jaxslam.mapping.occlusion_states import occluded_shares
 from jaxslam.results.dense_results import DENSE_FILES, write_dense
@@ -203,6 +204,7 @@ def _summary(slam: Slam, records: Sequence[FrameRecord], info: RunInfo, evaluate
         "preset": info.preset,
         "cut_short": info.cut_short,
         "model": slam.config.semantics.model,
+        "networks": {setting: path and _hashed(path) for setting, path in slam.networks.items()},
         "without_network": slam.without_network,
         "deterministic": slam.config.run.in_turn,
         "realtime": slam.config.run.realtime,
@@ -228,6 +230,10 @@ def _summary(slam: Slam, records: Sequence[FrameRecord], info: RunInfo, evaluate
         "peak_rss_mb": round(peak_rss_mb(), 1),
         **machine(),
     }
+
+
+def _hashed(path: Path) -> dict[str, str]:
+    return {"file": path.name, "sha256": sha256_of(path)}
 
 
 def _frame_counts(records: Sequence[FrameRecord]) -> dict[str, Any]:
