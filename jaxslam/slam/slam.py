@@ -262,6 +262,7 @@ class Slam:
         self._frame += 1
         self._back.dispatch_jobs()
         watch.ends("hand over")
+        self.times.frame_ends(is_keyframe=result.is_keyframe)
         track_ms = (time.perf_counter() - began) * 1e3
         return replace(result, covariance=covariance, track_ms=track_ms, warnings=self._warnings.taken())
 
