@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from jaxslam.benchmark.reports.document import Block, Bullets, Heading, Image, Paragraph, Table, to_markdown
-from jaxslam.benchmark.reports.published_tables import protocols, published_tables, rank_table
+from jaxslam.benchmark.reports.published_tables import comparison_table, protocols, published_tables, rank_table
 from jaxslam.benchmark.suites.aggregate import (
     ACCURACY,
     RUNNING,
@@ -66,6 +66,7 @@ def suite_report(
     yield Heading(suite.name, 1)
     yield Paragraph(suite.about)
     yield Table(overview_table(suite, rows), "overview")
+    yield Table(comparison_table(suite, rows), "comparison")
     if suite.protocol is not None:
         yield Heading("Table of the paper")
         yield Paragraph(suite.protocol.about)
