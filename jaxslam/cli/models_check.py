@@ -114,10 +114,14 @@ class CheckModel(WithJson):
         from jaxslam.semantics import network_check  # noqa: PLC0415 - with ONNX
         from jaxslam.semantics.prompted import load_segmenter  # noqa: PLC0415 - with ONNX
 
+        prompts = self.prompt_encoder is not None or self.prompt_decoder is not None
+        for option, given in (("FILE", self.file if self.file != _NONE else None), ("--adapter", self.adapter)):
+            if prompts and given is not None:
+                raise ConfigError(f"{option}: expected none with prompts and without an image, got '{given}'")
         if self.prompt_encoder is not None and self.prompt_decoder is not None:
             files = [find_model(name) for name in (self.prompt_encoder, self.prompt_decoder)]
             return network_check.check_segmenter(load_segmenter(*files)), files
-        if self.prompt_encoder is not None or self.prompt_decoder is not None:
+        if prompts:
             given, other = ("encoder", "decoder")[:: 1 if self.prompt_decoder is None else -1]
             raise ConfigError(f"--prompt-{other}: expected what belongs to --prompt-{given}, got none")
         path = find_model(self.file)

@@ -120,7 +120,8 @@ class Loader:
         open: Function that opens a folder with its camera.
         rectifies: Whether `open` also takes a stereo pair that is not rectified.
         files: Files and folders that a recording of this kind has, for the message about a folder without any.
-        parts: Files that every recording of this kind has, for the message about a folder that lacks one of them.
+        parts: Files and folders that a recording of this kind has, for the message about a folder that has at least
+            half of them, but not all.
         reads_calibration: Whether `camera` reads calibration files in the folder, rather than the name of the folder.
         depth_scale_per_m: Counts of the depth images per meter that the layout prescribes; `None` if it does not.
     """

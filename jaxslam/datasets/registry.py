@@ -108,16 +108,16 @@ def _loader(folder: Path, kind: str) -> Loader:
 
 
 def _check_complete(folder: Path) -> None:
-    """Refuse a folder that lacks one of the files of a layout.
+    """Refuse a folder that seems to be a recording from which a part is missing.
 
     Raises:
-        DatasetError: If there are some of the files of a layout but not all.
+        DatasetError: If there is at least half of the parts of a layout, but not all.
     """
     for loader in _loaders().values():
-        there = [part for part in loader.parts if (folder / part).is_file()]
+        there = [part for part in loader.parts if (folder / part).exists()]
         absent = [part for part in loader.parts if part not in there]
-        if there and absent:
-            raise DatasetError(f"{folder / absent[0]}: expected a file, as there is {there[0]}, got none")
+        if absent and 2 * len(there) >= len(loader.parts):
+            raise DatasetError(f"{folder / absent[0]}: expected it beside {there[0]}, got none")
 
 
 def _hint_of_recording_in(folder: Path) -> str:

@@ -29,7 +29,7 @@ DEPTH_SCALE_PER_M = 5000.0
 """Counts of the depth images per meter, by the description of the benchmark."""
 
 _MOST_MISSING = 0.1
-"""Largest share of listed depth images that may be missing; Bonn's archives lack up to 1 %, a broken one more."""
+"""Largest share of listed depth images that may be missing: Bonn's `kidnapping_box` lacks nine, a broken copy more."""
 
 _COLOR_LIST, _DEPTH_LIST, _GROUND_TRUTH = "rgb.txt", "depth.txt", "groundtruth.txt"
 LAYOUT = (_COLOR_LIST, _DEPTH_LIST)

@@ -312,6 +312,10 @@ class TestVerdict:
         [
             (("none", "--prompt-encoder", "e.onnx"), "--prompt-decoder: expected what belongs to --prompt-encoder"),
             (("none", "--prompt-decoder", "d.onnx"), "--prompt-encoder: expected what belongs to --prompt-decoder"),
+            (
+                ("net.onnx", "--prompt-encoder", "e.onnx", "--prompt-decoder", "d.onnx"),
+                "FILE: expected none with prompts and without an image, got 'net.onnx'",
+            ),
             (("net.onnx", "--labels", "car"), "IMAGE: expected an image for --labels, got none"),
             (("none", "--examples", "e.yaml"), "IMAGE: expected an image for --examples, got none"),
         ],
