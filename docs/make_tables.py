@@ -9,18 +9,18 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from jaxslam.benchmark.reports.document import Table, to_markdown
 from jaxslam.benchmark.reports.live import MEANING, section
+from jaxslam.benchmark.reports.published_tables import comparison_table, described
 from jaxslam.benchmark.suites.accuracy_ruler import AccuracyBaseline, load_accuracy_baseline
-from jaxslam.benchmark.suites.published import Figure, published_for
+from jaxslam.benchmark.suites.published import published_for
+from jaxslam.benchmark.suites.suite import load_suite
 from jaxslam.config.loading import configs_dir
-from jaxslam.datasets.synthetic import SyntheticConfig
 
 DOCS = Path(__file__).resolve().parent
 PAGES = (DOCS.parent / "README.md", DOCS / "measured-results.md", DOCS / "performance.md")
-_SYSTEMS_IN_README = ("DROID-W", "DynaSLAM", "Occlusion SLAM", "RTS-SLAM", "NGD-SLAM", "ORB-SLAM2")
+_SUITE = load_suite("accuracy")
 
 
 def tables() -> dict[str, str]:
@@ -48,7 +48,7 @@ def accuracy_table(baseline: AccuracyBaseline) -> str:
         rows.append(
             [
                 f"`{name}`",
-                described(baseline.sequences[name]),
+                described(next(clip for clip in _SUITE.sequences if clip.name == name)),
                 str(runs.frames),
                 str(len(runs.ates_m)),
                 f"{runs.tracked_percent:.4g} %",
@@ -88,27 +88,19 @@ def published_tables(baselines: list[AccuracyBaseline]) -> list[str]:
 
 
 def results_table(baseline: AccuracyBaseline) -> str:
-    """Make the short table of README.md: the recordings of a baseline, and published figures where they compare."""
-    whole = whole_recordings(baseline)
-    rows = []
-    for name, runs in baseline.recordings.items():
-        best_of_each: dict[str, Figure] = {}
-        for figure in published_for(whole[name]) if name in whole else []:  # best first
-            best_of_each.setdefault(figure.system, figure)
-        others = [
-            f"{figure.system}{'' if figure.sensor == 'rgbd' else f' ({figure.sensor})'} {figure.value:g} m"
-            for figure in best_of_each.values()
-            if figure.system in _SYSTEMS_IN_README
-        ]
-        rows.append(
-            [
-                described(baseline.sequences[name]),
-                f"{runs.tracked_percent:.4g} %",
-                f"{runs.median_m:.4f} m",
-                ", ".join(others) or "-",
-            ]
-        )
-    return table(("recording", "tracked", "ATE", "published"), rows)
+    """Make the short table of README.md, as `jaxslam bench` prints it, of a baseline."""
+    rows = [
+        {
+            "sequence": name,
+            "label": baseline.preset,
+            "ate_rmse_m": {"median": runs.median_m},
+            "tracked_percent": {"least": runs.tracked_percent},
+            "done": len(runs.ates_m),
+            "runs": len(runs.ates_m),
+        }
+        for name, runs in baseline.recordings.items()
+    ]
+    return to_markdown([Table(comparison_table(_SUITE, rows))])
 
 
 def whole_recordings(baseline: AccuracyBaseline) -> dict[str, str]:
@@ -118,17 +110,6 @@ def whole_recordings(baseline: AccuracyBaseline) -> dict[str, str]:
         for name, sequence in baseline.sequences.items()
         if "recording" in sequence and "stop" not in sequence
     }
-
-
-def described(sequence: Mapping[str, Any]) -> str:
-    """Say in words what a sequence of a suite is."""
-    if "recording" in sequence:
-        part = f", first {sequence['stop']} frames" if "stop" in sequence else ""
-        return f"`{sequence['recording']}`{part}"
-    room = SyntheticConfig(**sequence["room"])
-    moving = [f"{number} {what}" for number, what in ((room.people, "people"), (room.boxes, "boxes")) if number]
-    sensor = ["stereo"] if room.baseline_m is not None else []
-    return ", ".join([f"rendered room, path {room.path}", *(moving or ["nothing moves"]), *sensor])
 
 
 def with_tables(text: str, blocks: Mapping[str, str]) -> str:

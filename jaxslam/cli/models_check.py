@@ -1,11 +1,11 @@
-"""`jaxslam models check`: what a network finds in an image, and how long it takes."""
+"""`jaxslam models check`: what a network finds in an image, or whether it is good; and how long it takes."""
 
 import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import cv2
 import numpy as np
@@ -14,11 +14,14 @@ import tyro
 from jaxslam.cli.console import make_table, plain_console, print_json
 from jaxslam.cli.shared_options import WithJson
 from jaxslam.config.schema import SemanticsConfig
-from jaxslam.errors import ConfigError
+from jaxslam.errors import ConfigError, ModelError
 from jaxslam.io.atomic_files import write_atomically
 from jaxslam.semantics import Detections, Detector, OnnxDetector, load_detector
 from jaxslam.semantics.model_zoo import find_model
 from jaxslam.visualization.draw_detections import draw_detections
+
+if TYPE_CHECKING:
+    from jaxslam.semantics.network_check import NetworkCheck
 
 _REPEATS = 5
 _NONE = "none"
@@ -31,8 +34,9 @@ class CheckModel(WithJson):
     file: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
     """Model file (ONNX), or the name of a known model; with `--prompt-encoder` its boxes are prompts, and `none` is for
     prompts of `--examples` alone."""
-    image: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="IMAGE")]
-    """Image to look at."""
+    image: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[IMAGE]")] = None
+    """Image to look at. Without one, the network looks at a picture that comes with jaxslam, in which it is known what
+    is there; the command fails if the network does not find it."""
     out: Path = Path("detections.png")
     """PNG to draw to."""
     labels: str = "person"
@@ -58,6 +62,9 @@ class CheckModel(WithJson):
             raise ConfigError(f"--min-score: expected 0 to 1, got {self.min_score}")
         if self.out.suffix.lower() != ".png":
             raise ConfigError(f"--out: expected a name that ends in .png, got '{self.out}'")
+        if self.image is None:
+            self._judge(labels)
+            return
         from jaxslam.sensors.image_files import read_color  # noqa: PLC0415 - with JAX, which `--help` does without
 
         image = read_color(self.image)
@@ -71,6 +78,59 @@ class CheckModel(WithJson):
         if isinstance(detector, OnnxDetector) and detector.missing_labels:
             plain_console.print(f"The network does not know: {', '.join(detector.missing_labels)}.")
         plain_console.print(f"{median_ms:.1f} ms an image, the first {first_ms:.1f} ms ({', '.join(map(str, files))})")
+        self._draw(image, found)
+
+    def _judge(self, labels: tuple[str, ...]) -> None:
+        """Check the network on a picture that comes with jaxslam.
+
+        Raises:
+            ModelError: If it does not find what is there.
+        """
+        from jaxslam.semantics.network_check import LABEL  # noqa: PLC0415 - with ONNX, which `--help` does without
+
+        if self.examples is not None or labels != (LABEL,):
+            got = "--labels" if self.examples is None else "--examples"
+            raise ConfigError(f"IMAGE: expected an image for {got}, got none")
+        check, files = self._checked()
+        if self.json:
+            shown = dict(zip(check.things, check.ious, strict=True))
+            print_json({"good": check.good, "iou": check.iou, "least_iou": check.least, "ious": shown})
+        else:
+            table = make_table("Found of what is in the picture", "thing", "IoU")
+            for thing, iou in zip(check.things, check.ious, strict=True):
+                table.add_row(thing, f"{iou:.2f}")
+            plain_console.print(table)
+        self._draw(check.picture, check.found)
+        names = ", ".join(file.name for file in files)
+        if not check.good:
+            raise ModelError(
+                f"{names}: expected a median IoU of at least {check.least:g} with what is in the picture, got"
+                f" {check.iou:.2f}; not trained, damaged, or exported with other inputs"
+            )
+        plain_console.print(f"{names}: good, with a median IoU of {check.iou:.2f}")
+
+    def _checked(self) -> "tuple[NetworkCheck, list[Path]]":
+        """Check the promptable segmenter if one is given, else the network, of either kind."""
+        from jaxslam.semantics import network_check  # noqa: PLC0415 - with ONNX
+        from jaxslam.semantics.prompted import load_segmenter  # noqa: PLC0415 - with ONNX
+
+        prompts = self.prompt_encoder is not None or self.prompt_decoder is not None
+        for option, given in (("FILE", self.file if self.file != _NONE else None), ("--adapter", self.adapter)):
+            if prompts and given is not None:
+                raise ConfigError(f"{option}: expected none with prompts and without an image, got '{given}'")
+        if self.prompt_encoder is not None and self.prompt_decoder is not None:
+            files = [find_model(name) for name in (self.prompt_encoder, self.prompt_decoder)]
+            return network_check.check_segmenter(load_segmenter(*files)), files
+        if prompts:
+            given, other = ("encoder", "decoder")[:: 1 if self.prompt_decoder is None else -1]
+            raise ConfigError(f"--prompt-{other}: expected what belongs to --prompt-{given}, got none")
+        path = find_model(self.file)
+        if network_check.is_example_network(path):
+            return network_check.check_in_context(path), [path]
+        detector = load_detector(path, labels=(network_check.LABEL,), min_score=self.min_score, adapter=self.adapter)
+        return network_check.check_detector(detector), [path]
+
+    def _draw(self, image: np.ndarray, found: Detections) -> None:
         bgr = cv2.cvtColor(draw_detections(image, found), cv2.COLOR_RGB2BGR)
         write_atomically(self.out, cv2.imencode(".png", bgr)[1].tobytes())
         plain_console.print(f"Picture: {self.out}")

@@ -10,10 +10,12 @@ from typing import Any, NamedTuple
 
 from rich.progress import TimeRemainingColumn
 
+from jaxslam.benchmark.reports.document import Table, to_markdown
 from jaxslam.benchmark.reports.html import html_report
 from jaxslam.benchmark.reports.markdown import markdown_report, suite_report
+from jaxslam.benchmark.reports.published_tables import comparison_table
 from jaxslam.benchmark.reports.table_files import write_tables
-from jaxslam.benchmark.suites.aggregate import row_name, with_shown_labels
+from jaxslam.benchmark.suites.aggregate import row_name, rows_of, with_shown_labels
 from jaxslam.benchmark.suites.collected_results import RESULTS, Collected, read_results
 from jaxslam.benchmark.suites.job import DONE, FAILED, NOT_RUN, Job, about
 from jaxslam.benchmark.suites.plan import missing, not_judged, plan, replaced_settings, swept
@@ -180,7 +182,9 @@ class _Report:
         )
 
     def print_outcome(self) -> None:
-        """Print how many runs were made and where the files are."""
+        """Print the short comparison with others, how many runs were made, and where the files are."""
+        rows = rows_of(with_shown_labels(self.collected.every))
+        plain_console.print(to_markdown([Table(comparison_table(self.suite, rows))]), highlight=False, markup=False)
         planned, out = self.collected.planned, self.out
         statuses = Counter(result["status"] for result in planned)
         made, left = len(planned) - statuses[NOT_RUN], f", {statuses[NOT_RUN]} not made" if statuses[NOT_RUN] else ""

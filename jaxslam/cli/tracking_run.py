@@ -210,9 +210,15 @@ def _print_summary(summary: dict[str, Any], evaluation: Evaluation | None, out: 
 
 
 def _network(summary: dict[str, Any]) -> tuple[str, str]:
-    """The network that looked at frames, or that none did and why."""
-    why = summary["without_network"]
-    return (summary["model"] or "given", "") if why is None else ("none", why)
+    """The network that looked at frames and what made masks of its boxes, or that none did and why."""
+    why, networks = summary["without_network"], summary["networks"]
+    if why is not None:
+        return "none", why
+    if "prompt_encoder" not in networks:
+        return summary["model"] or "given", ""
+    encoder, decoder = networks["prompt_encoder"], networks["prompt_decoder"]
+    masks = "depth: no segmenter here" if None in (encoder, decoder) else encoder["file"]
+    return summary["model"] or "given", f"masks from {masks}"
 
 
 def number(value: float | None, digits: int) -> str:

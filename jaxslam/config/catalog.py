@@ -18,7 +18,7 @@ from jaxslam.config.loading import configs_dir
 from jaxslam.config.validation import Range, ValidatedConfig, from_mapping
 from jaxslam.io.yaml_files import checked_mapping, read_yaml
 
-_NAME = re.compile(r"[a-z0-9_-]+\Z")
+_NAME = re.compile(r"[A-Za-z0-9_-]+\Z")
 _SHA256 = re.compile(r"[0-9a-f]{64}\Z")
 
 
@@ -27,7 +27,7 @@ class CatalogEntry(ValidatedConfig):
     """One file that can be downloaded, or made.
 
     Attributes:
-        name: Name of the entry in commands and settings: lowercase letters, digits, `_` and `-`.
+        name: Name of the entry in commands and settings: letters, digits, `_` and `-`.
         license: License, as the page words it or as an SPDX identifier.
         page: Web page of the authors.
         about: Description in a few words.
@@ -52,7 +52,7 @@ class CatalogEntry(ValidatedConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not _NAME.match(self.name):
-            raise self._error(f"name: expected lowercase letters, digits, _ and -, got {self.name!r:.80}")
+            raise self._error(f"name: expected letters, digits, _ and -, got {self.name!r:.80}")
         if self.url is None and not self.how:
             raise self._error("url: expected an address, or `how` to obtain the file, got neither")
         if self.url is not None and not self.url.startswith("http"):

@@ -4,6 +4,7 @@ from .protocol import Associated as Associated
 from .protocol import Dataset as Dataset
 from .protocol import Loader as Loader
 from .protocol import Unmatched as Unmatched
+from .protocol import frames_with_depth as frames_with_depth
 from .protocol import imu_samples as imu_samples
 from .protocol import imu_sheet as imu_sheet
 from .registry import dataset_kinds as dataset_kinds

@@ -38,7 +38,7 @@ class Recording(CatalogEntry):
     _error: ClassVar[type[JaxSlamError]] = DatasetError
 
     dataset: str
-    kind: Literal["tum", "bonn", "kitti"]
+    kind: Literal["tum", "bonn", "kitti", "euroc"]
     typical_size: str = "-"
     frames: Annotated[int, Range(at_least=1)] | None = None
 

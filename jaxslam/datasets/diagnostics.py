@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxslam.datasets import Associated, Dataset, open_dataset
+from jaxslam.datasets import Associated, Dataset, frames_with_depth, open_dataset
 from jaxslam.errors import JaxSlamError
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.depth_checks import contradiction_of_depth, is_plausible
@@ -19,6 +19,8 @@ from jaxslam.sensors.stereo_checks import look_over
 from jaxslam.trajectory.trajectory import associate
 
 _SAMPLED_PAIRS = 8
+_MANY_WITHOUT_DEPTH = 0.1
+"""Share of frames; of fr1/desk 7 % have no depth image."""
 _USUAL_DEPTH_SCALES = (1000.0, 5000.0)  # counts per meter: millimeters; TUM and Bonn
 
 
@@ -95,6 +97,7 @@ def diagnose(path: str | Path, kind: str = "auto", camera: Camera | str | Path |
             _contents(dataset),
             *_timing(dataset),
             *_association(dataset),
+            *_frames_without_depth(dataset),
             *_calibration(dataset.camera),
             *unreadable,
             *_images(frames),
@@ -145,6 +148,14 @@ def _association(dataset: Dataset) -> Iterator[Finding]:
     text = f"{color} {first} and {depth} {second} images have no partner in time and are left out"
     share = max(color, depth) / (len(dataset) + max(color, depth))
     yield _graded(share > 0.05, "association", text, "fewer frames, more motion between them; is it the same clock?")
+
+
+def _frames_without_depth(dataset: Dataset) -> Iterator[Finding]:
+    missing = ~frames_with_depth(dataset)
+    if missing.any():
+        text = f"{missing.sum()} of {len(dataset)} frames have no depth image and are tracked without"
+        many = missing.mean() > _MANY_WITHOUT_DEPTH
+        yield _graded(bool(many), "depth images", text, "a pose without depth is less certain")
 
 
 def _calibration(camera: Camera) -> Iterator[Finding]:

@@ -2,7 +2,7 @@
 
 import functools
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,8 @@ from jaxslam.sensors.image_files import check_size
 from jaxslam.sensors.rectification import RectifiedPair
 from jaxslam.trajectory.trajectory import Trajectory
 
-Files = list[tuple[Path, Path]]
+Files = Sequence[tuple[Path, Path | None]]
+"""The two files of each frame; `None` for a frame without a depth image."""
 
 
 class ImagePairs(ABC):
@@ -81,10 +82,16 @@ class ImagePairs(ABC):
             DatasetError: If an image is unreadable, or its size is not the camera's.
         """
         files = self._files[index]
-        first, second = (read(file) for read, file in zip(self._readers, files, strict=True))
-        for file, image in zip(files, (first, second), strict=True):
-            check_size(file, image, self.camera)
-        return self._frame(index, first, second)
+        first, second = (
+            None if file is None else self._read(read, file) for read, file in zip(self._readers, files, strict=True)
+        )
+        assert first is not None  # every frame has a color or left image
+        return Frame(int(self.timestamps_ns[index]), first) if second is None else self._frame(index, first, second)
+
+    def _read(self, read: Callable[[Path], np.ndarray], file: Path) -> np.ndarray:
+        image = read(file)
+        check_size(file, image, self.camera)
+        return image
 
     def _frame(self, index: int, first: np.ndarray, second: np.ndarray) -> Frame:
         stamp = int(self.timestamps_ns[index])
@@ -103,13 +110,13 @@ def check_stereo(camera: Camera) -> None:
         raise CameraError(f"camera '{camera.name}': baseline_m: expected meters for a stereo pair, got none")
 
 
-def check_present(files: Sequence[tuple[Path, Path]]) -> None:
-    """Refuse a list of files of which some do not exist.
+def check_present(files: Iterable[Path]) -> None:
+    """Refuse files of which some do not exist.
 
     Raises:
         DatasetError: If a file is missing.
     """
-    missing = [file for pair in files for file in pair if not file.is_file()]
+    missing = [file for file in files if not file.is_file()]
     if missing:
         raise DatasetError(f"{missing[0]}: listed but missing, one of {len(missing)} such images")
 

@@ -9,7 +9,7 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from jaxslam.datasets.protocol import Dataset, imu_samples, imu_sheet
+from jaxslam.datasets.protocol import Dataset, frames_with_depth, imu_samples, imu_sheet
 from jaxslam.errors import DatasetError
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame
@@ -61,6 +61,11 @@ class Subset:
     def ground_truth(self) -> Trajectory | None:
         """The ground truth of the whole recording."""
         return self.whole.ground_truth
+
+    @property
+    def has_depth(self) -> np.ndarray:
+        """`(n,)` bool, true for chosen frames that have a depth image."""
+        return frames_with_depth(self.whole)[self.indices.start : self.indices.stop : self.indices.step]
 
     @property
     def imu(self) -> ImuSheet | None:

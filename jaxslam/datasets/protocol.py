@@ -49,7 +49,8 @@ class Unmatched(NamedTuple):
     """Counts of images left out because no image of the other kind was taken at nearly the same time.
 
     Attributes:
-        color: Number of color images left out, or of images of the left camera.
+        color: Number of color images left out, or of images of the left camera. A color image without a depth image
+            is left out only before the first frame with depth and after the last one.
         depth: Number of depth images left out, or of images of the right camera.
     """
 
@@ -65,6 +66,11 @@ class Associated(Protocol):
     def unmatched(self) -> Unmatched:
         """The number of images without a partner."""
         ...
+
+
+def frames_with_depth(dataset: Dataset) -> np.ndarray:
+    """Return `(n,)` bool, true for frames that have a depth image; all true where a recording does not tell."""
+    return getattr(dataset, "has_depth", np.ones(len(dataset), bool))
 
 
 def imu_sheet(dataset: Dataset) -> ImuSheet | None:
@@ -114,6 +120,8 @@ class Loader:
         open: Function that opens a folder with its camera.
         rectifies: Whether `open` also takes a stereo pair that is not rectified.
         files: Files and folders that a recording of this kind has, for the message about a folder without any.
+        parts: Files and folders that a recording of this kind has, for the message about a folder that has at least
+            half of them, but not all.
         reads_calibration: Whether `camera` reads calibration files in the folder, rather than the name of the folder.
         depth_scale_per_m: Counts of the depth images per meter that the layout prescribes; `None` if it does not.
     """
@@ -124,5 +132,6 @@ class Loader:
     open: Callable[[Path, Any], Dataset]
     rectifies: bool = False
     files: str = ""
+    parts: tuple[str, ...] = ()
     reads_calibration: bool = False
     depth_scale_per_m: float | None = None

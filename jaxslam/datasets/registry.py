@@ -98,12 +98,35 @@ def _loader(folder: Path, kind: str) -> Loader:
         return _loaders()[kind]
     best = max(_loaders().values(), key=lambda loader: loader.fit(folder))
     if best.fit(folder) is Fit.NO:
+        _check_complete(folder)
         files = "; ".join(dict.fromkeys(loader.files for loader in _loaders().values() if loader.files))
         raise DatasetError(
             f"{folder}: expected a recording of kind {' or '.join(dataset_kinds())} ({files}),"
-            " got a folder without those files"
+            f" got a folder without those files{_hint_of_recording_in(folder)}"
         )
     return best
+
+
+def _check_complete(folder: Path) -> None:
+    """Refuse a folder that seems to be a recording from which a part is missing.
+
+    Raises:
+        DatasetError: If there is at least half of the parts of a layout, but not all.
+    """
+    for loader in _loaders().values():
+        there = [part for part in loader.parts if (folder / part).exists()]
+        absent = [part for part in loader.parts if part not in there]
+        if absent and 2 * len(there) >= len(loader.parts):
+            raise DatasetError(f"{folder / absent[0]}: expected it beside {there[0]}, got none")
+
+
+def _hint_of_recording_in(folder: Path) -> str:
+    """Name a recording in a folder or in its folders; empty if there is none."""
+    for pattern in ("*", "*/*"):
+        for inner in sorted(path for path in folder.glob(pattern) if path.is_dir()):
+            if max(loader.fit(inner) for loader in _loaders().values()) >= Fit.LAYOUT:
+                return f"; a recording in it is {inner.relative_to(folder)}"
+    return ""
 
 
 def _camera(folder: Path, loader: Loader, camera: Camera | RectifiedPair | str | Path | None) -> Camera | RectifiedPair:

@@ -2,7 +2,7 @@
 
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from jaxslam.config.loading import to_yaml
 from jaxslam.datasets import Dataset
 from jaxslam.errors import TrajectoryError
 from jaxslam.io.atomic_files import write_atomically
+from jaxslam.io.download import sha256_of
 from jaxslam.map.export import write_keyframe_trajectory
 from jaxslam.mapping.occlusion_states import occluded_shares
 from jaxslam.results.dense_results import DENSE_FILES, write_dense
@@ -203,6 +204,7 @@ def _summary(slam: Slam, records: Sequence[FrameRecord], info: RunInfo, evaluate
         "preset": info.preset,
         "cut_short": info.cut_short,
         "model": slam.config.semantics.model,
+        "networks": {setting: path and _hashed(path) for setting, path in slam.networks.items()},
         "without_network": slam.without_network,
         "deterministic": slam.config.run.in_turn,
         "realtime": slam.config.run.realtime,
@@ -222,12 +224,19 @@ def _summary(slam: Slam, records: Sequence[FrameRecord], info: RunInfo, evaluate
         "keyframes_passed_over": slam.keyframes_passed_over,
         "detector_errors": sum(bool(record.detector_error) for record in records),
         "stage_ms": {stage: _distribution(times.tolist()) for stage, times in slam.times.ms.items()},
-        "track_ms": _distribution([record.track_ms for record in records if record.track_ms is not None]),
+        "keyframe_stage_ms": {stage: _distribution(ms.tolist()) for stage, ms in slam.times.keyframe_ms.items()},
+        "track_ms": _track_ms(records),
+        "keyframe_ms": _track_ms([record for record in records if record.is_keyframe]),
+        "between_keyframes_ms": _track_ms([record for record in records if not record.is_keyframe]),
         "compile_s": round(slam.compile_s, 3),
         "wall_s": round(info.wall_s, 3),
         "peak_rss_mb": round(peak_rss_mb(), 1),
         **machine(),
     }
+
+
+def _hashed(path: Path) -> dict[str, str]:
+    return {"file": path.name, "sha256": sha256_of(path)}
 
 
 def _frame_counts(records: Sequence[FrameRecord]) -> dict[str, Any]:
@@ -252,6 +261,11 @@ def _frame_counts(records: Sequence[FrameRecord]) -> dict[str, Any]:
 def _occluded_shares(slam: Slam) -> list[float]:
     """Return the share of the points of each keyframe that are OCCLUDED; empty if occlusion states are disabled."""
     return occluded_shares(slam.map).tolist() if slam.config.dynamics.occlusion.enabled else []
+
+
+def _track_ms(records: Iterable[FrameRecord]) -> dict[str, float] | None:
+    """Summarize the tracking times of frames, milliseconds."""
+    return _distribution([record.track_ms for record in records if record.track_ms is not None])
 
 
 def _distribution(figures: Sequence[float]) -> dict[str, float] | None:

@@ -1,5 +1,6 @@
 """Record the duration of each tracking stage of each frame, and of each background job."""
 
+import threading
 import time
 from array import array
 from collections.abc import Callable, Mapping
@@ -19,14 +20,24 @@ class StageTimes:
 
     def __init__(self) -> None:
         """Create a record without durations."""
+        self._lock = threading.Lock()
         self._ms: dict[str, array[float]] = {}
+        self._keyframe_ms: dict[str, array[float]] = {}
+        self._of_frame: dict[str, float] = {}
 
     def add(self, stage: str, seconds: float) -> None:
         """Record that a stage took so many seconds."""
-        times = self._ms.setdefault(stage, array("d"))
-        times.append(1e3 * seconds)
-        if len(times) >= 2 * NUM_KEPT:
-            del times[:NUM_KEPT]
+        with self._lock:
+            _append(self._ms, stage, 1e3 * seconds)
+            self._of_frame[stage] = self._of_frame.get(stage, 0.0) + 1e3 * seconds
+
+    def frame_ends(self, *, is_keyframe: bool) -> None:
+        """Assign to a frame what each stage took since the frame before; that of jobs beside too, wherever they ran."""
+        with self._lock:
+            if is_keyframe:
+                for stage, ms in self._of_frame.items():
+                    _append(self._keyframe_ms, stage, ms)
+            self._of_frame = {}
 
     def timed(self, stage: str, work: Callable[[_Given], _Made]) -> Callable[[_Given], _Made]:
         """Wrap a function so that the duration of every call, also of one that raises, is recorded under `stage`."""
@@ -50,7 +61,21 @@ class StageTimes:
 
         The stages are in the order of their first record.
         """
-        return {stage: np.array(times) for stage, times in self._ms.items()}
+        with self._lock:
+            return {stage: np.array(times) for stage, times in self._ms.items()}
+
+    @property
+    def keyframe_ms(self) -> Mapping[str, Float[np.ndarray, " times"]]:
+        """Durations of each stage in frames that became keyframes, milliseconds; as many are kept as of `ms`."""
+        with self._lock:
+            return {stage: np.array(times) for stage, times in self._keyframe_ms.items()}
+
+
+def _append(durations: dict[str, "array[float]"], stage: str, ms: float) -> None:
+    times = durations.setdefault(stage, array("d"))
+    times.append(ms)
+    if len(times) >= 2 * NUM_KEPT:
+        del times[:NUM_KEPT]
 
 
 class Stopwatch:

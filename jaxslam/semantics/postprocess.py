@@ -94,12 +94,12 @@ def _suppress(boxes: np.ndarray, classes: np.ndarray, order: np.ndarray, max_iou
     while len(order) and len(kept) < MAX_KEPT:
         best, order = order[0], order[1:]
         kept.append(best)
-        order = order[(classes[order] != classes[best]) | (_iou(boxes[best], boxes[order]) <= max_iou)]
+        order = order[(classes[order] != classes[best]) | (box_iou(boxes[best], boxes[order]) <= max_iou)]
     return np.asarray(kept, np.intp)
 
 
-def _iou(box: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """`(n,)` intersection over union of one box with each of `(n, 4)`."""
+def box_iou(box: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """Return the `(n,)` intersection over union of one box with each of `(n, 4)`."""
     sides = np.minimum(box[2:], boxes[:, 2:]) - np.maximum(box[:2], boxes[:, :2])
     shared = np.maximum(sides, 0).prod(axis=1)
     return shared / ((box[2:] - box[:2]).prod() + (boxes[:, 2:] - boxes[:, :2]).prod(axis=1) - shared)

@@ -19,7 +19,7 @@ from jaxslam.runtime.stage_timer import StageTimes
 from jaxslam.runtime.threads import bound_threads, shorten_switch_interval
 from jaxslam.semantics import Detector
 from jaxslam.semantics.checked_detector import CheckedDetector
-from jaxslam.semantics.from_config import detector_of, key_detector_of, why_no_network
+from jaxslam.semantics.from_config import detector_of, key_detector_of, network_files, why_no_network
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.depth_correction import with_corrected_depth
 from jaxslam.sensors.frame import Frame, check_frame
@@ -64,6 +64,8 @@ class Slam:
         config: Settings in effect.
         without_network: Reason why no network segments the frames, as part of a sentence; `None` if one, or a
             `detector`, does.
+        networks: Files of the networks that segment the frames, by setting; `None` for one that is missing. It is empty
+            with a `detector`.
         dense_mapping: Thread of the dense map; `None` without `dense.enabled`, or with `localize_only`.
         times: Durations of the stages of every frame: `take over` map corrections, `flow`, `wait for mask`, `pose`,
             `match with map`, and `hand over` to mapping and the detector; and of the jobs of other threads: `match
@@ -126,6 +128,7 @@ class Slam:
         self._tracker = Tracker(camera, self.config)
         self._detector = _watched(detector or detector_of(self.config.semantics, self.config.run.threads))
         self.without_network = None if self._detector is not None else why_no_network(self.config.semantics)
+        self.networks = network_files(self.config.semantics) if detector is None else {}
         self._key_detector = _watched(key_detector or key_detector_of(self.config))
         motion = self._tracker.plan.motion
         self._memory = FrameMemory(camera.height, camera.width, pairs=camera.is_stereo, movable=motion is not None)
@@ -259,6 +262,7 @@ class Slam:
         self._frame += 1
         self._back.dispatch_jobs()
         watch.ends("hand over")
+        self.times.frame_ends(is_keyframe=result.is_keyframe)
         track_ms = (time.perf_counter() - began) * 1e3
         return replace(result, covariance=covariance, track_ms=track_ms, warnings=self._warnings.taken())
 

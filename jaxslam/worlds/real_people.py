@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
+from jaxslam.datasets.protocol import frames_with_depth
 from jaxslam.datasets.registry import open_dataset
 from jaxslam.datasets.synthetic.virtual_camera import TakenPicture
 from jaxslam.errors import ConfigError
@@ -75,7 +76,7 @@ class PeopleCutter:
         self._map = _pixel_map(self._recording.camera, camera, people.mirrored)
 
     def cut_out(self, time_s: float) -> CutOut:
-        """Cut people out of the frame of the recording that is nearest in time.
+        """Cut people out of the frame of the recording, of those with depth, that is nearest in time.
 
         Args:
             time_s: Time since the start of the world's recording.
@@ -84,10 +85,10 @@ class PeopleCutter:
             DatasetError: The frame cannot be read.
             ModelError: The network fails.
         """
-        frame = self._recording[int(np.argmin(np.abs(self._times_s - (self._people.from_s + time_s))))]
+        frame = self._recording[self._nearest(self._people.from_s + time_s)]
         found = _person_mask(self._detector, frame)
         assert found is not None  # the network gives masks
-        assert frame.depth_m is not None  # as all frames
+        assert frame.depth_m is not None
         mask = refined_mask(found, frame.depth_m, frame.image)
         filled_m = filled_depth(mask, frame.depth_m)
         return CutOut(
@@ -96,6 +97,10 @@ class PeopleCutter:
             filled_m=self._scale * self._moved(filled_m, cv2.INTER_NEAREST),
             mask=self._moved(mask.view(np.uint8), cv2.INTER_NEAREST).view(bool),
         )
+
+    def _nearest(self, time_s: float) -> int:
+        with_depth = np.flatnonzero(frames_with_depth(self._recording))
+        return int(with_depth[np.argmin(np.abs(self._times_s[with_depth] - time_s))])
 
     def set_into(self, taken: TakenPicture, time_s: float, number: int) -> TakenPicture:
         """Set people into a picture where they are nearer than what is rendered.

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from jaxslam.benchmark.reports.document import Block, Bullets, Heading, Image, Paragraph, Table, to_markdown
-from jaxslam.benchmark.reports.published_tables import protocols, published_tables, rank_table
+from jaxslam.benchmark.reports.published_tables import comparison_table, protocols, published_tables, rank_table
 from jaxslam.benchmark.suites.aggregate import (
     ACCURACY,
     RUNNING,
@@ -16,7 +16,7 @@ from jaxslam.benchmark.suites.aggregate import (
     rows_of,
     with_shown_labels,
 )
-from jaxslam.benchmark.suites.protocol import Protocol
+from jaxslam.benchmark.suites.protocol import PaperTable, Protocol
 from jaxslam.benchmark.suites.published_comparison import (
     VERDICTS,
     best_of_systems,
@@ -66,10 +66,13 @@ def suite_report(
     yield Heading(suite.name, 1)
     yield Paragraph(suite.about)
     yield Table(overview_table(suite, rows), "overview")
+    yield Table(comparison_table(suite, rows), "comparison")
     if suite.protocol is not None:
         yield Heading("Table of the paper")
         yield Paragraph(suite.protocol.about)
         yield Table(protocol_table(suite.protocol, rows), "protocol")
+        for number, table in enumerate(suite.protocol.tables, 1):
+            yield Table(paper_table(suite.protocol, table, rows), f"paper-{number}")
     yield Bullets(summary_lines(suite, rows))
     yield Table(rank_table(suite, rows), "ranks")
     yield Bullets(warnings(suite, results), is_warning=True)
@@ -127,6 +130,18 @@ def protocol_table(protocol: Protocol, rows: Sequence[Mapping[str, Any]]) -> lis
         if len(group) > 1:
             lines.append(["mean of the sequences", label, "", *(_mean_cell(group, column) for column in columns)])
     return lines if rows else []
+
+
+def paper_table(protocol: Protocol, table: PaperTable, rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """Figures of a paper above those of all rows, as a protocol takes them; headings first.
+
+    Times of the paper are of its machine.
+    """
+    columns = protocol.shown(table.columns)
+    lines = [[table.title, "of", *(column.heading for column in columns)]]
+    lines += [[system, f"paper of {table.paper}", *figures] for system, figures in table.published_rows().items()]
+    ours = [[row["label"], row["sequence"], *(cell(row, column) for column in columns)] for row in rows]
+    return lines + ours if ours else []
 
 
 def _mean_cell(rows: Sequence[Mapping[str, Any]], column: Column) -> str:

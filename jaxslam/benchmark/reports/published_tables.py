@@ -12,15 +12,23 @@ from jaxslam.benchmark.suites.published_comparison import (
     METRICS,
     PublishedMetric,
     best_of_systems,
+    clip_of,
     kitti_means,
     published_of,
     rank_among,
     reservations,
     verdict_on,
 )
+from jaxslam.benchmark.suites.suite import Sequence as Clip
 from jaxslam.benchmark.suites.suite import Suite
 
 _NONE = "-"
+_COMPARED = (
+    *("DROID-W", "DynaSLAM", "Occlusion SLAM", "RTS-SLAM", "NGD-SLAM", "TRS-SLAM", "USD-SLAM"),
+    *("ORB-SLAM2", "ORB-SLAM3"),
+)
+"""Systems of the short comparison: those that jaxslam builds, their base, and two that many compare with."""
+_ALL_TRACKED_PERCENT = 99.95
 
 
 class _Ours(NamedTuple):
@@ -75,6 +83,55 @@ def published_table(
     lines = [(figure.value, _published_line(figure, figures, ours, metric)) for figure in figures]
     lines += [(one.value, _line_of_ours(one, figures, len(ours), statistic)) for one in ours]
     return [head, *(line for _, line in sorted(lines, key=lambda line: line[0]))]
+
+
+def comparison_table(suite: Suite, rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """Compare labels, other systems that were run too, and published figures in a short table; headings first.
+
+    It is the table of the README. A cell has the ATE, the share of frames tracked if not all are, and the number of
+    runs if not all are done.
+
+    Args:
+        suite: Suite that was run.
+        rows: From `rows_of`.
+    """
+    labels = list(dict.fromkeys(row["label"] for row in rows))
+    lines = [["recording", *labels, "published"]]
+    for sequence, of_it in by_sequence(rows).items():
+        cells = {row["label"]: _short_cell(row, _statistic(suite)) for row in of_it}
+        others = [
+            f"{figure.system}{'' if figure.sensor == 'rgbd' else f' ({figure.sensor})'} {figure.value:g} m"
+            for figure in best_of_systems(published_of(suite, sequence))
+            if figure.system in _COMPARED
+        ]
+        clip = clip_of(suite, sequence)
+        name = f"`{sequence}`" if clip is None else described(clip)
+        lines.append([name, *(cells.get(label, _NONE) for label in labels), ", ".join(others) or _NONE])
+    return lines if rows else []
+
+
+def described(clip: Clip) -> str:
+    """Say in words what a sequence of a suite is."""
+    part = f", frames {clip.start} to {'the end' if clip.stop is None else clip.stop - 1}" if clip.start else ""
+    if not clip.start and clip.stop is not None:
+        part = f", first {clip.stop} frames"
+    every = f", one frame in {clip.every}" if clip.every > 1 else ""
+    if clip.room is None:
+        return f"`{clip.source}`{part}{every}"
+    room = clip.room
+    moving = [f"{number} {what}" for number, what in ((room.people, "people"), (room.boxes, "boxes")) if number]
+    sensor = ["stereo"] if room.baseline_m is not None else []
+    return ", ".join([f"rendered room, path {room.path}", *(moving or ["nothing moves"]), *sensor]) + part + every
+
+
+def _short_cell(row: Mapping[str, Any], statistic: Statistic) -> str:
+    ate, tracked = row["ate_rmse_m"], row["tracked_percent"]
+    texts = [_NONE if ate is None or statistic not in ate else f"{ate[statistic]:.4f} m"]
+    if tracked is not None and tracked["least"] < _ALL_TRACKED_PERCENT:
+        texts.append(f"{tracked['least']:.4g} % tracked")
+    if row["done"] < row["runs"]:
+        texts.append(f"{row['done']} of {row['runs']} runs")
+    return ", ".join(texts)
 
 
 def rank_table(suite: Suite, rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:

@@ -77,10 +77,43 @@ _OF_PROTOCOLS = (
     Column("mean, ms", "track_ms_mean", 1),
 )
 """More figures of tables of papers."""
+_STAGES = (
+    *("take over", "flow", "wait for mask", "pose", "match with map", "hand over"),
+    *("match pair", "masks", "detector", "mapping", "places"),
+)
+"""Stages and jobs of a frame, as `Slam.times` names them."""
+
+
+def _stage_figure(kind: str, stage: str) -> str:
+    """Name the mean time of a stage: `stage_flow_ms` of all frames, `keyframe_flow_ms` of keyframes."""
+    return f"{kind}_{stage.replace(' ', '_')}_ms"
+
+
+_TIMES = (
+    *(Column(f"{stage}, ms", _stage_figure("stage", stage), 2) for stage in _STAGES),
+    *(Column(f"{stage}, ms a keyframe", _stage_figure("keyframe", stage), 2) for stage in _STAGES),
+    Column("keyframe, ms", "keyframe_ms_mean", 2),
+    Column("other frame, ms", "between_keyframes_ms_mean", 2),
+)
+"""Mean times of the stages of frames and of keyframes."""
+_DENSE = (
+    Column("measured points", "dense_measured_points", 0),
+    Column("points", "dense_points", 0),
+    Column("MB", "dense_megabytes", 2),
+    Column("ms a keyframe", "dense_ms", 2),
+    Column("occupied cells", "dense_occupied", 0),
+    Column("free cells", "dense_free", 0),
+    Column("side of a cell, m", "dense_side_m", 3),
+)
+"""The dense map, and its octree for OctoMap."""
 COVERAGE = ("images", "tracked_of_all_percent", "matched_percent", "span_percent")
 """What else decides whether figures may be compared with published ones: images of the whole recording, and shares of
 the frames, dropped ones too, that were tracked, and that were matched with ground truth; and of its time."""
-_COLUMNS = {column.figure: column for column in (*ACCURACY, *RUNNING, *_OF_PROTOCOLS) if column.which != "range"}
+_COLUMNS = {
+    column.figure: column
+    for column in (*ACCURACY, *RUNNING, *_OF_PROTOCOLS, *_TIMES, *_DENSE)
+    if column.which != "range"
+}
 _FIGURES = (*_COLUMNS, *COVERAGE)
 
 
@@ -144,10 +177,20 @@ def figures_of(result: Mapping[str, Any]) -> dict[str, float | None]:
         flat["tracked_of_all_percent"] = 100 * flat["tracked"] / frames
         if (matched := flat.get("num_matched")) is not None:
             flat["matched_percent"] = 100 * matched / frames
-    for name in ("track_ms", "mask_age_frames"):
+    for name in ("track_ms", "mask_age_frames", "keyframe_ms", "between_keyframes_ms"):
         short = name.removesuffix("_frames")
-        flat |= {f"{short}_{measure}": value for measure, value in (result[name] or {}).items()}
+        flat |= {f"{short}_{measure}": value for measure, value in (result.get(name) or {}).items()}
+    for kind, name in (("stage", "stage_ms"), ("keyframe", "keyframe_stage_ms")):
+        flat |= {_stage_figure(kind, stage): times["mean"] for stage, times in (result.get(name) or {}).items()}
+    flat |= _dense_figures(result.get("dense") or {})
     return {name: flat.get(name) for name in _FIGURES}
+
+
+def _dense_figures(dense: Mapping[str, Any]) -> dict[str, float | None]:
+    """Figures of the dense map of a run by name; none without one."""
+    found = {f"dense_{name}": dense.get(name) for name in ("measured_points", "points", "megabytes")}
+    found["dense_ms"] = (dense.get("ms_per_keyframe") or {}).get("mean")
+    return found | {f"dense_{name}": value for name, value in (dense.get("cells") or {}).items()}
 
 
 def columns_of(rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]) -> list[Column]:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxslam.datasets.image_folders import IMAGES, files_in, times_of
+from jaxslam.datasets.loaders.tum import LAYOUT
 from jaxslam.datasets.paired_images import ImagePairs, check_stereo, moved
 from jaxslam.datasets.protocol import Fit, Loader
 from jaxslam.errors import CameraError, DatasetError
@@ -120,6 +121,8 @@ def _check_camera(camera: Camera, folder: Path, layout: _Layout, suffix: str) ->
 
 
 def _fit(folder: Path) -> Fit:
+    if any((folder / name).is_file() for name in LAYOUT):
+        return Fit.NO  # a recording of TUM that lacks a list
     names = [name for name in (*_COLOR, _DEPTH, _LEFT, _RIGHT) if (folder / name).is_dir()]
     return Fit.FOLDERS if (_DEPTH in names or _LEFT in names) and len(names) > 1 else Fit.NO
 

@@ -66,7 +66,7 @@ class EurocDataset(ImagePairs):
         self.timestamps_ns = np.array(common, np.int64)
         self.unmatched = Unmatched(len(left) - len(common), len(right) - len(common))
         self._files = [(left[stamp], right[stamp]) for stamp in common]
-        check_present(self._files)
+        check_present(images[stamp] for images in (left, right) for stamp in common)
         self._T_body_camera = _T_body_left(self._root)
         if self._pair is not None:
             self._T_body_camera = compose(self._T_body_camera, self._pair.T_left_camera)
@@ -160,5 +160,12 @@ def _fit(folder: Path) -> Fit:
 
 
 LOADER = Loader(
-    "euroc", _fit, _camera, EurocDataset, rectifies=True, files="mav0/cam0 and mav0/cam1", reads_calibration=True
+    "euroc",
+    _fit,
+    _camera,
+    EurocDataset,
+    rectifies=True,
+    files="mav0/cam0 and mav0/cam1",
+    parts=tuple(f"mav0/{which}/{_LIST}" for which in _CAMERAS),
+    reads_calibration=True,
 )

@@ -165,5 +165,6 @@ LOADER = Loader(
     _camera,
     KittiDataset,
     files="calib.txt, times.txt, image_0 and image_1",
+    parts=(_PAIRS[0].left, _CALIBRATION, _TIMES),
     reads_calibration=True,
 )

@@ -1,14 +1,10 @@
 """In-context segmenters: find objects that are similar to those in example images with masks.
 
 Wang et al., SegGPT (arXiv 2304.03284): the example is stacked above the image, and its mask above the painted output.
-Inputs and output are those of transformers' `SegGptForImageSegmentation`, which stacks them itself:
+Inputs and output are those of transformers' `SegGptForImageSegmentation`, which stacks them itself;
+`docs/export_segmenter.py` exports it.
 
-    model = SegGptForImageSegmentation.from_pretrained("BAAI/seggpt-vit-large").eval()
-    names = ["pixel_values", "prompt_pixel_values", "prompt_masks"]
-    torch.onnx.export(model, tuple(torch.zeros(3, 1, 3, 448, 448)), "seggpt.onnx", input_names=names,
-        output_names=["pred_masks"], opset_version=17, dynamo=False)
-
-With `dynamic_axes` for the first axis all examples of a class are given at once. A network that was exported with
+A network with an open first axis is given all examples of a class at once. One that was exported with
 `feature_ensemble=True` then averages their features; what it paints for each is averaged here in any case.
 """
 

@@ -17,7 +17,14 @@ from jaxslam.benchmark.reports.markdown import (
     without_network,
 )
 from jaxslam.benchmark.reports.plots import plot_spread
-from jaxslam.benchmark.reports.published_tables import protocols, published_table, published_tables, rank_table
+from jaxslam.benchmark.reports.published_tables import (
+    comparison_table,
+    described,
+    protocols,
+    published_table,
+    published_tables,
+    rank_table,
+)
 from jaxslam.benchmark.reports.table_files import to_csv, to_latex, write_tables
 from jaxslam.benchmark.suites.aggregate import rows_of
 from jaxslam.benchmark.suites.protocol import Protocol
@@ -341,7 +348,7 @@ class TestTableFiles:
     def test_names_in_the_report_of_a_suite(self) -> None:
         blocks = suite_report(CROWD, [done(), done("mine")], {})
         assert [block.name for block in blocks if isinstance(block, Table) and block.lines] == [
-            *("overview", "ranks", "crowd-accuracy", "crowd-running", "crowd-published-ate_rmse_m"),
+            *("overview", "comparison", "ranks", "crowd-accuracy", "crowd-running", "crowd-published-ate_rmse_m"),
             *("crowd-published-frame_ms", "mine-accuracy", "mine-running"),
         ]
 
@@ -354,3 +361,39 @@ def test_long_labels_leave_room() -> None:
     names = [text.get_text() for text in axes.axes[0].get_yticklabels()]
     assert len(names[0]) < 35
     assert names[1] == "static"
+
+
+class TestComparison:
+    """The short table of the README: presets, systems that were run too, and published figures."""
+
+    ROOM = Sequence("room", room=SyntheticConfig(people=2))
+    SUITE = Suite("any", "", (Sequence("crowd", "rgbd_bonn_crowd"), Sequence("start", "kitti_06", stop=51), ROOM))
+
+    def test_systems_stand_beside_presets(self) -> None:
+        results = [
+            done(ate_rmse_m=0.01),
+            done(label="ORB-SLAM3", ate_rmse_m=0.42, tracked_percent=98.25),
+            done(sequence="start", ate_rmse_m=0.03),
+            not_done("failed", "killed", sequence="start", seed=1),
+            done(sequence="room", label="ORB-SLAM3", ate_rmse_m=None, evaluation=None),
+        ]
+        head, crowd, start, room = comparison_table(self.SUITE, rows_of(results))
+        assert head == ["recording", "static", "ORB-SLAM3", "published"]
+        assert crowd[:3] == ["`rgbd_bonn_crowd`", "0.0100 m", "0.4200 m, 98.25 % tracked"]
+        assert crowd[3].startswith("DROID-W (mono) 0.013 m, DynaSLAM 0.016 m, Occlusion SLAM 0.0177 m")
+        assert start == ["`kitti_06`, first 51 frames", "0.0300 m, 1 of 2 runs", "-", "-"]
+        assert room == ["rendered room, path xyz, 2 people", "-", "-", "-"]
+
+    def test_is_a_table_of_the_report(self) -> None:
+        assert "| recording | static | published |" in markdown_report(self.SUITE, [done()], {})
+
+    @pytest.mark.parametrize(
+        ("sequence", "words"),
+        [
+            (Sequence("x", "a", start=10), "`a`, frames 10 to the end"),
+            (Sequence("x", "a", start=10, stop=20, every=3), "`a`, frames 10 to 19, one frame in 3"),
+            (Sequence("x", world="flat"), "`flat`"),
+        ],
+    )
+    def test_describes_parts(self, sequence: Sequence, words: str) -> None:
+        assert described(sequence) == words

@@ -206,6 +206,7 @@ class TestGoingOn:
         results, messages = printed_json(capsys)
         assert results == json.loads(kept)
         assert "4 runs, 0 failed" in messages
+        assert "| recording | static | default | published |" in messages
 
     def test_not_by_mistake(self, out: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert "--resume keeps them" in fails(capsys, suite_file(out.parent), "--out", str(out))

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import tiny_models
 from command_line import failing
 from small_scene import HEIGHT, SETTINGS, WIDTH
 
@@ -21,7 +22,7 @@ refused = failing(code=2)
 NEEDED_BY = {
     *("ngd", "ngd-published", "ngd-detector", "ngd-propagation"),
     *("occlusion", "occlusion-published", "occlusion-masks"),
-    *("usd", "usd-published", "usd-segmentation"),
+    *("usd", "usd-published", "usd-sam", "usd-segmentation"),
     *("rts", "rts-published", "rts-semantics", "rts-semantics-epipolar"),
     *("trs-published", "trs-semantics"),
 }
@@ -47,10 +48,11 @@ class TestPresets:
         if preset not in NEEDED_BY:
             assert detector_of(semantics) is None
             return
-        with pytest.raises(MissingModelError, match="to download it: jaxslam models get yolox-nano"):
+        first = semantics.prompt_encoder or "yolox-nano"
+        with pytest.raises(MissingModelError, match=f"to download it: jaxslam models get {first}"):
             detector_of(semantics)
         assert detector_of(replace(semantics, missing_model="allow")) is None
-        assert detector_of(replace(semantics, model=None)) is None
+        assert detector_of(replace(semantics, model=None, prompt_encoder=None, prompt_decoder=None)) is None
 
     def test_another_network_than_the_default_is_needed(self) -> None:
         """Whoever names one wants it."""
@@ -78,6 +80,15 @@ class TestSlam:
         """A function of the user's own is as good as the network."""
         with Slam(ROOM.camera, load_config("ngd"), detector=lambda image: no_detections()) as slam:
             assert slam.without_network is None
+            assert slam.networks == {}
+
+    def test_names_the_files(self, tmp_path: Path) -> None:
+        """Masks are from depth where the segmenter is missing, and what is there is told."""
+        path = tiny_models.yolox(tmp_path / "net.onnx", [])
+        settings = [f"semantics.model={path}", "semantics.missing_model=allow"]
+        with Slam(ROOM.camera, load_config("usd-sam", overrides=settings)) as slam:
+            assert slam.networks == {"model": path, "prompt_encoder": None, "prompt_decoder": None}
+            assert slam.without_network is None
 
     def test_says_so(self, caplog: pytest.LogCaptureFixture) -> None:
         with Slam(ROOM.camera, load_config("ngd", overrides=["semantics.missing_model=allow"])) as slam:
@@ -101,6 +112,7 @@ class TestCommands:
         main(["run", str(recording), "--out", str(tmp_path), *chosen])
         summary = json.loads((tmp_path / "summary.json").read_text())
         assert (summary["model"], summary["without_network"]) == ("yolox-nano", "yolox-nano not on this machine")
+        assert summary["networks"] == {"model": None}
         out = capsys.readouterr().out
         assert "yolox-nano not on this machine" in out
         assert "…" not in out

@@ -11,6 +11,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import tiny_models
+import tiny_segmenters
 from command_line import failing
 
 from jaxslam.cli import fetch, models_check
@@ -266,6 +268,60 @@ class TestCheck:
         for adapter, file in files.items():
             if file is not None:
                 assert models_check.load_detector(file).adapter == adapter
+
+
+class TestVerdict:
+    """Without an image, the command says whether a network is good."""
+
+    def check(self, *arguments: str | Path, out: Path) -> None:
+        main(["models", "check", *map(str, arguments), "--out", str(out / "out.png")])
+
+    def test_good_segmenter(self, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+        encoder, decoder = tiny_segmenters.sam(tmp_path)
+        self.check("none", "--prompt-encoder", encoder, "--prompt-decoder", decoder, out=tmp_path)
+        out = capsys.readouterr().out
+        assert all(word in out for word in ("star", "cross", "bar", "leaf"))
+        assert "sam_encoder.onnx, sam_decoder.onnx: good, with a median IoU of 0.70" in out
+        picture = cv2.imread(str(tmp_path / "out.png"))
+        assert picture is not None
+        assert picture.shape == (480, 640, 3)
+
+    def test_bad_segmenter(self, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+        """It paints the boxes that it is asked for."""
+        encoder, decoder = map(str, tiny_segmenters.sam(tmp_path, blind=True))
+        message = fails(capsys, "check", "none", "--prompt-encoder", encoder, "--prompt-decoder", decoder)
+        assert "sam_decoder.onnx: expected a median IoU of at least 0.65" in message
+        assert "got 0.40" in message
+
+    def test_json(self, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+        self.check(tiny_segmenters.in_context(tmp_path / "seggpt.onnx", side=112), "--json", out=tmp_path)
+        told = json.loads(capsys.readouterr().out)
+        assert told["good"]
+        assert told["iou"] >= told["least_iou"]
+        assert told["ious"].keys() == {"star", "cross", "bar", "leaf"}
+
+    def test_detector(
+        self, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    ) -> None:
+        monkeypatch.setattr(models_check, "load_detector", lambda *_, **__: lambda image: no_detections())
+        path = tiny_models.yolox(tmp_path / "net.onnx", [])
+        assert "net.onnx: expected a median IoU of at least 0.68" in fails(capsys, "check", str(path))
+
+    @pytest.mark.parametrize(
+        ("arguments", "expected"),
+        [
+            (("none", "--prompt-encoder", "e.onnx"), "--prompt-decoder: expected what belongs to --prompt-encoder"),
+            (("none", "--prompt-decoder", "d.onnx"), "--prompt-encoder: expected what belongs to --prompt-decoder"),
+            (
+                ("net.onnx", "--prompt-encoder", "e.onnx", "--prompt-decoder", "d.onnx"),
+                "FILE: expected none with prompts and without an image, got 'net.onnx'",
+            ),
+            (("net.onnx", "--labels", "car"), "IMAGE: expected an image for --labels, got none"),
+            (("none", "--examples", "e.yaml"), "IMAGE: expected an image for --examples, got none"),
+        ],
+    )
+    def test_needs(self, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], expected: str) -> None:
+        assert expected in fails(capsys, "check", *arguments)
 
 
 class TestDrawing:

@@ -72,7 +72,9 @@ class TestCatalog:
                 assert isinstance(camera, Camera)
                 assert f"/freiburg{camera.name[-1]}/" in (entry.url or "")
             else:
-                assert name.startswith({"bonn": "rgbd_bonn_", "kitti": "kitti_"}[entry.kind])
+                assert name.startswith(
+                    {"bonn": "rgbd_bonn_", "kitti": "kitti_", "euroc": ("MH_", "V1_", "V2_")}[entry.kind]
+                )
 
     @pytest.mark.parametrize(
         "names",
@@ -84,7 +86,9 @@ class TestCatalog:
             [f"rgbd_bonn_{what}{part}" for what in ("balloon", "person_tracking", "synchronous") for part in ("", "2")],
             [f"rgbd_bonn_crowd{part}" for part in ("", "2", "3")],
             [f"rgbd_bonn_moving_{kind}_box{part}" for kind in ("obstructing", "nonobstructing") for part in ("", "2")],
+            [f"rgbd_bonn_{what}" for what in ("kidnapping_box", "kidnapping_box2", "static", "static_close_far")],
             [f"kitti_{number:02d}" for number in range(11)],
+            ["MH_01_easy", "MH_05_difficult", "V1_03_difficult", "V2_02_medium", "V2_03_difficult"],
         ],
     )
     def test_holds_what_papers_use(self, names: list[str]) -> None:
@@ -95,6 +99,7 @@ class TestCatalog:
             "tum": "CC BY 4.0",
             "bonn": "see page",
             "kitti": "CC BY-NC-SA 3.0",
+            "euroc": "see page",
         }
 
     @pytest.mark.parametrize(
@@ -141,7 +146,7 @@ class TestCatalogFile:
             (("about: a walk", "about: a walk\n      sha256: abc"), "walk: sha256: expected 64"),
             (("{name}.tgz", "{name}.rar"), "walk: url: expected .tgz or .zip"),
             (("  url: https://example.org/{name}.tgz\n", ""), "walk: url: expected an address, or `how`"),
-            (("    walk:", "    ../walk:"), "name: expected lowercase letters"),
+            (("    walk:", "    ../walk:"), "name: expected letters"),
             (("      about: a walk", "      - a walk"), "walk: expected `key: value` lines, got ['a walk']"),
             (("  recordings:", "  recording:"), "group 1: recordings: expected `key: value` lines"),
             ((ENTRY, "words"), "expected a list of groups, got str"),

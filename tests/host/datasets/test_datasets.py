@@ -19,7 +19,17 @@ from tiny_recording import (
     write_recording,
 )
 
-from jaxslam.datasets import Associated, Dataset, Subset, Unmatched, dataset_kinds, imu_sheet, open_dataset, prefetch
+from jaxslam.datasets import (
+    Associated,
+    Dataset,
+    Subset,
+    Unmatched,
+    dataset_kinds,
+    frames_with_depth,
+    imu_sheet,
+    open_dataset,
+    prefetch,
+)
 from jaxslam.errors import CameraError, DatasetError
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame
@@ -102,10 +112,13 @@ class TestMatching:
                 depth_times=["1.008", "1.9800", "3.0201", "4.0005", "5.0"],
             )
         )
-        assert dataset.timestamps_ns.tolist() == [1_010_000_000, 2_000_000_000, 4_000_000_000]
-        assert unmatched(dataset) == (2, 2)
+        assert dataset.timestamps_ns.tolist() == [1_010_000_000, 2_000_000_000, 3_000_000_000, 4_000_000_000]
+        assert frames_with_depth(dataset).tolist() == [True, True, False, True]
+        assert frames_with_depth(Subset(dataset, 1, 4, 2)).tolist() == [True, True]
+        assert unmatched(dataset) == (1, 2)
         np.testing.assert_array_equal(dataset[0].depth_m, depth_counts(0) / np.float32(SCALE))
-        np.testing.assert_array_equal(dataset[2].depth_m, depth_counts(3) / np.float32(SCALE))
+        assert dataset[2].depth_m is None
+        np.testing.assert_array_equal(dataset[3].depth_m, depth_counts(3) / np.float32(SCALE))
 
     def test_nothing_matches(self, tmp_path: Path) -> None:
         write_recording(tmp_path, depth_times=times(6, first=900))
