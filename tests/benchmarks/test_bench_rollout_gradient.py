@@ -40,7 +40,7 @@ def _run(program: Callable[..., Any], *arguments: Any) -> tuple[Any, float, floa
 
 def test_gradient_by_all_parameters() -> None:
     config = load_config()
-    room = SyntheticDataset(SyntheticConfig(frames=NUM_FRAMES, width=WIDTH, height=HEIGHT))
+    room: Any = SyntheticDataset(SyntheticConfig(frames=NUM_FRAMES, width=WIDTH, height=HEIGHT))
     plan, params = track_plan(config.track), track_params(room.camera, config.track)
     clip = jax.tree.map(jnp.asarray, stack_frames(room))
     state = init_state(HEIGHT, WIDTH, plan)
