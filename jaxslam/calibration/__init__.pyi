@@ -1,5 +1,9 @@
 from .camera_calibration import calibrate as calibrate
 from .gyro_calibration import calibrate_gyro as calibrate_gyro
+from .noise_calibration import NoiseCalibration as NoiseCalibration
+from .noise_calibration import NoiseEstimate as NoiseEstimate
+from .noise_calibration import NoiseVerdict as NoiseVerdict
+from .noise_calibration import calibrate_noise as calibrate_noise
 from .report import Calibration as Calibration
 from .report import Estimate as Estimate
 from .report import ResidualField as ResidualField

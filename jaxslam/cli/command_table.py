@@ -174,6 +174,13 @@ COMMANDS = (
         " recording cannot tell, as the scale of depth, is called unobservable.",
     ),
     Command(
+        ("calibrate", "noise"),
+        "calibrate_noise:CalibrateNoise",
+        "Estimate the noise of pixels and of depth or disparity from a recording, so that covariances are right.",
+        "Tracks it forward and backward, and compares the motions with their covariances; without ground truth. Writes"
+        " settings for `jaxslam run --config`. A setting changes only if held-out parts are more likely with it.",
+    ),
+    Command(
         ("export",),
         "export:Export",
         "Write a map for other programs.",

@@ -44,6 +44,7 @@ from jaxslam.slam.program_compiler import ProgramCompiler
 from jaxslam.slam.recording_run import run_recording
 from jaxslam.slam.status_log import StatusLog
 from jaxslam.slam.tracker import Tracker
+from jaxslam.tracking.points import TrackedPoints
 from jaxslam.tracking.state import TrackReason, TrackStatus
 from jaxslam.trajectory.trajectory import PathLike, Trajectory
 
@@ -313,6 +314,11 @@ class Slam:
     def map(self) -> Map:
         """The current map; it is immutable, and mapping replaces it by another one."""
         return self._back.map
+
+    @property
+    def points(self) -> TrackedPoints:
+        """The points of the tracker after the latest frame; their arrays are only valid until the next one."""
+        return self._tracker.state.points
 
     @property
     def compile_s(self) -> float:

@@ -198,6 +198,33 @@ def pose_cost(T_world_cam: SE3, problem: PoseProblem, loss: Loss) -> PoseCost:
     return PoseCost(cost, NormalEquations(gradient, hessian), chi2, robust_weights)
 
 
+def pose_residuals(T_world_cam: SE3, problem: PoseProblem, loss: Loss) -> tuple[Float[Array, "3 n"], Float[Array, "6"]]:
+    """Residuals of which half the sum of squares is the cost of `pose_cost`, for solvers of least squares.
+
+    Those of a point are its whitened residuals times `sqrt(w ρ(s) / s)`; without a value, `UNKNOWN_CHI2` counts. The
+    root of the prior's information is symmetric, and exists where that leaves directions free.
+
+    Returns:
+        `(3, n)` residuals of the points, and `(6,)` those of the prior, zeros without one.
+    """
+    rows, front = _linearize(T_world_cam, problem)
+    whitened = jnp.where(front[None, :], rows[6], 0.0)
+    chi2 = jnp.sum(jnp.square(whitened), axis=0)
+    there = chi2 > 0
+    safe = jnp.where(there, chi2, 1.0)
+    stretch = jnp.where(there, loss_value(safe, problem.scale, loss) / safe, 1.0)
+    unknown = loss_value(jnp.full_like(chi2, UNKNOWN_CHI2), problem.scale, loss)
+    weights = jnp.where(problem.weights > 0, problem.weights, 1.0)
+    scaled = whitened * jnp.sqrt(stretch * weights)[None, :]
+    behind = jnp.zeros_like(whitened).at[0].set(jnp.sqrt(unknown * weights))
+    residuals = jnp.where((problem.weights > 0)[None, :], jnp.where(front[None, :], scaled, behind), 0.0)
+    if problem.prior is None:
+        return residuals, jnp.zeros(6, chi2.dtype)
+    values, vectors = jnp.linalg.eigh(problem.prior.information)
+    root = (vectors * jnp.sqrt(jnp.maximum(values, 0.0))[None, :]) @ vectors.T
+    return residuals, root @ _prior_error(T_world_cam, problem.prior)[0]
+
+
 def _linearize(T_world_cam: SE3, problem: PoseProblem) -> tuple[Float[Array, "7 3 n"], Mask]:
     """Derivatives of the three whitened residuals along the tangent, then the residuals, and which points are in front.
 

@@ -1,11 +1,11 @@
 """Refines one camera pose by robust, weighted Levenberg-Marquardt, differentiably.
 
-The solver is optimistix's loop around fused normal equations (`levenberg_marquardt`); the cost is `pose_cost`'s. The
-result is differentiable, forward and reverse, by the implicit function theorem at the optimum: its derivative with
-respect to points, pixels, weights, depths, deviations, intrinsics, scale and prior costs one 6 x 6 solve, however
-many steps the solver took. Higher derivatives are right as well. The initial pose has no derivative, since the optimum
-does not depend on it. Of a weight that is exactly 0 the derivative is the one-sided limit from above: what letting the
-point back in would do.
+The solver is optimistix's loop around fused normal equations (`levenberg_marquardt`), or any of its least-squares
+solvers on residuals of the same cost; the cost is `pose_cost`'s. The result is differentiable, forward and reverse, by
+the implicit function theorem at the optimum: its derivative with respect to points, pixels, weights, depths,
+deviations, intrinsics, scale and prior costs one 6 x 6 solve, however many steps the solver took. Higher derivatives
+are right as well. The initial pose has no derivative, since the optimum does not depend on it. Of a weight that is
+exactly 0 the derivative is the one-sided limit from above: what letting the point back in would do.
 """
 
 from enum import IntEnum
@@ -29,6 +29,7 @@ from jaxslam_kernels.pose.pose_cost import (
     PoseProblem,
     pose_cost,
     pose_problem,
+    pose_residuals,
     retract,
     shifted,
     with_idle,
@@ -111,6 +112,7 @@ def refine_pose(
     prior: PosePrior | None = None,
     max_steps: int = 25,
     tolerance: float | None = None,
+    solver: optx.AbstractLeastSquaresSolver | None = None,
 ) -> PoseRefinement:
     """Finds the pose that explains where points are seen, and how far away.
 
@@ -133,12 +135,20 @@ def refine_pose(
         max_steps: Bound on the evaluations of the cost, static.
         tolerance: Length of the next step, in standard deviations of the estimate, at which the solver stops, static;
             `None` for what the floating-point type resolves.
+        solver: Least-squares solver of optimistix, such as `optimistix.Dogleg(rtol=1e-6, atol=1e-6)`, static; `None`
+            for `ManifoldLevenbergMarquardt`, which is faster. It changes neither the optimum nor its derivatives, which
+            are those of the optimum: they are as exact as its tolerances.
 
     Returns:
         A `PoseRefinement`; everything in it is finite, and so are its derivatives.
+
+    Raises:
+        ValueError: If both `tolerance` and `solver` are given: a solver has tolerances of its own.
     """
+    if solver is not None and tolerance is not None:
+        raise ValueError(f"refine_pose: tolerance: expected None, as the solver has its own, got {tolerance:g}")
     problem, idle = pose_problem(X_world, uv, intrinsics, weights, depth, sigma_px, sigma_depth, scale, prior)
-    return refine_problem(T_world_cam, problem, idle, loss, max_steps, tolerance)
+    return refine_problem(T_world_cam, problem, idle, loss, max_steps, tolerance, solver)
 
 
 def refine_problem(
@@ -148,10 +158,14 @@ def refine_problem(
     loss: Loss,
     max_steps: int,
     tolerance: float | None = None,
+    solver: optx.AbstractLeastSquaresSolver | None = None,
 ) -> PoseRefinement:
     """`refine_pose` on a problem that is already clean; the idle points matter to derivatives only."""
     initial, finite_initial = usable_pose(T_world_cam)
-    optimum, solver = solve_pose(initial, problem, loss, max_steps, tolerance)
+    if solver is None:
+        optimum, report = solve_pose(initial, problem, loss, max_steps, tolerance)
+    else:
+        optimum, report = _solve_with(solver, initial, problem, loss, max_steps)
     step = implicit_shift(
         partial(_slope, loss), partial(_solve, loss), jnp.zeros(6, problem.xy.dtype), optimum, (problem, idle)
     )
@@ -160,15 +174,15 @@ def refine_problem(
         [
             ~finite_initial,
             jnp.sum(problem.weights > 0) < MIN_POINTS,
-            ~is_determined(solver.hessian),
-            ~solver.converged,
+            ~is_determined(report.hessian),
+            ~report.converged,
         ],
         [PoseStatus.BAD_INITIAL, PoseStatus.TOO_FEW_POINTS, PoseStatus.DEGENERATE, PoseStatus.NOT_CONVERGED],
         PoseStatus.OK,
     ).astype(jnp.int32)
     found = status <= PoseStatus.NOT_CONVERGED
     pose = SE3(jnp.where(found, optimum.wxyz_xyz, initial.wxyz_xyz))
-    return _report(pose, problem, idle, loss, status, solver.num_steps)
+    return _report(pose, problem, idle, loss, status, report.num_steps)
 
 
 def solve_pose(
@@ -194,6 +208,27 @@ def solve_pose(
     converged = solution.result == optx.RESULTS.successful
     hessian = solution.state.model.hessian.as_matrix()
     return solution.value, SolverReport(hessian, solution.stats["num_steps"].astype(jnp.int32), converged)
+
+
+def _solve_with(
+    solver: optx.AbstractLeastSquaresSolver, initial: SE3, problem: PoseProblem, loss: Loss, max_steps: int
+) -> tuple[SE3, SolverReport]:
+    """The optimum that a solver of optimistix finds from a finite initial pose; constant for differentiation."""
+    initial, problem = lax.stop_gradient((initial, problem))
+
+    def residuals(
+        tangent: Float[Array, "6"], args: tuple[SE3, PoseProblem]
+    ) -> tuple[Float[Array, "3 n"], Float[Array, "6"]]:
+        start, problem = args
+        return pose_residuals(retract(start, tangent), problem, loss)
+
+    still = jnp.zeros(6, problem.xy.dtype)
+    solution = optx.least_squares(residuals, solver, still, (initial, problem), max_steps=max_steps, throw=False)
+    tangent = lax.stop_gradient(solution.value)
+    found = retract(initial, jnp.where(jnp.isfinite(tangent).all(), tangent, 0.0))
+    hessian = pose_cost(found, problem, loss).equations.hessian
+    converged = solution.result == optx.RESULTS.successful
+    return found, SolverReport(hessian, jnp.asarray(solution.stats["num_steps"], jnp.int32), converged)
 
 
 def _slope(loss: Loss, step: Float[Array, "6"], optimum: SE3, inputs: tuple[PoseProblem, PoseProblem]) -> Array:

@@ -77,6 +77,11 @@ def _check_calibration(folder: Path, printed: str) -> None:
     assert "unobservable" in printed
 
 
+def _check_noise(folder: Path, printed: str) -> None:
+    assert {path.name for path in (folder / "results" / "noise").iterdir()} == {"noise.yaml", "noise.json"}
+    assert "track.depth_sigma_per_m2" in printed
+
+
 def _check_networks(folder: Path, printed: str) -> None:
     assert [example.label for example in read_examples(folder / "examples.yaml")] == ["arm", "arm"]
 
@@ -107,6 +112,7 @@ _LEFT_BEHIND = {
     "getting-started": _check_started,
     "cameras-and-recordings": _check_cameras,
     "calibration": _check_calibration,
+    "noise": _check_noise,
     "networks": _check_networks,
     "dense-map": _check_dense,
     "gradients-and-batches": _check_gradients,
