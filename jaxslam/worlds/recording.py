@@ -177,7 +177,7 @@ class WorldRecording:
         taken = self._take(index)
         delivered = taken if source == index else self._take(source)
         rgb, right = delivered.rgb, delivered.right
-        depth_m = np.where(_shows_backdrop(delivered), np.float32(0), delivered.depth_m)
+        depth_m = _without_backdrop(delivered.depth_m, delivered)
         if self._has_fault("black", now)[0]:
             rgb, depth_m = np.zeros_like(rgb), np.zeros_like(depth_m)
             right = None if right is None else np.zeros_like(right)
@@ -190,9 +190,9 @@ class WorldRecording:
             timestamp_ns=int(self.timestamps_ns[index]),
             rgb=rgb,
             depth_m=depth_m,
-            exact_depth_m=np.where(_shows_backdrop(taken), np.float32(0), np.asarray(taken.exact.depth_m)),
+            exact_depth_m=_without_backdrop(np.asarray(taken.exact.depth_m), taken),
             instance_mask=instance_mask,
-            moving_mask=moves[instance_mask],
+            moving_mask=moves.take(instance_mask),
             T_world_cam=self.ground_truth.T_world_cam[index].copy(),
             T_world_instance=poses,
             right=right,
@@ -276,6 +276,8 @@ def _outline(placed: PlacedSolid) -> np.ndarray:
     return corners @ placed.T_world_solid[:2, :2].T + placed.T_world_solid[:2, 3]
 
 
-def _shows_backdrop(taken: TakenPicture) -> np.ndarray:
-    """Tell which pixels show nothing but the backdrop, `(height, width)` bool."""
-    return np.asarray(taken.exact.owner) == BACKDROP
+def _without_backdrop(depth_m: np.ndarray, taken: TakenPicture) -> np.ndarray:
+    """Depth `(height, width)`, 0 where the picture shows nothing but the backdrop."""
+    kept = depth_m.copy()
+    kept[np.asarray(taken.exact.owner) == BACKDROP] = 0.0
+    return kept

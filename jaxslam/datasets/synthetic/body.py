@@ -75,6 +75,6 @@ def below(angle: np.ndarray, length: float) -> np.ndarray:
 
 
 def bone(first: np.ndarray, second: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """`(t, 4, 4)` placements of a limb from joint to joint, `(t, 3)` each, turned about y as in `below`."""
+    """`(..., 4, 4)` placements of limbs from joint to joint, `(..., 3)` each, turned about y as in `below`."""
     rotation = matrices(axis_rotation(1, angle))
     return transform(rotation, 0.5 * (first + second))

@@ -11,19 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt
 
-from jaxslam.datasets.synthetic.primitives import Solid
-from jaxslam.datasets.synthetic.raycast import (
-    TILE_HEIGHT,
-    TILE_WIDTH,
-    InTile,
-    Rays,
-    Shapes,
-    compact,
-    nearest_solid,
+from jaxslam.datasets.synthetic.culling import (
+    Candidates,
+    Tiling,
+    list_candidates,
     rows_of_solids,
     solids_in_tiles,
-    unpack,
 )
+from jaxslam.datasets.synthetic.primitives import Solid
+from jaxslam.datasets.synthetic.raycast import Rays, Shapes, nearest_solid, unpack
 from jaxslam.datasets.synthetic.shading import Hits, Light, shade
 from jaxslam.datasets.synthetic.texture import N_WORDS
 from jaxslam.runtime.compiled import compiled
@@ -73,7 +69,7 @@ class CameraView(NamedTuple):
 
 
 class Rendering(NamedTuple):
-    """Image and depth before any sensor model.
+    """Image and depth before any sensor model, as planes of the picture, or of rows of its tiles.
 
     Attributes:
         color: Packed color; see `shading.unpack_color`.
@@ -82,10 +78,10 @@ class Rendering(NamedTuple):
         owner: 0 on static things, otherwise the number of the actor.
     """
 
-    color: UInt[Array, "h w"]
-    depth_m: Float[Array, "h w"]
-    incidence: Float[Array, "h w"]
-    owner: Int[Array, "h w"]
+    color: UInt[Array, "*plane"]
+    depth_m: Float[Array, "*plane"]
+    incidence: Float[Array, "*plane"]
+    owner: Int[Array, "*plane"]
 
 
 class PackedSolids(NamedTuple):
@@ -146,30 +142,73 @@ def arrange_scene(
     return jax.device_put(RenderScene(*arrays)), slots
 
 
+def find_candidates(
+    scene: RenderScene, solid_from_cam: np.ndarray, intrinsics: np.ndarray, height: int, width: int
+) -> Candidates:
+    """List what the tiles of a picture have to look at, over all moments of its exposure.
+
+    Args:
+        scene: Solids of the scene.
+        solid_from_cam: `CameraView.solid_from_cam` of each moment, `(t, n, 3, 4)` or `(t, rows, n, 3, 4)`.
+        intrinsics: `fx, fy, cx, cy` in pixels.
+        height: Rows of the image.
+        width: Columns of the image.
+    """
+    tiling = Tiling.of(height, width)
+    reaches, rows = (np.asarray(each) for each in _reach(scene, solid_from_cam, intrinsics, tiling=tiling))
+    return list_candidates(reaches, rows, len(scene.box_size), tiling)
+
+
+@compiled(when="first use", static=("tiling",))
+def _reach(
+    scene: RenderScene, solid_from_cam: Array, intrinsics: Float[Array, " 4"], *, tiling: Tiling
+) -> tuple[Bool[Array, "tiles n"], Int[Array, "r 2 n"]]:
+    """Tell which solids but the first may reach into which tiles, and into which rows of the picture."""
+    size, stem = _sizes_and_stems(scene)
+    if solid_from_cam.ndim == 4:
+        over_time = solid_from_cam[None]
+    else:
+        # Over the time of a row of tiles, a corner is between where it is at the beginning and at the end.
+        by_row = jnp.moveaxis(solid_from_cam, 1, 0)
+        over_time = jnp.concatenate([by_row[:-1], by_row[1:]], axis=1)
+    corners = jax.vmap(lambda moments: _corners(moments, size, stem))(over_time)
+    reaches = solids_in_tiles(corners, intrinsics, tiling) & scene.used[None]
+    return reaches.at[:, 0].set(False), jax.vmap(lambda each: rows_of_solids(each, intrinsics))(corners)
+
+
+def _sizes_and_stems(scene: RenderScene) -> tuple[Float[Array, "n 3"], Float[Array, " n"]]:
+    """Sizes of boxes and capsules, and stems, 0 for boxes."""
+    size = jnp.concatenate([scene.box_size, scene.capsule_size])
+    return size, jnp.concatenate([jnp.zeros(len(scene.box_size), scene.capsule_stem.dtype), scene.capsule_stem])
+
+
 @compiled(when="first use", static=("height", "width", "rows"), options=FUSION_EMITTERS)
 def render(
-    scene: RenderScene, view: CameraView, first: int = 0, *, height: int, width: int, rows: int | None = None
+    scene: RenderScene,
+    view: CameraView,
+    candidates: Candidates,
+    first: int,
+    *,
+    rows: int,
+    height: int,
+    width: int,
 ) -> Rendering:
-    """Cast one ray a pixel.
+    """Cast one ray a pixel; the result is in tiles, for `untiled`.
 
     Args:
         scene: Solids and light of the scene.
         view: From where it is seen.
-        first: First row of tiles to render, if not all.
+        candidates: What the tiles have to look at, from `find_candidates`.
+        first: First row of tiles to render.
+        rows: Number of rows of tiles to render, static.
         height: Rows of the image, static.
         width: Columns of the image, static.
-        rows: Rows of tiles to render, static; `None` for all.
     """
-    n_boxes = scene.box_size.shape[0]
-    all_rows, columns = tile_rows(height), -(-width // TILE_WIDTH)
-    size = jnp.concatenate([scene.box_size, scene.capsule_size])
-    stem = jnp.concatenate([jnp.zeros(n_boxes, scene.capsule_stem.dtype), scene.capsule_stem])
+    n_boxes, tiling = scene.box_size.shape[0], Tiling.of(height, width)
+    size, stem = _sizes_and_stems(scene)
     rolls = view.solid_from_cam.ndim == 4
     unit_from_cam = view.solid_from_cam / (size[None, :, :, None] if rolls else size[:, :, None])
-    reaches, rows_of = _tiles_and_rows(view, size, stem, all_rows, columns)
-    reaches &= scene.used[None]
-    boxes, capsules = compact(reaches[:, 1:n_boxes], 1), compact(reaches[:, n_boxes:], n_boxes)
-    turned = (view.solid_from_cam[all_rows // 2] if rolls else view.solid_from_cam)[:, :, :3]
+    turned = (view.solid_from_cam[tiling.rows // 2] if rolls else view.solid_from_cam)[:, :, :3]
     sun = jnp.einsum("nij,kj,k->ni", turned, view.world_from_cam[:, :3], scene.light.towards_sun)
     # Nothing turns the sky towards the sun.
     sun = jnp.where((scene.owner == BACKDROP)[:, None], 0.0, sun)
@@ -180,75 +219,58 @@ def render(
     def shapes_and_looks(row: Array) -> tuple[Shapes, Array, Array | None]:
         """Shapes of the solids as a row of tiles sees them, their rows of the table, and what those change by."""
         if not rolls:
-            return Shapes(unit_from_cam, stem, rows_of), table, None
+            return Shapes(unit_from_cam, stem), table, None
         above = unit_from_cam[row]
         change = unit_from_cam[row + 1] - above
         looks = jnp.concatenate([above.reshape(-1, 12), own], axis=1)
-        return Shapes(above, stem, rows_of[row], change), looks, change.reshape(-1, 12)
+        return Shapes(above, stem, change), looks, change.reshape(-1, 12)
 
-    def render_tile(tile: tuple[Array, InTile, InTile]) -> tuple[Array, ...]:
-        index, boxes, capsules = tile
-        top = (index // columns) * TILE_HEIGHT
-        rays = _rays(view, top, (index % columns) * TILE_WIDTH)
-        shapes, looks, changes = shapes_and_looks(index // columns)
-        depth, which = unpack(shapes, nearest_solid(shapes, rays, boxes, capsules, top))
+    def render_tile(tile: tuple[Array, Array]) -> tuple[Array, ...]:
+        index, begins = tile
+        row, column = index // tiling.columns, index % tiling.columns
+        rays = _rays(view, row, column, tiling)
+        shapes, looks, changes = shapes_and_looks(row)
+        nearest = nearest_solid(shapes, rays, candidates._replace(begins=begins), tiling)
+        depth, which = unpack(shapes, nearest)
         hits = Hits(rays, depth, which, which < n_boxes)
         return (
             *shade(looks, scene.surface, hits, view.world_from_cam, view.intrinsics[0], scene.light, changes),
             scene.owner[which],
         )
 
-    tiles = (jnp.arange(all_rows * columns, dtype=jnp.int32), boxes, capsules)
-    if rows is None:
-        rows = all_rows
-    else:
-        tiles = jax.tree.map(lambda each: jax.lax.dynamic_slice_in_dim(each, first * columns, rows * columns), tiles)
+    tiles = (jnp.arange(tiling.rows * tiling.columns, dtype=jnp.int32), candidates.begins)
+    start, count = first * tiling.columns, rows * tiling.columns
+    tiles = jax.tree.map(lambda each: jax.lax.dynamic_slice_in_dim(each, start, count), tiles)
     planes = jax.lax.map(render_tile, tiles)
-    return Rendering(*(_untile(plane, rows, columns)[:height, :width] for plane in planes))
+    return Rendering(*(plane.reshape(rows, tiling.columns, tiling.height, tiling.width) for plane in planes))
 
 
-def tile_rows(height: int) -> int:
-    """Return the number of rows of tiles of an image of `height` rows."""
-    return -(-height // TILE_HEIGHT)
-
-
-def _tiles_and_rows(
-    view: CameraView, size: Float[Array, "n 3"], stem: Float[Array, " n"], rows: int, columns: int
-) -> tuple[Bool[Array, "tiles n"], Int[Array, "*rows 2 n"]]:
-    """Tell which solids may reach into which tiles, and into which rows of the picture at the time of each."""
-    if view.solid_from_cam.ndim == 3:
-        corners = _corners(view.solid_from_cam, size, stem)
-        return solids_in_tiles(corners, view.intrinsics, rows, columns), rows_of_solids(corners, view.intrinsics)
-    corners = jax.vmap(lambda solid_from_cam: _corners(solid_from_cam, size, stem))(view.solid_from_cam)
-    # Over the time of a row of tiles, a corner is between where it is at the beginning and at the end.
-    over_time = jnp.concatenate([corners[:-1], corners[1:]], axis=2)
-    reaches = [
-        solids_in_tiles(over_time[row], view.intrinsics, rows, columns).reshape(rows, columns, -1)[row]
-        for row in range(rows)
-    ]
-    return jnp.concatenate(reaches), jax.vmap(lambda each: rows_of_solids(each, view.intrinsics))(over_time)
+def untiled(parts: Sequence[np.ndarray | Array], height: int, width: int) -> np.ndarray:
+    """Put a plane of `render` together, `(height, width)`; its parts are below each other."""
+    tiling = Tiling.of(height, width)
+    plane = np.empty((tiling.rows, tiling.height, tiling.columns, tiling.width), parts[0].dtype)
+    first = 0
+    for part in parts:
+        plane[first : first + len(part)] = np.swapaxes(np.asarray(part), 1, 2)
+        first += len(part)
+    return np.ascontiguousarray(plane.reshape(tiling.rows * tiling.height, -1)[:height, :width])
 
 
 def _corners(
-    solid_from_cam: Float[Array, "n 3 4"], size: Float[Array, "n 3"], stem: Float[Array, " n"]
-) -> Float[Array, "3 8 n"]:
-    """The corners of the bounding boxes of all solids in camera coordinates."""
+    solid_from_cam: Float[Array, "t n 3 4"], size: Float[Array, "n 3"], stem: Float[Array, " n"]
+) -> Float[Array, "3 t*8 n"]:
+    """The corners of the bounding boxes of all solids in camera coordinates, at several moments."""
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)
     bounds = size.at[:, 2].multiply(1.0 + stem)
-    local = signs[:, None, :] * bounds[None] - solid_from_cam[None, :, :, 3]
-    return jnp.einsum("nij,kni->jkn", solid_from_cam[:, :, :3], local)
+    local = (signs[:, None, :] * bounds[None])[None] - solid_from_cam[:, None, :, :, 3]
+    corners = jnp.einsum("tnij,tkni->jtkn", solid_from_cam[..., :3], local)
+    return corners.reshape(3, -1, len(size))
 
 
-def _rays(view: CameraView, row: Int[Array, ""], column: Int[Array, ""]) -> Rays:
+def _rays(view: CameraView, row: Int[Array, ""], column: Int[Array, ""], tiling: Tiling) -> Rays:
     """Rays through the pixels of one tile."""
     fx, fy, cx, cy = view.intrinsics
-    v, u = np.divmod(np.arange(TILE_HEIGHT * TILE_WIDTH, dtype=np.int32), np.int32(TILE_WIDTH))
-    x = ((u + column).astype(jnp.float32) + view.offset[0] - cx) / fx
-    y = ((v + row).astype(jnp.float32) + view.offset[1] - cy) / fy
-    return Rays(x, y, jnp.asarray(v / np.float32(TILE_HEIGHT)))
-
-
-def _untile(tiles: Array, rows: int, columns: int) -> Array:
-    """`(rows * columns, p)` to `(rows * tile height, columns * tile width)`."""
-    blocks = tiles.reshape(rows, columns, TILE_HEIGHT, TILE_WIDTH)
-    return blocks.transpose(0, 2, 1, 3).reshape(rows * TILE_HEIGHT, columns * TILE_WIDTH)
+    v, u = np.divmod(np.arange(tiling.height * tiling.width, dtype=np.int32), np.int32(tiling.width))
+    x = ((u + column * tiling.width).astype(jnp.float32) + view.offset[0] - cx) / fx
+    y = ((v + row * tiling.height).astype(jnp.float32) + view.offset[1] - cy) / fy
+    return Rays(x, y, jnp.asarray(v / np.float32(tiling.height)))

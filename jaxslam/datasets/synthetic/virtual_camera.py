@@ -1,8 +1,8 @@
 """A camera in a rendered scene: what it measures at any time, and the exact picture behind it."""
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from functools import cached_property, partial
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import cv2
@@ -11,16 +11,17 @@ import numpy as np
 
 from jaxslam.datasets.synthetic import homogeneous as rigid
 from jaxslam.datasets.synthetic.actors import Actor
+from jaxslam.datasets.synthetic.culling import Candidates, Tiling
 from jaxslam.datasets.synthetic.primitives import PlacedSolid
-from jaxslam.datasets.synthetic.raycast import TILE_HEIGHT
 from jaxslam.datasets.synthetic.render import (
     CameraView,
     Rendering,
     RenderScene,
     arrange_scene,
+    find_candidates,
     pack_solids,
     render,
-    tile_rows,
+    untiled,
 )
 from jaxslam.datasets.synthetic.sensor_noise import (
     LensParams,
@@ -217,21 +218,28 @@ class VirtualCamera:
         baseline_m = self._camera.baseline_m
         to_the_right_m = (0.0,) if baseline_m is None else (0.0, baseline_m)
         keys = [key, *(jax.random.fold_in(key, number) for number in range(1, len(to_the_right_m)))]
-        moments = self._expose(time_s, to_the_right_m)
-        own = moments[0][len(moments[0]) // 2]
-        with ThreadPoolExecutor(usable_cores()) as pool:
-            depth_m = pool.submit(self._depth, own, key)
-            left, *right = pool.map(partial(self._color, time_s), moments, keys)
-        return TakenPicture(own, left, depth_m.result(), *right)
+        scene, cameras = self._expose(time_s, to_the_right_m)
+        middle = len(cameras[0]) // 2
+        # What waits for pictures does so in threads of its own, so that no core does.
+        with ThreadPoolExecutor(usable_cores()) as pool, ThreadPoolExecutor(1 + len(cameras)) as sensors:
+            renderers = [_Renderer(pool, scene, moments, self._camera) for moments in cameras]
+            exact = renderers[0].submit(cameras[0][middle])
+            depth_m = sensors.submit(self._depth, exact, key)
+            colors = []
+            for renderer, moments, its_key in zip(renderers, cameras, keys, strict=True):
+                pictures = [exact if view is cameras[0][middle] else renderer.submit(view) for view in moments]
+                colors.append(sensors.submit(self._color, time_s, pictures, its_key))
+            left, *right = (color.result() for color in colors)
+            return TakenPicture(exact.whole, left, depth_m.result(), *right)
 
-    def _depth(self, exact: Rendering, key: jax.Array) -> np.ndarray:
-        params = depth_params(self._sensor)
+    def _depth(self, picture: "_Picture", key: jax.Array) -> np.ndarray:
+        params, exact = depth_params(self._sensor), picture.whole
         return np.asarray(measure_depth(exact.depth_m, exact.incidence, self._camera.fx, params, key))
 
-    def _color(self, time_s: float, moments: list[Rendering], key: jax.Array) -> np.ndarray:
-        colors = tuple(moment.color for moment in moments)
+    def _color(self, time_s: float, moments: list["_Picture"], key: jax.Array) -> np.ndarray:
         rows = self._row_times(np.arange(self._camera.height))
         gain = self._gain_of_rows(time_s + rows) if self._rolls else self._gain_at(time_s)
+        colors = tuple(moment.color for moment in moments)
         channels = measure_color(colors, gain, self._sensor.image_noise, key, self._optics.lens)
         # XLA needs as long to interleave the channels as to render a moment.
         return cv2.merge(list(np.asarray(channels)))
@@ -239,15 +247,14 @@ class VirtualCamera:
     def _gain_of_rows(self, times_s: np.ndarray) -> np.ndarray:
         return np.array([self._gain_at(float(time_s)) for time_s in times_s])[None, :, None]
 
-    def _expose(self, time_s: float, to_the_right_m: Sequence[float]) -> list[list[Rendering]]:
+    def _expose(self, time_s: float, to_the_right_m: Sequence[float]) -> tuple[RenderScene, list[list[CameraView]]]:
         """The moments of one exposure, evenly in time, each on its own row and column within the pixel, by camera."""
         n = self._sensor.exposure_samples
         rank = np.arange(n)
         centered = (rank + 0.5) / n - 0.5
         offsets = np.stack([centered, centered[(2 * rank + (n + 1) // 2) % n]], axis=1)
         scene, views = self._views(time_s + self._sensor.exposure_s * centered, offsets, to_the_right_m)
-        renderings = _render_all(scene, views, self._camera)
-        return [renderings[n * k : n * (k + 1)] for k in range(len(to_the_right_m))]
+        return scene, [views[k : k + n] for k in range(0, len(views), n)]
 
     def _row_times(self, rows: np.ndarray) -> np.ndarray:
         """Times of `(r,)` rows since that of the middle one, `(r,)`; a single 0 if all are taken at once."""
@@ -263,7 +270,8 @@ class VirtualCamera:
     ) -> tuple[RenderScene, list[CameraView]]:
         """Return the scene in sight of cameras side by side, and their views at `(t,)` times, camera by camera."""
         camera, num_views = self._camera, len(time_s) * len(to_the_right_m)
-        since_s = self._row_times(np.arange(tile_rows(camera.height) + 1) * TILE_HEIGHT)
+        tiling = Tiling.of(camera.height, camera.width)
+        since_s = self._row_times(np.arange(tiling.rows + 1) * tiling.height)
         times = np.tile((time_s[:, None] + since_s).ravel(), len(to_the_right_m))
         world_from_cam = rigid.matrix_from_pose(self._pose_at(times))
         aside_m = np.repeat(to_the_right_m, len(time_s) * len(since_s))
@@ -278,27 +286,57 @@ class VirtualCamera:
         return scene, [CameraView(solids, place, intrinsics, shift) for solids, place, shift in arrays]
 
 
-def _render_all(scene: RenderScene, views: list[CameraView], camera: Camera) -> list[Rendering]:
-    """Render views on all processor cores: XLA renders one at a time, and those it is given at once in turn."""
-    size, rows = {"height": camera.height, "width": camera.width}, tile_rows(camera.height)
-    cores = min(usable_cores(), len(views) * rows)
-    if len(views) % cores == 0:
-        parts = [(view, 0, None) for view in views]
-    else:
-        share = -(-rows // cores)
+class _Renderer:
+    """Renders what one camera sees over an exposure, on all processor cores: XLA renders one picture at a time."""
+
+    def __init__(self, pool: ThreadPoolExecutor, scene: RenderScene, moments: list[CameraView], camera: Camera) -> None:
+        """Find what is in sight.
+
+        Args:
+            pool: A thread for each core.
+            scene: What is to be seen.
+            moments: The views over the exposure.
+            camera: Size of the picture.
+        """
+        self._pool, self._scene = pool, scene
+        self._size = {"height": camera.height, "width": camera.width}
+        self._candidates = pool.submit(self._find, moments)
+
+    def submit(self, view: CameraView) -> "_Picture":
+        """Begin to render a view in parts, rows of tiles below each other."""
+        rows = Tiling.of(**self._size).rows
+        share = -(-rows // usable_cores())
         firsts = range(0, rows, share)
-        parts = [(view, first, min(share, rows - first)) for view in views for first in firsts]
-    with ThreadPoolExecutor(cores) as pool:
-        done = list(
-            pool.map(lambda part: jax.block_until_ready(render(scene, part[0], part[1], rows=part[2], **size)), parts)
-        )
-    each = len(done) // len(views)
-    return [_stacked(done[k : k + each], camera.height) for k in range(0, len(done), each)]
+        parts = [self._pool.submit(self._render_part, view, first, min(share, rows - first)) for first in firsts]
+        return _Picture(parts, **self._size)
+
+    def _find(self, moments: list[CameraView]) -> Candidates:
+        solid_from_cam = np.stack([np.asarray(view.solid_from_cam) for view in moments])
+        return find_candidates(self._scene, solid_from_cam, np.asarray(moments[0].intrinsics), **self._size)
+
+    def _render_part(self, view: CameraView, first: int, rows: int) -> Rendering:
+        part = render(self._scene, view, self._candidates.result(), first, rows=rows, **self._size)
+        return jax.block_until_ready(part)
 
 
-def _stacked(parts: list[Rendering], height: int) -> Rendering:
-    """Put parts of a picture of `height` rows below each other."""
-    if len(parts) == 1:
-        return parts[0]
-    planes: Any = (np.concatenate(each)[:height] for each in zip(*parts, strict=True))
-    return Rendering(*planes)
+class _Picture:
+    """A picture that is being rendered: what asks for it waits.
+
+    Most pictures are one moment of an exposure, of which only the color is put together.
+    """
+
+    def __init__(self, parts: "list[Future[Rendering]]", height: int, width: int) -> None:
+        """Take the parts, below each other, and the size of the picture."""
+        self._parts, self._height, self._width = parts, height, width
+
+    @property
+    def color(self) -> np.ndarray:
+        """`Rendering.color`."""
+        return untiled([part.result().color for part in self._parts], self._height, self._width)
+
+    @cached_property
+    def whole(self) -> Rendering:
+        """All of it."""
+        by_plane = zip(*(part.result() for part in self._parts), strict=True)
+        planes: Any = (untiled(plane, self._height, self._width) for plane in by_plane)
+        return Rendering(*planes)

@@ -1,4 +1,6 @@
-"""Rays against solids: the rows in which a solid is looked for."""
+"""Rays against solids: the tiles, and their rows, in which a solid is looked for."""
+
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
@@ -6,18 +8,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxslam.datasets.synthetic.raycast import (
-    TILE_HEIGHT,
-    TILE_WIDTH,
-    InTile,
-    Rays,
-    Shapes,
-    compact,
-    nearest_solid,
+from jaxslam.datasets.synthetic.culling import (
+    Tiling,
+    list_candidates,
     rows_of_solids,
+    solids_in_tiles,
 )
+from jaxslam.datasets.synthetic.raycast import Rays, Shapes, nearest_solid
 
 INTRINSICS = np.array([300.0, 300.0, 319.5, 239.5], np.float32)
+TILING = Tiling.of(480, 640)
 NUM_BOXES, NUM_CAPSULES = 60, 40
 
 
@@ -35,41 +35,72 @@ def scattered(seed: int) -> tuple[Shapes, np.ndarray]:
     bounds = size * np.stack([np.ones(n), np.ones(n), 1.0 + stem], axis=1)
     corners = np.einsum("nji,knj->ikn", rotation, signs[:, None] * bounds) + center.T[:, None]
     unit_from_cam = (solid_from_cam / size[:, :, None]).astype(np.float32)
-    rows = rows_of_solids(jnp.asarray(corners, jnp.float32), jnp.asarray(INTRINSICS))
-    return Shapes(jnp.asarray(unit_from_cam), jnp.asarray(stem, jnp.float32), rows), corners
+    return Shapes(jnp.asarray(unit_from_cam), jnp.asarray(stem, jnp.float32)), corners
 
 
-def rays_of_tile(top: int, left: int) -> Rays:
-    v, u = np.divmod(np.arange(TILE_HEIGHT * TILE_WIDTH), TILE_WIDTH)
-    x, y = (u + left - INTRINSICS[2]) / INTRINSICS[0], (v + top - INTRINSICS[3]) / INTRINSICS[1]
-    return Rays(*(jnp.asarray(each, jnp.float32) for each in (x, y, v / TILE_HEIGHT)))
-
-
-def every(first: int, count: int) -> InTile:
-    return InTile(jnp.arange(first, first + count, dtype=jnp.int32), jnp.int32(count))
+def rays_of_tile(row: int, column: int) -> Rays:
+    v, u = np.divmod(np.arange(TILING.height * TILING.width), TILING.width)
+    x = (u + column * TILING.width - INTRINSICS[2]) / INTRINSICS[0]
+    y = (v + row * TILING.height - INTRINSICS[3]) / INTRINSICS[1]
+    return Rays(*(jnp.asarray(each, jnp.float32) for each in (x, y, v / TILING.height)))
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_no_ray_meets_a_solid_outside_its_rows(seed):
+def test_no_ray_meets_a_solid_outside_its_tiles_and_rows(seed):
     shapes, corners = scattered(seed)
-    anywhere = jnp.broadcast_to(jnp.array([[-1_000_000], [1_000_000]], jnp.int32), shapes.rows.shape)
-    cast = jax.jit(nearest_solid)
-    boxes, capsules = every(1, NUM_BOXES - 1), every(NUM_BOXES, NUM_CAPSULES)
-    for top in range(0, 480, TILE_HEIGHT):
-        rays, first = rays_of_tile(top, 280), jnp.int32(top)
+    once = jnp.asarray(corners, jnp.float32)[None]
+    reaches = np.array(solids_in_tiles(once, jnp.asarray(INTRINSICS), TILING))
+    rows = np.asarray(rows_of_solids(once[0], jnp.asarray(INTRINSICS)))[None]
+    reaches[:, 0] = False
+    everywhere = np.ones_like(reaches)
+    everywhere[:, 0] = False
+    anywhere = np.broadcast_to([[-1_000_000], [1_000_000]], rows.shape)
+    found = list_candidates(reaches, rows, NUM_BOXES, TILING)
+    every = list_candidates(everywhere, anywhere, NUM_BOXES, TILING)
+    assert found.begins[-1, -1] < 0.3 * every.begins[-1, -1]
+    cast = jax.jit(nearest_solid, static_argnames="tiling")
+    for row in range(TILING.rows):
+        tile = row * TILING.columns + 3
+        rays = rays_of_tile(row, 3)
+        of_tile = lambda candidates, tile=tile: candidates._replace(begins=candidates.begins[tile])
         np.testing.assert_array_equal(
-            cast(shapes, rays, boxes, capsules, first),
-            cast(shapes._replace(rows=anywhere), rays, boxes, capsules, first),
+            cast(shapes, rays, of_tile(found), tiling=TILING), cast(shapes, rays, of_tile(every), tiling=TILING)
         )
-    first_row, after_last = np.asarray(shapes.rows)
+    first_row, after_last = rows[0]
     ahead = (corners[2] > 0.05).all(axis=0)
     assert np.median((after_last - first_row)[ahead]) < 90
     assert (~ahead).any()
 
 
-def test_lists_hold_the_solids_that_reach_into_each_tile_in_order():
-    reaches = np.random.default_rng(0).random((7, 200)) < 0.1
+@pytest.mark.parametrize("by_row", [False, True])
+def test_lists_hold_the_solids_that_reach_into_each_tile_by_kind_and_window(by_row):
+    rng = np.random.default_rng(0)
+    reaches = rng.random((TILING.rows * TILING.columns, 200)) < 0.1
     reaches[3] = False
-    listed = compact(jnp.asarray(reaches), 5)
-    for row, indices, count in zip(reaches, np.asarray(listed.indices), np.asarray(listed.n_reaching), strict=True):
-        np.testing.assert_array_equal(indices[:count], 5 + np.flatnonzero(row))
+    first = rng.integers(0, 480, (TILING.rows if by_row else 1, 200))
+    rows = np.stack([first, first + rng.integers(1, 100, first.shape)], axis=1)
+    listed = list_candidates(reaches, rows, 120, TILING)
+    windows = TILING.windows
+    for tile, begins in enumerate(listed.begins):
+        np.testing.assert_array_equal(np.sort(listed.solids[begins[0] : begins[-1]]), np.flatnonzero(reaches[tile]))
+        row = tile // TILING.columns
+        for group, (begin, end) in enumerate(pairwise(begins)):
+            solids, window = listed.solids[begin:end], windows[group % len(windows)]
+            assert ((solids >= 120) == (group >= len(windows))).all()
+            above, below = np.clip(rows[row if by_row else 0][:, solids] - 60 * row, 0, 60)
+            top = listed.first_rows[begin:end]
+            assert (top <= above).all()
+            assert (below <= top + window).all()
+            assert (top + window <= 60).all()
+            smaller = [each for each in windows if each < window]
+            assert not smaller or (below - above > smaller[-1]).all()
+
+
+@pytest.mark.parametrize(("height", "width"), [(480, 640), (370, 1226), (8, 8), (61, 81), (2160, 3840)])
+def test_tiles_cover_the_picture_and_little_more(height, width):
+    tiling = Tiling.of(height, width)
+    assert height <= tiling.rows * tiling.height < height + tiling.rows
+    assert width <= tiling.columns * tiling.width < width + tiling.width
+    assert tiling.height <= 60
+    assert list(tiling.windows) == sorted(set(tiling.windows))
+    assert tiling.windows[-1] == tiling.height
