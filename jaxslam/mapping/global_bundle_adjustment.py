@@ -116,7 +116,8 @@ def adjust_submap(
         slam_map: The map.
         submap: Number of the submap.
         plan: Settings of the adjustment, of which `window` and `max_steps` are those of local adjustment only.
-        is_interrupted: Function that tells whether to end early; called before every chunk of points.
+        is_interrupted: Function that tells whether to end early; called before every chunk of points, where it may
+            wait.
 
     Returns:
         The adjusted submap; `None` if nothing in it can be adjusted, or if it was interrupted.

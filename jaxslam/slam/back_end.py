@@ -102,7 +102,8 @@ class BackEnd:
         self._searches = PlaceSearch(loops, plan)
         self._to_mapping: Worker[MapJob, MapUpdate] = self._worker(self._writer.do, "mapping", 1)
         self._to_places: Worker[PlaceJob, PlaceResult] = self._worker(self._searches.do, "places", 2)
-        self._adjuster = MapAdjuster(self._plan.adjust, lambda work: self._worker(work, "adjustment", _SLOW_TURN))
+        make_adjuster = lambda work: self._worker(work, "adjustment", _SLOW_TURN)
+        self._adjuster = MapAdjuster(self._plan.adjust, make_adjuster, in_turn=config.run.in_turn)
         self._semantics = None if detector is None else KeyframeSemantics(camera, detector, config, self._times)
         has_dense = config.dense.enabled and not localize_only
         self.dense = dense_mapping_of(camera, sensor, config, key_detector, self._times) if has_dense else None
@@ -211,6 +212,7 @@ class BackEnd:
             Exception: Error of a job in a thread. The state is unchanged, and nothing else is lost.
         """
         self.check_open()
+        self._adjuster.frame_begun()
         self._localizer.begin_frame()
         if self._semantics is not None:
             self._take_movers(*self._semantics.collect(frame), frame)
@@ -234,6 +236,7 @@ class BackEnd:
         jobs, self._jobs = self._jobs, []
         for submit in jobs:
             submit()
+        self._adjuster.frame_ended()
 
     def latest_error(self) -> str:
         """Return the latest error of the detector of keyframes, once; empty if there is none."""
