@@ -155,7 +155,8 @@ class MappingConfig(ValidatedConfig):
     the farthest from the camera. Without it, the map grows with the space that it shows."""
     global_adjustment: bool = True
     """Whether to adjust all keyframes and points of the map together after a loop, beside tracking (global bundle
-    adjustment). Without it, only those around the loop are adjusted, window by window."""
+    adjustment). A deterministic run has the result after ten times `latency_frames`. Without it, only those around the
+    loop are adjusted, window by window."""
 
 
 @dataclass(frozen=True)

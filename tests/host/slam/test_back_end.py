@@ -19,10 +19,12 @@ from jaxslam.config.schema import Config, MappingConfig, RunConfig
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.geometry.se3 import angle, between, compose
 from jaxslam.loop_closing.loop_detector import LoopClosing, LoopClosure
-from jaxslam.map.types import Map
+from jaxslam.map.types import Map, empty_map
 from jaxslam.map.validate import problems
 from jaxslam.mapping.global_bundle_adjustment import AdjustedSubmap
+from jaxslam.mapping.local_bundle_adjustment import AdjustPlan
 from jaxslam.mapping.local_mapping import LocalMapping, NewKeyframe
+from jaxslam.runtime.worker import ThreadWorker
 from jaxslam.sensors.frame import Frame
 from jaxslam.slam import map_adjuster
 from jaxslam.slam.slam import Slam
@@ -315,6 +317,31 @@ class TestGlobalAdjustment:
         closes_in_time(slam)
         assert ended.wait(1)
         assert threads() == []
+
+    def test_waits_while_a_frame_is_tracked(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Before each chunk of points; a newer job ends it all the same."""
+        asked, answers = threading.Event(), []
+
+        def adjust(slam_map: Map, submap: int, plan: Any, is_interrupted: Callable[[], bool]) -> None:
+            asked.set()
+            answers.append(is_interrupted())
+
+        monkeypatch.setattr(map_adjuster, "adjust_submap", adjust)
+        monkeypatch.setattr(map_adjuster, "_PATIENCE_S", 60.0)
+        make = lambda work: ThreadWorker(work, "jaxslam-adjustment")
+        adjuster = map_adjuster.MapAdjuster(AdjustPlan(), make, in_turn=False)
+        for is_newer in (False, True):
+            asked.clear()
+            adjuster.frame_begun()
+            adjuster.worker.submit(adjuster.next_job(empty_map(recording().camera), [0]), 0)
+            assert asked.wait(10)
+            assert len(answers) == is_newer, "did not wait"
+            if is_newer:
+                adjuster.interrupt()
+            adjuster.frame_ended()
+            adjuster.worker.flush()
+        adjuster.worker.close()
+        assert answers == [False, True]
 
     def watched(self, monkeypatch: pytest.MonkeyPatch) -> tuple[list[Map], list[AdjustedSubmap]]:
         """The maps that are adjusted, and the results that are taken over."""
