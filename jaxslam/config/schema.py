@@ -153,6 +153,10 @@ class MappingConfig(ValidatedConfig):
     max_mb: Annotated[float, Positive] | None = None
     """Memory that the map may take, megabytes. Beyond it keyframes leave: first those whose points others show, then
     the farthest from the camera. Without it, the map grows with the space that it shows."""
+    global_adjustment: bool = True
+    """Whether to adjust all keyframes and points of the map together after a loop, beside tracking (global bundle
+    adjustment). A deterministic run has the result after ten times `latency_frames`. Without it, only those around the
+    loop are adjusted, window by window."""
 
 
 @dataclass(frozen=True)

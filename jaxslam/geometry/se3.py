@@ -100,12 +100,12 @@ def displacement(first: Transforms, second: Transforms) -> Float[np.ndarray, "..
     return np.concatenate([change[..., 4:], turn * axis], axis=-1)
 
 
-def retract(T: Pose, tangent: Num[np.ndarray, "6"]) -> Pose:
-    """Retract a `(6,)` tangent vector at a `(7,)` transform: the product of `T` and the small motion.
+def retract(T: Transforms, tangent: Num[np.ndarray, "... 6"]) -> Transforms:
+    """Retract `(..., 6)` tangent vectors at `(..., 7)` transforms: the product of `T` and the small motion.
 
     The tangent holds a translation (meters) and a rotation vector (radians), both in the local axes of `T`. The two are
     applied separately, so this is the retraction of SO(3) x R^3 and not the exponential map of SE(3).
     """
-    turn = np.linalg.norm(tangent[3:])
-    axis = np.sinc(turn / (2 * np.pi)) * 0.5 * tangent[3:]
-    return compose(T, np.concatenate([[np.cos(turn / 2)], axis, tangent[:3]]))
+    turn = np.linalg.norm(tangent[..., 3:], axis=-1, keepdims=True)
+    axis = np.sinc(turn / (2 * np.pi)) * 0.5 * tangent[..., 3:]
+    return compose(T, np.concatenate([np.cos(turn / 2), axis, tangent[..., :3]], axis=-1))

@@ -3,6 +3,7 @@
 import numpy as np
 
 from jaxslam.geometry.se3 import IDENTITY, compose, inverse, rotate
+from jaxslam.geometry.types import Ids, Poses
 from jaxslam.loop_closing.loop_detector import LoopClosure
 from jaxslam.map.edit import transformed, with_loop, with_positions
 from jaxslam.map.point_records import NONE, has, rows
@@ -36,11 +37,28 @@ def _bent(slam_map: Map, loop: LoopClosure) -> Map:
     known = np.flatnonzero(has(slam_map.ids, loop.keyframes))
     if not len(known):
         return slam_map
-    row = rows(slam_map.ids, loop.keyframes[known])
-    first = known[0]  # fixed in the pose graph: the world stays where it is now, even if it was transformed since
-    T_now_then = compose(slam_map.T_world_cam[row[0]], inverse(loop.T_world_cam[first]))
+    # The first is fixed in the pose graph: the world stays where it is now, even if it was transformed since.
+    now = slam_map.pose(int(loop.keyframes[known[0]]))
+    T_now_then = compose(now, inverse(loop.T_world_cam[known[0]]))
+    return with_corrected_keyframes(slam_map, loop.keyframes[known], compose(T_now_then, loop.T_world_cam[known]))
+
+
+def with_corrected_keyframes(slam_map: Map, keyframe_ids: Ids, T_world_cam: Poses) -> Map:
+    """Set the poses of some keyframes, and move everything else along.
+
+    Other keyframes move with their parent in the spanning tree, and points with their reference keyframe.
+
+    Args:
+        slam_map: The map.
+        keyframe_ids: `(m,)` ids of the keyframes.
+        T_world_cam: `(m, 7)` new poses of the keyframes.
+
+    Raises:
+        KeyError: If a keyframe is not in the map.
+    """
+    row = rows(slam_map.ids, keyframe_ids)
     change = np.tile(IDENTITY, (len(slam_map.ids), 1))
-    change[row] = compose(compose(T_now_then, loop.T_world_cam[known]), inverse(slam_map.T_world_cam[row]))
+    change[row] = compose(T_world_cam, inverse(slam_map.T_world_cam[row]))
     settled = slam_map.parent == NONE
     settled[row] = True
     for index in np.flatnonzero(~settled):
@@ -51,4 +69,6 @@ def _bent(slam_map: Map, loop: LoopClosure) -> Map:
         settled[line] = True
     of_point = change[rows(slam_map.ids, surviving_keyframes(slam_map, slam_map.points.reference_keyframe))]
     X_world = (rotate(of_point, slam_map.points.X_world.T) + of_point[:, 4:]).T
-    return with_positions(slam_map, slam_map.ids, compose(change, slam_map.T_world_cam), slam_map.points.ids, X_world)
+    moved = (change != IDENTITY).any(axis=1)
+    poses = compose(change[moved], slam_map.T_world_cam[moved])
+    return with_positions(slam_map, slam_map.ids[moved], poses, slam_map.points.ids, X_world)

@@ -18,6 +18,7 @@ def padded_edges(
     T_source_target: Poses,
     information: Float[np.ndarray, "e 6 6"],
     room: int,
+    dtype: type[np.floating] = np.float32,
 ) -> PoseGraphEdges:
     """Return edges of weight one in arrays of length `room`.
 
@@ -27,15 +28,16 @@ def padded_edges(
         T_source_target: `(e, 7)` measured relative poses.
         information: `(e, 6, 6)` inverse covariances of the measurements: translation (m), then rotation (rad).
         room: Length of the arrays, at least e.
+        dtype: Floating-point type of the arrays.
     """
     num = len(source)
-    poses: Any = padded(T_source_target, room, fill=IDENTITY).astype(np.float32)
+    poses: Any = padded(T_source_target, room, fill=IDENTITY).astype(dtype)
     columns: Any = (
         padded(source, room).astype(np.int32),
         padded(target, room).astype(np.int32),
         SE3(poses),
-        padded(information, room, fill=np.eye(6)).astype(np.float32),
-        padded(np.ones(num, np.float32), room),
+        padded(information, room, fill=np.eye(6)).astype(dtype),
+        padded(np.ones(num, dtype), room),
         np.arange(room) < num,
     )
     return PoseGraphEdges(*columns)

@@ -31,9 +31,9 @@ _OBSERVATIONS_A_POINT = 6
 _MIN_KEYFRAMES = 4
 """Minimum number of keyframes. With fewer, tracking is more accurate: it has tracked the points through all frames in
 between. With people in two or three keyframes, adjusting turned 2.6 mm into 4.1 mm in the synthetic room."""
-_STRONG = 100
+STRONG = 100
 """Number of common points from which they alone tell the relative pose of a keyframe and its parent."""
-_EDGE_PX = 1.0
+EDGE_PX = 1.0
 """Standard deviation of that relative pose where there are fewer: how far it moves the points in view, pixels."""
 _TOLERANCE = 1e-3
 """Share of the cost: a step that changes it by less is the last one. With 1e-3 a window of fr1_rpy takes five to nine
@@ -164,7 +164,7 @@ def _window(slam_map: Map, keyframe_id: int, plan: AdjustPlan, movable: Ids) -> 
     outside, shared = np.unique(slam_map.observations.keyframe[others], return_counts=True)
     # And the keyframe that this one came from, however few points they share: then the edges in between hold it.
     ancestor = ancestor_outside(slam_map, keyframe_id, free)
-    few = ancestor != NONE and ancestor not in outside[shared >= _STRONG]
+    few = ancestor != NONE and ancestor not in outside[shared >= STRONG]
     kept = np.union1d(first, [ancestor] if few else []).astype(np.int64)
     most = outside[np.lexsort((outside, -shared))]
     held = np.concatenate([kept, most[~np.isin(most, kept)]])[:_NUM_FIXED]
@@ -192,29 +192,51 @@ def _solve_input(
     return poses.astype(np.float32), X.astype(np.float32)
 
 
-def _observations(slam_map: Map, window: _Window, size: int, plan: AdjustPlan) -> BundleObservations:
-    camera, seen = slam_map.camera, window.observations
-    room = size * _OBSERVATIONS_A_POINT
-    row = _places(window.keyframes, seen.keyframe)
+class Measurements(NamedTuple):
+    """What observations say, as bundle adjustment takes it; `s` observations.
+
+    Attributes:
+        xy: `(2, s)` normalized coordinates in the ideal image.
+        depth: `(s,)` measured depths, meters; 0 where there is none.
+        precision: `(3, s)` inverse standard deviations: of the two coordinates, and of depth per meter.
+        weights: `(s,)` weights of the observation and its point, multiplied.
+    """
+
+    xy: Float[np.ndarray, "2 s"]
+    depth: Float[np.ndarray, " s"]
+    precision: Float[np.ndarray, "3 s"]
+    weights: Float[np.ndarray, " s"]
+
+
+def measurements(slam_map: Map, seen: Observations, plan: AdjustPlan) -> Measurements:
+    """Return the measurements of some observations of a map."""
+    camera = slam_map.camera
     sigma_depth = plan.depth_sigma_m + plan.depth_sigma_per_m2 * np.square(seen.depth)
     focal = np.array([[camera.fx], [camera.fy]])
     center = np.array([[camera.cx], [camera.cy]])
-    point_row = np.searchsorted(window.points, seen.point)
     at = rows(slam_map.points.ids, seen.point)
     weight = seen.weight * slam_map.points.weight[at]
     if plan.occluded_weight != 1:
         weight = weight * state_weights(slam_map.points.state[at], plan.occluded_weight)
     of_depth = np.divide(1, sigma_depth, out=np.zeros_like(sigma_depth), where=seen.depth > 0)
     precision = np.concatenate([focal / seen.sigma_px, of_depth[None, :]])
+    return Measurements((seen.uv - center) / focal, seen.depth, precision, weight)
+
+
+def _observations(slam_map: Map, window: _Window, size: int, plan: AdjustPlan) -> BundleObservations:
+    seen, measured = window.observations, measurements(slam_map, window.observations, plan)
+    room = size * _OBSERVATIONS_A_POINT
+    row = _places(window.keyframes, seen.keyframe)
+    point_row = np.searchsorted(window.points, seen.point)
     fit: Any = lambda array, dtype: padded(array.astype(dtype), room, axis=-1, fill=0)
     valid: Any = np.arange(room) < len(row)
     return BundleObservations(
         camera=fit(row, np.int32),
         point=fit(point_row, np.int32),
-        xy=fit((seen.uv - center) / focal, np.float32),
-        depth=fit(seen.depth, np.float32),
-        precision=fit(precision, np.float32),
-        weights=fit(weight, np.float32),
+        xy=fit(measured.xy, np.float32),
+        depth=fit(measured.depth, np.float32),
+        precision=fit(measured.precision, np.float32),
+        weights=fit(measured.weights, np.float32),
         valid=valid,
     )
 
@@ -231,12 +253,12 @@ def _tree_edges(slam_map: Map, window: _Window, room: int) -> PoseGraphEdges:
     seen = np.zeros((len(window.keyframes), len(window.points)), np.float32)
     of_keyframe, of_point = window.observations.keyframe, window.observations.point
     seen[_places(window.keyframes, of_keyframe), rows(window.points, of_point)] = 1
-    few = np.sum(seen[parent] * seen[child], axis=1) < _STRONG
+    few = np.sum(seen[parent] * seen[child], axis=1) < STRONG
     parent, child = parent[few], child[few]
     poses = slam_map.T_world_cam[rows(slam_map.ids, window.keyframes)]
     X_world = slam_map.points.X_world[:, rows(slam_map.points.ids, window.points)]
     distance = np.median(np.linalg.norm(X_world - poses[0, 4:, None], axis=0))
-    sigma = _EDGE_PX / slam_map.camera.fx
+    sigma = EDGE_PX / slam_map.camera.fx
     information = np.tile(np.diag(np.repeat([sigma * distance, sigma], 3) ** -2.0), (len(child), 1, 1))
     return padded_edges(parent, child, between(poses[parent], poses[child]), information, room)
 

@@ -36,6 +36,7 @@ from jaxslam.mapping.culling import (
     without_redundant,
     without_unconfirmed,
 )
+from jaxslam.mapping.global_bundle_adjustment import AdjustedSubmap, with_adjusted_submap
 from jaxslam.mapping.local_bundle_adjustment import AdjustPlan, adjust_all, adjust_around, compile_adjustment
 from jaxslam.mapping.local_map_tracking import LOCAL_KEYFRAMES, local_keyframes
 from jaxslam.mapping.map_point_matching import (
@@ -124,6 +125,7 @@ class MappingPlan(NamedTuple):
         track_sigma_px: Standard deviation of the position of a point tracked by optical flow, pixels.
         search_px: Search radius around the projection of a map point at octave 0, pixels.
         max_mb: Memory that the map may take, megabytes; `None` without a limit.
+        global_adjustment: Whether global bundle adjustment follows a loop, so that windows need not be adjusted.
     """
 
     features: FeaturePlan = FeaturePlan()
@@ -131,6 +133,7 @@ class MappingPlan(NamedTuple):
     track_sigma_px: float = _SETTINGS.track_sigma_px
     search_px: float = _SETTINGS.search_px
     max_mb: float | None = _SETTINGS.max_mb
+    global_adjustment: bool = _SETTINGS.global_adjustment
 
 
 def mapping_plan(camera: Camera, config: Config) -> MappingPlan:
@@ -155,6 +158,7 @@ def mapping_plan(camera: Camera, config: Config) -> MappingPlan:
         track_sigma_px=mapping.track_sigma_px,
         search_px=mapping.search_px,
         max_mb=mapping.max_mb,
+        global_adjustment=mapping.global_adjustment,
     )
 
 
@@ -234,9 +238,17 @@ class LocalMapping:
         near = covisible(part.map, loop.source)[0]
         near = near[has(part.keyframes, near) & (near != loop.target)][:LOCAL_KEYFRAMES]
         slam_map = self._fused(part.map, loop.target, np.append(np.int64(loop.source), near))
-        # 3. Bundle adjustment of the target's local map, then of all keyframes around the loop, window by window.
+        # 3. Bundle adjustment of the target's local map. That of the whole map (ORB-SLAM2, 2017, III-D) comes later;
+        #    without it, all keyframes around the loop are adjusted window by window.
         slam_map = adjust_around(slam_map, loop.target, self._plan.adjust, part.keyframes)
-        self.map = merge_back(whole, part, adjust_all(slam_map, self._plan.adjust, part.keyframes))
+        if not self._plan.global_adjustment:
+            slam_map = adjust_all(slam_map, self._plan.adjust, part.keyframes)
+        self.map = merge_back(whole, part, slam_map)
+        return self.map
+
+    def take_adjusted(self, adjusted: AdjustedSubmap) -> Map:
+        """Take over the result of global bundle adjustment; return the new map."""
+        self.map = with_adjusted_submap(self.map, adjusted).in_blocks()
         return self.map
 
     def remove(self, movers: DynamicObservations) -> tuple[Map, Ids]:

@@ -28,8 +28,10 @@ _AGO_S = (0.27, 0.5)
 width, and by more than a step. With 0.33 s for the latter, masks without detections for a second are worse, because
 people who pause drop out of them (Bonn `crowd`, against DeepLab, without new surfaces: median IoU 0.35 instead of
 0.39)."""
-_KEPT_S = 1.0
-"""Time for which frames are kept, seconds."""
+_LONG_AGO_S = (1.0, 2.0, 3.5)
+"""Ages of further frames, seconds: what they see through has appeared since, also if it stands still by now."""
+_KEPT_S, _DENSE_S, _SPARSE_S = 4.5, 1.0, 0.2
+"""Time for which frames are kept, seconds; of those older than the second time, only such as are the third apart."""
 _NEW_SHARE = 0.003
 """Smallest share of the image that a new surface covers."""
 _NEW_RANGE = 0.12
@@ -40,6 +42,8 @@ camera displaces edges by that: on TUM `fr1_rpy`, at 2 rad/s, desks got false ne
 edges."""
 _PERCENTILES = (5, 95)
 """Percentiles that bound the depth range of a new surface."""
+_MIN_HELD = 0.2
+"""Smallest share of an appeared surface that the mask must hold to get all of it back."""
 _MIN_OVERLAP = 0.1
 """Smallest share of the new surface that a connected component of its object holds."""
 
@@ -54,6 +58,8 @@ class BackgroundSurfaces(NamedTuple):
         still: `(h, w)` mask of the surfaces that were there in the older of the two earlier frames.
         unmoved: `(h, w)` mask of the surfaces that were there, outside the mask, in the newer of these frames.
         new: `(h, w)` mask of the surfaces that are in front of those of the newer of the two earlier frames.
+        appeared: `(h, w)` mask of the surfaces that are in front of those of the older one, or of a frame up to four
+            seconds old.
         displaced_px: Largest displacement of edges against the newer of the two earlier frames, reduced pixels.
     """
 
@@ -62,6 +68,7 @@ class BackgroundSurfaces(NamedTuple):
     still: np.ndarray
     unmoved: np.ndarray
     new: np.ndarray
+    appeared: np.ndarray
     displaced_px: float
 
 
@@ -76,7 +83,7 @@ class _Remembered(NamedTuple):
 
 
 class SurfaceMemory:
-    """The depth images, masks and poses of the last second, with which new frames are compared."""
+    """The depth images, masks and poses of the last seconds, with which new frames are compared."""
 
     def __init__(self, raster: ImageGrid, farthest_m: float = math.inf) -> None:
         """Start without frames.
@@ -88,7 +95,7 @@ class SurfaceMemory:
         self._farthest_m = farthest_m
         self._reduced = Downscaler(raster, _COARSE_WIDTH)
         self._intrinsics, shape = self._reduced.raster.intrinsics, self._reduced.raster.shape
-        num = 1 + len(_AGO_S)
+        num = 1 + len(_AGO_S) + len(_LONG_AGO_S)
         self._depth = aligned_array(shape, np.float32)
         self._depths_then = aligned_array((num, *shape), np.float32)
         self._masks_then = aligned_array((num, *shape), np.bool_)
@@ -123,14 +130,15 @@ class SurfaceMemory:
         if since is not None and first is not None:
             first = first._replace(mask=self._reduced.every(since[1]))
         before = [first, *(self._about(time_s - ago_s, ago_s / 2) for ago_s in _AGO_S)]
+        before += [self._about(time_s - ago_s, ago_s / 4) for ago_s in _LONG_AGO_S]
         for slot, then in enumerate(before):
             if then is not None:
                 self._depths_then[slot], self._masks_then[slot] = then.depth, then.mask
                 poses[slot] = between(then.T_world_cam, T_world_cam)
         turns = turn_rad_per_s + (0.0 if before[1] is None else before[1].turn_rad_per_s)
         displaced_px = float(self._intrinsics.fx) * turns * _TIMING_S
-        outside, still, unmoved, new = self._compared(poses)
-        return BackgroundSurfaces(self._depth, outside, still, unmoved, new, displaced_px)
+        outside, still, unmoved, new, appeared = self._compared(poses)
+        return BackgroundSurfaces(self._depth, outside, still, unmoved, new, appeared, displaced_px)
 
     def remember(
         self,
@@ -151,8 +159,13 @@ class SurfaceMemory:
         """
         coarse = self._depth.copy(), self._reduced.every(mask).copy()
         self._seen[frame] = _Remembered(time_s, T_world_cam, turn_rad_per_s, *coarse)
-        for old in [number for number, seen in self._seen.items() if not 0 <= time_s - seen.time_s <= _KEPT_S]:
-            del self._seen[old]
+        last_s = -math.inf
+        for number, then_s in sorted((number, seen.time_s) for number, seen in self._seen.items()):
+            age_s = time_s - then_s
+            if not 0 <= age_s <= _KEPT_S or (age_s > _DENSE_S and then_s < last_s + _SPARSE_S):
+                del self._seen[number]
+            else:
+                last_s = then_s
 
     def correct(self, T_new_old: Float[np.ndarray, "7"]) -> None:
         """Apply a correction of the world frame to the stored poses."""
@@ -167,6 +180,17 @@ class SurfaceMemory:
         """Remove the pixels of a reduced mask `drop` from a mask, except isolated ones."""
         smooth = cv2.medianBlur(drop.view(np.uint8), 3)
         return mask & ~self._reduced.whole(smooth.view(bool)) if smooth.any() else mask
+
+    def with_lost_parts(self, mask: Bool[np.ndarray, "h w"], seen: BackgroundSurfaces) -> Bool[np.ndarray, "h w"]:
+        """Add appeared surfaces to a mask that holds a part of each: what propagation has lost of an object."""
+        appeared = _opened(seen.appeared, seen.displaced_px)
+        num, labels = cv2.connectedComponents(appeared.view(np.uint8), connectivity=4)
+        piece = np.asarray(labels, np.int32)
+        area = np.bincount(piece.ravel(), minlength=num)
+        held = np.bincount(piece[self._reduced.every(mask)], minlength=num)
+        back = held > _MIN_HELD * area
+        back[0] = False  # what has not appeared
+        return mask | self._reduced.whole(back[piece]) if back.any() else mask
 
     def with_new_surfaces(self, mask: Bool[np.ndarray, "h w"], seen: BackgroundSurfaces) -> Bool[np.ndarray, "h w"]:
         """Add the objects with new surfaces to a mask."""
@@ -189,9 +213,8 @@ def new_surfaces(seen: BackgroundSurfaces, mask: Bool[np.ndarray, "h w"]) -> Boo
 
     The rest of an object is at the depth of its new surface, connected to it, and not known to be unmoved.
     """
-    side = max(3, 1 + math.ceil(seen.displaced_px)) | 1  # depth edges are ragged; an even side would shift the mask
-    fresh = cv2.morphologyEx((seen.new & ~mask).view(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8))
-    num, piece, measures, _ = cv2.connectedComponentsWithStats(fresh, connectivity=4)
+    fresh = _opened(seen.new & ~mask, seen.displaced_px)
+    num, piece, measures, _ = cv2.connectedComponentsWithStats(fresh.view(np.uint8), connectivity=4)
     coming = np.zeros(mask.shape, bool)
     for index in range(1, num):
         area = measures[index, cv2.CC_STAT_AREA]
@@ -208,6 +231,12 @@ def new_surfaces(seen: BackgroundSurfaces, mask: Bool[np.ndarray, "h w"]) -> Boo
     return coming
 
 
+def _opened(surfaces: Bool[np.ndarray, "h w"], displaced_px: float) -> Bool[np.ndarray, "h w"]:
+    """Remove what is no wider than edges are displaced from a mask of surfaces."""
+    side = max(3, 1 + math.ceil(displaced_px)) | 1  # depth edges are ragged; an even side would shift the mask
+    return cv2.morphologyEx(surfaces.view(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8)).view(bool)
+
+
 @compiled(when="warm-up")
 def _compared(
     depth: Float[Array, "h w"],
@@ -216,8 +245,8 @@ def _compared(
     T_then_now: Float[Array, "k 7"],
     intrinsics: Intrinsics,
 ) -> tuple[Bool[Array, "h w"], ...]:
-    """Compute `outside`, `still`, `unmoved` and `new` from three frames: of the mask, the newer one, the older one."""
+    """Compute the masks of `BackgroundSurfaces` from the frame of the mask, the newer one, the older one and others."""
     change = jax.vmap(lambda then, pose: depth_change(depth, then, SE3(pose), intrinsics))(depths_then, T_then_now)
     masked = jax.vmap(lambda mask, then: mask.reshape(-1)[then])(masks_then, change.then)
     outside = change.same & ~masked
-    return outside[0], change.same[2], outside[1], change.new[1]
+    return outside[0], change.same[2], outside[1], change.new[1], change.new[2:].any(axis=0)

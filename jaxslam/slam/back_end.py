@@ -38,6 +38,7 @@ from jaxslam.slam.dense_thread import dense_mapping_of
 from jaxslam.slam.frame_localizer import FeatureMotion, FrameLocalizer, LocalizedPose
 from jaxslam.slam.frame_result import FrameResult
 from jaxslam.slam.keyframe_semantics import KeyframeSemantics
+from jaxslam.slam.map_adjuster import AdjustResult, MapAdjuster
 from jaxslam.slam.map_changes import MapChanges
 from jaxslam.slam.map_jobs import MapJob, MapUpdate, MapWriter, PointRemoval
 from jaxslam.slam.place_jobs import IndexUpdate, LoopSearch, PlaceJob, PlaceResult, PlaceSearch, Reload
@@ -49,6 +50,8 @@ from jaxslam.tracking.state import TrackOutput, TrackPlan, TrackState, TrackStat
 
 _RELOAD_EVERY = 10
 """Number of frames after which keyframes of the surroundings are requested again."""
+_SLOW_TURN = 10
+"""Factor on `mapping.latency_frames` after which a deterministic run has the result of global bundle adjustment."""
 _Step: TypeAlias = Callable[[], None]
 _Job = TypeVar("_Job")
 _Result = TypeVar("_Result")
@@ -99,6 +102,8 @@ class BackEnd:
         self._searches = PlaceSearch(loops, plan)
         self._to_mapping: Worker[MapJob, MapUpdate] = self._worker(self._writer.do, "mapping", 1)
         self._to_places: Worker[PlaceJob, PlaceResult] = self._worker(self._searches.do, "places", 2)
+        make_adjuster = lambda work: self._worker(work, "adjustment", _SLOW_TURN)
+        self._adjuster = MapAdjuster(self._plan.adjust, make_adjuster, in_turn=config.run.in_turn)
         self._semantics = None if detector is None else KeyframeSemantics(camera, detector, config, self._times)
         has_dense = config.dense.enabled and not localize_only
         self.dense = dense_mapping_of(camera, sensor, config, key_detector, self._times) if has_dense else None
@@ -181,6 +186,12 @@ class BackEnd:
         self._begun = True
         self._to_mapping.begin()
         self._to_places.begin()
+        self._adjuster.worker.begin()
+
+    def check_open(self) -> None:
+        """Raise a `RuntimeError` after `close`."""
+        if self._closed:
+            raise RuntimeError("the tracker is closed; Slam.reset() begins anew")
 
     def is_due(self, frame: int) -> bool:
         """Tell whether a deterministic run must have results, and so the programs, by frame number `frame`."""
@@ -200,12 +211,13 @@ class BackEnd:
             RuntimeError: After `close`.
             Exception: Error of a job in a thread. The state is unchanged, and nothing else is lost.
         """
-        if self._closed:
-            raise RuntimeError("the tracker is closed; Slam.reset() begins anew")
+        self.check_open()
+        self._adjuster.frame_begun()
         self._localizer.begin_frame()
         if self._semantics is not None:
             self._take_movers(*self._semantics.collect(frame), frame)
         self._take_places(self._to_places.collect(frame), frame)
+        self._take_adjusted(self._adjuster.worker.collect(frame), frame)
         more = self._take_maps(self._to_mapping.collect(frame), frame)
         if self.dense is not None:
             self.dense.collect(frame)
@@ -224,6 +236,7 @@ class BackEnd:
         jobs, self._jobs = self._jobs, []
         for submit in jobs:
             submit()
+        self._adjuster.frame_ended()
 
     def latest_error(self) -> str:
         """Return the latest error of the detector of keyframes, once; empty if there is none."""
@@ -366,19 +379,37 @@ class BackEnd:
         if self._states is not None and not (self._localize_only or self._closed):
             self._offer_states(self._states)
         self._take_places(self._flush(self._to_places), 0)
-        while self._take_maps(self._flush(self._to_mapping), 0):
+        while self._take_maps(self._flush(self._to_mapping), 0) or self._take_adjusted(
+            self._flush(self._adjuster.worker), 0
+        ):
             self._take_places(self._flush(self._to_places), 0)
         if self.dense is not None:
             self.dense.finish()
         return self._carried(state)
 
+    def adjust_map(self, state: TrackState) -> TrackState:
+        """Adjust every submap by global bundle adjustment, and wait for it; to be called after `finish`.
+
+        Args:
+            state: State of the tracker.
+
+        Returns:
+            The state, corrected as the map.
+
+        Raises:
+            Exception: Error of a job in a thread, as in `finish`.
+        """
+        self._request_adjustment(self.map, np.unique(self.map.submap).tolist(), 0)
+        return self.finish(state)
+
     def close(self) -> None:
         """End the threads within two seconds, and discard jobs that have not begun."""
         self._closed = True
         self._jobs.clear()
+        self._adjuster.interrupt()
         looking = () if self._semantics is None else (self._semantics.worker,)
         dense = () if self.dense is None else (self.dense.worker,)
-        close_all((self._to_mapping, self._to_places, *looking, *dense))
+        close_all((self._to_mapping, self._to_places, self._adjuster.worker, *looking, *dense))
 
     def _insert_keyframe(
         self, frame: Frame, arrays: FrameArrays, output: TrackOutput, number: int, recognized: AnchoredPose | None
@@ -419,6 +450,9 @@ class BackEnd:
         for update in updates:
             self._arrived = update.map
             self._loops_closed += update.loops
+            if update.loops and self._config.mapping.global_adjustment:
+                closed = update.map.surviving_keyframe(int(update.map.loops.target[-1]))
+                self._request_adjustment(update.map, [int(update.map.submap[update.map.row(closed)])], frame)
             self._removed += update.removed
             self._graphs.keep_ahead(len(update.map.ids))
             if self.dense is not None and not self._closed:
@@ -462,9 +496,21 @@ class BackEnd:
         if len(changes.ids):
             self._submit(self._to_mapping, changes, 0)
 
+    def _request_adjustment(self, slam_map: Map, submaps: list[int], frame: int) -> None:
+        if not self._closed:
+            self._submit(self._adjuster.worker, self._adjuster.next_job(slam_map, submaps), frame)
+
+    def _take_adjusted(self, results: list[AdjustResult], frame: int) -> bool:
+        """Have mapping take over the submaps after global bundle adjustment; return whether there are any."""
+        adjusted = [] if self._closed else self._adjuster.still_wanted(results)
+        for submap in adjusted:
+            self._submit(self._to_mapping, submap, frame)
+        return bool(adjusted)
+
     def _take_places(self, results: list[PlaceResult], frame: int) -> None:
         for result in results:
             if isinstance(result, LoopClosure):
+                self._adjuster.interrupt()  # it would undo what the loop corrects
                 if not self._closed:
                     self._submit(self._to_mapping, result, frame)
             elif result is not None:

@@ -10,6 +10,7 @@ from jaxslam.loop_closing.loop_detector import LoopClosure
 from jaxslam.map.dynamic_removal import DynamicObservations
 from jaxslam.map.point_records import NONE
 from jaxslam.map.types import Map
+from jaxslam.mapping.global_bundle_adjustment import AdjustedSubmap
 from jaxslam.mapping.local_mapping import LocalMapping, MappingPlan, NewKeyframe, with_new_keyframe
 from jaxslam.mapping.occlusion_states import StateChanges
 from jaxslam.sensors.camera import Camera
@@ -27,8 +28,9 @@ class PointRemoval(NamedTuple):
     ids: Ids
 
 
-MapJob: TypeAlias = NewKeyframe | LoopClosure | DynamicObservations | StateChanges | PointRemoval
-"""A keyframe to insert, a loop to close, observations or points to remove, or occlusion states to store."""
+MapJob: TypeAlias = NewKeyframe | LoopClosure | AdjustedSubmap | DynamicObservations | StateChanges | PointRemoval
+"""A keyframe to insert, a loop to close, a submap after global bundle adjustment, observations or points to remove, or
+occlusion states to store."""
 
 
 class MapUpdate(NamedTuple):
@@ -89,6 +91,8 @@ class MapWriter:
             if isinstance(job, LoopClosure):
                 slam_map = self._mapping.close_loop(job)
                 return MapUpdate(slam_map, loops=int(slam_map is not before))
+            if isinstance(job, AdjustedSubmap):
+                return MapUpdate(self._mapping.take_adjusted(job))
             if isinstance(job, DynamicObservations):
                 slam_map, gone = self._mapping.remove(job)
                 removed = before.contents.num_points - slam_map.contents.num_points

@@ -184,9 +184,13 @@ class MaskPipeline:
         """Compare the depth of the last frame with that of earlier ones, correct its mask by it, and store both."""
         seen = self._surfaces.compare(time_s, T_world_cam, turn_rad_per_s, self._depth, self._carried_from)
         if self._carried_from is not None and self._propagate:
-            # While nothing is detected, what only stands there may never have been part of an object.
-            lately = self._detected_in is not None and frame - self._detected_in <= _TRUSTED_FRAMES
-            self._mask = self._surfaces.without(self._mask, seen.outside if lately else seen.outside | seen.still)
+            if self._detected_in is not None and frame - self._detected_in <= _TRUSTED_FRAMES:
+                self._mask = self._surfaces.without(self._mask, seen.outside)
+            else:
+                # While nothing is detected, what only stands there may never have been part of an object, unless it
+                # has appeared lately; and what has appeared is part of one as a whole.
+                self._mask = self._surfaces.without(self._mask, (seen.outside | seen.still) & ~seen.appeared)
+                self._mask = self._surfaces.with_lost_parts(self._mask, seen)
         if self._new_surfaces:
             self._mask = self._surfaces.with_new_surfaces(self._mask, seen)
         self._surfaces.remember(frame, time_s, T_world_cam, turn_rad_per_s, self._mask)

@@ -70,8 +70,8 @@ class Slam:
         dense_mapping: Thread of the dense map; `None` without `dense.enabled`, or with `localize_only`.
         times: Durations of the stages of every frame: `take over` map corrections, `flow`, `wait for mask`, `pose`,
             `match with map`, and `hand over` to mapping and the detector; and of the jobs of other threads: `match
-            pair` of a stereo camera, `masks`, `detector`, `mapping`, `places`, `dense` and its parts. In a
-            deterministic run, jobs count towards stages as well: `match pair` in `flow`, `masks` in `flow` and `hand
+            pair` of a stereo camera, `masks`, `detector`, `mapping`, `places`, `adjustment`, `dense` and its parts. In
+            a deterministic run, jobs count towards stages as well: `match pair` in `flow`, `masks` in `flow` and `hand
             over`, the others in `hand over` or `take over`.
     """
 
@@ -189,7 +189,8 @@ class Slam:
 
         The first call compiles what tracking itself needs. All else is compiled in a thread meanwhile: keyframes wait
         for it, frames that are lost or weak stay so, and a map to start with is not looked into. With
-        `run.deterministic`, a frame waits for what it needs instead. After `warm_up`, nothing is left to compile.
+        `run.deterministic`, a frame waits for what it needs instead. After `warm_up`, nothing is left to compile, but
+        for global bundle adjustment, whose thread compiles when the first loop is closed.
 
         Args:
             frame: Image with depth, or a stereo pair, of the size of the camera and later than the frame before.
@@ -294,6 +295,25 @@ class Slam:
         self._programs.finish()
         self._tracker.recover()  # from a step that Ctrl-C ended
         self._tracker.state = self._back.finish(self._tracker.state)
+
+    @one_at_a_time
+    def adjust_map(self) -> None:
+        """Adjust all keyframes and points of the map together (global bundle adjustment), and wait until that is done.
+
+        After a loop, this happens by itself, beside tracking (`mapping.global_adjustment`). Mapping catches up first,
+        as in `finish`, and what is not compiled yet is compiled. The first keyframe of each submap stays where it is;
+        `trajectory` moves with the keyframes, and the next result has the `correction`.
+
+        Raises:
+            RuntimeError: With `localize_only`, which leaves the map unchanged, or after `close`.
+            Exception: Error of compiling, or of a job of mapping.
+        """
+        if self._localize_only:
+            raise RuntimeError("adjust_map: the map stays as it is with localize_only")
+        self._back.check_open()
+        self._programs.compile_all()
+        self.finish()
+        self._tracker.state = self._back.adjust_map(self._tracker.state)
 
     def close(self) -> None:
         """End the threads, within two seconds; before another frame can be tracked, call `reset`.

@@ -28,7 +28,8 @@ CASES = cases(N)
 EMPTY = cases(0)
 ANY_SHAPE = {"absolute_orientation", "adjugate", "valid_depth", "loss_value", "loss_weight", "compose", "between"}
 INSIDE = {  # parts of kernels: called by kernels only, with what those have checked
-    *("bundle.edges", "bundle.lens", "bundle.schur", "bundle.zero_weight_points", "checks", "derivative_rules"),
+    *("bundle.edges", "bundle.lens", "bundle.point_chunk", "bundle.schur", "bundle.zero_weight_points", "checks"),
+    "derivative_rules",
     *(
         "flow.lk_row_search",
         "flow.lk_search",

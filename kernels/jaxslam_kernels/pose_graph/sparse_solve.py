@@ -48,7 +48,7 @@ def _solve_words(shapes: tuple[tuple[int, ...], ...], dtype: np.dtype, pieces: l
     arrays = [np.concatenate(p).reshape(shape) for p, shape in zip(pieces, shapes, strict=True)]
     diagonal, coupling, right = (_numbers(words, dtype) for words in arrays[:3])
     source, target = (index.astype(np.int32) for index in arrays[3:])
-    found = _solve(diagonal, coupling, right, source, target)
+    found = solve_blocks(diagonal, coupling, right, source, target)
     return np.ascontiguousarray(found).view(np.uint32).reshape(shapes[2])
 
 
@@ -58,9 +58,21 @@ def _numbers(words: np.ndarray, dtype: np.dtype) -> np.ndarray:
     return numbers[..., 0] if dtype.itemsize > words.itemsize else numbers
 
 
-def _solve(
+def solve_blocks(
     diagonal: np.ndarray, coupling: np.ndarray, right: np.ndarray, source: np.ndarray, target: np.ndarray
 ) -> np.ndarray:
+    """Solve a sparse symmetric system of NumPy arrays in double precision, for callers that are on the host already.
+
+    Args:
+        diagonal: `(k, d, d)` symmetric block of each node.
+        coupling: `(e, d, d)` block of each edge, rows of the source and columns of the target.
+        right: `(k, d)` right-hand side.
+        source: `(e,)` index of each edge's first node.
+        target: `(e,)` index of its second node.
+
+    Returns:
+        `(k, d)` solution, in the precision of `right`; NaN where the matrix is not finite or is singular.
+    """
     from scipy.sparse.linalg import splu  # noqa: PLC0415 - only for graphs, on the host
 
     if not all(np.isfinite(values).all() for values in (diagonal, coupling, right)):

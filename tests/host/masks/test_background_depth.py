@@ -15,6 +15,7 @@ from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset, Synthe
 from jaxslam.datasets.synthetic.camera_path_kind import CameraPathKind
 from jaxslam.geometry.se3 import IDENTITY, angle, between, compose
 from jaxslam.masks.background_depth import BackgroundSurfaces, SurfaceMemory, new_surfaces
+from jaxslam.semantics.detections import no_detections
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.downscale import ImageGrid
 from jaxslam.sensors.frame import Frame, to_gray
@@ -102,7 +103,7 @@ class TestNewSurfaces:
         depth = with_box(wall(self.SHAPE), (self.ROWS, self.COLUMNS))
         nothing = np.zeros(self.SHAPE, bool)
         standing = depth == WALL_M if unmoved is None else unmoved
-        return BackgroundSurfaces(depth, nothing, nothing, standing, new, displaced_px)
+        return BackgroundSurfaces(depth, nothing, nothing, standing, new, nothing, displaced_px)
 
     def area(self, rows: slice, columns: slice) -> np.ndarray:
         area = np.zeros(self.SHAPE, bool)
@@ -144,7 +145,7 @@ class TestNewSurfaces:
         for beside_m in (0.0, WALL_M):
             depth = np.where(new, np.float32(BOX_M), np.float32(beside_m))
             nothing = np.zeros(self.SHAPE, bool)
-            seen = BackgroundSurfaces(depth, nothing, nothing, nothing, new, displaced_px)
+            seen = BackgroundSurfaces(depth, nothing, nothing, nothing, new, nothing, displaced_px)
             np.testing.assert_array_equal(new_surfaces(seen, nothing), new)
 
     @pytest.mark.parametrize(("wide", "displaced_px"), [(2, 0.0), (5, 5.0), (9, 9.0)])
@@ -246,6 +247,62 @@ class TestMemory:
         assert mask.shape == (height, width)
         assert ((mask == whole) | near_edges(whole, 1 + width // 100)).all()
         assert mask[height // 2, width // 2]
+
+
+class TestAppeared:
+    """Who pauses has appeared before surfaces of some seconds ago, and stays in the mask."""
+
+    def after(self, standing_s: float) -> tuple[SurfaceMemory, BackgroundSurfaces]:
+        """A wall for a second, then a box before it for so long."""
+        watcher, came_s, rate_hz = Watcher(), 1.0, 15
+        for index in range(round((came_s + standing_s) * rate_hz)):
+            watcher.look(index / rate_hz, with_box(wall()) if index / rate_hz >= came_s else wall())
+        return watcher.memory, watcher.memory.compare(came_s + standing_s, IDENTITY, 0.0, with_box(wall()))
+
+    @pytest.mark.parametrize(("standing_s", "has_appeared"), [(0.2, True), (1.5, True), (3.0, True), (6.0, False)])
+    def test_for_some_seconds(self, standing_s: float, has_appeared: bool) -> None:
+        box = with_box(wall())[1::2, 1::2] == BOX_M
+        _, seen = self.after(standing_s)
+        assert seen.still[box].all() == (standing_s > 0.5)
+        assert seen.appeared[box].all() == has_appeared
+        assert not seen.appeared[~box].any()
+
+    @pytest.mark.parametrize(("columns", "comes_back"), [(30, True), (4, False), (0, False)])
+    def test_comes_back_whole_if_the_mask_holds_enough_of_it(self, columns: int, comes_back: bool) -> None:
+        """Of the 80 columns of the box."""
+        memory, seen = self.after(1.5)
+        mask = np.zeros((HEIGHT, WIDTH), bool)
+        mask[BOX[0], 100 : 100 + columns] = True
+        again = memory.with_lost_parts(mask, seen)
+        assert is_box(again) if comes_back else np.array_equal(again, mask)
+
+    def test_memory_is_bounded(self) -> None:
+        watcher = Watcher(small_camera(32, 24))
+        for index in range(600):
+            watcher.look(index / 60, wall((24, 32)))
+        assert len(watcher.memory._seen) < 60 + 4 / 0.2 + 2
+
+    def test_a_box_that_stops_stays_in_the_mask_without_the_detector(self) -> None:
+        """It moves for two thirds of a second, is detected once, and stands for another two seconds."""
+        rng = np.random.default_rng(0)
+        background, texture = rng.integers(0, 255, (2, HEIGHT, WIDTH), dtype=np.uint8)
+        found: list[np.ndarray] = []
+        detector = lambda image: no_detections()._replace(class_mask=found.pop() if found else None)
+        alone = replace(MASKS, semantics=replace(MASKS.semantics, latency_frames=0), dynamics=DynamicsConfig())
+        pipeline, num = MaskPipeline(small_camera(), detector, alone), 110
+        mask = where = np.zeros((HEIGHT, WIDTH), bool)
+        for index in range(num):
+            left = 5 * min(max(index - 30, 0), 20)
+            box = (slice(60, 160), slice(left, left + 80))
+            gray = cv2.GaussianBlur(background, (0, 0), 2)
+            gray[box] = cv2.GaussianBlur(texture, (0, 0), 2)[60:160, :80]
+            where = np.zeros((HEIGHT, WIDTH), bool)
+            where[box] = True
+            if index == 50:
+                found.append(where)
+            mask = pipeline.mask_frame(index, gray, gray, with_box(wall(), box)).mask
+            pipeline.frame_tracked(index, index / 30, IDENTITY, 0.0)
+        assert np.count_nonzero(mask & where) > 0.8 * np.count_nonzero(mask | where)
 
 
 class TestTime:

@@ -15,14 +15,18 @@ import numpy as np
 import pytest
 from small_scene import HEIGHT, TRACK, WIDTH, Clip
 
-from jaxslam.config.schema import Config, RunConfig
+from jaxslam.config.schema import Config, MappingConfig, RunConfig
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.geometry.se3 import angle, between, compose
 from jaxslam.loop_closing.loop_detector import LoopClosing, LoopClosure
-from jaxslam.map.types import Map
+from jaxslam.map.types import Map, empty_map
 from jaxslam.map.validate import problems
+from jaxslam.mapping.global_bundle_adjustment import AdjustedSubmap
+from jaxslam.mapping.local_bundle_adjustment import AdjustPlan
 from jaxslam.mapping.local_mapping import LocalMapping, NewKeyframe
+from jaxslam.runtime.worker import ThreadWorker
 from jaxslam.sensors.frame import Frame
+from jaxslam.slam import map_adjuster
 from jaxslam.slam.slam import Slam
 from jaxslam.tracking.state import TrackStatus
 from jaxslam.trajectory.trajectory import write_tum
@@ -245,6 +249,112 @@ def loop_at(slam_map: Map, keyframe_id: int) -> LoopClosure | None:
         return None
     relative = between(slam_map.pose(0), slam_map.pose(keyframe_id))
     return LoopClosure(0, keyframe_id, relative, 1e4 * np.eye(6), slam_map.ids, slam_map.T_world_cam)
+
+
+class TestGlobalAdjustment:
+    def test_follows_a_loop_and_ends_for_a_newer_one(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Of two loops close to each other, the map after the second one counts; the tracker moves along with it."""
+        second, third = keyframe_frames()[1:3]
+        given, taken = self.watched(monkeypatch)
+        monkeypatch.setattr(
+            LoopClosing, "look", lambda self, slam_map, number: loop_at(slam_map, number) if number in (1, 2) else None
+        )
+        with new_slam() as slam:
+            for frame in _frames()[: third + 20]:
+                slam.track(frame)
+            assert third - second < 10 * INLINE.mapping.latency_frames
+            slam.finish()
+            assert slam.loops_closed == 2
+            assert [len(slam_map.loops.target) for slam_map in given] == [1, 2]
+            assert len(taken) == 1
+            there = np.isin(taken[0].keyframes, slam.map.ids)
+            poses = np.array([slam.map.pose(int(number)) for number in taken[0].keyframes[there]])
+            np.testing.assert_allclose(poses, taken[0].T_world_cam[there], atol=0.02)  # local adjustment came after it
+            last = slam.track(_frames()[third + 20])
+            assert np.linalg.norm(last.correction[4:]) < 0.02
+            assert problems(slam.map) == []
+
+    def test_on_request_and_not_without_the_setting(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        given, taken = self.watched(monkeypatch)
+        monkeypatch.setattr(LoopClosing, "look", lambda self, slam_map, number: loop_at(slam_map, number))
+        without = dataclasses.replace(INLINE, mapping=MappingConfig(global_adjustment=False))
+        with new_slam(without) as slam:
+            for frame in _frames()[:50]:
+                slam.track(frame)
+            slam.finish()
+            assert slam.loops_closed >= 1
+            assert given == taken == []
+            slam.adjust_map()
+            assert len(given) == len(taken) == 1
+            assert taken[0].cost < taken[0].initial_cost
+            np.testing.assert_allclose(slam.map.T_world_cam[1:], taken[0].T_world_cam[1:], atol=1e-12)
+            whole = slam.map
+        with pytest.raises(RuntimeError, match="is closed"):
+            slam.adjust_map()
+        with Slam(recording().camera, INLINE, slam_map=whole) as loaded:  # and without a frame, or a warm-up
+            loaded.adjust_map()
+            assert taken[1].initial_cost <= 1.001 * taken[0].cost  # it goes on from there, the tree as it is now
+        localizer = Slam(recording().camera, INLINE, slam_map=whole, localize_only=True)
+        with localizer, pytest.raises(RuntimeError, match="stays as it is with localize_only"):
+            localizer.adjust_map()
+
+    def test_ends_when_the_tracker_is_closed(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        begun, ended = threading.Event(), threading.Event()
+
+        def endless(slam_map: Map, submap: int, plan: Any, is_interrupted: Callable[[], bool]) -> None:
+            begun.set()
+            while not is_interrupted():
+                time.sleep(0.001)
+            ended.set()
+
+        monkeypatch.setattr("jaxslam.slam.map_adjuster.adjust_submap", endless)
+        monkeypatch.setattr(LoopClosing, "look", lambda self, slam_map, number: loop_at(slam_map, number))
+        slam = new_slam(LIVE)
+        for frame in _frames():
+            slam.track(frame)
+            time.sleep(0.01)
+        assert begun.wait(10)
+        closes_in_time(slam)
+        assert ended.wait(1)
+        assert threads() == []
+
+    def test_waits_while_a_frame_is_tracked(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Before each chunk of points; a newer job ends it all the same."""
+        asked, answers = threading.Event(), []
+
+        def adjust(slam_map: Map, submap: int, plan: Any, is_interrupted: Callable[[], bool]) -> None:
+            asked.set()
+            answers.append(is_interrupted())
+
+        monkeypatch.setattr(map_adjuster, "adjust_submap", adjust)
+        monkeypatch.setattr(map_adjuster, "_PATIENCE_S", 60.0)
+        make = lambda work: ThreadWorker(work, "jaxslam-adjustment")
+        adjuster = map_adjuster.MapAdjuster(AdjustPlan(), make, in_turn=False)
+        for is_newer in (False, True):
+            asked.clear()
+            adjuster.frame_begun()
+            adjuster.worker.submit(adjuster.next_job(empty_map(recording().camera), [0]), 0)
+            assert asked.wait(10)
+            assert len(answers) == is_newer, "did not wait"
+            if is_newer:
+                adjuster.interrupt()
+            adjuster.frame_ended()
+            adjuster.worker.flush()
+        adjuster.worker.close()
+        assert answers == [False, True]
+
+    def watched(self, monkeypatch: pytest.MonkeyPatch) -> tuple[list[Map], list[AdjustedSubmap]]:
+        """The maps that are adjusted, and the results that are taken over."""
+        given: list[Map] = []
+        taken: list[AdjustedSubmap] = []
+        adjust, take = map_adjuster.adjust_submap, LocalMapping.take_adjusted
+        monkeypatch.setattr(
+            map_adjuster, "adjust_submap", lambda slam_map, *others: given.append(slam_map) or adjust(slam_map, *others)
+        )
+        monkeypatch.setattr(
+            LocalMapping, "take_adjusted", lambda self, submap: taken.append(submap) or take(self, submap)
+        )
+        return given, taken
 
 
 class TestErrors:
