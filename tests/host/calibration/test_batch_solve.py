@@ -20,6 +20,7 @@ from jaxslam.calibration.gating import gate
 from jaxslam.calibration.parameters import DEPTH_OFFSET, FOCAL, GROUPS, PARAMETERS, READOUT, group_mask, prior_sigmas
 from jaxslam.calibration.residuals import NUM_POINT, NUM_POSE, linearize, residuals_of
 from jaxslam.calibration.uncertainty import standard_deviations
+from jaxslam.errors import DatasetError
 from jaxslam.geometry.se3 import retract
 
 TRUTH = true_vector()
@@ -134,6 +135,17 @@ def test_gate_takes_what_is_wrong_and_leaves_what_is_right() -> None:
     assert result.after.costs.sum() < result.before.costs.sum()
     assert result.gains[FOCAL] > 0
     assert steps[0].startswith("held-out frames")
+
+
+def test_derivatives_that_are_not_finite_are_told(fitted: tuple[BatchProblem, BatchSolution]) -> None:
+    block, state = fitted[0].blocks[0], fitted[1].states[0]
+    seen, points = block.seen.copy(), state.points.copy()
+    seen[:, 0], points[:, 0] = False, np.nan
+    block = block._replace(seen=seen)
+    linearize(block, state.poses, points, TRUTH, **SETTINGS)
+    points[:, 1] = np.nan
+    with pytest.raises(DatasetError, match=r"expected finite derivatives of .* in its frames"):
+        linearize(block, state.poses, points, TRUTH, **SETTINGS)
 
 
 def test_depth_needs_settings_to_be_looked_up(fitted: tuple[BatchProblem, BatchSolution]) -> None:
