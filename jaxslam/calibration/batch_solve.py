@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxslam.calibration.depth_patches import DepthSettings, planes_at
-from jaxslam.calibration.elimination import Noise, Reduced, reduce_block, weighted
+from jaxslam.calibration.elimination import Noise, Reduced, reduce_block, shares_of_points, weighted
 from jaxslam.calibration.parameters import CameraVector
 from jaxslam.calibration.residuals import linearize, residuals_of
 from jaxslam.calibration.track_block import TrackBlock
@@ -185,9 +185,17 @@ def _prior_cost(problem: BatchProblem, camera: CameraVector) -> float:
     return float(0.5 * np.square((camera - problem.prior) / problem.prior_sigma).sum())
 
 
-def reduced_at(problem: BatchProblem, solution: BatchSolution, free: Bool[np.ndarray, " q"]) -> list[Reduced]:
-    """Return the normal equations of each block at a solution, reduced to the free parameters of the camera."""
-    return _equations(problem, solution.camera, solution.states, free, 0.0)
+def shares_at(
+    problem: BatchProblem, solution: BatchSolution, free: Bool[np.ndarray, " q"]
+) -> list[tuple[Float[np.ndarray, "p k"], Float[np.ndarray, "p k k"]]]:
+    """Return what each point of each block adds to the normal equations at a solution, see `shares_of_points`."""
+    shares = []
+    for block, state in zip(problem.blocks, solution.states, strict=True):
+        linear = linearize(block, *state, solution.camera, height=problem.height)
+        parts = weighted(block, state.points, linear.residuals, problem.noise)
+        reduced = reduce_block(linear, parts, problem.noise, free, 0.0)
+        shares.append(shares_of_points(linear, parts, problem.noise, free, reduced))
+    return shares
 
 
 def estimated_noise(problem: BatchProblem, solution: BatchSolution) -> Noise:

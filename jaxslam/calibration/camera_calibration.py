@@ -119,7 +119,10 @@ def calibrate(
         CameraError: If the recording is of stereo pairs.
     """
     if dataset.camera.is_stereo:
-        raise CameraError(f"camera '{dataset.camera.name}': expected a camera with depth images, got a stereo pair")
+        raise CameraError(
+            f"camera '{dataset.camera.name}': expected a camera with depth images, got a stereo pair, whose depth is"
+            " computed from the very focal length and baseline in question; calibrate a pair with a target"
+        )
     start = dataset.camera
     camera, done = start, 0
     while True:

@@ -20,6 +20,13 @@ _MIN_SHARE = 0.7
 """Share of the window that must be measured."""
 _FLAT = 1.0
 """Largest deviation from the plane, root mean square, in standard deviations of depth: at an edge it is more."""
+_BENT, _LEAST_BENT = 3.0, 0.1
+"""Second difference of the inverse depth from which on a patch lies at an edge: in those of the median patch, and at
+least in standard deviations of the inverse depth."""
+_BENT_PERCENTILE, _HALF = 90, 4
+"""Percentile of the second differences of a patch, over that many samples to each side."""
+_MOST_MISSING = 0.15
+"""Share of the samples of a patch that may be missing: depth ends at edges."""
 _COUNTS = 65535
 _OFFSETS = np.stack(np.meshgrid(*2 * [np.arange(-_REACH, _REACH + 1)])).reshape(2, -1)
 
@@ -120,3 +127,33 @@ def planes_at(patches: DepthPatches, uv: Float[np.ndarray, "*batch 2 n"], settin
     sigma = settings.noise.sigma_m * np.maximum(plane[..., 0, :], least) ** 2 + settings.noise.sigma_per_m2
     measured = enough & (spread < _FLAT * sigma) & (plane[..., 0, :] > least)
     return DepthPlanes(plane, uv, sigma, measured)
+
+
+def near_edges(
+    patches: DepthPatches, settings: DepthSettings, used: Bool[np.ndarray, "*batch n"]
+) -> Bool[np.ndarray, "*batch n"]:
+    """Tell which patches hold an edge in depth, where optical flow is drawn aside by what moves differently behind it.
+
+    On a plane second differences of the inverse depth are noise only. At an edge many are much larger, or depth is
+    missing.
+
+    Args:
+        patches: The patches.
+        settings: What is known of the sensor.
+        used: Which patches count for the median, by which the noise is known.
+    """
+    side = 2 * _REACH + 1
+    counts = patches.counts.reshape(*patches.counts.shape[:-1], side, side)
+    inverse = np.where(counts > 0, _COUNTS / settings.max_m / np.maximum(counts, 1), np.nan)
+    missing = np.isnan(inverse).mean(axis=(-2, -1))
+    whole = used & (missing <= _MOST_MISSING)
+    patch = inverse[whole]
+    middle = slice(_HALF, -_HALF)
+    along = patch[..., 2 * _HALF :] - 2 * patch[..., middle] + patch[..., : -2 * _HALF]
+    down = patch[..., 2 * _HALF :, :] - 2 * patch[..., middle, :] + patch[..., : -2 * _HALF, :]
+    edges = np.ones(used.shape, bool)
+    if whole.any():
+        flat = [np.abs(each).reshape(len(patch), -1) for each in (along, down)]
+        bent = np.max([np.nanpercentile(each, _BENT_PERCENTILE, axis=-1) for each in flat], axis=0)
+        edges[whole] = bent > max(_BENT * float(np.median(bent)), _LEAST_BENT * settings.noise.sigma_per_m2)
+    return edges

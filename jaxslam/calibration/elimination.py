@@ -101,21 +101,12 @@ def reduce_block(
         free: Which parameters of the camera are free.
         damping: Share of the diagonal that is added to it, for poses and points.
     """
-    # Frames, points, residuals, tangents: the small sums are over the last but one.
-    factors = np.sqrt(parts.weights) / np.array([noise.pixel, noise.pixel, noise.depth])[:, None]
-    # What is not seen has no weight, whatever its derivative, which may not even be a number.
-    jacobian = np.where(factors[..., None] > 0, linearized.jacobian, 0.0) * factors[..., None]
-    jacobian = np.moveaxis(jacobian, 1, 2)
-    residuals = np.moveaxis(np.sqrt(parts.weights) * parts.residuals, 1, 2)[..., None]
+    jacobian, residuals = _whitened(linearized, parts, noise)
     kept = np.concatenate([np.arange(NUM_POSE), NUM_POSE + NUM_POINT + np.flatnonzero(free)])
     rest, point = jacobian[..., kept], jacobian[..., NUM_POSE : NUM_POSE + NUM_POINT]
     rest_T, point_T = np.swapaxes(rest, -1, -2), np.swapaxes(point, -1, -2)
     hessian, gradient, cross = _assembled(rest, rest_T @ residuals, rest_T @ point)
-    inner = (point_T @ point).sum(axis=0)
-    pull = (point_T @ residuals).sum(axis=0)
-    inner[:, -1, -1] += 1
-    pull[:, -1, 0] += parts.shared
-    inner += _damped(inner, damping)
+    inner, pull = _of_points(point_T, residuals, parts, damping)
     inverse = np.linalg.inv(inner)
     point_by_rest = -inverse @ np.swapaxes(cross, -1, -2)
     point_step = -(inverse @ pull)[..., 0]
@@ -136,6 +127,59 @@ def reduce_block(
         point_step=point_step,
         point_by_rest=point_by_rest,
     )
+
+
+def shares_of_points(
+    linearized: Linearized, parts: Weighted, noise: Noise, free: Bool[np.ndarray, " q"], reduced: Reduced
+) -> tuple[Float[np.ndarray, "p k"], Float[np.ndarray, "p k k"]]:
+    """Split the reduced normal equations of a block into what each of its points adds to gradient and Hessian.
+
+    Args:
+        linearized: Residuals and derivatives of the block.
+        parts: Its weighted residuals.
+        noise: Standard deviations.
+        free: Which parameters of the camera are free.
+        reduced: The reduced equations, without damping.
+    """
+    jacobian, residuals = _whitened(linearized, parts, noise)
+    num_frames = len(jacobian)
+    # How a step of the camera moves the residuals if all poses follow it.
+    by_pose = np.concatenate([np.zeros((6, int(free.sum()))), reduced.pose_by_camera]).reshape(num_frames, 6, -1)
+    around = np.clip(np.arange(num_frames)[:, None] + np.array([-1, 0, 1]), 0, num_frames - 1)
+    following = by_pose[around].reshape(num_frames, 1, NUM_POSE, -1)
+    rows = jacobian[..., :NUM_POSE] @ following + jacobian[..., NUM_POSE + NUM_POINT :][..., free]
+    point = jacobian[..., NUM_POSE : NUM_POSE + NUM_POINT]
+    rows_T, point_T = np.swapaxes(rows, -1, -2), np.swapaxes(point, -1, -2)
+    inner, pull = _of_points(point_T, residuals, parts, 0.0)
+    cross = (point_T @ rows).sum(axis=0)
+    back = np.swapaxes(cross, -1, -2) @ np.linalg.inv(inner)
+    gradient = (rows_T @ residuals).sum(axis=0) - back @ pull
+    return gradient[..., 0], (rows_T @ rows).sum(axis=0) - back @ cross
+
+
+def _whitened(
+    linearized: Linearized, parts: Weighted, noise: Noise
+) -> tuple[Float[np.ndarray, "f p 3 t"], Float[np.ndarray, "f p 3 1"]]:
+    """Return derivatives and residuals in standard deviations, times the square roots of the weights.
+
+    Frames, points, residuals, tangents: the small sums are over the last but one.
+    """
+    factors = np.sqrt(parts.weights) / np.array([noise.pixel, noise.pixel, noise.depth])[:, None]
+    # What is not seen has no weight, whatever its derivative, which may not even be a number.
+    jacobian = np.where(factors[..., None] > 0, linearized.jacobian, 0.0) * factors[..., None]
+    residuals = np.sqrt(parts.weights) * parts.residuals
+    return np.moveaxis(jacobian, 1, 2), np.moveaxis(residuals, 1, 2)[..., None]
+
+
+def _of_points(
+    point_T: Float[np.ndarray, "f p 4 3"], residuals: Float[np.ndarray, "f p 3 1"], parts: Weighted, damping: float
+) -> tuple[Float[np.ndarray, "p 4 4"], Float[np.ndarray, "p 4 1"]]:
+    """Return Hessian and gradient of each point alone."""
+    inner = (point_T @ np.swapaxes(point_T, -1, -2)).sum(axis=0)
+    pull = (point_T @ residuals).sum(axis=0)
+    inner[:, -1, -1] += 1
+    pull[:, -1, 0] += parts.shared
+    return inner + _damped(inner, damping), pull
 
 
 def _assembled(

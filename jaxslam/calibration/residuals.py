@@ -14,10 +14,11 @@ from jaxslam_kernels.camera import Intrinsics, project
 from jaxslam_kernels.rolling_shutter import row_time
 from jaxslam_kernels.se3 import cross_matrix, displacement, retract, to_camera
 from jaxslam_kernels.types import Pixels, Points, Scalar, Weights
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxslam.calibration.parameters import PARAMETERS, CameraVector
 from jaxslam.calibration.track_block import TrackBlock
+from jaxslam.errors import DatasetError
 from jaxslam.runtime.compiled import compiled
 from jaxslam.runtime.compiler_options import FAST_COMPILE, SINGLE_THREAD
 
@@ -78,11 +79,26 @@ def linearize(
             common.
         camera: Parameters of the camera.
         height: Rows of the image.
+
+    Raises:
+        DatasetError: If a derivative of a residual that is used is not finite.
     """
     arguments = _arguments(block, poses, points, camera)
     residuals, jacobian = _linearized(*arguments, height=height)
     # Out of the compiled function tangents come first, as that is how they are computed.
-    return Linearized(np.asarray(residuals, np.float64), np.moveaxis(np.asarray(jacobian, np.float64), 1, -1))
+    linearized = Linearized(np.asarray(residuals, np.float64), np.moveaxis(np.asarray(jacobian, np.float64), 1, -1))
+    _check_finite(linearized.jacobian, np.stack([block.seen, block.seen, block.measured], axis=1))
+    return linearized
+
+
+def _check_finite(jacobian: Float[np.ndarray, "f 3 p t"], used: Bool[np.ndarray, "f 3 p"]) -> None:
+    wrong = used & ~np.isfinite(jacobian).all(axis=-1)
+    if wrong.any():
+        frames = np.flatnonzero(wrong.any(axis=(1, 2)))
+        raise DatasetError(
+            f"calibration: expected finite derivatives of {used.sum()} residuals of a block, got {wrong.sum()} that are"
+            f" not, in its frames {', '.join(map(str, frames[:5]))}; another --focal-px to begin with may help"
+        )
 
 
 def residuals_of(

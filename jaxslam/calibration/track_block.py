@@ -21,6 +21,7 @@ class TrackBlock(NamedTuple):
         patches: Depth from which they are fitted; `None` where they stay as they are.
         delay_s: `(f,)` times from the images to their depth images by their timestamps, seconds.
         time_sign: `(f,)` 1, or -1 of a recording that is played backward.
+        origin: `(7,)` pose of the first frame in the world of the whole recording, in which blocks see the same places.
     """
 
     times_s: Float[np.ndarray, " f"]
@@ -32,6 +33,7 @@ class TrackBlock(NamedTuple):
     patches: DepthPatches | None
     delay_s: Float[np.ndarray, " f"]
     time_sign: Float[np.ndarray, " f"]
+    origin: Float[np.ndarray, "7"]
 
     @property
     def measured(self) -> Bool[np.ndarray, "f p"]:

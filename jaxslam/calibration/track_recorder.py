@@ -9,7 +9,14 @@ import numpy as np
 from jaxslam_kernels.camera import back_project
 from jaxtyping import Float, Int
 
-from jaxslam.calibration.depth_patches import DepthPatches, DepthPlanes, DepthSettings, cut_patches, planes_at
+from jaxslam.calibration.depth_patches import (
+    DepthPatches,
+    DepthPlanes,
+    DepthSettings,
+    cut_patches,
+    near_edges,
+    planes_at,
+)
 from jaxslam.calibration.track_block import TrackBlock
 from jaxslam.config.schema import TrackConfig
 from jaxslam.errors import DatasetError
@@ -30,6 +37,8 @@ _FEWEST_SEEN = 4
 """Frames of a block in which a point must be seen."""
 _MOST_POINTS, _FEWEST_POINTS = 384, 24
 """Points of a block."""
+_MOST_AT_EDGES = 0.3
+"""Share of the frames of a track in which it may be near an edge in depth; of more, the track is left out."""
 
 
 class _Recorded(NamedTuple):
@@ -163,9 +172,13 @@ class TrackRecorder:
             place = np.searchsorted(chosen, frame.track)
             own = np.flatnonzero((place < len(chosen)) & (chosen[np.minimum(place, len(chosen) - 1)] == frame.track))
             grid.put(index, place[own], frame, own)
+        patches = DepthPatches(grid.counts, grid.origin)
+        at_edges = (near_edges(patches, self.depth, grid.seen) & grid.seen).sum(axis=0)
+        grid.seen &= at_edges <= _MOST_AT_EDGES * grid.seen.sum(axis=0)
+        if grid.seen.any(axis=0).sum() < _FEWEST_POINTS:
+            return None
         origin = frames[0].pose
         poses = np.stack([between(origin, frame.pose) for frame in frames])
-        patches = DepthPatches(grid.counts, grid.origin)
         depth = planes_at(patches, grid.depth_uv, self.depth)
         stamps = np.array([frame.timestamp_ns for frame in frames], np.int64)
         return TrackBlock(
@@ -178,6 +191,7 @@ class TrackRecorder:
             patches=patches,
             delay_s=np.array([frame.delay_s for frame in frames]),
             time_sign=np.array([frame.time_sign for frame in frames]),
+            origin=origin,
         )
 
     def _positions(self, grid: "_Grid", planes: DepthPlanes, poses: np.ndarray) -> Float[np.ndarray, "3 p"]:

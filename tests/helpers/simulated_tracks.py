@@ -88,6 +88,7 @@ def _block(simulation: Simulation, start_s: float, num_frames: int, rng: np.rand
         patches=None,
         delay_s=np.zeros(num_frames),
         time_sign=np.ones(num_frames),
+        origin=poses[0],
     )
 
 

@@ -11,14 +11,16 @@ from jaxslam.calibration.batch_solve import (
     BatchSolution,
     estimated_noise,
     first_states,
+    shares_at,
     solve_batch,
     with_depth_looked_up,
 )
-from jaxslam.calibration.elimination import Noise
+from jaxslam.calibration.elimination import Noise, reduce_block, weighted
 from jaxslam.calibration.gating import gate
 from jaxslam.calibration.parameters import DEPTH_OFFSET, FOCAL, GROUPS, PARAMETERS, READOUT, group_mask, prior_sigmas
 from jaxslam.calibration.residuals import NUM_POINT, NUM_POSE, linearize, residuals_of
 from jaxslam.calibration.uncertainty import standard_deviations
+from jaxslam.errors import DatasetError
 from jaxslam.geometry.se3 import retract
 
 TRUTH = true_vector()
@@ -28,7 +30,7 @@ SETTINGS = {"height": CAMERA.height}
 
 
 def problem(start: np.ndarray = START, truth: np.ndarray = TRUTH, seed: int = 0) -> BatchProblem:
-    blocks = simulate_blocks(Simulation(truth, seed=seed), num_blocks=6, num_frames=12)
+    blocks = simulate_blocks(Simulation(truth, seed=seed), num_blocks=10, num_frames=12)
     return BatchProblem(blocks, start, prior_sigmas(CAMERA), CAMERA.height, Noise(0.3, 1.0))
 
 
@@ -72,6 +74,21 @@ def test_all_parameters_are_found(fitted: tuple[BatchProblem, BatchSolution]) ->
     assert (errors[[10, 11]] < 2e-3).all()
     assert (errors < 4 * sigmas).all()
     assert (sigmas < 0.5 * noisy.prior_sigma).all()
+
+
+def test_points_share_the_reduced_equations(fitted: tuple[BatchProblem, BatchSolution]) -> None:
+    noisy, solution = fitted
+    block, state = noisy.blocks[0], solution.states[0]
+    linear = linearize(block, *state, solution.camera, **SETTINGS)
+    parts = weighted(block, state.points, linear.residuals, noisy.noise)
+    reduced = reduce_block(linear, parts, noisy.noise, ALL, 0.0)
+    gradients, hessians = shares_at(noisy, solution, ALL)[0]
+    gradients, hessians = gradients * noisy.prior_sigma, hessians * np.outer(noisy.prior_sigma, noisy.prior_sigma)
+    whole = reduced.hessian * np.outer(noisy.prior_sigma, noisy.prior_sigma)
+    np.testing.assert_allclose(hessians.sum(axis=0), whole, atol=1e-5 * np.abs(whole).max())
+    # The poses are at their optimum, where what all points say of them cancels.
+    spread = np.abs(gradients).sum(axis=0)
+    assert (np.abs(gradients.sum(axis=0) - reduced.gradient * noisy.prior_sigma) < 0.02 * spread).all()
 
 
 def test_noise_is_found(fitted: tuple[BatchProblem, BatchSolution]) -> None:
@@ -118,6 +135,17 @@ def test_gate_takes_what_is_wrong_and_leaves_what_is_right() -> None:
     assert result.after.costs.sum() < result.before.costs.sum()
     assert result.gains[FOCAL] > 0
     assert steps[0].startswith("held-out frames")
+
+
+def test_derivatives_that_are_not_finite_are_told(fitted: tuple[BatchProblem, BatchSolution]) -> None:
+    block, state = fitted[0].blocks[0], fitted[1].states[0]
+    seen, points = block.seen.copy(), state.points.copy()
+    seen[:, 0], points[:, 0] = False, np.nan
+    block = block._replace(seen=seen)
+    linearize(block, state.poses, points, TRUTH, **SETTINGS)
+    points[:, 1] = np.nan
+    with pytest.raises(DatasetError, match=r"expected finite derivatives of .* in its frames"):
+        linearize(block, state.poses, points, TRUTH, **SETTINGS)
 
 
 def test_depth_needs_settings_to_be_looked_up(fitted: tuple[BatchProblem, BatchSolution]) -> None:

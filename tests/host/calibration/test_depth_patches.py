@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxslam.calibration.depth_patches import DepthSettings, cut_patches, planes_at
+from jaxslam.calibration.depth_patches import DepthSettings, cut_patches, near_edges, planes_at
 from jaxslam.sensors.sensor_model import DepthNoise
 
 NOISE = DepthNoise(0.005, 0.007)
@@ -40,3 +40,18 @@ def test_no_plane_without_depth_at_an_edge_or_out_of_reach() -> None:
     assert planes_at(patches, uv, settings).measured.tolist() == [False, False, True, False]
     far = uv + np.array([[5.0], [0.0]])
     assert not planes_at(patches, far, settings).measured.any()
+
+
+def test_edges_are_a_step_or_missing_depth_and_noise_is_none() -> None:
+    depth, _ = slanted(320, 120)
+    depth[:, 150:] *= 0.9
+    depth[:30, :60] = np.nan
+    inverse = 1 / depth + 1e-3 * np.random.default_rng(0).normal(size=depth.shape)
+    settings = DepthSettings.of(NOISE, (0.3, 6.0), 320)
+    uv = np.array([[154.0, 40.0, 60.0, 90.0, 250.0, 200.0], [60.0, 26.0, 60.0, 80.0, 90.0, 40.0]])
+    patches = cut_patches((1 / inverse).astype(np.float32), uv, settings)
+    used = np.ones(6, bool)
+    assert near_edges(patches, settings, used).tolist() == [True, True, False, False, False, False]
+    without_noise = cut_patches(depth, uv, settings)
+    assert near_edges(without_noise, settings, used).tolist() == [True, True, False, False, False, False]
+    assert near_edges(patches, settings, ~used).all()  # nothing tells the noise
