@@ -30,7 +30,8 @@ class custom_jvp(Generic[P, T]):  # noqa: N801 (named as that of JAX)
 
     def __init__(self, function: Callable[P, T], nondiff_argnums: tuple[int, ...] = ()) -> None:
         update_wrapper(self, function)
-        self._function, self._static = function, nondiff_argnums
+        self._function: Callable[..., T] = function
+        self._static = nondiff_argnums
         self._rule: Callable[..., tuple[T, Any]] | None = None
 
     def defjvp(self, rule: Callable[..., tuple[T, Any]]) -> Callable[..., tuple[T, Any]]:
