@@ -18,6 +18,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from jaxslam_kernels.checks import checked
+from jaxslam_kernels.derivative_rules import custom_jvp
 from jaxslam_kernels.types import Mask, Pixels, Points, Scalar, Weights
 
 MIN_DEPTH = 0.01
@@ -164,7 +165,7 @@ def _distort(coefficients: _Coefficients, x: Array, y: Array) -> _Planes:
     )
 
 
-@jax.custom_jvp
+@custom_jvp
 def _undistort(coefficients: _Coefficients, target: _Planes) -> _Planes:
     """The inverse of `_distort`."""
     return _newton(coefficients, target, _NEWTON_STEPS)
@@ -182,7 +183,7 @@ def _last_step(held: _Coefficients, at: _Planes, coefficients: _Coefficients, ta
     return _newton_step(held, *at, _distort(coefficients, *at), target)
 
 
-@jax.custom_jvp
+@custom_jvp
 def _nearly_undistorted(coefficients: _Coefficients, target: _Planes) -> _Planes:
     """The solution but for the last step, with the derivative of the solution: for second derivatives."""
     return _newton(coefficients, target, _NEWTON_STEPS - 1)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from jaxslam_kernels.derivative_rules import custom_jvp
 from jaxslam_kernels.types import Mask, Pixels
 
 Measures = PyTree[Float[Array, " n"]]
@@ -28,7 +29,7 @@ class ConvergedPositions(NamedTuple):
     measures: Measures
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+@partial(custom_jvp, nondiff_argnums=(0, 1))
 def implicit_positions(
     solve: Callable[[Any], ConvergedPositions],
     explain: Callable[[Pixels, Any], tuple[Pixels, Measures]],

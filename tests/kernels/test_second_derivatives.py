@@ -17,6 +17,7 @@ from jaxslam_kernels.se3 import retract
 from quick_compile import quick_compile
 from small_problems import (
     CAMERA,
+    PoseInputs,
     adjust,
     bundle_inputs,
     graph_inputs,
@@ -182,7 +183,6 @@ ORDERS = {
     "of compiled": lambda f: jax.jacfwd(jax.jit(jax.grad(f))),
     "of a checkpoint": lambda f: jax.hessian(jax.checkpoint(f)),
     "batch": lambda f: lambda x: jax.vmap(jax.hessian(f))(jnp.stack([x, x]))[1],
-    "scan": lambda f: jax.hessian(lambda x: jax.lax.scan(lambda c, _: (c + f(x), None), 0.0 * x[0], length=1)[0]),
 }
 
 
@@ -195,6 +195,41 @@ def test_in_any_order(order):
     expected = quick_compile(jax.hessian(loss))(weights)
     np.testing.assert_allclose(expected, expected.T, atol=1e-7 * np.abs(expected).max())
     np.testing.assert_allclose(ORDERS[order](loss)(weights), expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max())
+
+
+class TestThroughScan:
+    """Solvers that get what the ones before them found: to second order in whatever way the loop is written."""
+
+    STEPS = 2
+
+    def loss(self, weights, scan):
+        start, X_world, uv = pose_inputs(8)
+
+        def step(X_world, shift):
+            pose = refine(PoseInputs(start, X_world, uv + shift), weights).T_world_cam
+            return X_world + 0.1 * jnp.sin(pose.translation())[:, None] * weights[None], pose.translation()
+
+        shifts = 0.3 * jnp.asarray(np.random.default_rng(3).normal(size=(self.STEPS, 2, 8)))
+        return jnp.sum(jnp.square(scan(step, X_world, shifts)[1]))
+
+    @staticmethod
+    def unrolled(step, carry, shifts):
+        found = []
+        for shift in shifts:
+            carry, one = step(carry, shift)
+            found.append(one)
+        return carry, jnp.stack(found)
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize("checkpoint", [False, True])
+    def test_as_unrolled(self, checkpoint):
+        rematerialized = lambda step, *rest: jax.lax.scan(jax.checkpoint(step, prevent_cse=False), *rest)
+        scan = rematerialized if checkpoint else jax.lax.scan
+        weights, direction = _varied(8)
+        along = lambda f: quick_compile(lambda w: jax.jvp(f, (w,), (direction,))[1])(weights)
+        curvature = lambda scan: along(jax.grad(partial(self.loss, scan=scan)))
+        second = curvature(scan)
+        np.testing.assert_allclose(second, curvature(self.unrolled), rtol=1e-6, atol=1e-9 * np.abs(second).max())
 
 
 def test_of_what_is_undetermined():

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxslam_kernels.camera import Intrinsics
 from jaxslam_kernels.checks import checked
-from jaxslam_kernels.derivative_rules import implicit_shift
+from jaxslam_kernels.derivative_rules import custom_jvp, implicit_shift
 from jaxslam_kernels.levenberg_marquardt import ManifoldLevenbergMarquardt, NormalEquations
 from jaxslam_kernels.pose.pose_cost import (
     PoseCost,
@@ -282,7 +282,7 @@ def _figures_at(at_pose: PoseCost, problem: PoseProblem, status: Array) -> _Figu
     return _Figures(at_pose.cost, covariance, residual_scale)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(5,))
+@partial(custom_jvp, nondiff_argnums=(5,))
 def _figures(
     at_pose: PoseCost, pose: SE3, problem: PoseProblem, idle: PoseProblem, status: Array, loss: Loss
 ) -> _Figures:

@@ -10,13 +10,13 @@ Source: Umeyama, "Least-Squares Estimation of Transformation Parameters Between 
 import enum
 from typing import Annotated, Literal, NamedTuple, TypeAlias
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxlie import SE3, SO3
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam_kernels.checks import checked
+from jaxslam_kernels.derivative_rules import custom_jvp
 from jaxslam_kernels.se3 import cross_matrix, lenient_promotion
 from jaxslam_kernels.types import Code, Mask, Points, Scalar, Weights
 
@@ -187,7 +187,7 @@ def rpe(
     return RelativeErrors(translations, rotations, translation, rotation, _count(weights))
 
 
-@jax.custom_jvp
+@custom_jvp
 def nearest_rotation(matrix: _Matrix) -> _Matrix:
     """The rotation R that maximizes `tr(Rᵀ M)`: the polar factor of M, kept proper.
 

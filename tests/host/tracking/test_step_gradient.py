@@ -46,6 +46,10 @@ DIFFERENCE = Inputs(
     ignore=jnp.asarray(1e-2),
 )
 """Steps that change the loss by 2e-7 or more: the tolerances of searches and solvers change it by up to 2e-11."""
+FRAMES = 3
+"""For second derivatives. Between pixels, interpolation bends, and a gradient has a step there: few frames, and short
+steps, so that no point crosses a pixel on the way."""
+SHORT = {"camera": 1e-5, "weight": 1e-4, "X_world": 1e-6, "loss_scale": 1e-3, "pixel_sigma": 1e-4}
 
 
 class Problem(NamedTuple):
@@ -67,11 +71,18 @@ class Problem(NamedTuple):
 def problem() -> Iterator[Problem]:
     recording = clip()
     with jax.enable_x64(True):
-        yield _problem(recording)
+        yield _problem(*_loss(recording, STEPS))
 
 
-def _problem(recording: Clip) -> Problem:
-    frames = stacked(recording.frames[: BEFORE + STEPS], np.float64, np.float64)
+def _problem(loss: Callable[[Inputs], Array], inputs: Inputs, counted: Array) -> Problem:
+    gradient = quick_compile(jax.grad(loss))(inputs)
+    forward = quick_compile(lambda direction: jax.jvp(loss, (inputs,), (direction,))[1])
+    return Problem(inputs, gradient, quick_compile(loss), forward, counted)
+
+
+def _loss(recording: Clip, steps: int) -> tuple[Callable[[Inputs], Array], Inputs, Array]:
+    """The squared error of the position over some frames, what it depends on, and which points exist."""
+    frames = stacked(recording.frames[: BEFORE + steps], np.float64, np.float64)
     given = params(np.float64)
     given = given._replace(sensor=given.sensor._replace(readout_s=jnp.asarray(0.005)))
     step = quick_compile(track_step, static_argnums=3)
@@ -83,7 +94,7 @@ def _problem(recording: Clip) -> Problem:
     random = np.random.default_rng(0)
     change = jnp.asarray(random.normal(size=window.image.shape))
     ignore, other = (jnp.asarray(random.uniform(size=window.image.shape)) for _ in range(2))
-    truth = jnp.asarray(truth_from_start(recording.source.ground_truth)[BEFORE : BEFORE + STEPS, :3, 3])
+    truth = jnp.asarray(truth_from_start(recording.source.ground_truth)[BEFORE : BEFORE + steps, :3, 3])
 
     def loss(inputs: Inputs) -> Array:
         fx, fy, cx, cy = inputs.camera
@@ -109,9 +120,7 @@ def _problem(recording: Clip) -> Problem:
         image=jnp.zeros(()),
         ignore=jnp.zeros(()),
     )
-    gradient = quick_compile(jax.grad(loss))(inputs)
-    forward = quick_compile(lambda direction: jax.jvp(loss, (inputs,), (direction,))[1])
-    return Problem(inputs, gradient, quick_compile(loss), forward, state.points.valid)
+    return loss, inputs, state.points.valid
 
 
 class TestGradient:
@@ -143,3 +152,28 @@ class TestGradient:
 
     def test_points_without_a_slot_have_none(self, problem: Problem) -> None:
         assert not jnp.where(problem.counted, 0, problem.gradient.weight).any()
+
+
+@pytest.mark.slow
+def test_second_derivative_equals_finite_differences() -> None:
+    """Of the gradient, along a change of each input; forward over reverse, as `jax.hessian` computes it."""
+    recording = clip()
+    with jax.enable_x64(True):
+        loss, inputs, _ = _loss(recording, FRAMES)
+        both = quick_compile(lambda at, along: jax.jvp(jax.grad(loss), (at,), (along,)))
+        nothing = jax.tree.map(jnp.zeros_like, inputs)
+        for name, h in SHORT.items():
+            value = getattr(inputs, name)
+            change = jnp.asarray(np.random.default_rng(2).normal(size=value.shape))
+            along = nothing._replace(**{name: change})
+            moved = [both(inputs._replace(**{name: value + k * h * change}), along)[0] for k in (-1, 1)]
+            second = both(inputs, along)[1]
+            for by in SHORT:
+                before, after, derivative = (getattr(of, by) for of in (*moved, second))
+                expected = (after - before) / (2 * h)
+                largest = float(jnp.abs(expected).max())
+                print(
+                    f"{name}, {by}: {largest:.3e}, off by {float(jnp.abs(derivative - expected).max()) / largest:.1e}"
+                )
+                assert largest > 0
+                np.testing.assert_allclose(derivative, expected, atol=1e-3 * largest, err_msg=f"{name}, {by}")
