@@ -33,6 +33,8 @@ _DEPTH_APART_S = 1.0
 """Depth further from its image in time is of another clock."""
 _UNITS = {1e-3: "microseconds", 1e-6: "milliseconds", 1e3: "picoseconds"}
 
+_NOTHING_ASKED: tuple[int | None, tuple[float, float, bool]] = None, (0.0, 0.0, False)
+
 
 class FrameClock:
     """Tells the seconds from frame to frame, refuses stamps that cannot be, and names those that look wrong.
@@ -55,6 +57,7 @@ class FrameClock:
         self._ahead_s, self._irregular = 0.0, False
         self._refused_ns: list[int] = []
         self._offset_ns = 0
+        self._asked = _NOTHING_ASKED
 
     def check(self, timestamp_ns: int, depth_timestamp_ns: int | None = None) -> None:
         """Refuse a frame whose time cannot be: not later than the last one, or of a depth image of another time.
@@ -93,11 +96,14 @@ class FrameClock:
 
     def elapsed_s(self, timestamp_ns: int) -> float:
         """Seconds from the last frame to one with this stamp; a nominal period for the first one."""
-        return self._advanced(timestamp_ns)[0]
+        self._asked = timestamp_ns, self._advanced(timestamp_ns)
+        return self._asked[1][0]
 
     def advance(self, timestamp_ns: int) -> None:
         """Take a frame with this stamp for the last one."""
-        _, self._ahead_s, self._irregular = self._advanced(timestamp_ns)
+        asked_ns, advanced = self._asked
+        _, self._ahead_s, self._irregular = advanced if asked_ns == timestamp_ns else self._advanced(timestamp_ns)
+        self._asked = _NOTHING_ASKED
         if self.last_ns is not None:
             interval_s = (timestamp_ns - self.last_ns) * 1e-9
             if interval_s > 0:
