@@ -166,6 +166,7 @@ def cases(n: int = 11) -> dict[str, Case]:
         },
         image.half_size: {"image": f(40, 48)},
         image.build_pyramid: {"image": f(40, 48)},
+        kmeans.nearest_centers: {"points": f(2, n), "centers": f(2, 3)},
         partial(kmeans.kmeans, num_clusters=2, num_steps=2): {
             "key": KEY,
             "points": f(2, n),
@@ -236,6 +237,7 @@ def cases(n: int = 11) -> dict[str, Case]:
         partial(robust.loss_value, loss="huber"): {"squared": f(n), "scale": f()},
         partial(robust.loss_weight, loss="huber"): {"squared": f(n), "scale": f()},
         robust.weighted_median: {"values": f(n), "weights": f(n)},
+        robust.masked_median: {"values": f(n), "mask": b(n)},
         robust.robust_scale: {"residuals": f(n), "weights": f(n)},
         rolling_shutter.image_velocity: {"xy": f(2, n), "depth": f(n), "twist": f(6)},
         partial(rolling_shutter.row_time, height=40): {"v": f(n), "readout_s": f()},

@@ -162,6 +162,7 @@ def _means(rows: Float[Array, "n d_1"], label: Int[Array, " n"], centers: Float[
     return jnp.where(sums[dim:] > 0, sums[:dim] / jnp.maximum(sums[dim:], 1), centers)
 
 
+@checked
 def nearest_centers(points: Float[Array, "d n"], centers: Float[Array, "d k"]) -> Int[Array, " n"]:
     """Return the `(n,)` index of the nearest center of each point, the first of equally near ones.
 
