@@ -16,6 +16,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxslam_kernels.checks import checked
+from jaxslam_kernels.program_parts import apart
 from jaxslam_kernels.types import Mask, Scalar, Weights
 
 Loss: TypeAlias = Literal["squared", "huber", "cauchy", "geman_mcclure"]
@@ -113,10 +114,11 @@ def masked_median(values: Weights, mask: Mask) -> Scalar:
     if values.shape[0] == 0:
         return jnp.zeros((), values.dtype)
     counts = jnp.isfinite(values) & mask
-    ordered = jnp.sort(_ordinal(jnp.where(counts, lax.stop_gradient(values), jnp.inf)))
-    middle = (jnp.sum(counts, dtype=jnp.int32) + 1) // 2 - 1
-    at_middle = counts & (_ordinal(lax.stop_gradient(values)) == ordered[jnp.maximum(middle, 0)])
-    return jnp.where(middle >= 0, jnp.where(counts, values, 0.0)[jnp.argmax(at_middle)], 0.0)
+    ordinal = _ordinal(lax.stop_gradient(jnp.where(counts, values, jnp.inf)))
+    half = (jnp.sum(counts, dtype=jnp.int32) + 1) >> 1
+    middle = lax.dynamic_index_in_dim(jnp.sort(ordinal), jnp.maximum(half - 1, 0), keepdims=False)
+    at_middle = counts & (ordinal == middle)
+    return apart(lambda: jnp.where(half > 0, jnp.max(jnp.where(at_middle, values, -jnp.inf)), 0))
 
 
 def _ordinal(values: Weights) -> Int[Array, " n"]:
