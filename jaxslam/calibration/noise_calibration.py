@@ -237,7 +237,7 @@ def _search(dataset: Dataset, start: Config, first: _Tracked, rounds: int, on_pr
 
 
 def _follows(first: _Tracked, search: _Search) -> bool:
-    """Whether a factor is within its bounds, and covariances have changed by more than half of it."""
+    """Tell if a factor is within its bounds, and covariances have changed by more than half of it."""
     if not 1 / _LARGEST_CHANGE < search.change < _LARGEST_CHANGE:
         return False
     size = lambda tracked: float(np.median(np.linalg.slogdet(tracked.motions.covariance)[1])) / 12
@@ -280,7 +280,7 @@ def _track(dataset: Dataset, config: Config, stage: str, on_progress: OnProgress
 
 
 def _is_told(motions: Disagreements) -> bool:
-    """Whether the factor surely differs from one, and held-out motions are more likely with it.
+    """Tell if the factor surely differs from one, and held-out motions are more likely with it.
 
     No test by ranks: where the factor is above one, most motions are less likely with it, and a few much more.
     """

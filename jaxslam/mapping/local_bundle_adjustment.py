@@ -193,7 +193,7 @@ def _solve_input(
 
 
 class Measurements(NamedTuple):
-    """What observations say, as bundle adjustment takes it; `s` observations.
+    """Measurements of `s` observations, in the form that bundle adjustment takes.
 
     Attributes:
         xy: `(2, s)` normalized coordinates in the ideal image.

@@ -36,7 +36,7 @@ _COLORS = ((240, 214, 120), (150, 220, 240), (245, 175, 190), (175, 235, 160))
 
 
 class NetworkCheck(NamedTuple):
-    """What a network found in the picture that it was checked with.
+    """Result of checking a network on a picture whose content is known.
 
     Attributes:
         picture: `(h, w, 3)` RGB picture.
@@ -59,7 +59,7 @@ class NetworkCheck(NamedTuple):
 
     @property
     def good(self) -> bool:
-        """Whether the network found what is there."""
+        """True if the network found what is there."""
         return self.iou >= self.least
 
 

@@ -71,7 +71,7 @@ class Candidates(NamedTuple):
 def solids_in_tiles(
     corners: Float[Array, "r 3 c n"], intrinsics: Float[Array, " 4"], tiling: Tiling
 ) -> Bool[Array, "tiles n"]:
-    """Whether the bounding box of each solid may reach into each tile.
+    """Tell which solids may reach into which tiles, by their bounding boxes.
 
     Args:
         corners: The corners of the bounding boxes in camera coordinates, at one time or several: once, or for each row

@@ -22,7 +22,7 @@ from jaxslam_kernels.types import Points, Scalar
 
 
 class EliminatedChunk(NamedTuple):
-    """What the m observations of n points add to the equations of the cameras once the points are eliminated.
+    """Contribution of m observations of n points to the equations of the cameras, with the points eliminated.
 
     With `B` the couplings of all observations and `y` of all points, the Hessian of the cameras is the sum of
     `hessian` by cameras, minus `B Bᵀ`; their gradient is the sum of `gradient`, minus `B y`. A step x of the cameras

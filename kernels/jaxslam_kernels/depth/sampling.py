@@ -43,8 +43,8 @@ def sample_depth(
         max_step: Largest difference of depth in them, as a share of the depth in the middle,
         noise: and so much more, in the unit of the depth, which noise alone makes at any depth.
         nearest: Depth at or below which there is none to believe, meters, 0 or more, and
-        farthest: depth from which on there is none: the same as of `valid_depth` of the whole image, which takes 0.2 ms
-            for one of 640x480.
+        farthest: depth from which on there is none. The result is that of `valid_depth` on the whole image first,
+            which takes 0.2 ms for 640x480 pixels.
     """
     side = 2 * reach + 1
     # Far outside where it is not a number, and never so far that the conversion to integers overflows.
