@@ -266,6 +266,9 @@ def _check_sides(plan: TrackPlan) -> None:
     for name, side in cells.items():
         if side < 2 or side % 2:
             raise ValueError(f"plan.{name}: expected an even number, at least 2, got {side}")
+    for name, flow in {"flow": plan.flow, "pair_flow": plan.pair_flow}.items():
+        if flow.seeds < 0:
+            raise ValueError(f"plan.{name}.seeds: expected at least 0, got {flow.seeds}")
     for name, level in _levels(plan).items():
         if level.window < 1 or not level.window % 2:
             raise ValueError(f"plan.{name}.window: expected an odd number, got {level.window}")

@@ -18,7 +18,10 @@ from jaxslam_kernels.image import patches
 from jaxslam_kernels.image.patches import Window
 from jaxslam_kernels.image.pyramid import Pyramid
 from jaxslam_kernels.program_parts import apart
-from jaxslam_kernels.types import Mask, Pixels, Scalar
+from jaxslam_kernels.types import Flag, Mask, Pixels, Scalar
+
+_NEAR_PX = 3.0
+"""How far from its start a point may be found at the finest level alone; a window of 21 draws from further."""
 
 
 class LevelPlan(NamedTuple):
@@ -63,6 +66,12 @@ class FlowPlan(NamedTuple):
             page faults alone.
         along_rows: Whether points only move along their row, as from left to right in a rectified pair. What the two
             images differ by in brightness over a window does not count then: two cameras expose apart.
+        seeds: Number of points that are searched from the coarsest level. The others begin at the finest where the
+            nearest seed has moved, and at the coarsest if they are not found within `_NEAR_PX` of there; 0 to search
+            all from the coarsest. A handheld camera leaves the prediction by 4.5 pixels in the median, but nearly all
+            points by the same (fr1_rpy): from the nearest seed it is 0.4, and the flow of 450 points takes 2.5 ms with
+            the pyramid instead of 3.8 (Bonn crowd: 2.0 instead of 3.1; Xeon, one thread). It finds the same points and
+            0.7 % more; 2 % of them more than 0.1 pixels away, 0.5 % more than half a pixel (0.2 % and 0.1 %).
     """
 
     coarsest: LevelPlan = LevelPlan(21, 12, 0.2)
@@ -70,6 +79,7 @@ class FlowPlan(NamedTuple):
     finest: LevelPlan = LevelPlan(21, 6, 0.03)
     chunk: int = 32
     along_rows: bool = False
+    seeds: int = 32
 
     def level(self, level: int, num_levels: int) -> LevelPlan:
         """The plan of a level, 0 the finest."""
@@ -247,8 +257,9 @@ def _search_chunk(
     plan: FlowPlan,
     min_texture: Scalar,
     settle: Callable[..., Search],
+    from_coarsest: Flag | None = None,
 ) -> Solution:
-    """Search one chunk of finite points, from the coarsest level to the finest."""
+    """Search one chunk of finite points from the coarsest level to the finest, or at the finest alone by a flag."""
     num_levels, border = len(previous.levels), previous.border
 
     def search_level(level: int, flow: Pixels) -> tuple[Search, Template, Pixels]:
@@ -264,10 +275,14 @@ def _search_chunk(
         search = settle(search, template, current.levels[level], border, level_plan, coarsest=coarsest)
         return search, template, search.position - start
 
-    flow = (guess - points) / 2**num_levels
-    for level in range(num_levels - 1, 0, -1):
-        flow = search_level(level, 2 * flow)[2]
-    search, template, _ = search_level(0, 2 * flow)
+    def coarse_flow() -> Pixels:
+        flow = (guess - points) / 2**num_levels
+        for level in range(num_levels - 1, 0, -1):
+            flow = search_level(level, 2 * flow)[2]
+        return 2 * flow
+
+    flow = coarse_flow() if from_coarsest is None else lax.cond(from_coarsest, coarse_flow, lambda: guess - points)
+    search, template, _ = search_level(0, flow)
     window = Window(plan.finest.window)
     sight = apart(lambda: look(search.position, current.levels[0], border, window))
     residual = mean_absolute(difference(sight, template.patch, window), window)
@@ -305,6 +320,59 @@ def in_chunks(function: Callable[..., Any], arrays: tuple[Array, ...], wanted: M
     return jax.tree.map(join, lax.map(one, tuple(map(split, (*arrays, wanted)))))
 
 
+def _search_from_seeds(
+    chunk: Callable[..., Solution], points: Pixels, guess: Pixels, usable: Mask, plan: FlowPlan
+) -> Solution:
+    """Search seeds from the coarsest level, the others near where the seeds have moved, and what is left as the seeds.
+
+    The three passes are one loop, so that the search is compiled once.
+    """
+    is_seed = _evenly_chosen(usable, plan.seeds)
+    far_chunk = partial(chunk, from_coarsest=jnp.array(True))
+    shapes = jax.eval_shape(lambda: in_chunks(far_chunk, (points, guess, usable), usable, plan.chunk))
+    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+
+    def search_some(carry: tuple[Solution, Mask], is_near: Flag) -> tuple[tuple[Solution, Mask], None]:
+        solution, done = carry
+        wanted = jnp.where(jnp.any(done), usable & ~done, is_seed)
+        shift = lax.cond(
+            is_near, lambda: _shift_of_nearest(solution, points, guess, is_seed, plan), lambda: jnp.zeros_like(guess)
+        )
+        start = guess + shift
+        found = in_chunks(partial(chunk, from_coarsest=~is_near), (points, start, wanted), wanted, plan.chunk)
+        moved = jnp.sum(jnp.square(found.position - start), axis=0)
+        is_close = (found.last_step < plan.finest.accepted**2) & (moved < _NEAR_PX**2)
+        known = wanted & (is_close | ~is_near)
+        return (jax.tree.map(partial(jnp.where, known), found, solution), done | known), None
+
+    passes = jnp.array([False, True, False])
+    return lax.scan(search_some, (nothing, jnp.zeros_like(usable)), passes)[0][0]
+
+
+def _evenly_chosen(mask: Mask, number: int) -> Mask:
+    """Choose at most `number` points of a mask, at equal distances in their order."""
+    rank = jnp.cumsum(mask, dtype=jnp.int32) - 1
+    stride = jnp.maximum((rank[-1] + number) // number, 1)
+    return mask & (rank % stride == 0)
+
+
+def _shift_of_nearest(solution: Solution, points: Pixels, guess: Pixels, is_seed: Mask, plan: FlowPlan) -> Pixels:
+    """For each point, the offset from its guess at which the nearest seed was found from its own; 0 if none was."""
+    found = is_seed & (solution.last_step < plan.finest.accepted**2) & (solution.texture > 0)
+    rank = jnp.cumsum(found, dtype=jnp.int32) - 1
+    place = jnp.where(found, rank, plan.seeds)
+    listed = lambda array: jnp.zeros((2, plan.seeds), array.dtype).at[:, place].set(array, mode="drop")
+    at, shift = listed(points), listed(solution.position - guess)
+    squared = sum(jnp.square(points[axis][:, None] - at[axis][None, :]) for axis in range(2))
+    # Distance and number of a seed in one integer, whose least is found by vector instructions.
+    bits = plan.seeds.bit_length()
+    number = jnp.arange(plan.seeds, dtype=jnp.int32)
+    key = (jnp.minimum(squared, 2.0 ** (30 - bits)).astype(jnp.int32) << bits) | number[None, :]
+    key = jnp.where(number[None, :] <= rank[-1], key, jnp.iinfo(jnp.int32).max)
+    nearest = jnp.min(key, axis=1) & (2**bits - 1)
+    return jnp.where(rank[-1] >= 0, jnp.take(shift, nearest, axis=1, mode="clip"), 0)
+
+
 def _settle(
     search: Search, template: Template, level: Float[Array, "h w"], border: int, plan: LevelPlan, **_: Any
 ) -> Search:
@@ -332,6 +400,8 @@ def search(
     def search_all(previous, current, points, guess, usable, min_texture):
         fixed = {"previous": previous, "current": current, "plan": plan, "min_texture": min_texture, "settle": settle}
         chunk = partial(_search_chunk, **fixed)
+        if plan.seeds > 0 and plan.seeds + plan.chunk < points.shape[1]:
+            return _search_from_seeds(chunk, points, guess, usable, plan)
         return in_chunks(chunk, (points, guess, usable), usable, plan.chunk)
 
     return search_all(previous, current, points, guess, usable, min_texture)

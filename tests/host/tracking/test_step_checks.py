@@ -268,6 +268,7 @@ class TestPlan:
             ({"pose_tolerance": 0.0}, "pose_tolerance: expected more than 0, or None, got 0.0"),
             ({"look_up": LevelPlan(14, 8, 0.05)}, "look_up.window: expected an odd number, got 14"),
             ({"flow": FlowPlan(middle=LevelPlan(10, 5, 0.2))}, "flow.middle.window: expected an odd number, got 10"),
+            ({"flow": FlowPlan(seeds=-1)}, "flow.seeds: expected at least 0, got -1"),
             ({"motion": MotionPlan(dense_cell_px=13)}, "motion.dense_cell_px: expected an even number"),
         ],
     )  # fmt: skip

@@ -1,5 +1,7 @@
 """Optical flow against OpenCV's and against known warps, in batches, and its failures."""
 
+from functools import partial
+
 import cv2
 import jax
 import jax.numpy as jnp
@@ -22,7 +24,7 @@ from flow_cases import (
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from jaxslam_kernels.flow.lk_flow import Flow, FlowStatus, lk_flow, lk_flow_forward_backward
+from jaxslam_kernels.flow.lk_flow import Flow, FlowPlan, FlowStatus, lk_flow, lk_flow_forward_backward
 from jaxslam_kernels.image.pyramid import build_pyramid
 from quick_compile import quick_compile
 
@@ -92,6 +94,28 @@ class TestMatchesReference:
         ours, theirs = np.concatenate(ours), np.concatenate(theirs)
         assert np.mean(ours < 1) >= np.mean(theirs < 1)
         assert np.median(ours) <= np.median(theirs) * 1.02  # both are limited by the rotation of the window
+
+    def test_seeds_find_what_all_levels_find(self):
+        """A camera that turns and a part of the picture that moves another way: neighbors do not mislead points."""
+        image = picture(320, 240)
+        points = corners(image, 300, distance=5)
+        known = warp(image, 9, seed=3)
+        current = known.current.astype(np.float32)
+        moved = within(known.move(points), (120, 80), (199, 159))
+        current[60:190, 100:220] = np.roll(current, (-9, 13), axis=(0, 1))[60:190, 100:220]
+        truth = known.move(points) + np.where(moved, np.array([[13.0], [-9.0]]), 0)
+        sure = known.visible(points) & (moved | ~within(known.move(points), (80, 40), (240, 210)))
+        inputs = Inputs(known.previous.astype(np.float32), current, points, points, sure, np.float32(1))
+        by_seeds, by_all = (
+            quick_compile(flow_of(partial(lk_flow, plan=FlowPlan(seeds=seeds)), 4))(inputs) for seeds in (32, 0)
+        )
+        for part in (sure & moved, sure & ~moved):
+            right, expected = (distances(flow.points, truth)[part] < 1 for flow in (by_seeds, by_all))
+            assert part.sum() > 15
+            assert right.sum() >= 0.98 * expected.sum()
+            both = np.asarray(by_seeds.ok & by_all.ok)[part] & right & expected
+            apart = distances(by_seeds.points, by_all.points)[part][both]
+            assert np.mean(apart < 0.05) > 0.98
 
     def test_guess_carries_a_large_motion(self):
         """From a good guess a motion is found that is out of reach otherwise."""
