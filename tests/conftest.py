@@ -64,26 +64,24 @@ def pytest_collection_finish() -> None:
 
 _LONGEST = (
     "test_readme",
-    "test_bench",
     "test_step",
-    "test_pose_graph",
-    "test_notebooks",
-    "test_back_end",
     "test_keyframe_semantics",
+    "test_pose_graph",
     "test_step_gradient",
-    "test_epipolar",
     "test_relocalization",
-    "test_lens",
-    "test_pnp",
+    "test_epipolar",
+    "test_back_end",
     "test_bundle_adjust",
     "test_occlusion_states",
+    "test_lens",
+    "test_pnp",
 )
-"""Files that take a minute or more. The first two compile the trackers of 640x480 and of small scenes, one each, which
-most of the others then load."""
+"""Files that take 20 seconds or more. The first two compile the trackers of 640x480 and of small scenes, one each,
+which most of the others then load."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files that take minutes come first, so that at the end no process waits for another one."""
+    """The longest files come first, so that at the end no process waits for another one."""
     items.sort(key=lambda item: _LONGEST.index(item.path.stem) if item.path.stem in _LONGEST else len(_LONGEST))
 
 

@@ -1,6 +1,7 @@
 """A third of a round of the room, at a size at which places are recognized, and a tracker for it."""
 
 import functools
+from dataclasses import fields
 
 from small_scene import Clip
 
@@ -12,6 +13,13 @@ WIDTH, HEIGHT, FPS, FRAMES = 320, 240, 15.0, 166
 TRACK = TrackConfig(
     num_points=256, num_levels=3, num_keyframes=6, num_sources=2, points_per_source=96, num_hypotheses=32, cell_px=16
 )
+
+SETTINGS = [
+    f"track.{field.name}={getattr(TRACK, field.name)}"
+    for field in fields(TRACK)
+    if getattr(TRACK, field.name) != field.default
+]
+"""The same as overrides of a preset: pictures of this size need no other tracker."""
 
 
 def room() -> Clip:

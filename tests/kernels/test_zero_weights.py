@@ -132,6 +132,7 @@ def test_bundle_adjust_points():
     _compare(solve, np.linspace(0.5, 1.0, 8), [2, 5], BundleStatus.OK)
 
 
+@pytest.mark.slow
 def test_bundle_adjust_observations():
     """By the weight of one observation of a point that others see; alone, any observation can be fitted exactly."""
     inputs = bundle_inputs()

@@ -177,6 +177,7 @@ class TestResults:
         assert seen["sorted"] == [up, up[::-1]]
 
 
+@pytest.mark.slow
 class TestRates:
     def test_errors_over_the_rate(self, out: Path, mine: Path) -> None:
         """Of a room that is there at two rates, one line a preset, through the medians of its runs."""
@@ -196,6 +197,7 @@ class TestRates:
         assert "Error over the rate of frames" not in (out / "report.html").read_text()
 
 
+@pytest.mark.slow
 class TestGoingOn:
     def test_nothing_twice(self, out: Path, capsys: pytest.CaptureFixture[str]) -> None:
         before = times_of(sorted(out.rglob("result.json")))
@@ -211,7 +213,6 @@ class TestGoingOn:
     def test_not_by_mistake(self, out: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert "--resume keeps them" in fails(capsys, suite_file(out.parent), "--out", str(out))
 
-    @pytest.mark.slow
     def test_what_differs_is_run_again(self, mine: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         """That alone, and it is said why; other presets and seeds stay in the report."""
         config = mine / "room/default/0/config.yaml"
@@ -236,7 +237,6 @@ class TestGoingOn:
         assert "| static | 2 of 2 |" in (mine / "report.md").read_text()
         assert "<td>static</td><td>2 of 2</td>" in (mine / "report.html").read_text()
 
-    @pytest.mark.slow
     def test_killed_in_the_middle(self, tmp_path: Path) -> None:
         """No run that was finished is repeated, and none is lost: one at work then, one not begun."""
         suite, folder = suite_file(tmp_path, SUITE.replace("runs: 2", "runs: 3")), tmp_path / "out"
@@ -278,6 +278,7 @@ class TestTrouble:
         assert "| static | 0 of 1 |" in report
         assert "- 4 of 6 planned runs are done, 2 failed\n" in report
 
+    @pytest.mark.slow
     def test_recording_that_is_not_there(self, mine: Path, tmp_path: Path) -> None:
         suite = suite_file(tmp_path, SUITE + "  - recording: rgbd_bonn_nowhere\n")
         main(["bench", suite, "--out", str(mine), "--resume"])

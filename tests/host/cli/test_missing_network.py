@@ -27,6 +27,8 @@ NEEDED_BY = {
     *("trs-published", "trs-semantics"),
 }
 pytestmark = pytest.mark.usefixtures("models_cache")
+CUES = ["dynamics.new_surfaces=false", "dynamics.cues=[clusters]", "dynamics.balance_regions=true"]
+"""Those of `default`: its small tracker is that of other tests."""
 
 
 ROOM = SyntheticDataset(SyntheticConfig(width=WIDTH, height=HEIGHT, frames=3, people=0))
@@ -108,7 +110,7 @@ class TestCommands:
         assert not (tmp_path / "out").exists()
 
     def test_go_on_if_allowed(self, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        chosen = ["--preset", "ngd", "--allow-missing-model", "--set", *SETTINGS]
+        chosen = ["--preset", "ngd", "--allow-missing-model", "--set", *SETTINGS, *CUES]
         main(["run", str(recording), "--out", str(tmp_path), *chosen])
         summary = json.loads((tmp_path / "summary.json").read_text())
         assert (summary["model"], summary["without_network"]) == ("yolox-nano", "yolox-nano not on this machine")

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from real_networks import real_network
+from room_round import SETTINGS
 
 from jaxslam import Camera, Config, Frame, FrameResult, Slam, TrackStatus, load_config
 from jaxslam.datasets import Dataset, open_dataset
@@ -63,13 +64,22 @@ def assert_same(results: Sequence[FrameResult], scaled: Sequence[FrameResult], f
         np.testing.assert_array_equal(one.dynamic_mask, other.dynamic_mask, str(index))
 
 
-@pytest.mark.parametrize(("baseline_m", "factor"), [(None, 0.25), (0.12, 16.0)])
-def test_room(baseline_m: float | None, factor: float) -> None:
+NEW_SURFACES = ["dynamics.new_surfaces=true", "dynamics.cues=[trajectory]"]
+
+
+@pytest.mark.parametrize(
+    ("baseline_m", "factor", "settings"),
+    [
+        pytest.param(None, 0.25, SETTINGS, id="clusters"),
+        pytest.param(None, 0.25, NEW_SURFACES, id="new surfaces", marks=pytest.mark.slow),
+        pytest.param(0.12, 16.0, ["dynamics.new_surfaces=false"], id="pair", marks=pytest.mark.slow),
+    ],
+)
+def test_room(baseline_m: float | None, factor: float, settings: list[str]) -> None:
     """Frames until the first adjustment of the map, whose solver rounds in another way."""
     size = {"width": 320, "height": 240, "fps": 15.0}
     room = SyntheticDataset(SyntheticConfig(frames=20, people=2, path="xyz", baseline_m=baseline_m, **size))
-    cues = ["dynamics.new_surfaces=true", "dynamics.cues=[trajectory]"] if baseline_m is None else []
-    overrides = ["semantics.model=null", "dynamics.new_surfaces=false", *cues]
+    overrides = ["semantics.model=null", *settings]
     frames = [room[index] for index in range(len(room))]
     results, scaled = (tracked(frames, room.camera, f, overrides=overrides) for f in (1.0, factor))
     assert sum(result.status == TrackStatus.OK for result in results) >= 18

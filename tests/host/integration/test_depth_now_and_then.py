@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from real_networks import real_network
+from room_round import SETTINGS
 
 from jaxslam import Camera, Config, Frame, FrameResult, KeyframeReason, Slam, TrackReason, TrackStatus, load_config
 from jaxslam.datasets import open_dataset
@@ -17,7 +18,9 @@ from jaxslam.trajectory.trajectory import Trajectory
 from jaxslam.worlds.library import load_world
 from jaxslam.worlds.stored_world import StoredWorld
 
-CONFIG = load_config("default", overrides=["semantics.model=null"])
+CONFIG = load_config("default", overrides=["semantics.model=null", *SETTINGS])
+"""For the room; its tracker is that of other tests."""
+LARGE = load_config("default", overrides=["semantics.model=null"])
 
 
 @functools.cache
@@ -30,8 +33,10 @@ def without_depth(frame: Frame) -> Frame:
     return dataclasses.replace(frame, depth_m=None)
 
 
-def tracked(change: Callable[[int, Frame], Frame], camera: Camera, frames: tuple[Frame, ...]) -> list[FrameResult]:
-    with Slam(camera, CONFIG) as slam:
+def tracked(
+    change: Callable[[int, Frame], Frame], camera: Camera, frames: tuple[Frame, ...], config: Config = CONFIG
+) -> list[FrameResult]:
+    with Slam(camera, config) as slam:
         return [slam.track(change(index, frame)) for index, frame in enumerate(frames)]
 
 
@@ -82,13 +87,15 @@ def test_a_sensor_that_fails_for_a_second() -> None:
     assert error_m(results, source.ground_truth) < 0.01
 
 
+@pytest.mark.slow
 def test_a_sensor_that_fails_on_the_way() -> None:
     """Almost three seconds in a corridor: points of before leave the picture, and parallax locates new ones."""
     corridor = load_world("corridor")
     camera = dataclasses.replace(corridor.camera, width=480, height=360)
     source = StoredWorld(dataclasses.replace(corridor, camera=camera))
     frames = tuple(source[index] for index in range(120))
-    results = tracked(lambda i, frame: without_depth(frame) if 30 <= i < 110 else frame, source.camera, frames)
+    change = lambda i, frame: without_depth(frame) if 30 <= i < 110 else frame
+    results = tracked(change, source.camera, frames, LARGE)
     assert all(result.status in (TrackStatus.OK, TrackStatus.STARTED) for result in results)
     way_m = np.linalg.norm(results[110].T_world_cam[4:] - results[30].T_world_cam[4:])
     print(f"way without depth {way_m:.2f} m, error {1e3 * error_m(results, source.ground_truth):.1f} mm")

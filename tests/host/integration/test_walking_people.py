@@ -22,7 +22,7 @@ from jaxslam.trajectory.evaluation import evaluate
 from jaxslam.trajectory.trajectory import Trajectory
 
 FRAMES = 60
-SEEDS = [0, 2, 3]
+SEEDS = [0, pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)]
 """0 is the worst for jaxslam, 2 the worst and 3 the best for the naive odometry."""
 WORST_ATE_M = 0.004
 TIMES_WORSE = 15

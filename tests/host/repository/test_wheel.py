@@ -77,6 +77,7 @@ def test_is_a_module_too(environment: Path) -> None:
     assert _run([python, "-m", "jaxslam", "models", "list"], "/") == _run([command, "models", "list"], "/")
 
 
+@pytest.mark.slow
 def test_demo_runs_in_another_folder(environment: Path, tmp_path: Path) -> None:
     printed = _run([environment / "bin" / "jaxslam", "demo", "--frames", "12", "--out", tmp_path / "out"], tmp_path)
     assert "12 of 12" in printed

@@ -119,7 +119,7 @@ def write_run(folder: Path) -> None:
 
 
 class TestCompiling:
-    @KINDS
+    @pytest.mark.parametrize("config", [pytest.param(INLINE, marks=pytest.mark.slow), LIVE], ids=["inline", "live"])
     def test_nothing_while_frames_come(self, compiled: list[str], config: Config) -> None:
         """Not for the work of mapping, a loss and a place recognized, corrections and recalls."""
         jax.clear_caches()

@@ -454,7 +454,8 @@ class TestFailure:
         assert problems(slam_map) == []
         assert len(np.unique(slam_map.submap)) == 1
 
-    @pytest.mark.parametrize("new_points", ["always", "keyframes"])
+    # The second needs a tracker of its own.
+    @pytest.mark.parametrize("new_points", ["always", pytest.param("keyframes", marks=pytest.mark.slow)])
     def test_all_is_always_masked(self, new_points: Any) -> None:
         """Nothing is left of the map; tracking goes on by what has just come, or by the features of the last frame."""
         with Slam(source().camera, with_points_in(new_points), detector=everything) as slam:

@@ -55,6 +55,7 @@ def test_between_them_points_count_in_part(frames: FrameArrays, hard: tuple[Trac
     assert float(state.keyframes.weight.max()) == pytest.approx(0.75 * float(hard[0].keyframes.weight.max()))
 
 
+@pytest.mark.slow
 def test_arrays_of_numpy_outside_of_jit(frames: FrameArrays) -> None:
     """With nothing traced, the step takes them as they are."""
     first = jax.device_get(at(frames, 0))

@@ -84,7 +84,7 @@ def _loss(recording: Clip, steps: int) -> tuple[Callable[[Inputs], Array], Input
     """The squared error of the position over some frames, what it depends on, and which points exist."""
     frames = stacked(recording.frames[: BEFORE + steps], np.float64, np.float64)
     given = params(np.float64)
-    given = given._replace(sensor=given.sensor._replace(readout_s=jnp.asarray(0.005)))
+    given = given._replace(sensor=given.sensor._replace(readout_s=jnp.asarray(0.005, np.float64)))
     step = quick_compile(track_step, static_argnums=3)
     state = new_state(np.float64, np.float64)
     for index in range(BEFORE):

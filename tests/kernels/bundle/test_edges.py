@@ -138,6 +138,7 @@ def test_edges_alone():
     np.testing.assert_array_equal(result.X_world, inputs.X_world)
 
 
+@pytest.mark.slow
 def test_gradient():
     """Forward = reverse = finite differences: measured poses, information, weights, what is fixed, observations."""
     rng = np.random.default_rng(4)
