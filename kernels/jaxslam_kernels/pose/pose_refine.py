@@ -137,7 +137,9 @@ def refine_pose(
             `None` for what the floating-point type resolves.
         solver: Least-squares solver of optimistix, such as `optimistix.Dogleg(rtol=1e-6, atol=1e-6)`, static; `None`
             for `ManifoldLevenbergMarquardt`, which is faster. It changes neither the optimum nor its derivatives, which
-            are those of the optimum: they are as exact as its tolerances.
+            are those of the optimum: they are as exact as its tolerances. Give it tolerances that the floating-point
+            type resolves: in single precision, `optimistix.LevenbergMarquardt(1e-3, 1e-3)` may run out of steps at the
+            optimum (`NOT_CONVERGED`), where it rejects each step for a rounding error of the cost.
 
     Returns:
         A `PoseRefinement`; everything in it is finite, and so are its derivatives.

@@ -79,22 +79,26 @@ def test_residuals_have_the_cost(loss: Any) -> None:
 
 
 def test_degenerate() -> None:
-    """A batch of problems: one that is fine, two points, no finite pose, all points in one place."""
-    T = pose_of(SCENE.initial)
-    X_world, uv, depth, weights, _ = _inputs()
-    cases = {
-        PoseStatus.OK: (T.wxyz_xyz, X_world, weights),
-        PoseStatus.TOO_FEW_POINTS: (T.wxyz_xyz, X_world, weights.at[2:].set(0.0)),
-        PoseStatus.BAD_INITIAL: (jnp.full(7, jnp.nan), X_world, weights),
-        PoseStatus.DEGENERATE: (T.wxyz_xyz, jnp.broadcast_to(X_world[:, :1], X_world.shape), weights),
-    }
+    """A batch of problems: one that is fine, two points, no finite pose, all points in one place.
 
-    def refined(wxyz_xyz: Any, X_world: Any, weights: Any) -> PoseRefinement:
-        solver = optx.LevenbergMarquardt(rtol=1e-3, atol=1e-3)
-        return refine_pose(SE3(wxyz_xyz), X_world, uv, camera(), weights=weights, depth=depth, solver=solver)
+    In double precision: in single, on some processors, rounding keeps this solver from its tolerances.
+    """
+    with jax.enable_x64(True):
+        T = pose_of(SCENE.initial)
+        X_world, uv, depth, weights, _ = _inputs()
+        cases = {
+            PoseStatus.OK: (T.wxyz_xyz, X_world, weights),
+            PoseStatus.TOO_FEW_POINTS: (T.wxyz_xyz, X_world, weights.at[2:].set(0.0)),
+            PoseStatus.BAD_INITIAL: (jnp.full(7, jnp.nan), X_world, weights),
+            PoseStatus.DEGENERATE: (T.wxyz_xyz, jnp.broadcast_to(X_world[:, :1], X_world.shape), weights),
+        }
 
-    stacked = jax.tree.map(lambda *arrays: jnp.stack(arrays), *cases.values())
-    result = quick_compile(jax.vmap(refined))(*stacked)
+        def refined(wxyz_xyz: Any, X_world: Any, weights: Any) -> PoseRefinement:
+            solver = optx.LevenbergMarquardt(rtol=1e-3, atol=1e-3)
+            return refine_pose(SE3(wxyz_xyz), X_world, uv, camera(), weights=weights, depth=depth, solver=solver)
+
+        stacked = jax.tree.map(lambda *arrays: jnp.stack(arrays), *cases.values())
+        result = quick_compile(jax.vmap(refined))(*stacked)
     assert [PoseStatus(int(code)) for code in result.status] == list(cases)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(result))
     assert max(pose_error(result.T_world_cam.wxyz_xyz[0], SCENE.pose)) < 0.01
