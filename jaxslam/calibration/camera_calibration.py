@@ -50,7 +50,7 @@ OnProgress: TypeAlias = Callable[[str, int, int], None]
 _ROUNDS = 3
 _SETTLED_PX = 0.1
 """Mean change of projections below which the recording is not tracked again."""
-_FIRST_NOISE = Noise(0.5, 1.0)
+_FIRST_NOISE = Noise(0.5, 1.0, 1.0)
 _NOISE_ROUNDS = 4
 _TOLD = 0.5
 """Largest standard deviation of a parameter that a recording tells, in those assumed beforehand."""
