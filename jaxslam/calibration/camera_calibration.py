@@ -195,6 +195,8 @@ def _gated(tracked: _Tracked, start: Camera, rounds: int, scale: Scale | None, o
     free = group_mask(groups)
     all_sigmas = standard_deviations(problem, fitted, free)
     told = tuple(group for group in groups if _is_told(group, all_sigmas, problem.prior_sigma))
+    change = np.square((fitted.camera - before) / all_sigmas)
+    told = tuple(sorted(told, key=lambda group: float(change[group_mask((group,))].mean())))
     count = 0
 
     def on_step(text: str) -> None:
