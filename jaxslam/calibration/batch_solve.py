@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxslam.calibration.depth_patches import DepthSettings, planes_at
-from jaxslam.calibration.elimination import Noise, Reduced, reduce_block, shares_of_points, weighted
+from jaxslam.calibration.elimination import Noise, Reduced, reduce_block, shared_variances, shares_of_points, weighted
 from jaxslam.calibration.parameters import CameraVector
 from jaxslam.calibration.residuals import linearize, residuals_of
 from jaxslam.calibration.track_block import TrackBlock
@@ -23,6 +23,10 @@ _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-7, 1e-10, 1e6
 _STEP = 10.0
 _LEVEL = 1e-5
 """Share of the cost by which the last step lowers it."""
+_LEAST_TOLD, _FEWEST_TOLD = 0.9, 24
+"""Largest share of the variance of a shared error that may be left by the tracks, and points for which that holds."""
+_LEAST_SHARED = 0.01
+"""Smallest standard deviation of shared errors, in those of the settings."""
 _SHORT = 0.05
 """Length of the last step of the camera, in standard deviations."""
 
@@ -213,7 +217,26 @@ def estimated_noise(problem: BatchProblem, solution: BatchSolution) -> Noise:
     left = np.sqrt(measured / max(measured - unknowns, 1))
     pixel = left * np.median(of_pixels) / np.sqrt(2 * np.log(2))  # the median of a Rayleigh distribution
     depth = left * 1.4826 * np.median(of_depths) if len(of_depths) else problem.noise.depth
-    return Noise(float(pixel), float(depth))
+    return Noise(float(pixel), float(depth), _shared_noise(problem, solution))
+
+
+def _shared_noise(problem: BatchProblem, solution: BatchSolution) -> float:
+    """Estimate the standard deviation of what all measurements of the depth of a point share.
+
+    Tracks alone tell it of points only that are seen from different places: an error is estimated smaller than it is by
+    the share of its variance that is left.
+    """
+    errors = []
+    for block, state in zip(problem.blocks, solution.states, strict=True):
+        linear = linearize(block, *state, solution.camera, height=problem.height)
+        parts = weighted(block, state.points, linear.residuals, problem.noise)
+        left = shared_variances(linear, parts, problem.noise) / problem.noise.shared**2
+        told = block.measured.any(axis=0) & (left < _LEAST_TOLD)
+        errors.append(np.abs(parts.shared[told]) / np.sqrt(1 - left[told]))
+    of_points = np.concatenate(errors)
+    if len(of_points) < _FEWEST_TOLD:
+        return problem.noise.shared
+    return float(max(1.4826 * np.median(of_points), _LEAST_SHARED))
 
 
 def residuals_of_states(problem: BatchProblem, solution: BatchSolution) -> list[Float[np.ndarray, "f 3 p"]]:

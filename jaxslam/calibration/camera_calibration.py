@@ -32,6 +32,7 @@ from jaxslam.calibration.parameters import (
 )
 from jaxslam.calibration.report import Calibration, Estimate, ResidualField, Verdict
 from jaxslam.calibration.scale import Scale, scale_of
+from jaxslam.calibration.track_alignment import aligned, gray
 from jaxslam.calibration.track_block import TrackBlock
 from jaxslam.calibration.track_recorder import TrackRecorder
 from jaxslam.calibration.uncertainty import standard_deviations
@@ -50,8 +51,9 @@ OnProgress: TypeAlias = Callable[[str, int, int], None]
 _ROUNDS = 3
 _SETTLED_PX = 0.1
 """Mean change of projections below which the recording is not tracked again."""
-_FIRST_NOISE = Noise(0.5, 1.0)
-_NOISE_ROUNDS = 4
+_FIRST_NOISE = Noise(0.5, 1.0, 1.0)
+_NOISE_ROUNDS, _ALIGNED_BEFORE = 5, (1, 3)
+"""Fits after the first one, and those of them before which points are looked up again in the images."""
 _TOLD = 0.5
 """Largest standard deviation of a parameter that a recording tells, in those assumed beforehand."""
 _SURE_OF_SCALE = 2.0
@@ -165,17 +167,25 @@ def _track_and_fit(
         _FIRST_NOISE,
         recorder.depth,
     )
-    camera, states = vector_of(dataset.camera), first_states(problem.blocks)
-    solution = None
+    solution = solve_batch(problem, vector_of(dataset.camera), first_states(problem.blocks), free)
     for index in range(_NOISE_ROUNDS):
-        on_progress(f"fitting, round {number}", index, _NOISE_ROUNDS)
-        solution = solve_batch(problem, camera, states, free)
-        camera, states = solution.camera, solution.states
-        if index + 1 < _NOISE_ROUNDS:
-            problem = with_depth_looked_up(problem, solution)
-            problem = replace(problem, noise=estimated_noise(problem, solution))
-    assert solution is not None
+        on_progress(f"fitting, round {number}", index + 1, _NOISE_ROUNDS + 1)
+        if index in _ALIGNED_BEFORE:
+            problem = _with_tracks_aligned(problem, solution, dataset)
+        problem = with_depth_looked_up(problem, solution)
+        problem = replace(problem, noise=estimated_noise(problem, solution))
+        solution = solve_batch(problem, solution.camera, solution.states, free)
     return _Tracked(problem, solution, trajectory)
+
+
+def _with_tracks_aligned(problem: BatchProblem, solution: BatchSolution, dataset: Dataset) -> BatchProblem:
+    """Return the problem with all points looked up again in the images, block by block; see `aligned`."""
+    blocks = []
+    for block, state in zip(problem.blocks, solution.states, strict=True):
+        index = np.searchsorted(dataset.timestamps_ns, block.timestamps_ns)
+        images = np.stack([gray(dataset[int(each)]) for each in index])
+        blocks.append(aligned(block, state, solution.camera, images))
+    return replace(problem, blocks=blocks)
 
 
 def _gated(tracked: _Tracked, start: Camera, rounds: int, scale: Scale | None, on_progress: OnProgress) -> Calibration:
@@ -185,6 +195,8 @@ def _gated(tracked: _Tracked, start: Camera, rounds: int, scale: Scale | None, o
     free = group_mask(groups)
     all_sigmas = standard_deviations(problem, fitted, free)
     told = tuple(group for group in groups if _is_told(group, all_sigmas, problem.prior_sigma))
+    change = np.square((fitted.camera - before) / all_sigmas)
+    told = tuple(sorted(told, key=lambda group: float(change[group_mask((group,))].mean())))
     count = 0
 
     def on_step(text: str) -> None:

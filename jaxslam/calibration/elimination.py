@@ -28,10 +28,12 @@ class Noise(NamedTuple):
     Attributes:
         pixel: Of each coordinate of a tracked point, pixels.
         depth: Of the measured inverse depth, as a factor of `DepthPlanes.sigma`.
+        shared: Of the error that all measurements of the depth of a point share, as the same factor.
     """
 
     pixel: float
     depth: float
+    shared: float
 
 
 class Weighted(NamedTuple):
@@ -40,13 +42,15 @@ class Weighted(NamedTuple):
     Attributes:
         residuals: `(f, 3, p)` residuals in standard deviations, 0 where nothing is seen or measured.
         weights: `(f, 3, p)` weights of iteratively reweighted least squares.
-        shared: `(p,)` errors that all measurements of the depth of a point share, in standard deviations.
+        shared: `(p,)` errors that all measurements of the depth of a point share, as factors of `DepthPlanes.sigma`.
+        shared_weights: `(p,)` inverse variances of those, times the weights of the robust loss.
         cost: Cost of the block.
     """
 
     residuals: Float[np.ndarray, "f 3 p"]
     weights: Float[np.ndarray, "f 3 p"]
     shared: Float[np.ndarray, " p"]
+    shared_weights: Float[np.ndarray, " p"]
     cost: float
 
 
@@ -85,8 +89,10 @@ def weighted(
     white = np.where(seen, residuals / scales, 0.0)
     squares = np.stack([white[:, 0] ** 2 + white[:, 1] ** 2, white[:, 2] ** 2], axis=1) / LOSS_SCALE**2
     weights = (1 / (1 + squares))[:, [0, 0, 1]] * seen
-    cost = 0.5 * LOSS_SCALE**2 * np.log1p(squares).sum() + 0.5 * np.square(points[3]).sum()
-    return Weighted(white, weights, points[3], float(cost))
+    shared_squares = np.square(points[3] / noise.shared) / LOSS_SCALE**2
+    shared_weights = 1 / (1 + shared_squares) / noise.shared**2
+    cost = 0.5 * LOSS_SCALE**2 * (np.log1p(squares).sum() + np.log1p(shared_squares).sum())
+    return Weighted(white, weights, points[3], shared_weights, float(cost))
 
 
 def reduce_block(
@@ -157,6 +163,19 @@ def shares_of_points(
     return gradient[..., 0], (rows_T @ rows).sum(axis=0) - back @ cross
 
 
+def shared_variances(linearized: Linearized, parts: Weighted, noise: Noise) -> Float[np.ndarray, " p"]:
+    """Return the variance of the shared error of each point if poses and camera are known; see `Weighted.shared`.
+
+    Args:
+        linearized: Residuals and derivatives of the block.
+        parts: Its weighted residuals.
+        noise: Standard deviations.
+    """
+    jacobian, residuals = _whitened(linearized, parts, noise)
+    point_T = np.swapaxes(jacobian[..., NUM_POSE : NUM_POSE + NUM_POINT], -1, -2)
+    return np.linalg.inv(_of_points(point_T, residuals, parts, 0.0)[0])[:, -1, -1]
+
+
 def _whitened(
     linearized: Linearized, parts: Weighted, noise: Noise
 ) -> tuple[Float[np.ndarray, "f p 3 t"], Float[np.ndarray, "f p 3 1"]]:
@@ -168,7 +187,9 @@ def _whitened(
     # What is not seen has no weight, whatever its derivative, which may not even be a number.
     jacobian = np.where(factors[..., None] > 0, linearized.jacobian, 0.0) * factors[..., None]
     residuals = np.sqrt(parts.weights) * parts.residuals
-    return np.moveaxis(jacobian, 1, 2), np.moveaxis(residuals, 1, 2)[..., None]
+    # In memory as the axes say: everything that follows goes along the last one, in half of the time.
+    whitened = np.ascontiguousarray(np.moveaxis(jacobian, 1, 2))
+    return whitened, np.moveaxis(residuals, 1, 2)[..., None]
 
 
 def _of_points(
@@ -177,8 +198,8 @@ def _of_points(
     """Return Hessian and gradient of each point alone."""
     inner = (point_T @ np.swapaxes(point_T, -1, -2)).sum(axis=0)
     pull = (point_T @ residuals).sum(axis=0)
-    inner[:, -1, -1] += 1
-    pull[:, -1, 0] += parts.shared
+    inner[:, -1, -1] += parts.shared_weights
+    pull[:, -1, 0] += parts.shared_weights * parts.shared
     return inner + _damped(inner, damping), pull
 
 
@@ -193,12 +214,15 @@ def _assembled(
         # At an end there is no frame before or after, and nothing depends on it.
         around = frame + np.array([-1, 0, 1])
         there = np.flatnonzero((around >= 0) & (around < num_frames))
-        own = np.concatenate([(6 * there[:, None] + np.arange(6)).ravel(), np.arange(NUM_POSE, c)])
-        places = np.concatenate([(6 * around[there, None] + np.arange(6)).ravel(), np.arange(6 * num_frames, size)])
-        rows = rest[frame].reshape(-1, c)[:, own]
-        hessian[np.ix_(places, places)] += rows.T @ rows
-        gradient[places] += pulls[frame, ..., 0].sum(axis=0)[own]
-        cross[:, places] += crosses[frame][:, own]
+        poses = slice(6 * around[there[0]], 6 * around[there[-1]] + 6), slice(6 * there[0], 6 * there[-1] + 6)
+        camera = slice(6 * num_frames, size), slice(NUM_POSE, c)
+        rows = rest[frame].reshape(-1, c)
+        squares, pull = rows.T @ rows, pulls[frame, ..., 0].sum(axis=0)
+        for place, own in (poses, camera):
+            gradient[place] += pull[own]
+            cross[:, place] += crosses[frame][:, own]
+            for other_place, other in (poses, camera):
+                hessian[place, other_place] += squares[own, other]
     return hessian[6:, 6:], gradient[6:], cross[:, 6:]
 
 

@@ -12,9 +12,8 @@ from jaxslam.calibration.parameters import CameraVector, group_mask
 
 _CONTINUED_STEPS = 6
 """Steps of a solve that begins near its optimum."""
-_SURE, _CLEAR = 1.64, 2.5
-"""Signed-rank statistics: above the first a group stays, as chance is above it in 5 % of cases only; above the second
-it is not asked again."""
+_SURE = 1.64
+"""Signed-rank statistic above which a group stays: chance is above it in 5 % of cases only."""
 
 Step = Callable[[str], None]
 """Told what is done next."""
@@ -60,14 +59,15 @@ def gate(
     """Decide which groups of parameters may change.
 
     Every other block is fitted to, and the rest is held out; then the other way round. On held-out blocks the camera is
-    fixed, and poses and points are found anew. Groups leave one after the other, the least useful first, while held-out
-    frames are not surely worse for it (5 %, signed ranks); the groups that stay are fitted again each time.
+    fixed, and poses and points are found anew. Each group is left out in turn, and leaves for good if held-out frames
+    are not surely worse for it (5 %, signed ranks); the other groups are fitted again each time.
 
     Args:
         problem: The problem, with the noise as estimated.
         start: Camera as it was.
         fitted: Solution of the whole problem with all groups free, from which solves begin.
-        groups: Groups to decide on.
+        groups: Groups to decide on, the one that probably changes least first: it is asked about while all others are
+            free.
         on_step: Told what is done next.
     """
     on_step("held-out frames, camera as it was")
@@ -75,19 +75,13 @@ def gate(
     accepted, gains = tuple(groups), {}
     on_step("held-out frames, all parameters")
     after = _held_out(problem, start, fitted, accepted)
-    clear: set[str] = set()
-    while asked := [group for group in accepted if group not in clear]:
-        without, surety = {}, {}
-        for group in asked:
-            on_step(f"held-out frames without {group}")
-            without[group] = _held_out(problem, start, fitted, tuple(each for each in accepted if each != group))
-            gains[group] = float(without[group].costs.sum() / after.costs.sum() - 1)
-            surety[group] = _signed_rank(after.costs, without[group].costs)
-        clear |= {group for group in asked if surety[group] > _CLEAR}
-        worst = min(asked, key=lambda group: surety[group])
-        if surety[worst] > _SURE:
-            break
-        accepted, after = tuple(each for each in accepted if each != worst), without[worst]
+    for group in groups:
+        on_step(f"held-out frames without {group}")
+        rest = tuple(each for each in accepted if each != group)
+        without = _held_out(problem, start, fitted, rest)
+        gains[group] = float(without.costs.sum() / after.costs.sum() - 1)
+        if _signed_rank(after.costs, without.costs) <= _SURE:
+            accepted, after = rest, without
     return Gate(accepted, gains, before, after)
 
 

@@ -178,10 +178,7 @@ def _of_frame(
     motions = displacement(now, before), displacement(now, after)
 
     def motion_until(elapsed_s: Weights) -> Float[Array, "6 p"]:
-        weights = frame.motion
-        back = weights[0] * elapsed_s + weights[1] * jnp.square(elapsed_s)
-        on = weights[2] * elapsed_s + weights[3] * jnp.square(elapsed_s)
-        return motions[0][:, None] * back[None, :] + motions[1][:, None] * on[None, :]
+        return _motion_until(elapsed_s, motions, frame.motion)
 
     rows_s = row_time(frame.uv[1], height, readout_s * frame.time_sign)
     pixels = project(intrinsics, _from_moved_camera(X_cam, motion_until(rows_s))) - frame.uv
@@ -192,6 +189,61 @@ def _of_frame(
     measured = frame.plane[0] + jnp.sum(frame.plane[1:] * shift, axis=0)
     expected = 1 / jnp.maximum(X_depth[2] + offset_m, _MIN_DEPTH_M)
     return jnp.concatenate([pixels, ((expected - measured) / frame.plane_sigma + shared)[None, :]]), depth_uv
+
+
+_ROW_STEPS = 4
+"""Steps that find the row at which a rolling shutter sees a point: each leaves a hundredth of the error."""
+
+
+def predicted_pixels(
+    block: TrackBlock, poses: np.ndarray, X_world: np.ndarray, camera: CameraVector, *, height: int
+) -> Float[np.ndarray, "f 2 n"]:
+    """Compute the pixels at which the color images of a block show points, wherever those were tracked.
+
+    Args:
+        block: The block.
+        poses: See `linearize`.
+        X_world: `(3, n)` positions of points, meters; of any number.
+        camera: See `linearize`.
+        height: See `linearize`.
+    """
+    frames, points, parameters = _arguments(block, poses, X_world, camera)
+    return np.asarray(_predicted(frames.poses, frames.motion, frames.time_sign, points, parameters, height=height))
+
+
+@compiled(when="first use", static="height", options=FAST_COMPILE | SINGLE_THREAD)
+def _predicted(
+    poses: Float[Array, "f 3 7"],
+    motion: Float[Array, "f 4"],
+    time_sign: Float[Array, " f"],
+    X_world: Points,
+    camera: Array,
+    *,
+    height: int,
+) -> Float[Array, "f 2 n"]:
+    intrinsics = Intrinsics(*camera[:4], distortion=camera[4:9])
+
+    def of_frame(arguments: tuple[Array, Array, Array]) -> Pixels:
+        poses, motion, time_sign = arguments
+        before, now, after = (SE3(poses[k]) for k in range(3))
+        X_cam = to_camera(now, X_world)
+        motions = displacement(now, before), displacement(now, after)
+        uv = project(intrinsics, X_cam)
+        for _ in range(_ROW_STEPS):
+            rows_s = row_time(uv[1], height, camera[11] * time_sign)
+            uv = project(intrinsics, _from_moved_camera(X_cam, _motion_until(rows_s, motions, motion)))
+        return uv
+
+    return jax.lax.map(of_frame, (poses, motion, time_sign))
+
+
+def _motion_until(
+    elapsed_s: Weights, motions: tuple[Float[Array, "6"], Float[Array, "6"]], weights: Float[Array, "4"]
+) -> Float[Array, "6 n"]:
+    """Motion of the camera after times since the frame, `(6, n)`; see `TrackBlock.motion_weights`."""
+    back = weights[0] * elapsed_s + weights[1] * jnp.square(elapsed_s)
+    on = weights[2] * elapsed_s + weights[3] * jnp.square(elapsed_s)
+    return motions[0][:, None] * back[None, :] + motions[1][:, None] * on[None, :]
 
 
 def _small_rotation(w: Float[Array, "3"]) -> Float[Array, "3 3"]:

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxslam.calibration.depth_patches import DepthPatches, DepthPlanes
 
@@ -22,6 +22,7 @@ class TrackBlock(NamedTuple):
         delay_s: `(f,)` times from the images to their depth images by their timestamps, seconds.
         time_sign: `(f,)` 1, or -1 of a recording that is played backward.
         origin: `(7,)` pose of the first frame in the world of the whole recording, in which blocks see the same places.
+        timestamps_ns: `(f,)` times of the frames as the recording says them, nanoseconds.
     """
 
     times_s: Float[np.ndarray, " f"]
@@ -34,6 +35,7 @@ class TrackBlock(NamedTuple):
     delay_s: Float[np.ndarray, " f"]
     time_sign: Float[np.ndarray, " f"]
     origin: Float[np.ndarray, "7"]
+    timestamps_ns: Int[np.ndarray, " f"]
 
     @property
     def measured(self) -> Bool[np.ndarray, "f p"]:

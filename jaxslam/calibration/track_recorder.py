@@ -192,6 +192,7 @@ class TrackRecorder:
             delay_s=np.array([frame.delay_s for frame in frames]),
             time_sign=np.array([frame.time_sign for frame in frames]),
             origin=origin,
+            timestamps_ns=stamps,
         )
 
     def _positions(self, grid: "_Grid", planes: DepthPlanes, poses: np.ndarray) -> Float[np.ndarray, "3 p"]:

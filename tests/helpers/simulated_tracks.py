@@ -89,6 +89,7 @@ def _block(simulation: Simulation, start_s: float, num_frames: int, rng: np.rand
         delay_s=np.zeros(num_frames),
         time_sign=np.ones(num_frames),
         origin=poses[0],
+        timestamps_ns=np.round(1e9 * (start_s + times_s)).astype(np.int64),
     )
 
 

@@ -31,7 +31,7 @@ SETTINGS = {"height": CAMERA.height}
 
 def problem(start: np.ndarray = START, truth: np.ndarray = TRUTH, seed: int = 0) -> BatchProblem:
     blocks = simulate_blocks(Simulation(truth, seed=seed), num_blocks=10, num_frames=12)
-    return BatchProblem(blocks, start, prior_sigmas(CAMERA), CAMERA.height, Noise(0.3, 1.0))
+    return BatchProblem(blocks, start, prior_sigmas(CAMERA), CAMERA.height, Noise(0.3, 1.0, 1.0))
 
 
 def solved(given: BatchProblem, free: np.ndarray = ALL) -> tuple[BatchProblem, BatchSolution]:
@@ -95,6 +95,22 @@ def test_noise_is_found(fitted: tuple[BatchProblem, BatchSolution]) -> None:
     noisy, _ = fitted
     assert noisy.noise.pixel == pytest.approx(0.2, rel=0.1)
     assert noisy.noise.depth == pytest.approx(0.5, rel=0.15)  # the simulation states twice its noise
+
+
+def test_what_the_depths_of_a_point_share_is_found() -> None:
+    """Shared errors of twice the single ones are told from those, and fewer of them make the offset surer."""
+    rng, given = np.random.default_rng(5), problem(TRUTH)
+    blocks = []
+    for block in given.blocks:
+        plane = block.depth.plane.copy()
+        plane[:, 0] += 0.004 * rng.normal(size=plane.shape[-1])
+        blocks.append(block._replace(depth=block.depth._replace(plane=plane)))
+    alike, solution = solved(replace(given, blocks=blocks))
+    for _ in range(3):
+        alike = replace(alike, noise=estimated_noise(alike, solution))
+        solution = solve_batch(alike, solution.camera, solution.states, ALL)
+    assert alike.noise.depth == pytest.approx(0.5, rel=0.15)
+    assert alike.noise.shared == pytest.approx(1.0, rel=0.15)  # the simulation states a deviation of 0.004
 
 
 def test_what_is_not_free_stays(fitted: tuple[BatchProblem, BatchSolution]) -> None:
