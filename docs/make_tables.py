@@ -1,12 +1,13 @@
-"""Rewrite the tables of README.md, docs/measured-results.md and docs/performance.md from stored results.
+"""Rewrite the generated tables: results from stored files, and what is differentiable from the cases of the tests.
 
 Run `python docs/make_tables.py` after a file in `configs/benchmarks/baselines`, `configs/benchmarks/published` or
-`docs/performance` has changed.
+`docs/performance` has changed, or `derivative_cases.py` or `step_inputs.py` in `tests/helpers`.
 A table stands between the comments `<!-- NAME: begin ... -->` and `<!-- NAME: end -->`; nothing else is touched.
 """
 
 import json
 import re
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -19,7 +20,13 @@ from jaxslam.benchmark.suites.suite import load_suite
 from jaxslam.config.loading import configs_dir
 
 DOCS = Path(__file__).resolve().parent
-PAGES = (DOCS.parent / "README.md", DOCS / "measured-results.md", DOCS / "performance.md")
+PAGES = (
+    DOCS.parent / "README.md",
+    DOCS / "derivatives.md",
+    DOCS / "measured-results.md",
+    DOCS / "performance.md",
+)
+_HELPERS = DOCS.parent / "tests" / "helpers"
 _SUITE = load_suite("accuracy")
 
 
@@ -32,6 +39,8 @@ def tables() -> dict[str, str]:
         "published": "\n".join(published_tables(baselines)),
         "results": results_table(baselines[0]),
         "live": live_report(),
+        "kernels": kernels_table(),
+        "tracker": tracker_table(),
     }
 
 
@@ -65,6 +74,47 @@ def live_report() -> str:
     """Make a section of each live measurement, and say what the figures mean."""
     files = sorted((DOCS / "performance").glob("*.json"))
     return "\n".join([*(section(json.loads(file.read_text(encoding="utf-8"))) for file in files), MEANING])
+
+
+def kernels_table() -> str:
+    """Make the table of what is differentiable in each kernel, from the cases that tests compare with differences."""
+    _import_helpers()
+    import jax  # noqa: PLC0415 - after the path is set
+    from derivative_cases import MAKERS  # noqa: PLC0415 - likewise
+
+    rows = []
+    with jax.enable_x64(True):
+        for name, each in sorted(MAKERS.items()):
+            case = each.make()
+            constants = [*map(_code, case.constants), *(f"result `{result}`" for result in case.constant_results)]
+            carries = ", ".join(map(_code, case.carries)) or ("none is meant" if case.not_meant else "none")
+            rows.append([f"`{name}`", carries, ", ".join(constants) or "-", ", ".join(case.near) or "-"])
+    return table(("kernel", "first and second derivative by", "constant", "also compared at"), rows)
+
+
+def tracker_table() -> str:
+    """Make the table of what the tracker is differentiated by, from the inputs of its tests."""
+    _import_helpers()
+    from step_inputs import CONSTANT_PARAMS, STEP_INPUTS, STEPS, STEPS_TWICE  # noqa: PLC0415 - after the path is set
+
+    rows = [
+        [each.words, f"{STEPS} frames", "not compared" if each.second is None else f"{STEPS_TWICE} frames"]
+        for each in STEP_INPUTS.values()
+    ]
+    rows.append([", ".join(map(_code, CONSTANT_PARAMS)), "zero", "zero"])
+    return table(("by", "first derivative", "second derivative"), rows)
+
+
+def _import_helpers() -> None:
+    """Make the helpers of tests importable."""
+    if str(_HELPERS) not in sys.path:
+        sys.path.append(str(_HELPERS))
+
+
+def _code(label: str) -> str:
+    """Format the name of an argument; what follows a colon is the part of it that is meant."""
+    name, _, part = label.partition(":")
+    return f"`{name}` ({part.strip()})" if part else f"`{name}`"
 
 
 def published_tables(baselines: list[AccuracyBaseline]) -> list[str]:

@@ -114,7 +114,9 @@ def lk_flow(
         (~found.converged, FlowStatus.NOT_CONVERGED),
     )
     conditions, codes = zip(*reasons, strict=True)
-    status = jnp.select(conditions, [jnp.full(usable.shape, code, jnp.int32) for code in codes], FlowStatus.OK)
+    status = jnp.select(
+        conditions, [jnp.full(usable.shape, code, jnp.int32) for code in codes], jnp.int32(FlowStatus.OK)
+    )
     unsearched = lax.stop_gradient(jnp.where(jnp.isfinite(guess), guess, 0))
     position = jnp.where(usable[None, :], found.positions, unsearched)
     residual, texture = (jnp.where(usable & jnp.isfinite(array), array, 0) for array in (end.residual, end.texture))

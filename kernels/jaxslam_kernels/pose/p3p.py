@@ -87,7 +87,8 @@ def p3p_near(
     Args:
         bearings: `(3, 3, h)` as for `p3p`.
         X_world: `(3, 3, h)` as for `p3p`.
-        distances: `(3, h)` (point, triple) approximate distances, meters; positive.
+        distances: `(3, h)` (point, triple) approximate distances, meters; positive. They are constant for a derivative:
+            the solution does not depend on where the search begins.
 
     Returns:
         As `p3p`, with one solution a triple.
@@ -95,7 +96,7 @@ def p3p_near(
     bearings, X_world, known = apart(lambda: _known(bearings, X_world))
     known = known & (jnp.isfinite(distances) & (distances > 0)).all(axis=0)
     squared, versines, unit, spread = apart(lambda: _scaled(bearings, X_world))
-    near = jnp.where(known[None, :], distances, 1.0) * lax.rsqrt(unit)[None, :]
+    near = jnp.where(known[None, :], lax.stop_gradient(distances), 1.0) * lax.rsqrt(unit)[None, :]
     return _in_meters(*_newton((near[:1], near[1:2], near[2:]), squared, versines), unit, known & spread)
 
 

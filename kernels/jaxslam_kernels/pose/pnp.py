@@ -280,11 +280,12 @@ def _result(
     inliers, score = _consensus(T_world_cam, problem, averaged)
     num_inliers = jnp.sum(inliers, dtype=jnp.int32)
     usable = jnp.sum(problem.weights > 0)
+    codes = PoseStatus.TOO_FEW_POINTS, PoseStatus.DEGENERATE, PoseStatus.NO_CONSENSUS
     status = jnp.select(
         [usable < SAMPLE_SIZE, ~any_real | (status == PoseStatus.DEGENERATE), num_inliers < min_inliers],
-        [PoseStatus.TOO_FEW_POINTS, PoseStatus.DEGENERATE, PoseStatus.NO_CONSENSUS],
+        [jnp.int32(code) for code in codes],
         status,
-    ).astype(jnp.int32)
+    )
     found = status <= PoseStatus.NOT_CONVERGED
     return PnpResult(
         T_world_cam=SE3(jnp.where(found, T_world_cam.wxyz_xyz, fallback.wxyz_xyz)),

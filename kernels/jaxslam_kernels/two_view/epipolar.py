@@ -98,7 +98,7 @@ def seven_point(
     """The up to three fundamental matrices on which seven pairs of points agree, many samples at once.
 
     The matrices with `p2ᵀ F p1 = 0` for seven pairs form a pencil, found by Householder reflections; those of rank
-    two in it are at the roots of a cubic.
+    two in it are at the roots of a cubic. Not meant for differentiation: which solution stands in which place may jump.
 
     Args:
         uv_before: Pixels in the first view.

@@ -11,14 +11,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxslam_kernels.camera import Intrinsics
 from jaxtyping import Array
 from quick_compile import quick_compile
 from small_scene import PLAN, Clip, at, clip, new_state, params, stacked, truth_from_start
+from step_inputs import CONSTANT_PARAMS, STEP_INPUTS, STEPS, STEPS_TWICE
 
 from jaxslam.tracking.rollout import rollout
+from jaxslam.tracking.state import TrackParams
 from jaxslam.tracking.step import track_step
 
-BEFORE, STEPS = 10, 10
+BEFORE = 10
 EXACT = PLAN.exact()
 
 
@@ -33,23 +36,8 @@ class Inputs(NamedTuple):
     readout_s: Array
     image: Array
     ignore: Array
-
-
-DIFFERENCE = Inputs(
-    camera=jnp.asarray(1e-4),
-    weight=jnp.asarray(1e-2),
-    X_world=jnp.asarray(1e-5),
-    loss_scale=jnp.asarray(3e-3),
-    pixel_sigma=jnp.asarray(1e-3),
-    readout_s=jnp.asarray(1e-4),
-    image=jnp.asarray(1e-2),
-    ignore=jnp.asarray(1e-2),
-)
-"""Steps that change the loss by 2e-7 or more: the tolerances of searches and solvers change it by up to 2e-11."""
-FRAMES = 3
-"""For second derivatives. Between pixels, interpolation bends, and a gradient has a step there: few frames, and short
-steps, so that no point crosses a pixel on the way."""
-SHORT = {"camera": 1e-5, "weight": 1e-4, "X_world": 1e-6, "loss_scale": 1e-3, "pixel_sigma": 1e-4}
+    distortion: Array
+    depth_sigma_per_m2: Array
 
 
 class Problem(NamedTuple):
@@ -60,6 +48,8 @@ class Problem(NamedTuple):
     """Directional derivative, by forward mode."""
     counted: Array
     """Which points exist."""
+    of_params: TrackParams
+    """Gradient by the parameters, but for those that are inputs."""
 
     def direction(self, seed: int) -> Inputs:
         """A random change of every input, of the size of one."""
@@ -74,14 +64,14 @@ def problem() -> Iterator[Problem]:
         yield _problem(*_loss(recording, STEPS))
 
 
-def _problem(loss: Callable[[Inputs], Array], inputs: Inputs, counted: Array) -> Problem:
-    gradient = quick_compile(jax.grad(loss))(inputs)
+def _problem(loss: Callable[..., Array], inputs: Inputs, counted: Array, given: TrackParams) -> Problem:
+    gradient, of_params = quick_compile(jax.grad(loss, argnums=(0, 1)))(inputs, given)
     forward = quick_compile(lambda direction: jax.jvp(loss, (inputs,), (direction,))[1])
-    return Problem(inputs, gradient, quick_compile(loss), forward, counted)
+    return Problem(inputs, gradient, quick_compile(loss), forward, counted, of_params)
 
 
-def _loss(recording: Clip, steps: int) -> tuple[Callable[[Inputs], Array], Inputs, Array]:
-    """The squared error of the position over some frames, what it depends on, and which points exist."""
+def _loss(recording: Clip, steps: int) -> tuple[Callable[..., Array], Inputs, Array, TrackParams]:
+    """The squared error of the position over some frames, what it depends on, which points exist, and parameters."""
     frames = stacked(recording.frames[: BEFORE + steps], np.float64, np.float64)
     given = params(np.float64)
     given = given._replace(sensor=given.sensor._replace(readout_s=jnp.asarray(0.005, np.float64)))
@@ -96,16 +86,21 @@ def _loss(recording: Clip, steps: int) -> tuple[Callable[[Inputs], Array], Input
     ignore, other = (jnp.asarray(random.uniform(size=window.image.shape)) for _ in range(2))
     truth = jnp.asarray(truth_from_start(recording.source.ground_truth)[BEFORE : BEFORE + steps, :3, 3])
 
-    def loss(inputs: Inputs) -> Array:
+    def loss(inputs: Inputs, given: TrackParams = given) -> Array:
         fx, fy, cx, cy = inputs.camera
         sensor = given.sensor._replace(
-            intrinsics=given.sensor.intrinsics._replace(fx=fx, fy=fy, cx=cx, cy=cy), readout_s=inputs.readout_s
+            intrinsics=Intrinsics(fx, fy, cx, cy, inputs.distortion),
+            readout_s=inputs.readout_s,
+            depth_sigma_per_m2=inputs.depth_sigma_per_m2,
         )
         changed = given._replace(sensor=sensor, loss_scale=inputs.loss_scale, pixel_sigma=inputs.pixel_sigma)
 
         points = state.points._replace(weight=inputs.weight, X_world=inputs.X_world)
         mask = 0.8 * ignore + inputs.ignore * (other - ignore)
-        seen = window._replace(image=window.image + inputs.image * change, ignore=mask)
+        seen = window._replace(
+            image=window.image + inputs.image * change,
+            ignore=mask,
+        )
         _, outputs = rollout(state._replace(points=points), seen, changed, EXACT)
         return jnp.sum(jnp.square(outputs.T_world_cam.translation() - truth))
 
@@ -119,8 +114,14 @@ def _loss(recording: Clip, steps: int) -> tuple[Callable[[Inputs], Array], Input
         readout_s=given.sensor.readout_s,
         image=jnp.zeros(()),
         ignore=jnp.zeros(()),
+        distortion=jnp.asarray(camera.distortion),
+        depth_sigma_per_m2=given.sensor.depth_sigma_per_m2,
     )
-    return loss, inputs, state.points.valid
+    return loss, inputs, state.points.valid, given
+
+
+def test_every_input_is_listed() -> None:
+    assert tuple(STEP_INPUTS) == Inputs._fields
 
 
 class TestGradient:
@@ -129,7 +130,7 @@ class TestGradient:
     )
     def test_equals_finite_differences(self, problem: Problem, name: str) -> None:
         along = getattr(problem.direction(seed=2), name)
-        h = float(getattr(DIFFERENCE, name))
+        h = STEP_INPUTS[name].first
         moved = lambda step: problem.inputs._replace(**{name: getattr(problem.inputs, name) + step * along})
         expected = (float(problem.loss(moved(h))) - float(problem.loss(moved(-h)))) / (2 * h)
         derivative = float(jnp.vdot(getattr(problem.gradient, name), along))
@@ -150,6 +151,10 @@ class TestGradient:
         for name, gradient in problem.gradient._asdict().items():
             assert jnp.isfinite(gradient).all(), name
 
+    def test_is_zero_by_what_only_compares(self, problem: Problem) -> None:
+        for name in CONSTANT_PARAMS:
+            assert not jnp.any(getattr(problem.of_params, name)), name
+
     def test_points_without_a_slot_have_none(self, problem: Problem) -> None:
         assert not jnp.where(problem.counted, 0, problem.gradient.weight).any()
 
@@ -159,16 +164,17 @@ def test_second_derivative_equals_finite_differences() -> None:
     """Of the gradient, along a change of each input; forward over reverse, as `jax.hessian` computes it."""
     recording = clip()
     with jax.enable_x64(True):
-        loss, inputs, _ = _loss(recording, FRAMES)
+        loss, inputs, *_ = _loss(recording, STEPS_TWICE)
         both = quick_compile(lambda at, along: jax.jvp(jax.grad(loss), (at,), (along,)))
         nothing = jax.tree.map(jnp.zeros_like, inputs)
-        for name, h in SHORT.items():
+        lengths = {name: each.second for name, each in STEP_INPUTS.items() if each.second is not None}
+        for name, h in lengths.items():
             value = getattr(inputs, name)
             change = jnp.asarray(np.random.default_rng(2).normal(size=value.shape))
             along = nothing._replace(**{name: change})
             moved = [both(inputs._replace(**{name: value + k * h * change}), along)[0] for k in (-1, 1)]
             second = both(inputs, along)[1]
-            for by in SHORT:
+            for by in lengths:
                 before, after, derivative = (getattr(of, by) for of in (*moved, second))
                 expected = (after - before) / (2 * h)
                 largest = float(jnp.abs(expected).max())
