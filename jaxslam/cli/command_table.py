@@ -186,6 +186,14 @@ COMMANDS = (
         "Write a map for other programs.",
         "Points as PLY, all of it as a COLMAP model, keyframes as a trajectory.",
     ),
+    Command(("learn",), None, "Train what jaxslam learns from rendered scenes."),
+    Command(
+        ("learn", "weights"),
+        "learn_weights:LearnWeights",
+        "Learn the weights of the cue `learned` from rendered rooms, by true labels and by the pose error.",
+        "Rooms are rendered and tracked; real people are set into some of them where `JAXSLAM_DATA` and"
+        " `JAXSLAM_MODELS` are set. The same seed gives the same file on the same machine.",
+    ),
     Command(("models",), None, "Networks that find people: list them, get one, check one."),
     Command(
         ("models", "check"),

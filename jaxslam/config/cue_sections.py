@@ -63,6 +63,18 @@ class ClusterCueConfig(ValidatedConfig):
 
 
 @dataclass(frozen=True)
+class LearnedCueConfig(ValidatedConfig):
+    """Learned cue: does a small network, which sees all that is known of a point and its surface, say that it moves?"""
+
+    weights: str | None = None
+    """File with the weights of the network, as `jaxslam learn weights` writes it; the one that comes with jaxslam if
+    not set."""
+    recover_frames: Annotated[int, Range(at_least=1, at_most=1000)] = 2
+    """Number of frames without motion after which a surface that moved counts as static again, without other cues. The
+    network sees itself how a surface moved before: with the 15 of `clusters`, twice as many points are wrong."""
+
+
+@dataclass(frozen=True)
 class MotionConfig(ValidatedConfig):
     """Object motion state: a masked movable object is kept in while it stands still (USD-SLAM)."""
 

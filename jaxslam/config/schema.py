@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from jaxslam.config.cue_sections import (
     ClusterCueConfig,
     EpipolarCueConfig,
+    LearnedCueConfig,
     MotionConfig,
     OcclusionConfig,
     TrajectoryCueConfig,
@@ -204,7 +205,7 @@ class SemanticsConfig(ValidatedConfig):
     """Dilation of the detected masks, pixels."""
 
 
-_CueName = Literal["trajectory", "epipolar", "clusters"]
+_CueName = Literal["trajectory", "epipolar", "clusters", "learned"]
 
 
 @dataclass(frozen=True)
@@ -234,6 +235,8 @@ class DynamicsConfig(ValidatedConfig):
     """Settings of the epipolar cue."""
     clusters: ClusterCueConfig = field(default_factory=ClusterCueConfig)
     """Settings of the cluster cue."""
+    learned: LearnedCueConfig = field(default_factory=LearnedCueConfig)
+    """Settings of the learned cue. Its surfaces are those of `clusters`."""
     motion: MotionConfig = field(default_factory=MotionConfig)
     """Settings of the motion state of masked objects."""
     occlusion: OcclusionConfig = field(default_factory=OcclusionConfig)

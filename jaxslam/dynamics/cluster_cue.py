@@ -77,7 +77,7 @@ def _verdict(scene: CueInput, regions: Regions, params: ClusterParams, as_publis
     overall = jnp.sum(jnp.where(counts, error, 0)) / jnp.maximum(jnp.sum(counts, dtype=error.dtype), 1)
     limit = jnp.maximum(params.times_mean * overall, jnp.square(params.least_px))
     enough = (number >= params.fewest) & (limit > 0)
-    weight, evidence, judged, _ = threshold_evidence(mean / jnp.where(limit > 0, limit, 1), enough, params.temperature)
+    weight, evidence, judged = threshold_evidence(mean / jnp.where(limit > 0, limit, 1), enough, params.temperature)[:3]
     one, none = jnp.ones_like(overall), jnp.zeros_like(overall)
     return CueResult(
         weight=of_points(weight, regions, one),

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxlie import SE3
 from jaxslam_kernels.camera import Intrinsics
 from jaxslam_kernels.types import Mask, Pixels, Points, Scalar, Weights
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Int, Key
 
 from jaxslam.dynamics.regions import RegionCueResult, Regions
 
@@ -40,6 +40,9 @@ class CueInput(NamedTuple):
         size: `(2,)` columns and rows of the image.
         key: Key of this frame's random choices.
         regions: Regions of the depth image; `None` without `TrackPlan.regions`.
+        age: `(n,)` number of frames since each point was detected.
+        depth_sigma: `(n,)` standard deviation of `depth`, in meters.
+        region_weight: `(k,)` remembered weight of each region in the previous frame, as in `RegionMemory`.
     """
 
     uv_before: Pixels
@@ -58,6 +61,9 @@ class CueInput(NamedTuple):
     size: Float[Array, "2"]
     key: Key[Array, ""]
     regions: Regions | None = None
+    age: Int[Array, " n"] | None = None
+    depth_sigma: Weights | None = None
+    region_weight: Float[Array, " k"] | None = None
 
 
 class CueResult(NamedTuple):
@@ -68,12 +74,14 @@ class CueResult(NamedTuple):
         evidence: `(n,)` measured value in units of the threshold; 0 where nothing is known.
         known: `(n,)` whether the point could be classified.
         regions: The same result per region of `CueInput.regions`, if the cue classifies whole regions.
+        extra: Arrays of the cue's own, for whoever reads `TrackOutput.cue_results`; the tracker does not read them.
     """
 
     weight: Weights
     evidence: Weights
     known: Mask
     regions: RegionCueResult | None = None
+    extra: Any = None
 
 
 Cue: TypeAlias = Callable[[CueInput, Any], CueResult]
@@ -89,12 +97,15 @@ class SettingsCue(NamedTuple):
         params: Class of the parameters. Each field is a setting of the section, except `temperature`, which all cues
             share.
         needs_regions: Whether the cue classifies regions of the depth image.
+        read_params: Function from the section, the temperature and the floating-point type to the parameters, for a cue
+            whose parameters are not settings; `None` if each is one.
     """
 
     name: str
     make: Callable[[Any], Cue]
     params: Callable[..., Any]
     needs_regions: bool = False
+    read_params: Callable[[Any, float, Any], Any] | None = None
 
 
 def threshold_evidence(evidence: Weights, known: Mask, temperature: Scalar) -> CueResult:

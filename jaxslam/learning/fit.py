@@ -63,6 +63,7 @@ def fit(
     plan: TrackPlan = DEFAULT_PLAN,
     held_out: tuple[FrameArrays | Sequence[FrameArrays], Any] | None = None,
     states: TrackState | Sequence[TrackState] | None = None,
+    held_out_states: TrackState | Sequence[TrackState] | None = None,
     optimizer: optax.GradientTransformation | None = None,
     max_steps: int = 100,
     patience: int = 10,
@@ -83,7 +84,8 @@ def fit(
         select: Function that picks what to fit out of the settings: floating-point arrays, in a tuple if several.
         plan: Array sizes and search settings, static.
         held_out: More clips with their truth, whose loss decides when to stop and which settings are best.
-        states: State before each clip; by default new ones. The held-out clips begin with new ones.
+        states: State before each clip; by default new ones.
+        held_out_states: State before each held-out clip; by default new ones.
         optimizer: Optimizer of optax; Adam by default.
         max_steps: Largest number of steps.
         patience: Number of steps without a smaller loss after which it ends.
@@ -96,7 +98,7 @@ def fit(
         FloatingPointError: If the loss or its derivative is not finite.
     """
     examples = _examples(clips, truth, states, plan)
-    others = None if held_out is None else _examples(*held_out, None, plan)
+    others = None if held_out is None else _examples(*held_out, held_out_states, plan)
     start = _selected(params, select)
 
     def mean_loss(shift: PyTree, example: _Example) -> Scalar:

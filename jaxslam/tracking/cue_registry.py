@@ -37,7 +37,8 @@ def with_cues(plan: TrackPlan, config: DynamicsConfig, *, pairs: bool = False) -
     """
     chosen, clusters = [_known()[name] for name in config.cues], config.clusters
     step_px = 2 * clusters.step_px if pairs else clusters.step_px
-    regions = RegionPlan(clusters.num_regions, step_px, clusters.num_steps, clusters.recover_frames)
+    recover_frames = config.learned.recover_frames if config.cues == ("learned",) else clusters.recover_frames
+    regions = RegionPlan(clusters.num_regions, step_px, clusters.num_steps, recover_frames)
     needed = config.balance_regions or any(known.needs_regions for known in chosen)
     return plan._replace(
         cues=tuple(known.make(getattr(config, known.name)) for known in chosen),
@@ -57,12 +58,20 @@ def with_cue_params(params: TrackParams, config: DynamicsConfig, dtype: DTypeLik
         dtype: Floating-point type of the added parameters; by default the type of `params`.
 
     Raises:
+        ModelError: If the weights of the learned cue cannot be read.
         TypeError: If `dtype` is not a floating-point type, or is float64 while `jax_enable_x64` is off.
     """
     dtype = jnp.result_type(params.pixel_sigma) if dtype is None else floating_dtype(dtype)
-    cues = tuple(_params_of(getattr(config, name), _known()[name].params, config, dtype) for name in config.cues)
+    cues = tuple(_cue_params(_known()[name], config, dtype) for name in config.cues)
     motion = _params_of(config.motion, MotionParams, config, dtype) if config.motion.enabled else None
     return params._replace(cues=cues, motion=motion)
+
+
+def _cue_params(cue: SettingsCue, config: DynamicsConfig, dtype: jnp.dtype) -> Any:
+    section = getattr(config, cue.name)
+    if cue.read_params is not None:
+        return cue.read_params(section, config.temperature, dtype)
+    return _params_of(section, cue.params, config, dtype)
 
 
 def _motion_plan(config: MotionConfig) -> MotionPlan | None:

@@ -290,6 +290,9 @@ def _cue_results(step: StepContext, seen: FramePoints, regions: Regions | None, 
         size=jnp.array([width, height], seen.uv.dtype),
         key=jax.random.fold_in(jax.random.fold_in(state.random_key(), -1 - state.frame), 1),
         regions=regions,
+        age=points.age,
+        depth_sigma=observed.sigma,
+        region_weight=None if regions is None else state.regions.weight,
     )
     cue_results = tuple(cue(scene, chosen) for cue, chosen in zip(plan.cues, params.cues, strict=True))
     for index, result in enumerate(cue_results):

@@ -19,6 +19,7 @@ from jaxslam_kernels.depth import sampling as depth_image
 from jaxslam_kernels.flow import disparity, lk_flow, patch_align
 from jaxslam_kernels.image import corners
 from jaxslam_kernels.image import pyramid as image
+from jaxslam_kernels.point_network import PointNetwork, network_shapes, score_points
 from jaxslam_kernels.pose import absolute_orientation, p3p, pnp, pose_refine
 from jaxslam_kernels.pose.pose_cost import PosePrior, PoseProblem
 from jaxslam_kernels.pose_graph import cost as pose_graph_cost
@@ -167,6 +168,13 @@ def cases(n: int = 11) -> dict[str, Case]:
         image.half_size: {"image": f(40, 48)},
         image.build_pyramid: {"image": f(40, 48)},
         kmeans.nearest_centers: {"points": f(2, n), "centers": f(2, 3)},
+        score_points: {
+            "network": PointNetwork(**{name: f(*shape) for name, shape in network_shapes(5, 2, 3).items()}),
+            "features": f(5, n),
+            "group_features": f(2, 4),
+            "group_of": i(n),
+            "mask": b(n),
+        },
         partial(kmeans.kmeans, num_clusters=2, num_steps=2): {
             "key": KEY,
             "points": f(2, n),

@@ -44,7 +44,7 @@ INSIDE = {  # parts of kernels: called by kernels only, with what those have che
 NOT_CHECKED = {  # parts of kernels beside public ones, and functions of the host
     *("bundle_problem", "free_cameras", "clean_weights", "bundle_views", "bundle_cost", "normal_equations"),
     *("exact_blocks", "solve_bundle", "refine_problem", "solve_pose", "lenient_promotion"),
-    *("band_rank", "suitable_group_size", "seed_words"),
+    *("band_rank", "suitable_group_size", "seed_words", "network_shapes"),
 }
 NO_SHAPES = {"make_intrinsics", "empty_grid", "empty_table"}  # they take no arrays
 

@@ -1,0 +1,175 @@
+"""Learned cue: a small network tells from all that is known of a point, of its surface and of the frame if it moves.
+
+The other cues compare one measurement with one limit. The network reads what they measure: how far a point is, in the
+image and in depth, from where the map has it, from where it was measured up to half a second ago, and from where it was
+in the last frame; with age, trust and agreement with the coarse pose. It looks at them together: of the point, of the
+region of the depth image that it is on, and of the whole frame. It is trained in rendered rooms; see
+`jaxslam.learning.weights`.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxslam_kernels.camera import back_project, project
+from jaxslam_kernels.point_network import PointNetwork, score_points
+from jaxslam_kernels.se3 import to_camera, to_world
+from jaxslam_kernels.types import Mask, Points, Scalar, Weights
+from jaxtyping import Array, Float
+
+from jaxslam.config.cue_sections import LearnedCueConfig
+from jaxslam.dynamics.cue import CueInput, CueResult, SettingsCue, threshold_evidence
+from jaxslam.dynamics.network_file import load_network
+from jaxslam.dynamics.regions import RegionCueResult, Regions
+
+_SOFT_PX = 0.01
+"""Distance below which that of a point has no direction, pixels: it keeps lengths smooth at zero."""
+_MAX_SIGMAS = 100.0
+"""Largest difference of depth that is told from others, in standard deviations."""
+
+
+class LearnedParams(NamedTuple):
+    """Parameters of `learned_cue`.
+
+    Attributes:
+        network: Weights of the network.
+        temperature: Softness of the comparison, as in `cue.threshold_evidence`.
+    """
+
+    network: PointNetwork
+    temperature: Scalar
+
+
+class LearnedFeatures(NamedTuple):
+    """Inputs of the network for `n` points and `k` regions.
+
+    Attributes:
+        points: `(f, n)` features of the points, in the order of `network_file.POINT_FEATURES`.
+        regions: `(c, k)` features of the regions, in the order of `network_file.GROUP_FEATURES`.
+        mask: `(n,)` which points are classified.
+    """
+
+    points: Float[Array, "f n"]
+    regions: Float[Array, "c k"]
+    mask: Mask
+
+
+def learned_cue(scene: CueInput, params: LearnedParams) -> CueResult:
+    """Return the evidence of the network for each point and each region.
+
+    The evidence is twice the probability of motion that the network gives. It is 2 at most, so that a region is
+    remembered as moving (`regions.remembered_weights`) after a few frames, and never after a single one.
+
+    Args:
+        scene: Measurements of the points; its `regions`, `age`, `depth_sigma` and `region_weight` must be set.
+        params: Weights of the network.
+
+    Raises:
+        ValueError: If something of `scene` that the network reads is `None`.
+    """
+    regions = _regions(scene)
+    features = learned_features(scene)
+    scores = score_points(params.network, features.points, features.regions, regions.of_point, features.mask)
+    judged = threshold_evidence(_evidence(scores.point), features.mask, params.temperature)
+    of_regions = threshold_evidence(_evidence(scores.group), scores.number > 0, params.temperature)
+    return judged._replace(regions=RegionCueResult(of_regions.weight, of_regions.evidence, of_regions.known))
+
+
+def learned_features(scene: CueInput) -> LearnedFeatures:
+    """Compute the inputs of the network.
+
+    They do not depend on the scale of the world: lengths are in pixels, in standard deviations of depth, or relative to
+    the mean depth of the frame.
+
+    Raises:
+        ValueError: If something of `scene` that the network reads is `None`.
+    """
+    regions = _regions(scene)
+    mask, anchor, fused = _seen(scene)
+    points = _point_features(scene, mask, anchor, fused)
+    depth = jnp.where(mask, fused[2], 0)
+    mean_depth = jnp.sum(depth) / jnp.maximum(jnp.sum(mask, dtype=depth.dtype), 1)
+    mean_depth = jnp.where(mean_depth > 0, mean_depth, 1)
+    points.append(jnp.log(jnp.where(mask, fused[2], mean_depth) / mean_depth))
+    table = lax.stop_gradient(_region_features(scene, regions, mask, mean_depth))
+    return LearnedFeatures(jnp.stack(points), table, mask)
+
+
+def _regions(scene: CueInput) -> Regions:
+    for name in ("regions", "age", "depth_sigma", "region_weight"):
+        if getattr(scene, name) is None:
+            raise ValueError(f"scene.{name}: expected a value for the learned cue, got None; set TrackPlan.regions")
+    assert scene.regions is not None
+    return scene.regions
+
+
+def _seen(scene: CueInput) -> tuple[Mask, Points, Points]:
+    """Return which points are classified, and their two positions in the map in camera axes."""
+    anchor, fused = (to_camera(scene.T_world_cam, X) for X in (scene.X_anchor, scene.X_world))
+    finite = jnp.isfinite(scene.uv).all(axis=0) & jnp.isfinite(scene.uv_before).all(axis=0)
+    finite &= jnp.isfinite(anchor).all(axis=0) & jnp.isfinite(fused).all(axis=0)
+    mask = scene.followed & finite & (anchor[2] > 0) & (fused[2] > 0)
+    ahead = jnp.array([[0.0], [0.0], [1.0]], fused.dtype)
+    return mask, jnp.where(mask[None], anchor, ahead), jnp.where(mask[None], fused, ahead)
+
+
+def _point_features(scene: CueInput, mask: Mask, anchor: Points, fused: Points) -> list[Weights]:
+    """Return the features of points but the last one, each `(n,)`."""
+    dtype = scene.uv.dtype
+    assert scene.depth_sigma is not None
+    assert scene.age is not None
+    measured, before = mask & (scene.depth > 0), mask & (scene.depth_before > 0)
+    center = jnp.stack([scene.intrinsics.cx, scene.intrinsics.cy])[:, None]
+    uv, uv_before = (jnp.where(mask[None], each, center) for each in (scene.uv, scene.uv_before))
+    last = back_project(scene.intrinsics, uv_before, jnp.where(before, scene.depth_before, 1))
+    carried = to_camera(scene.T_world_cam, to_world(scene.T_world_before, last))
+    carried = jnp.where((before & (carried[2] > 0))[None], carried, fused)
+    sigma = jnp.where(measured & (scene.depth_sigma > 0), scene.depth_sigma, 1)
+    drift_px = scene.intrinsics.fx * _length(anchor - fused, 0) / fused[2]
+    distances = [_length(uv - project(scene.intrinsics, X), _SOFT_PX) for X in (anchor, fused, carried)]
+    sigmas = [jnp.where(measured, (scene.depth - X[2]) / sigma, 0) for X in (anchor, fused, carried)]
+    return [
+        *(jnp.log1p(each) for each in distances),
+        *(jnp.arcsinh(jnp.clip(each, -_MAX_SIGMAS, _MAX_SIGMAS)) / 2 for each in sigmas),
+        jnp.log1p(drift_px) / 2,
+        jnp.log1p(_length(uv - uv_before, _SOFT_PX)) / 2,
+        measured.astype(dtype),
+        before.astype(dtype),
+        (mask & scene.agrees).astype(dtype),
+        jnp.where(mask, scene.weight, 0),
+        jnp.log1p(scene.age.astype(dtype)) / 3,
+    ]
+
+
+def _region_features(scene: CueInput, regions: Regions, mask: Mask, mean_depth: Scalar) -> Float[Array, "c k"]:
+    """Return the features of regions."""
+    assert scene.region_weight is not None
+    num, dtype = regions.centers.shape[1], scene.uv.dtype
+    to = jnp.where(mask & (regions.of_point >= 0), regions.of_point, num)
+    number = jnp.zeros(num, dtype).at[to].add(1, mode="drop")
+    pixels = regions.num_pixels.astype(dtype)
+    share = pixels / jnp.maximum(jnp.sum(pixels), 1)
+    depth = regions.centers[2]
+    known = jnp.isfinite(depth) & (depth > 0)
+    relative = jnp.log(jnp.where(known, depth, mean_depth) / mean_depth)
+    return jnp.stack([jnp.log1p(number) / 3, num * share / 3, relative, scene.region_weight])
+
+
+def _length(apart: Float[Array, "d n"], soft: float) -> Weights:
+    """Compute lengths that are smooth at zero."""
+    tiny = 1e-12 if soft == 0 else soft * soft
+    return jnp.sqrt(jnp.sum(jnp.square(apart), axis=0) + tiny)
+
+
+def _evidence(score: Float[Array, " n"]) -> Float[Array, " n"]:
+    return 2 * jax.nn.sigmoid(score)
+
+
+def _read_params(section: LearnedCueConfig, temperature: float, dtype: jnp.dtype) -> LearnedParams:
+    weights = load_network(section.weights).weights
+    network = PointNetwork(**{name: jnp.asarray(value, dtype) for name, value in weights.items()})
+    return LearnedParams(network, jnp.asarray(temperature, dtype))
+
+
+CUE = SettingsCue("learned", lambda _: learned_cue, LearnedParams, needs_regions=True, read_params=_read_params)
