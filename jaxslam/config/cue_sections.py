@@ -71,7 +71,8 @@ class LearnedCueConfig(ValidatedConfig):
     not set."""
     recover_frames: Annotated[int, Range(at_least=1, at_most=1000)] = 2
     """Number of frames without motion after which a surface that moved counts as static again, without other cues. The
-    network sees itself how a surface moved before: with the 15 of `clusters`, twice as many points are wrong."""
+    network sees itself how a surface moved before: with 15 as for `clusters`, 1.66 % of the points of 28 rendered
+    scenes were wrong, where its verdicts alone were wrong for 0.78 %."""
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,8 @@ from jaxslam.dynamics.cue import CueInput, CueResult, SettingsCue, threshold_evi
 from jaxslam.dynamics.network_file import load_network
 from jaxslam.dynamics.regions import RegionCueResult, Regions
 
-_SOFT_PX = 0.01
-"""Distance below which that of a point has no direction, pixels: it keeps lengths smooth at zero."""
+_SOFT_PX, _SOFT_DRIFT_PX = 0.01, 1e-4
+"""Lengths to which those of distances and of the drift are rounded up, pixels, so that they are smooth at zero."""
 _MAX_SIGMAS = 100.0
 """Largest difference of depth that is told from others, in standard deviations."""
 
@@ -126,7 +126,7 @@ def _point_features(scene: CueInput, mask: Mask, anchor: Points, fused: Points) 
     carried = to_camera(scene.T_world_cam, to_world(scene.T_world_before, last))
     carried = jnp.where((before & (carried[2] > 0))[None], carried, fused)
     sigma = jnp.where(measured & (scene.depth_sigma > 0), scene.depth_sigma, 1)
-    drift_px = scene.intrinsics.fx * _length(anchor - fused, 0) / fused[2]
+    drift_px = _length(scene.intrinsics.fx * (anchor - fused) / fused[2][None], _SOFT_DRIFT_PX)
     distances = [_length(uv - project(scene.intrinsics, X), _SOFT_PX) for X in (anchor, fused, carried)]
     sigmas = [jnp.where(measured, (scene.depth - X[2]) / sigma, 0) for X in (anchor, fused, carried)]
     return [
@@ -158,8 +158,7 @@ def _region_features(scene: CueInput, regions: Regions, mask: Mask, mean_depth: 
 
 def _length(apart: Float[Array, "d n"], soft: float) -> Weights:
     """Compute lengths that are smooth at zero."""
-    tiny = 1e-12 if soft == 0 else soft * soft
-    return jnp.sqrt(jnp.sum(jnp.square(apart), axis=0) + tiny)
+    return jnp.sqrt(jnp.sum(jnp.square(apart), axis=0) + soft * soft)
 
 
 def _evidence(score: Float[Array, " n"]) -> Float[Array, " n"]:

@@ -54,7 +54,9 @@ def _resized_and_cropped(folder: Path) -> Camera:
     for kind, method in (("rgb", cv2.INTER_AREA), ("depth", cv2.INTER_NEAREST)):
         (folder / kind).mkdir(parents=True)
         for path in (_EXCERPT / kind).iterdir():
-            resized = cv2.resize(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), _RESIZED, interpolation=method)
+            whole = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+            assert whole is not None
+            resized = cv2.resize(whole, _RESIZED, interpolation=method)
             cropped = resized[top : top + height, left : left + width]
             cv2.imwrite(str(folder / kind / path.with_suffix(".png").name), cropped)
     for name in ("rgb.txt", "depth.txt", "groundtruth.txt"):

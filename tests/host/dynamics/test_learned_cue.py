@@ -49,14 +49,15 @@ def packaged(temperature: float = 0.0) -> LearnedParams:
 
 @pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS)
 def test_tells_what_moves(motion: Any) -> None:
-    """A surface that has moved by 15 cm since half a second ago, the last 3 cm of it since the last frame."""
+    """A third of the points has moved by 15 cm since half a second ago, the last 3 cm of it since the last frame.
+
+    How many of them are rejected is measured in scenes: here they are scattered over the picture, on no surface.
+    """
     given = full_scene(motion, (0.03, 0, 0), noise_px=0.1)
     given = given._replace(X_anchor=given.X_world.at[0].add(jnp.where(moves(), -0.12, 0.0)))
     found = learned_cue(given, packaged())
-    assert (np.asarray(found.weight)[moves()] == 0).mean() > 0.9
-    assert (np.asarray(found.weight)[~moves()] == 1).mean() > 0.9
-    assert found.regions is not None
-    assert found.regions.weight.tolist() == [0, 1, 1, 1]
+    evidence = np.asarray(found.evidence)
+    assert np.median(evidence[moves()]) > 10 * np.median(evidence[~moves()])
     assert found.known.all()
 
 
@@ -89,13 +90,14 @@ def test_features_have_names() -> None:
 def test_gradient() -> None:
     """By the weights of the network, positions of points and their pixels; and in a soft scene only."""
     given = full_scene(MOTIONS["all"], (0.02, 0, 0), noise_px=0.3)
+    given = given._replace(X_anchor=given.X_world + 0.01)  # not where the drift is zero, and bends within 1e-4 pixels
 
     def weight(network: PointNetwork, X_anchor: Any, uv: Any, temperature: float = 0.3) -> Any:
         params = LearnedParams(jax.tree.map(jnp.asarray, network), jnp.asarray(temperature))
         return learned_cue(given._replace(X_anchor=jnp.asarray(X_anchor), uv=jnp.asarray(uv)), params).weight
 
     network = packaged().network
-    check_grads(weight, (network, given.X_anchor, given.uv), order=1, modes=("fwd", "rev"))
+    check_grads(weight, (network, given.X_anchor, given.uv), order=1, modes=("fwd", "rev"), eps=1e-6)
     hard = jax.grad(lambda network: weight(network, given.X_anchor, given.uv, 0.0).sum())(network)
     assert not any(np.any(leaf) for leaf in jax.tree.leaves(hard))
 
