@@ -19,8 +19,8 @@ from jaxtyping import Array, Bool, Float, Int, Key, Shaped
 from jaxslam.config.cue_sections import ClusterCueConfig
 from jaxslam.runtime.filled_arrays import filled
 
-_CENTERS_STEP = 2
-"""Spacing, in rows and columns of the sampled pixels, of those from which the centers are computed."""
+_ENOUGH_PIXELS = 10_000
+"""Number of sampled pixels from which on every second row and column of them gives the centers; 19,200 at 640x480."""
 _PER_LIMIT = 0.25
 """Loss of weight for evidence that exceeds the threshold by one threshold."""
 Centers = Float[Array, "3 k"]
@@ -35,8 +35,8 @@ class RegionPlan(NamedTuple):
 
     Attributes:
         num_regions: Number of regions.
-        step_px: Spacing of the sampled pixels, in rows and in columns. The centers come from every second row and
-            column of them.
+        step_px: Spacing of the sampled pixels, in rows and in columns. Of many, the centers come from every second row
+            and column.
         num_steps: K-means steps per frame, starting from the centers of the previous frame.
         recover_frames: Number of frames without motion after which a region that moved for long counts again. A carried
             object pauses.
@@ -128,7 +128,8 @@ def find_regions(
     pixels = jnp.asarray([u, v], depth.dtype)
     points = back_project(intrinsics, pixels.reshape(2, -1), sampled.reshape(-1))
     # Centers are means of many pixels: those of a quarter of them are as good, in half of the time for all of it.
-    few = (slice(None, None, _CENTERS_STEP), slice(None, None, _CENTERS_STEP))
+    spacing = 2 if sampled.size >= _ENOUGH_PIXELS else 1
+    few = (slice(None, None, spacing), slice(None, None, spacing))
     few_points = back_project(intrinsics, pixels[:, *few].reshape(2, -1), sampled[few].reshape(-1))
     has_depth = sampled[few].reshape(-1) > 0
     found = kmeans(key, few_points, has_depth, num_clusters=plan.num_regions, num_steps=plan.num_steps, initial=before)
