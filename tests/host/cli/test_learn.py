@@ -13,7 +13,7 @@ fails = failing("learn", "weights")
     [
         (None, "recipe.yaml"),
         ("rooms: []\n", "rooms, held_out: expected at least one scene each"),
-        ("room: []\n", "room: unknown key"),
+        ("room: []\n", "unknown key 'room'"),
     ],
 )
 def test_wrong_recipes(capsys: pytest.CaptureFixture[str], tmp_path: Path, recipe: str | None, problem: str) -> None:

@@ -166,4 +166,5 @@ def test_every_cue_of_the_settings_is_found() -> None:
     for name, cue in _known().items():
         section, params_class = getattr(DynamicsConfig(), name), cast(Any, cue.params)
         assert callable(cue.make(section))
-        assert {field for field in params_class._fields if field != "temperature"} <= vars(section).keys()
+        if cue.read_params is None:
+            assert {field for field in params_class._fields if field != "temperature"} <= vars(section).keys()
