@@ -35,7 +35,7 @@ from jaxslam.runtime.compiled import compiled
 CAPACITY = 128
 """Largest number of points: for a person who fills a fifth of the image, one in about every other cell."""
 PYRAMID_LEVELS = 3
-_FLOW = FlowPlan(finest=LevelPlan(window=11, iterations=3, tolerance=0.2, accepted=0.5), seeds=0)
+_FLOW = FlowPlan(finest=LevelPlan(window=11, iterations=3, tolerance=0.2, accepted=0.5))
 """Objects are moved by whole pixels, so flow stops at a fifth of a pixel; with the smaller window it takes three
 quarters of the time."""
 _NEIGHBORS_PX = 20.0

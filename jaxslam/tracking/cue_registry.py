@@ -33,9 +33,7 @@ def with_cues(plan: TrackPlan, config: DynamicsConfig, *, pairs: bool = False) -
     Args:
         plan: The plan.
         config: Settings of the cues.
-        pairs: Whether the frames are stereo pairs, whose depth and regions are computed at half the image size. All
-            their points are followed from the coarsest level: along a road, neighbors at other depths move far apart.
-            With `FlowPlan.seeds`, KITTI 06 has 38 mm instead of 34 (medians of 30 seeds).
+        pairs: Whether the frames are stereo pairs, whose depth and regions are computed at half the image size.
     """
     chosen, clusters = [_known()[name] for name in config.cues], config.clusters
     step_px = 2 * clusters.step_px if pairs else clusters.step_px
@@ -43,7 +41,6 @@ def with_cues(plan: TrackPlan, config: DynamicsConfig, *, pairs: bool = False) -
     regions = RegionPlan(clusters.num_regions, step_px, clusters.num_steps, recover_frames)
     needed = config.balance_regions or any(known.needs_regions for known in chosen)
     return plan._replace(
-        flow=plan.flow._replace(seeds=0) if pairs else plan.flow,
         cues=tuple(known.make(getattr(config, known.name)) for known in chosen),
         regions=regions if needed else None,
         balance_regions=config.balance_regions,

@@ -183,7 +183,7 @@ class TrackPlan(NamedTuple):
         """
         to_the_end = lambda level: LevelPlan(level.window, 100, 1e-10, 1e-8)
         return self._replace(
-            flow=self.flow._replace(finest=to_the_end(self.flow.finest), seeds=0),
+            flow=self.flow._replace(finest=to_the_end(self.flow.finest)),
             look_up=to_the_end(self.look_up),
             pose_steps=1000,
             pose_tolerance=None,

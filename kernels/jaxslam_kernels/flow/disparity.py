@@ -21,7 +21,6 @@ ROW_PLAN = FlowPlan(
     middle=LevelPlan(11, 4, 0.1),
     finest=LevelPlan(13, 8, 0.02),
     along_rows=True,
-    seeds=0,
 )
 """For pyramids of two levels or so, with a guess that is good to a few pixels."""
 
