@@ -32,7 +32,7 @@ from jaxslam.calibration.parameters import (
 )
 from jaxslam.calibration.report import Calibration, Estimate, ResidualField, Verdict
 from jaxslam.calibration.scale import Scale, scale_of
-from jaxslam.calibration.track_alignment import aligned, gray
+from jaxslam.calibration.track_alignment import aligned
 from jaxslam.calibration.track_block import TrackBlock
 from jaxslam.calibration.track_recorder import TrackRecorder
 from jaxslam.calibration.uncertainty import standard_deviations
@@ -41,7 +41,7 @@ from jaxslam.datasets import Dataset, imu_samples, imu_sheet
 from jaxslam.errors import CameraError
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.camera_difference import distance_of_projections_px
-from jaxslam.sensors.frame import Frame
+from jaxslam.sensors.frame import Frame, to_gray
 from jaxslam.slam.slam import Slam
 from jaxslam.trajectory.trajectory import Trajectory
 
@@ -183,7 +183,7 @@ def _with_tracks_aligned(problem: BatchProblem, solution: BatchSolution, dataset
     blocks = []
     for block, state in zip(problem.blocks, solution.states, strict=True):
         index = np.searchsorted(dataset.timestamps_ns, block.timestamps_ns)
-        images = np.stack([gray(dataset[int(each)]) for each in index])
+        images = np.stack([to_gray(dataset[int(each)].image) for each in index])
         blocks.append(aligned(block, state, solution.camera, images))
     return replace(problem, blocks=blocks)
 

@@ -7,7 +7,7 @@ frames are compared with the same one.
 Source: Klein and Murray, "Parallel Tracking and Mapping for Small AR Workspaces", 2007, section 5.2.
 """
 
-import cv2
+import jax.numpy as jnp
 import numpy as np
 from jaxslam_kernels.flow.lk_search import LevelPlan
 from jaxslam_kernels.flow.patch_align import PatchMatch, align_patches
@@ -23,7 +23,6 @@ from jaxslam.calibration.track_block import TrackBlock
 from jaxslam.geometry.se3 import inverse, rotate
 from jaxslam.runtime.compiled import compiled
 from jaxslam.runtime.compiler_options import FAST_COMPILE, SINGLE_THREAD
-from jaxslam.sensors.frame import Frame
 
 _PLAN = LevelPlan(15, 20, 0.003)
 """Smaller than the patches of depth that tell edges: what moves differently behind an edge stays out of the window."""
@@ -37,11 +36,6 @@ _MIN_CORRELATION, _FARTHEST_PX = 0.85, 3.0
 """Correlation of patches, and distance from where the point is predicted."""
 _AREAS = 0.4, 2.5
 """Smallest and largest factor between the areas of a patch in two frames."""
-
-
-def gray(frame: Frame) -> UInt8[np.ndarray, "h w"]:
-    """Return the brightness of the image of a frame."""
-    return frame.image if frame.image.ndim == 2 else cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
 
 
 def aligned(
@@ -70,10 +64,11 @@ def aligned(
     sought &= (area * own_area > _AREAS[0] * own_area**2) & (area * own_area < _AREAS[1] * own_area**2)
     center = block.uv[anchor, :, number].T
     uv, seen = block.uv.copy(), np.zeros_like(block.seen)
+    pictures = jnp.asarray(images)  # once, not for every frame
     for frame, image in enumerate(images):
         warp = np.einsum("ijn,jkn->ikn", own, _inverse(arms[frame]))
         arrays = (np.asarray(array, np.float32) for array in (center, warp, middle[frame]))
-        match = _look_up(images, anchor, *arrays, sought[frame], image)
+        match = _look_up(pictures, anchor, *arrays, sought[frame], image)
         found = np.asarray(match.points, np.float64)
         good = np.asarray(match.converged) & (np.asarray(match.correlation) > _MIN_CORRELATION)
         seen[frame] = sought[frame] & good & (np.hypot(*(found - middle[frame])) < _FARTHEST_PX)

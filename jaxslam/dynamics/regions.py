@@ -136,9 +136,7 @@ def find_regions(
     centers = lax.stop_gradient(jnp.where(jnp.any(has_depth), found.centers, before))
     # In a branch, XLA computes the labels once; else once for each of their uses, and with `apart` a center at a time.
     nothing = jnp.full(known.shape, -1, jnp.int32)
-    label = lax.cond(
-        jnp.any(known), lambda: jnp.where(known, nearest_centers(points, centers), nothing), lambda: nothing
-    )
+    label = lax.cond(jnp.any(known), lambda: _nearest(points, centers), lambda: nothing)
     counts = jnp.zeros(plan.num_regions, jnp.int32).at[jnp.where(known, label, plan.num_regions)].add(1, mode="drop")
     of_before = jnp.isfinite(before).all(axis=0)
     counts = jnp.where(jnp.any(known), counts, of_before.astype(counts.dtype))

@@ -33,7 +33,7 @@ _EDGE_PX = 2
 
 
 class SeenPoints(NamedTuple):
-    """What a cue saw, in `CueResult.extra`, for `n` points.
+    """Points as a cue saw them, `n` of them, in `CueResult.extra`.
 
     Attributes:
         features: Inputs of the network.

@@ -181,7 +181,7 @@ def ate_of(tracked: TrackedScene) -> float:
 
 
 class WindowTruth(NamedTuple):
-    """What is true of the `t` frames of a window.
+    """Ground truth of the `t` frames of a window.
 
     Attributes:
         T_world_cam: `(t, 7)` poses, `wxyz_xyz`.
@@ -228,7 +228,7 @@ def window_loss(outputs: TrackOutput, truth: WindowTruth, label_share: float) ->
 
     Args:
         outputs: Outputs of the tracker, whose only cue is `recording(learned_cue)`.
-        truth: What is true of the frames.
+        truth: Ground truth of the frames.
         label_share: Weight of the loss of labels.
     """
     step = min(_POSE_STEP, len(truth.T_world_cam) - 1)

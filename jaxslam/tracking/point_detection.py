@@ -154,9 +154,8 @@ def _order(
 def _ascending(ranks: list[Mask], score: Weights) -> Int[Array, " m"]:
     """Order candidates by ranks, the first before the others, then from the highest score to the lowest.
 
-    All of it and the number of the candidate are one integer: a sort of one array takes a fifth of what `lexsort`
-    does, 30 us for 2,120 candidates instead of 164. Scores that agree in their leading digits, 3 of them or more, are
-    in the order of the grid.
+    All of it and the number of the candidate are one integer: a sort of one array takes 69 us for 2,080 candidates,
+    `lexsort` 485 (Xeon, one thread). Scores that differ by less than two thousandths are in the order of the grid.
     """
     number_bits = score.shape[0].bit_length()
     score_bits = 32 - len(ranks) - number_bits

@@ -12,6 +12,7 @@ import numpy as np
 from jax.core import Tracer
 from jax.typing import DTypeLike
 from jaxlie import SE3
+from jaxslam_kernels.flow.lk_flow import FlowPlan
 from jaxslam_kernels.pose.pose_cost import PosePrior
 
 from jaxslam.dynamics.cue import CueResult
@@ -266,7 +267,7 @@ def _check_sides(plan: TrackPlan) -> None:
     for name, side in cells.items():
         if side < 2 or side % 2:
             raise ValueError(f"plan.{name}: expected an even number, at least 2, got {side}")
-    for name, flow in {"flow": plan.flow, "pair_flow": plan.pair_flow}.items():
+    for name, flow in _flows(plan).items():
         if flow.seeds < 0:
             raise ValueError(f"plan.{name}.seeds: expected at least 0, got {flow.seeds}")
     for name, level in _levels(plan).items():
@@ -274,10 +275,13 @@ def _check_sides(plan: TrackPlan) -> None:
             raise ValueError(f"plan.{name}.window: expected an odd number, got {level.window}")
 
 
+def _flows(plan: TrackPlan) -> dict[str, FlowPlan]:
+    return {"flow": plan.flow, "pair_flow": plan.pair_flow}
+
+
 def _levels(plan: TrackPlan) -> dict[str, Any]:
-    flows = {"flow": plan.flow, "pair_flow": plan.pair_flow}
     parts = ("coarsest", "middle", "finest")
-    of_flows = {f"{name}.{part}": getattr(flow, part) for name, flow in flows.items() for part in parts}
+    of_flows = {f"{name}.{part}": getattr(flow, part) for name, flow in _flows(plan).items() for part in parts}
     return {**of_flows, "look_up": plan.look_up}
 
 

@@ -62,7 +62,7 @@ class DerivativeCase(NamedTuple):
 
     @property
     def is_choice(self) -> bool:
-        """Whether nothing in the result has a derivative."""
+        """True if nothing in the result has a derivative."""
         return not self.carries
 
 
@@ -407,7 +407,7 @@ def _() -> DerivativeCase:
 
 
 def _views(n: int = 12, **more: Any) -> dict[str, Any]:
-    """What `refine_pose` is given, with derivatives."""
+    """Inputs of `refine_pose` that have derivatives."""
     T, X_world, uv = pose_inputs(n)
     depth = transform.to_camera(T, X_world)[2] * (1 + 0.01 * _random(n, seed=6))
     prior = PosePrior(transform.retract(T, 0.02 * _random(6, seed=7)), 100.0 * jnp.eye(6) + 10.0)

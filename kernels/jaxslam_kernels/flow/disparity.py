@@ -17,10 +17,7 @@ from jaxslam_kernels.image.pyramid import Pyramid
 from jaxslam_kernels.types import Mask, Pixels, Scalar, Weights
 
 ROW_PLAN = FlowPlan(
-    coarsest=LevelPlan(11, 6, 0.1),
-    middle=LevelPlan(11, 4, 0.1),
-    finest=LevelPlan(13, 8, 0.02),
-    along_rows=True,
+    coarsest=LevelPlan(11, 6, 0.1), middle=LevelPlan(11, 4, 0.1), finest=LevelPlan(13, 8, 0.02), along_rows=True
 )
 """For pyramids of two levels or so, with a guess that is good to a few pixels."""
 

@@ -51,7 +51,7 @@ class TestLabels:
         assert edges(moving).sum() == 14 * 19 - 6 * 11
 
     def test_loss_is_cross_entropy(self) -> None:
-        """Of four points and the two regions that three of them are in, by its definition."""
+        """Loss of four points and the two regions that three of them are in, by its definition."""
         probability = np.array([0.9, 0.2, 0.6, 0.3])
         moving, sure = np.array([True, False, True, True]), np.array([True, True, True, False])
         of_regions = np.array([0.8, 0.4])
