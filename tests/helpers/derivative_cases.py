@@ -24,6 +24,7 @@ from jaxslam_kernels.flow.lk_flow import FlowPlan
 from jaxslam_kernels.flow.lk_search import LevelPlan
 from jaxslam_kernels.image import corners
 from jaxslam_kernels.image import pyramid as image
+from jaxslam_kernels.point_network import PointNetwork, network_shapes, score_points
 from jaxslam_kernels.pose import absolute_orientation, p3p, pnp, pose_refine
 from jaxslam_kernels.pose.pose_cost import PosePrior, PoseProblem
 from jaxslam_kernels.pose_graph import pose_graph
@@ -835,6 +836,15 @@ def _() -> DerivativeCase:
     initial = jnp.array([[-0.5, 0.5], [-0.5, 0.5]])
     bound = {"key": jax.random.key(0), "mask": jnp.ones(9, bool), "num_clusters": 2, "num_steps": 5}
     return _simple(kmeans.kmeans, {"points": _random(2, 9)}, {"initial": initial}, bound=bound)
+
+
+@maker("score_points")
+def _() -> DerivativeCase:
+    shapes = network_shapes(num_features=3, num_group_features=2, num_hidden=4)
+    weights = PointNetwork(**{name: _random(*shape, seed=i) for i, (name, shape) in enumerate(shapes.items())})
+    carries = {"network": weights, "features": _random(3, 6, seed=20), "group_features": _random(2, 3, seed=21)}
+    bound = {"group_of": jnp.array([0, 1, 1, 0, -1, 2]), "mask": jnp.array([True] * 5 + [False])}
+    return _simple(score_points, carries, bound=bound, constant_results=("number",))
 
 
 def _cloud(n: int = 6) -> dict[str, Any]:
