@@ -946,14 +946,14 @@ def _two_paths(n: int) -> dict[str, Any]:
     return {"estimate": estimate, "reference": SE3(moved)}
 
 
-@maker("rpe")
+@maker("rpe", slow=True)
 def _() -> DerivativeCase:
     first, second = jnp.arange(4), jnp.arange(1, 5)
     bound = {"first": first, "second": second, "mask": jnp.ones(4, bool)}
     return _simple(alignment.rpe, _two_paths(5), bound=bound)
 
 
-@maker("segment_errors")
+@maker("segment_errors", slow=True)
 def _() -> DerivativeCase:
     bound = {"mask": jnp.ones(6, bool), "step": 2}
     return _simple(segments.segment_errors, _two_paths(6) | {"lengths": jnp.array([0.3, 0.6])}, bound=bound)

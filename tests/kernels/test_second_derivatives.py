@@ -132,7 +132,7 @@ def _directions(t):
 
 
 @pytest.mark.parametrize(
-    "kernel", [_flow, _patches, _directions, _pose, *(slow(k) for k in (_bundle, _consensus, _graph, _match))]
+    "kernel", [_directions, *(slow(k) for k in (_bundle, _consensus, _flow, _graph, _match, _patches, _pose))]
 )
 def test_right(kernel):
     along = lambda f, t: jax.jvp(f, (t,), (jnp.ones_like(t),))[1]

@@ -104,6 +104,7 @@ def test_masked_points_stay_out():
     np.testing.assert_allclose(part[4:], whole[4:], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_ransac_pnp():
     """A point beyond the threshold has none."""
     inputs = pose_inputs()

@@ -90,6 +90,7 @@ class TestTrackClips:
         np.testing.assert_allclose(found.T_world_cam, alone.T_world_cam, atol=SAME_M)
         assert (np.linalg.norm(found.T_world_cam[1:, -1, 4:] - found.T_world_cam[0, -1, 4:], axis=1) > 1e-3).all()
 
+    @pytest.mark.slow
     def test_settings_of_each(self, task: Task, alone: TrackedClips) -> None:
         """One clip twice: as it is, and with more inliers asked for than there are points."""
         clip = task.rooms[0].frames

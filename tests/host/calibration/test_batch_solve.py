@@ -45,6 +45,7 @@ def fitted() -> tuple[BatchProblem, BatchSolution]:
     return solved(problem())
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_differences() -> None:
     block, rng = problem().blocks[0], np.random.default_rng(0)
     start = first_states([block])[0].points

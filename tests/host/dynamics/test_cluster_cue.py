@@ -225,6 +225,7 @@ class TestCue:
         with pytest.raises(ValueError, match=r"TrackPlan\.regions"):
             cluster_cue(given._replace(regions=None), params())
 
+    @pytest.mark.slow
     def test_gradient(self) -> None:
         """Of the weights by thresholds, pose and points."""
         given = in_regions(scene(MOTIONS["all"], (0.004, 0.002, 0), noise_px=0.6))

@@ -107,6 +107,7 @@ class TestCue:
     def test_same_function_for_the_same_number(self) -> None:
         assert make_epipolar_cue(64) is make_epipolar_cue(64)
 
+    @pytest.mark.slow
     def test_gradient(self) -> None:
         """Of the weights by the limit and by where points are seen, with which the lines turn."""
         given = ideal(scene(MOTION, (0.01, 0.0, 0.0), noise_px=0.05))

@@ -87,6 +87,7 @@ def test_features_have_names() -> None:
     assert features.regions.shape == (len(GROUP_FEATURES), K)
 
 
+@pytest.mark.slow
 def test_gradient() -> None:
     """By the weights of the network, positions of points and their pixels; and in a soft scene only."""
     given = full_scene(MOTIONS["all"], (0.02, 0, 0), noise_px=0.3)

@@ -598,6 +598,7 @@ class TestRoomWithPeople:
         assert run.occluded.sum() > 100
         assert max(share for share in run.shares if share is not None) > 0.02
 
+    @pytest.mark.slow
     def test_nothing_is_compiled_while_frames_come(self, compiled: list[str]) -> None:
         clip, detector = _scene()
         with Slam(clip.camera, settings(), detector=detector) as slam:
@@ -622,7 +623,9 @@ class TestRoomWithPeople:
             assert len(new) > 0
             slam.finish()
             first = slam.map
-            np.testing.assert_array_equal(first.points.state[rows(first.points.ids, new)], expected)
+            stayed = np.isin(new, first.points.ids)  # local mapping may have removed some meanwhile
+            assert stayed.any()
+            np.testing.assert_array_equal(first.points.state[rows(first.points.ids, new[stayed])], expected[stayed])
             slam.finish()
             assert slam.map is first
 

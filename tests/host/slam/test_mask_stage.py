@@ -40,7 +40,7 @@ def tracked(config: Config, frames: list[Frame], camera: Any, detector: Any, *, 
     return results
 
 
-@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("masked", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_buffers_are_not_read_after_the_frame(masked: bool) -> None:
     recording = clip(people=1, frames=FRAMES)
     settings = replace(CONFIG, semantics=replace(CONFIG.semantics, frames="every"))

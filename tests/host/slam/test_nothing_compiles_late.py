@@ -96,7 +96,8 @@ def test_a_dense_map_that_is_full(compiled: list[str]) -> None:
         assert compiled == []
 
 
-@pytest.mark.parametrize("localize_only", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("localize_only", [False, True])
 def test_a_loaded_map(compiled: list[str], *, localize_only: bool) -> None:
     with Slam(room().camera, CONFIG) as slam:
         for frame in room().frames:

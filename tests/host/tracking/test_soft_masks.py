@@ -37,6 +37,7 @@ def hard(frames: FrameArrays) -> tuple[TrackState, TrackOutput]:
     return tracked(frames)
 
 
+@pytest.mark.slow
 def test_of_zeros_and_ones_is_as_of_bool(frames: FrameArrays, hard: tuple[TrackState, TrackOutput]) -> None:
     soft = tracked(frames._replace(ignore=frames.ignore.astype(jnp.float32)))
     np.testing.assert_allclose(hard[1].T_world_cam.wxyz_xyz, soft[1].T_world_cam.wxyz_xyz, atol=1e-5)

@@ -152,6 +152,7 @@ class TestCompiled:
         np.testing.assert_array_equal(there, expected)
         assert np.abs(forward - there).max() > 1e-4
 
+    @pytest.mark.slow
     def test_a_motion_from_outside(self, counted: Counted) -> None:
         """A frame that turns by a third of the picture is tracked from a prediction, and lost without."""
         turning = SyntheticDataset(SyntheticConfig(width=WIDTH, height=HEIGHT, frames=120, people=0, path="rpy"))

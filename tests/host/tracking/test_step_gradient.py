@@ -124,10 +124,23 @@ def test_every_input_is_listed() -> None:
     assert tuple(STEP_INPUTS) == Inputs._fields
 
 
+def test_one_frame_along_a_change_of_everything() -> None:
+    """Each input by what its own comparison takes, so that none drowns the others."""
+    with jax.enable_x64(True):
+        loss, inputs, *_ = _loss(clip(), steps=1)
+        random = np.random.default_rng(2)
+        lengths = Inputs(**{name: each.first for name, each in STEP_INPUTS.items()})
+        along = jax.tree.map(lambda value, h: jnp.asarray(h * random.normal(size=value.shape)), inputs, lengths)
+        moved = lambda sign: jax.tree.map(lambda value, change: value + sign * change, inputs, along)
+        both = quick_compile(lambda at: jax.jvp(loss, (at,), (along,)))
+        expected = (float(both(moved(1))[0]) - float(both(moved(-1))[0])) / 2
+        assert abs(expected) > 0
+        assert float(both(inputs)[1]) == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.slow
 class TestGradient:
-    @pytest.mark.parametrize(
-        "name", [pytest.param(name, marks=pytest.mark.slow if name == "camera" else ()) for name in Inputs._fields]
-    )
+    @pytest.mark.parametrize("name", Inputs._fields)
     def test_equals_finite_differences(self, problem: Problem, name: str) -> None:
         along = getattr(problem.direction(seed=2), name)
         h = STEP_INPUTS[name].first
@@ -138,7 +151,6 @@ class TestGradient:
         assert abs(expected) > 0
         assert derivative == pytest.approx(expected, rel=1e-3)
 
-    @pytest.mark.slow
     def test_forward_equals_reverse(self, problem: Problem) -> None:
         """Along a random change of everything, scaled so that every input contributes as much as any other."""
         shares = jax.tree.map(jnp.vdot, problem.gradient, problem.direction(seed=1))

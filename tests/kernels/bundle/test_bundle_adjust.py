@@ -248,6 +248,7 @@ class TestReference:
         assert result.cost < 1e-15
         assert result.chi2[window.links.valid].max() < 1e-12
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("outliers", [0.0, 0.1])
     @pytest.mark.parametrize("seed", range(4))
     def test_float32_is_within_a_hundredth(self, seed, outliers):

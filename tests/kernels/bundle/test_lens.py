@@ -249,6 +249,7 @@ def _direction(inputs: Inputs, seed: int) -> Inputs:
     )
 
 
+@pytest.mark.slow
 def test_gradient():
     """Forward = reverse = finite differences, for every input and through every output."""
     inputs = make_scene(6).inputs
@@ -274,6 +275,7 @@ def test_vmap_equals_loop():
             np.testing.assert_allclose(batched.lenses[i], alone.lenses, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_single_trace():
     for seed in range(2):
         _run(make_scene(seed).inputs)

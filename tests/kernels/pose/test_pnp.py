@@ -437,6 +437,7 @@ class TestRansac:
         assert np.max(ours) < 0.05
         assert (np.median(ours, axis=0) <= 1.05 * np.median(theirs, axis=0)).all()
 
+    @pytest.mark.slow
     def test_without_refinement_on_inliers(self):
         """The optimum of the redescending loss: nearly as good, same inliers, derivatives exact."""
         scene = make_scene(4, N, noise_px=0.5, outliers=0.5)

@@ -300,6 +300,7 @@ class TestGradient:
         np.testing.assert_allclose(result.T_world_cam.wxyz_xyz, expected, atol=1e-8)
         np.testing.assert_allclose(change, expected_change, atol=1e-6 * np.abs(expected_change).max())
 
+    @pytest.mark.slow
     def test_gradient_through_scan_and_vmap(self):
         """Chains of frames, each starting from the pose before.
 

@@ -336,6 +336,7 @@ class TestRansac:
         assert np.median(ours) < np.median(theirs)
         assert np.max(ours) < 1.0
 
+    @pytest.mark.slow
     def test_matches_known_motion(self):
         """Without noise the matrix is that of the poses."""
         with jax.enable_x64(True):

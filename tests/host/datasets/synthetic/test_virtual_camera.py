@@ -32,6 +32,7 @@ def test_what_is_left_out_is_out_of_sight_or_tiny(monkeypatch, index):
     assert np.mean(frame.rgb != whole.rgb) < 1e-2
 
 
+@pytest.mark.slow
 def test_any_order_of_frames_gives_the_same_bytes():
     first, second = WorldRecording(STREET), WorldRecording(STREET)
     forward = [first.render(index).rgb for index in (0, 30)]
