@@ -157,7 +157,7 @@ class TrackPlan(NamedTuple):
     num_hypotheses: int = _SETTINGS.num_hypotheses
     cell_px: int = _SETTINGS.cell_px
     new_points: Literal["always", "keyframes"] = _SETTINGS.new_points
-    flow: FlowPlan = FlowPlan()
+    flow: FlowPlan = FlowPlan(seeds=32)
     look_up: LevelPlan = LevelPlan(15, 8, 0.05)
     cues: tuple[Cue, ...] = ()
     regions: RegionPlan | None = None
@@ -183,7 +183,7 @@ class TrackPlan(NamedTuple):
         """
         to_the_end = lambda level: LevelPlan(level.window, 100, 1e-10, 1e-8)
         return self._replace(
-            flow=self.flow._replace(finest=to_the_end(self.flow.finest)),
+            flow=self.flow._replace(finest=to_the_end(self.flow.finest), seeds=0),
             look_up=to_the_end(self.look_up),
             pose_steps=1000,
             pose_tolerance=None,
