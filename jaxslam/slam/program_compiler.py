@@ -14,6 +14,7 @@ from typing import TypeAlias
 import numpy as np
 
 from jaxslam.runtime.compiled import before_each_program
+from jaxslam.runtime.freed_memory import return_freed_memory
 from jaxslam.runtime.worker import ThreadWorker
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame
@@ -141,9 +142,10 @@ class ProgramCompiler:
             return
         self._alone_s = time.perf_counter()
         first, last = self._back.programs(self._blank, self._tracker.fresh_state())
-        self._num_first, self._num_steps, self._num_done = len(first), len(first) + len(last), 0
+        steps = (*first, *last, return_freed_memory)
+        self._num_first, self._num_steps, self._num_done = len(first), len(steps), 0
         self._worker = ThreadWorker(partial(_do_step, stopped=self._stopped), "jaxslam-compile")
-        for step in (*first, *last):
+        for step in steps:
             self._worker.submit(step, 0)
 
     def _take(self, *, wait: bool) -> None:
