@@ -20,8 +20,10 @@ from jaxslam_kernels.image.pyramid import Pyramid
 from jaxslam_kernels.program_parts import apart
 from jaxslam_kernels.types import Flag, Mask, Pixels, Scalar
 
-_NEAR_PX = 3.0
-"""How far from its start a point may be found at the finest level alone; a window of 21 draws from further."""
+_NEAR_PX = 1.0
+"""How far from its start a point may be found at the finest level alone. A window of 21 draws from further, but not all
+the way to the right place: with 3.0, errors in the room `xyz` with two people are 1.12 times those without seeds (20
+runs each), with 1.0 they are 0.97 times, and a frame takes as long (fr1_rpy, Bonn crowd)."""
 
 
 class LevelPlan(NamedTuple):
@@ -69,10 +71,10 @@ class FlowPlan(NamedTuple):
         seeds: Number of points that are searched from the coarsest level; 0 for all. The others begin at the finest
             where the nearest seed has moved, and at the coarsest if they are not found within `_NEAR_PX` of there. A
             handheld camera leaves the prediction by 4.5 pixels in the median, but nearly all points by the same
-            (fr1_rpy): with 32 seeds it is 0.4 from the nearest, and the flow of 450 points takes 2.5 ms with the
-            pyramid instead of 3.8 (Bonn crowd: 2.0 instead of 3.1; Xeon, one thread). 2 % of the points are found more
-            than 0.1 pixels away, 0.5 % more than half a pixel (0.2 % and 0.1 %). Along a road, neighbors at other
-            depths move far apart: KITTI 06 has 38 mm instead of 34 (medians of 30 seeds).
+            (fr1_rpy): with 32 seeds it is 0.4 from the nearest, and a frame takes 11.3 to 13.2 ms instead of 14.6 to
+            17.8 (Bonn crowd: 12.2 instead of 12.7; medians of runs in turn, AMD EPYC, one thread). Along a road,
+            neighbors at other depths move far apart: with `_NEAR_PX` of 3, KITTI 06 has 38 mm instead of 34 (medians of
+            30 seeds).
     """
 
     coarsest: LevelPlan = LevelPlan(21, 12, 0.2)
