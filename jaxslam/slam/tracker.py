@@ -151,9 +151,7 @@ class Tracker:
         """
         params = track_params(camera, with_dense_keyframes(config))._replace(restart_after=jnp.float32(jnp.inf))
         self.params = with_cue_params(params, config.dynamics)
-        plan = with_cues(track_plan(config.track), config.dynamics, pairs=camera.is_stereo)
-        # Along a road, neighbors at other depths move far apart: with `FlowPlan.seeds`, KITTI 06 has 38 mm, not 34.
-        self.plan = plan._replace(flow=plan.flow._replace(seeds=0)) if camera.is_stereo else plan
+        self.plan = with_cues(track_plan(config.track), config.dynamics, pairs=camera.is_stereo)
         # ORB-SLAM's local mapping does not accept keyframes either while it is busy.
         patient_s = max(_PATIENT_S, config.track.keyframe_weak_after_s)
         self._params_for = {

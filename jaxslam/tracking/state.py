@@ -157,7 +157,7 @@ class TrackPlan(NamedTuple):
     num_hypotheses: int = _SETTINGS.num_hypotheses
     cell_px: int = _SETTINGS.cell_px
     new_points: Literal["always", "keyframes"] = _SETTINGS.new_points
-    flow: FlowPlan = FlowPlan(seeds=32)
+    flow: FlowPlan = FlowPlan()
     look_up: LevelPlan = LevelPlan(15, 8, 0.05)
     cues: tuple[Cue, ...] = ()
     regions: RegionPlan | None = None
