@@ -88,6 +88,7 @@ def test_single_precision(seed):
     np.testing.assert_allclose(single.group, double.group, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_gradient_where_no_point_counts(x64):
     """By all weights and features, forward and reverse, to second order."""
     features, of_groups, group_of, mask = _points()

@@ -397,7 +397,9 @@ CLIPS: list[tuple[CameraPathKind, float, float]] = [
 
 
 class TestRoomWithNobodyInIt:
-    @pytest.mark.parametrize(("path", "fps", "seconds"), CLIPS)
+    @pytest.mark.parametrize(
+        ("path", "fps", "seconds"), [*CLIPS[:2], *(pytest.param(*clip, marks=pytest.mark.slow) for clip in CLIPS[2:])]
+    )
     def test_nothing_is_new(self, path: CameraPathKind, fps: float, seconds: float) -> None:
         masks = masks_at_true_poses(room(path, fps, 0, 0, seconds), rendered(path, fps, seconds=seconds))
         assert [mask.mask.sum() for mask in masks] == [0] * len(masks)
@@ -422,10 +424,13 @@ class TestRoomWithNobodyInIt:
         assert [mask.mask.sum() for mask in masks] == [0] * len(masks)
 
 
+MORE_PEOPLE: list[tuple[CameraPathKind, int, int, int, int]] = [("static", 0, 2, 60, 70), ("xyz", 1, 1, 75, 88)]
+
+
 class TestPeople:
     @pytest.mark.parametrize(
         ("path", "seed", "walker", "first", "last"),
-        [("xyz", 0, 2, 60, 70), ("static", 0, 2, 60, 70), ("xyz", 1, 1, 75, 88)],
+        [("xyz", 0, 2, 60, 70), *(pytest.param(*clip, marks=pytest.mark.slow) for clip in MORE_PEOPLE)],
     )
     def test_are_found_when_they_come_in(
         self, path: CameraPathKind, seed: int, walker: int, first: int, last: int

@@ -265,6 +265,7 @@ def test_gradient():
     np.testing.assert_allclose(reverse, forward, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_vmap_equals_loop():
     several = [make_scene(seed).inputs for seed in (10, 11)]
     with jax.enable_x64(True):
@@ -282,6 +283,7 @@ def test_single_trace():
 
 
 class TestDegenerate:
+    @pytest.mark.slow
     @pytest.mark.parametrize("value", [np.nan, np.inf, 0.0, -500.0])
     def test_degenerate_lenses(self, value):
         """None is usable: nothing moves, and everything is finite, derivatives too."""

@@ -346,6 +346,7 @@ class TestRansac:
                 assert _apart(result.F, scene.F) < 1e-6
                 assert result.inliers[~scene.outlier].all()
 
+    @pytest.mark.slow
     def test_gradient(self):
         """The inliers are constant; forward = reverse = finite differences through the refinement."""
         scene = make_two_views(3, N, noise_px=0.3, outliers=0.3)
