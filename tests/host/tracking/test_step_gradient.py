@@ -129,7 +129,7 @@ def test_one_frame_along_a_change_of_everything() -> None:
     with jax.enable_x64(True):
         loss, inputs, *_ = _loss(clip(), steps=1)
         random = np.random.default_rng(2)
-        lengths = Inputs(**{name: each.first for name, each in STEP_INPUTS.items()})
+        lengths = Inputs(**{name: jnp.asarray(each.first) for name, each in STEP_INPUTS.items()})
         along = jax.tree.map(lambda value, h: jnp.asarray(h * random.normal(size=value.shape)), inputs, lengths)
         moved = lambda sign: jax.tree.map(lambda value, change: value + sign * change, inputs, along)
         both = quick_compile(lambda at: jax.jvp(loss, (at,), (along,)))
