@@ -25,6 +25,7 @@ _COMPILES_FAST = [
     *([_OLDER_GENERATOR] if jaxlib.version.__version_info__ < (0, 11, 1) else []),
     "--xla_cpu_parallel_codegen_split_count=1",  # a program as one module: 6 % faster
 ]
+"""As in `.ci/run`, whose gates load what tests have compiled."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -122,10 +123,15 @@ tracker with its map 5,200, and what is compiled beyond the limit crashes or han
 
 
 @pytest.fixture(autouse=True, scope="module")
-def _compiled_programs_are_few():
-    """Those of earlier files are compiled again, or loaded from the disk, where they are needed."""
+def _programs_are_few_and_frozen():
+    """Those of earlier files are compiled again, or loaded from the disk, where they are needed.
+
+    What stays is not looked at again: trackers collect garbage before they begin, which took 2 s each otherwise.
+    """
     yield
     maps = Path("/proc/self/maps")
     if maps.is_file() and maps.read_bytes().count(b"\n") > _MAX_MAPS:
+        gc.unfreeze()
         jax.clear_caches()
-        gc.collect()
+    gc.collect()
+    gc.freeze()

@@ -32,6 +32,7 @@ from jaxslam_kernels.ransac_sampling import draw_samples
 from jaxslam_kernels.trajectory import alignment
 from jaxslam_kernels.trajectory import kitti_drift as segments
 from jaxslam_kernels.two_view import epipolar, fundamental
+from quick_compile import quick_compile
 from small_problems import CAMERA, bundle_inputs, graph_inputs, match_inputs, pose_inputs
 
 
@@ -99,9 +100,12 @@ def _random(*shape: int, seed: int = 0, low: float = -1.0, high: float = 1.0) ->
     return jnp.asarray(np.random.default_rng(seed).uniform(low, high, shape))
 
 
+_exponentials = quick_compile(jax.vmap(lambda tangent: SE3.exp(tangent).wxyz_xyz))
+
+
 def _poses(n: int, seed: int = 0, size: float = 0.4) -> SE3:
     tangents = size * np.random.default_rng(seed).normal(size=(n, 6))
-    return SE3(jax.vmap(lambda t: SE3.exp(t).wxyz_xyz)(jnp.asarray(tangents)))
+    return SE3(_exponentials(jnp.asarray(tangents)))
 
 
 def _pose(seed: int = 0, size: float = 0.4) -> SE3:
@@ -861,8 +865,9 @@ def _() -> DerivativeCase:
 
 def _filled_grid() -> voxel_grid.VoxelGrid:
     cloud = _cloud()
-    empty = voxel_grid.empty_grid(8, jnp.float64)
-    return voxel_grid.with_cloud(empty, **cloud, count=jnp.ones(6), evidence=jnp.ones(6), voxel_m=jnp.array(1.0))[0]
+    empty, ones, size = voxel_grid.empty_grid(8, jnp.float64), jnp.ones(6), jnp.array(1.0)
+    add = quick_compile(lambda cloud: voxel_grid.with_cloud(empty, **cloud, count=ones, evidence=ones, voxel_m=size)[0])
+    return add(cloud)
 
 
 def _on_grid(kernel: Callable[..., Any], table: Any) -> Callable[..., Any]:
@@ -942,7 +947,9 @@ def _() -> DerivativeCase:
 def _two_paths(n: int) -> dict[str, Any]:
     estimate = _poses(n)
     errors = 0.05 * np.random.default_rng(5).normal(size=(n, 6))
-    moved = jax.vmap(lambda T, e: transform.retract(SE3(T), e).wxyz_xyz)(estimate.wxyz_xyz, jnp.asarray(errors))
+    moved = quick_compile(jax.vmap(lambda T, e: transform.retract(SE3(T), e).wxyz_xyz))(
+        estimate.wxyz_xyz, jnp.asarray(errors)
+    )
     return {"estimate": estimate, "reference": SE3(moved)}
 
 

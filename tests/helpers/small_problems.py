@@ -15,8 +15,12 @@ from jaxslam_kernels.pose_graph.cost import PoseGraphEdges
 from jaxslam_kernels.pose_graph.pose_graph import PoseGraph, optimize_pose_graph
 from jaxslam_kernels.se3 import between, compose, retract, to_camera
 from jaxslam_kernels.two_view.fundamental import FundamentalResult, ransac_fundamental
+from quick_compile import quick_compile_nested
 
 CAMERA = (200.0, 210.0, 80.0, 60.0)
+_between, _compose, _project, _retract, _to_camera = map(
+    quick_compile_nested, (between, compose, project, retract, to_camera)
+)
 
 
 class PoseInputs(NamedTuple):
@@ -33,10 +37,10 @@ def identity() -> SE3:
 
 def pose_inputs(n: int = 12, seed: int = 0) -> PoseInputs:
     rng = np.random.default_rng(seed)
-    T = retract(identity(), jnp.array([0.1, 0.2, -0.1, 0.1, -0.2, 0.05]))
+    T = _retract(identity(), jnp.array([0.1, 0.2, -0.1, 0.1, -0.2, 0.05]))
     X_world = jnp.asarray(rng.uniform([-1, -1, 2], [1, 1, 5], (n, 3)).T)
-    uv = project(make_intrinsics(*CAMERA, dtype=jnp.float64), to_camera(T, X_world))
-    return PoseInputs(retract(T, jnp.full(6, 0.01)), X_world, uv + jnp.asarray(rng.normal(size=(2, n))) * 0.5)
+    uv = _project(make_intrinsics(*CAMERA, dtype=jnp.float64), _to_camera(T, X_world))
+    return PoseInputs(_retract(T, jnp.full(6, 0.01)), X_world, uv + jnp.asarray(rng.normal(size=(2, n))) * 0.5)
 
 
 def refine(inputs: PoseInputs, weights: jax.Array) -> PoseRefinement:
@@ -71,11 +75,11 @@ def bundle_inputs(n: int = 8, seed: int = 1) -> BundleInputs:
     camera = make_intrinsics(*CAMERA, dtype=jnp.float64)
     X_world = jnp.asarray(rng.uniform([-1, -1, 3], [1, 1, 5], (n, 3)).T)
     tangents = rng.normal(size=(3, 6)) * 0.02 + np.arange(3)[:, None] * np.array([0.5, 0, 0, 0, 0, 0])
-    poses = [retract(identity(), jnp.asarray(t)) for t in tangents]
-    uv = jnp.concatenate([project(camera, to_camera(T, X_world)) for T in poses], axis=1)
+    poses = [_retract(identity(), jnp.asarray(t)) for t in tangents]
+    uv = jnp.concatenate([_project(camera, _to_camera(T, X_world)) for T in poses], axis=1)
     uv = uv + jnp.asarray(rng.normal(size=uv.shape)) * 0.5
     index = jnp.asarray(np.stack(np.meshgrid(np.arange(3), np.arange(n), indexing="ij")).reshape(2, -1), jnp.int32)
-    start = jnp.stack([T.wxyz_xyz for T in (*poses[:2], retract(poses[2], jnp.full(6, 0.01)))])
+    start = jnp.stack([T.wxyz_xyz for T in (*poses[:2], _retract(poses[2], jnp.full(6, 0.01)))])
     return BundleInputs(
         start, X_world + jnp.asarray(rng.normal(size=(3, n))) * 0.05, observe(index[0], index[1], uv, camera)
     )
@@ -98,10 +102,10 @@ def adjust(
 def graph_inputs(seed: int = 2) -> tuple[SE3, PoseGraphEdges]:
     """Four nodes, of which the last has no edge, and six edges among the others, with noise in all."""
     rng = np.random.default_rng(seed)
-    nodes = [retract(identity(), jnp.asarray(t)) for t in rng.normal(size=(4, 6)) * 0.5]
+    nodes = [_retract(identity(), jnp.asarray(t)) for t in rng.normal(size=(4, 6)) * 0.5]
     source, target = np.array([0, 0, 1, 1, 2, 0]), np.array([1, 2, 2, 0, 0, 2])
     measured = [
-        retract(between(nodes[s], nodes[t]), jnp.asarray(rng.normal(size=6) * 0.05))
+        _retract(_between(nodes[s], nodes[t]), jnp.asarray(rng.normal(size=6) * 0.05))
         for s, t in zip(source, target, strict=True)
     ]
     edges = PoseGraphEdges(
@@ -112,7 +116,7 @@ def graph_inputs(seed: int = 2) -> tuple[SE3, PoseGraphEdges]:
         weights=jnp.ones(6),
         mask=jnp.ones(6, bool),
     )
-    start = SE3(jnp.stack([retract(T, jnp.full(6, 0.02)).wxyz_xyz for T in nodes]))
+    start = SE3(jnp.stack([_retract(T, jnp.full(6, 0.02)).wxyz_xyz for T in nodes]))
     return start, edges
 
 
@@ -127,8 +131,8 @@ def match_inputs(n: int = 20, seed: int = 3) -> tuple[jax.Array, jax.Array]:
     rng = np.random.default_rng(seed)
     camera = make_intrinsics(*CAMERA, dtype=jnp.float64)
     X_world = jnp.asarray(rng.uniform([-1, -1, 2], [1, 1, 5], (n, 3)).T)
-    second = compose(identity(), retract(identity(), jnp.array([0.4, 0.1, 0.05, 0.02, -0.05, 0.03])))
-    before, after = (project(camera, to_camera(T, X_world)) for T in (identity(), second))
+    second = _compose(identity(), _retract(identity(), jnp.array([0.4, 0.1, 0.05, 0.02, -0.05, 0.03])))
+    before, after = (_project(camera, _to_camera(T, X_world)) for T in (identity(), second))
     noise = jnp.asarray(rng.normal(size=(2, 2, n))) * 0.2
     return before + noise[0], after + noise[1]
 

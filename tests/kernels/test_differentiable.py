@@ -4,6 +4,7 @@ Derivatives along a random change of one argument are compared with central diff
 differences of the value, and the gradient by everything else with differences of gradients.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -43,11 +44,16 @@ class _At(NamedTuple):
     curvature: Any
 
 
+def _as_numpy(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function with results of NumPy: JAX compiles each operation on them outside of a program, for each shape."""
+    return lambda *arguments: jax.tree.map(np.asarray, function(*arguments))
+
+
 class _Differentiator:
     """Derivatives of a sum of all results, of which each counts as much as any other; compiled once for all cases."""
 
     def __init__(self, case: DerivativeCase, call: Any) -> None:
-        self._results = quick_compile(lambda inputs: _split(call(**inputs), case.constant_results)[0])
+        self._results = _as_numpy(quick_compile(lambda inputs: _split(call(**inputs), case.constant_results)[0]))
 
         def loss(inputs: dict[str, Any], probes: list[jax.Array]) -> jax.Array:
             results = _split(call(**inputs), case.constant_results)[0]
@@ -58,28 +64,28 @@ class _Differentiator:
             (value, gradient), (slope, curvature) = jax.jvp(both, (point,), (direction,))
             return _At(value, gradient, slope, curvature)
 
-        self.at = quick_compile(at)
+        self.at = _as_numpy(quick_compile(at))
 
-    def probes(self, inputs: dict[str, Any]) -> list[jax.Array]:
+    def probes(self, inputs: dict[str, Any]) -> list[np.ndarray]:
         random = np.random.default_rng(7)
         size = lambda leaf: float(np.sqrt(np.mean(np.square(leaf)))) if leaf.size else 1.0
-        return [jnp.asarray(random.normal(size=leaf.shape) / (size(leaf) or 1.0)) for leaf in self._results(inputs)]
+        return [np.asarray(random.normal(size=leaf.shape) / (size(leaf) or 1.0)) for leaf in self._results(inputs)]
 
 
 def _direction(inputs: dict[str, Any], name: str) -> dict[str, Any]:
     """A random change of one argument, each array by about its own size."""
     random = np.random.default_rng(11)
 
-    def change(leaf: jax.Array) -> jax.Array:
+    def change(leaf: jax.Array) -> np.ndarray:
         size = float(np.sqrt(np.mean(np.square(leaf)))) or 1.0
-        return jnp.asarray(size * random.normal(size=leaf.shape))
+        return np.asarray(size * random.normal(size=leaf.shape))
 
-    still = jax.tree.map(jnp.zeros_like, inputs)
+    still = jax.tree.map(np.zeros_like, inputs)
     return still | {name: jax.tree.map(change, inputs[name])}
 
 
 def _moved(inputs: dict[str, Any], direction: dict[str, Any], by: float) -> dict[str, Any]:
-    return jax.tree.map(lambda x, d: x + by * d, inputs, direction)
+    return jax.tree.map(lambda x, d: np.asarray(x) + by * d, inputs, direction)
 
 
 def _difference(values: dict[int, Any], h: float) -> Any:
@@ -88,7 +94,7 @@ def _difference(values: dict[int, Any], h: float) -> Any:
     return jax.tree.map(lambda a, b, c: (45 * a - 9 * b + c) / (60 * h), odd(1), odd(2), odd(3))
 
 
-def _largest(array: jax.Array) -> float:
+def _largest(array: np.ndarray) -> float:
     return float(np.abs(array).max())
 
 
@@ -151,7 +157,7 @@ def test_kernel(name: str) -> None:
 def _check_constants(case: DerivativeCase) -> None:
     """By a constant, the derivative of everything is exactly zero; that of a constant result, by everything."""
     everything = case.carries | case.constants
-    varying, fixed = _split(case.call(**everything), case.constant_results)
+    varying, fixed = jax.eval_shape(lambda inputs: _split(case.call(**inputs), case.constant_results), everything)
     assert len(fixed) == len(case.constant_results)
     assert bool(varying) or not case.carries
 

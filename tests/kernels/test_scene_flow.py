@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from jax.test_util import check_grads
 from jaxlie import SE3
 from jaxslam_kernels.scene_flow import GroupMotion, flow_length, group_motion, scene_flow, upper_limit
+from quick_compile import quick_compile_nested
 from scipy.spatial.transform import Rotation
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -40,11 +41,18 @@ def _scene(seed=0, dtype: Any = np.float64):
 
 def _state(X_world, X_cam, pose, group, robust=True) -> tuple[jax.Array, GroupMotion]:
     """The limit of the points of the first groups, and how all groups move by it."""
+    return _STATES[robust](X_world, X_cam, pose, group)
+
+
+def _state_of(X_world, X_cam, pose, group, robust) -> tuple[jax.Array, GroupMotion]:
     flow = scene_flow(jnp.asarray(X_world), jnp.asarray(X_cam), SE3(jnp.asarray(pose)))
     length = flow_length(flow)
     limit = upper_limit(length, (jnp.asarray(group) < K - 1).astype(flow.dtype), 3.0, robust=robust)
     moves = (length > limit).astype(flow.dtype)
     return limit, group_motion(flow, moves, jnp.ones(N, bool), jnp.asarray(group), K)
+
+
+_STATES = {robust: quick_compile_nested(partial(_state_of, robust=robust)) for robust in (True, False)}
 
 
 def test_shapes():

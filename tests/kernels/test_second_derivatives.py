@@ -155,7 +155,8 @@ SOLVERS = {
 }
 
 
-@pytest.mark.parametrize("solver", ["refine_pose", slow("bundle_adjust"), slow("optimize_pose_graph")])
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", ["refine_pose", "bundle_adjust", "optimize_pose_graph"])
 def test_of_weights_of_zero(solver):
     """The limit from above, as the first derivatives are."""
     solve, n = SOLVERS[solver]

@@ -10,6 +10,7 @@ from cue_scenes import MOTIONS, N, check_finite, moves, scene
 from jax.test_util import check_grads
 from jaxslam_kernels.camera import make_intrinsics
 from jaxslam_kernels.se3 import retract, to_camera
+from quick_compile import quick_compile
 
 from jaxslam.dynamics.cluster_cue import ClusterCue, ClusterParams, make_cluster_cue
 from jaxslam.dynamics.cue import CueInput
@@ -42,11 +43,14 @@ def box_before_wall(shift_px: int = 0) -> np.ndarray:
     return depth
 
 
+_find_regions = quick_compile(find_regions, static_argnums=5)
+
+
 def divided(depth: np.ndarray, before: Any = None, plan: RegionPlan = PLAN) -> Regions:
     intrinsics = make_intrinsics(*INTRINSICS, dtype=jnp.float64)
     X_cam = jnp.array([[-0.3, 0.9, 0.0, jnp.nan], [0.0, 0.1, 0.0, 0.0], [1.0, 3.0, 0.0, 1.0]])
     start = no_regions(plan, jnp.dtype(float)).centers if before is None else before
-    return find_regions(jax.random.key(1), jnp.asarray(depth), start, X_cam, intrinsics, plan)
+    return _find_regions(jax.random.key(1), jnp.asarray(depth), start, X_cam, intrinsics, plan)
 
 
 class TestRegions:

@@ -12,6 +12,7 @@ from cue_scenes import MOTIONS, N, check_finite, moves, scene
 from jax.test_util import check_grads
 from jaxslam_kernels.point_network import PointNetwork, network_shapes
 from jaxslam_kernels.se3 import to_camera
+from quick_compile import quick_compile
 
 from jaxslam.config.cue_sections import LearnedCueConfig
 from jaxslam.dynamics.cue import CueInput
@@ -41,6 +42,9 @@ def full_scene(motion: Any, moved_m: Any = (0, 0, 0), **named: Any) -> CueInput:
     )
 
 
+_judged = quick_compile(learned_cue)
+
+
 def packaged(temperature: float = 0.0) -> LearnedParams:
     made = CUE.read_params
     assert made is not None
@@ -55,7 +59,7 @@ def test_tells_what_moves(motion: Any) -> None:
     """
     given = full_scene(motion, (0.03, 0, 0), noise_px=0.1)
     given = given._replace(X_anchor=given.X_world.at[0].add(jnp.where(moves(), -0.12, 0.0)))
-    found = learned_cue(given, packaged())
+    found = _judged(given, packaged())
     evidence = np.asarray(found.evidence)
     assert np.median(evidence[moves()]) > 10 * np.median(evidence[~moves()])
     assert found.known.all()
@@ -63,7 +67,7 @@ def test_tells_what_moves(motion: Any) -> None:
 
 @pytest.mark.parametrize("motion", MOTIONS.values(), ids=MOTIONS)
 def test_nothing_moves(motion: Any) -> None:
-    assert (np.asarray(learned_cue(full_scene(motion, noise_px=0.1), packaged()).weight) == 1).all()
+    assert (np.asarray(_judged(full_scene(motion, noise_px=0.1), packaged()).weight) == 1).all()
 
 
 def test_scale_of_the_world_does_not_matter() -> None:
@@ -130,8 +134,8 @@ class TestDegenerate:
             },
         }[case]
         given = given._replace(**changed)
-        check_finite(learned_cue, given, packaged())
-        check_finite(learned_cue, given, packaged(0.3))
+        check_finite(_judged, given, packaged())
+        check_finite(_judged, given, packaged(0.3))
         slope = jax.grad(
             lambda network, X_world: learned_cue(
                 given._replace(X_world=X_world), LearnedParams(network, jnp.asarray(0.3))
@@ -139,9 +143,9 @@ class TestDegenerate:
             argnums=(0, 1),
         )
         if case != "not finite":
-            check_finite(slope, packaged().network, given.X_world)
+            check_finite(quick_compile(slope), packaged().network, given.X_world)
         if case in ("nothing followed", "behind"):
-            found = learned_cue(given, packaged())
+            found = _judged(given, packaged())
             assert (found.weight == 1).all()
             assert not found.known.any()
 

@@ -46,6 +46,9 @@ def _motion(**changes: float) -> Any:
     return PARAMS.motion._replace(**{key: jnp.asarray(value) for key, value in changes.items()})
 
 
+_classify = jax.jit(classify_motion, static_argnames="as_published")
+
+
 def _judged(
     moved_m: dict[int, float],
     before: MotionMemory,
@@ -67,7 +70,7 @@ def _judged(
     )
     background = jnp.asarray((of_point == 0).astype(np.float32))
     limits, pose = _motion(**changes), SE3.identity()
-    return classify_motion(
+    return _classify(
         *(points, jnp.asarray(of_point), background, pose, before, limits), inert=inert, as_published=as_published
     )
 

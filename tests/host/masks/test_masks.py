@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from jaxslam_kernels.image.pyramid import Pyramid, build_pyramid
+from quick_compile import quick_compile
 
 from jaxslam.datasets.synthetic import SyntheticConfig, SyntheticDataset
 from jaxslam.dynamics.object_motion import INERT
@@ -59,8 +60,11 @@ def detections(boxes: list[list[float]]) -> Detections:
     )
 
 
+_build = quick_compile(functools.partial(build_pyramid, num_levels=PYRAMID_LEVELS))
+
+
 def pyramid(gray: np.ndarray) -> Pyramid:
-    return build_pyramid(jnp.asarray(gray), num_levels=PYRAMID_LEVELS)
+    return _build(jnp.asarray(gray))
 
 
 def overlap(a: np.ndarray, b: np.ndarray) -> float:

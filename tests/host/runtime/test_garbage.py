@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import pytest
 
 from jaxslam.runtime.compiled import compiled
-from jaxslam.runtime.garbage import collector_paused
+from jaxslam.runtime.garbage import collector_paused, garbage_frozen
 
 
 class _Cycle:
@@ -91,3 +91,31 @@ def test_tracing_is_paused_and_calling_is_not():
     assert double(jnp.ones(3)).tolist() == [2, 2, 2]
     assert set(states) == {False}
     assert gc.isenabled()
+
+
+class TestFrozen:
+    @pytest.fixture(autouse=True)
+    def _as_it_was(self):
+        had = gc.get_freeze_count() > 0
+        gc.unfreeze()
+        yield
+        gc.collect()
+        (gc.freeze if had else gc.unfreeze)()
+
+    def test_thaws_what_it_has_frozen(self):
+        lost = _Cycle()
+        with garbage_frozen():
+            alive = weakref.ref(lost)
+            del lost
+            gc.collect()
+            assert alive() is not None
+        gc.collect()
+        assert alive() is None
+
+    def test_leaves_frozen_what_a_program_has_frozen(self):
+        gc.collect()
+        gc.freeze()
+        before = gc.get_freeze_count()
+        with garbage_frozen():
+            pass
+        assert gc.get_freeze_count() >= before

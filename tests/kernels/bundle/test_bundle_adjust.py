@@ -219,6 +219,13 @@ LOSSES = [pytest.param(loss, marks=pytest.mark.slow) if loss == "geman_mcclure" 
 """SciPy takes a minute with the one that is marked."""
 
 
+@pytest.fixture(params=[True, pytest.param(False, marks=pytest.mark.slow)], ids=["double", "single"])
+def precision(request):
+    """Each is a program of 14 s to compile; most tests need the double one."""
+    with jax.enable_x64(request.param):
+        yield
+
+
 class TestReference:
     @pytest.mark.parametrize("loss", LOSSES)
     def test_matches_reference(self, loss):
@@ -265,6 +272,7 @@ class TestReference:
         assert outliers or _pose_errors(single.poses, double.poses) < 1e-3
         assert _all_finite(single, gradient)
 
+    @pytest.mark.usefixtures("precision")
     def test_fixed_stays(self):
         window = make_window(3)
         result, *_ = _run(window.inputs, window.links)
@@ -272,6 +280,7 @@ class TestReference:
         np.testing.assert_allclose(result.X_world[:, :2], window.inputs.X_world[:, :2], atol=1e-6)
         assert np.abs(result.X_world[:, 2:] - window.inputs.X_world[:, 2:]).min() > 0
 
+    @pytest.mark.usefixtures("precision")
     def test_point_seen_twice_counts_once(self):
         """The last observation with weight has the slot, whatever others say."""
         window = make_window(4)
@@ -389,6 +398,7 @@ def test_vmap_equals_loop():
             assert batched.status[k] == looped.status
 
 
+@pytest.mark.usefixtures("precision")
 def test_single_trace():
     """Nothing that may change from window to window compiles again: who sees whom, what is fixed, all values."""
     for seed in range(3):
@@ -441,6 +451,7 @@ def _degenerate(change: str) -> tuple[Inputs, Links]:
     return changes[change]
 
 
+@pytest.mark.usefixtures("precision")
 class TestDegenerate:
     @pytest.mark.parametrize(
         "change",

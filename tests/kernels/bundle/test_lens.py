@@ -296,6 +296,7 @@ class TestDegenerate:
         np.testing.assert_allclose(result.poses, inputs.poses, atol=1e-6)
         np.testing.assert_allclose(result.lenses, np.repeat([[1.0, 0.0, 0.0]], K, axis=0))
 
+    @pytest.mark.slow
     def test_degenerate_in_part(self):
         """One camera without a usable lens does not count; the others are as they would be without it."""
         inputs = make_scene(9).inputs
@@ -310,6 +311,7 @@ class TestDegenerate:
         assert _pose_errors(result.poses[others], without.poses[others]) < 1e-7
         np.testing.assert_array_equal(result.used, CAMERA != 2)
 
+    @pytest.mark.slow
     def test_degenerate_masked(self):
         inputs = make_scene(9).inputs
         result, gradient, _ = _run(inputs._replace(weights=np.zeros(M)))

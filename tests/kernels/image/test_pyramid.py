@@ -1,5 +1,7 @@
 """Pyramids against OpenCV's."""
 
+from functools import partial
+
 import cv2
 import jax
 import jax.numpy as jnp
@@ -8,6 +10,7 @@ import pytest
 from equinox.debug import assert_max_traces
 from jax.test_util import check_grads
 from jaxslam_kernels.image.pyramid import build_pyramid, half_size
+from quick_compile import quick_compile
 
 
 @pytest.fixture
@@ -36,8 +39,8 @@ def test_shapes(dtype):
 @pytest.mark.parametrize(("given", "expected"), [(None, np.float32), (np.float64, np.float64)])
 def test_whole_numbers_equal_the_same_in_floating_point(x64, given, expected):
     image = _image(*SIZE).astype(np.uint8)
-    pyramid = build_pyramid(jnp.asarray(image), num_levels=3, dtype=given)
-    same = build_pyramid(jnp.asarray(image, expected), num_levels=3)
+    build = quick_compile(partial(build_pyramid, num_levels=3, dtype=given))
+    pyramid, same = build(jnp.asarray(image)), build(jnp.asarray(image, expected))
     for level, reference in zip(pyramid.levels, same.levels, strict=True):
         assert level.dtype == expected
         np.testing.assert_array_equal(level, reference)
