@@ -201,6 +201,9 @@ class SemanticsConfig(ValidatedConfig):
     propagate: bool = True
     """Whether to propagate masks from frame to frame by flow and depth. Without it, a mask stays where it was until the
     next one."""
+    mask_corners: Literal["shi-tomasi", "fast"] = "shi-tomasi"
+    """Corners at which a mask is followed while it is propagated: those of Shi and Tomasi, or FAST corners, as in
+    NGD-SLAM."""
     dilate_px: Annotated[int, Range(at_least=0, at_most=100)] = 3
     """Dilation of the detected masks, pixels."""
 

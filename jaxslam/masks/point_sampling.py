@@ -3,7 +3,7 @@
 Source: NGD-SLAM (Zhang, Bujanca and Luján 2025), section III-C.3, with cells of 15 pixels in an image 640 pixels wide.
 """
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -11,9 +11,12 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 CELL_PX = 8
 """Side of a cell in an image about 320 pixels wide, pixels."""
+CornerKind = Literal["shi-tomasi", "fast"]
 _WINDOW_PX = 5
 _MIN_SCORE = 1e-4
 """Smaller eigenvalue of the structure tensor, for gray values from 0 to 1, below which a random pixel is as good."""
+_FAST_THRESHOLD = 20
+"""Difference of gray values that makes a FAST corner: ORB-SLAM3's first threshold; NGD-SLAM gives none."""
 _TURNS = (0.7548776662, 0.5698402910)
 """Factors of the row and the column of a cell. The cells with the smallest fractional parts of the sum are spread
 evenly over the image (the additive sequence R2: Roberts, "The unreasonable effectiveness of quasirandom sequences",
@@ -35,7 +38,11 @@ class SampledPoints(NamedTuple):
 
 
 def sample_mask(
-    mask: Bool[np.ndarray, "h w"], gray: UInt8[np.ndarray, "h w"], capacity: int, seed: int
+    mask: Bool[np.ndarray, "h w"],
+    gray: UInt8[np.ndarray, "h w"],
+    capacity: int,
+    seed: int,
+    corners: CornerKind = "shi-tomasi",
 ) -> SampledPoints:
     """Sample one masked pixel in every cell that has one: the best corner or, without a corner, a random pixel.
 
@@ -48,12 +55,14 @@ def sample_mask(
         gray: `(h, w)` gray image.
         capacity: Largest number of points.
         seed: Seed of the random choice.
+        corners: Score of a corner: the smaller eigenvalue of Shi and Tomasi, or that of FAST (Rosten and Drummond,
+            ECCV 2006), which the paper uses.
     """
     region = _whole_cells(mask)
     inside = mask[region]
     if not inside.size:
         return SampledPoints(np.zeros((2, 0), np.float32), 1.0)
-    score = _by_cell(np.where(inside, _corners(gray, region), _NOT_MASKED))
+    score = _by_cell(np.where(inside, _corner_score(gray, region, corners), _NOT_MASKED))
     _rank_at_random(score, np.random.default_rng(seed))
     where = score.argmax(axis=1)
     cells = np.flatnonzero(score[np.arange(len(score)), where] > _NOT_MASKED)
@@ -98,12 +107,25 @@ def _cells(begin: int, end: int) -> slice:
     return slice(begin // CELL_PX * CELL_PX, -(-end // CELL_PX) * CELL_PX)
 
 
-def _corners(gray: UInt8[np.ndarray, "h w"], region: tuple[slice, slice]) -> Float32[np.ndarray, "_h _w"]:
-    """Return the smaller eigenvalues of the structure tensor in a part of the image, with complete windows."""
+def _corner_score(
+    gray: UInt8[np.ndarray, "h w"], region: tuple[slice, slice], corners: CornerKind
+) -> Float32[np.ndarray, "_h _w"]:
+    """Return the corner scores of a part of the image, with complete windows."""
     rows, columns = (slice(max(span.start - _WINDOW_PX, 0), span.stop + _WINDOW_PX) for span in region)
-    score = cv2.cornerMinEigenVal(gray[rows, columns], _WINDOW_PX)
+    part = gray[rows, columns]
+    score = cv2.cornerMinEigenVal(part, _WINDOW_PX) if corners == "shi-tomasi" else _fast_score(part)
     top, left = region[0].start - rows.start, region[1].start - columns.start
     return score[top:, left:][: region[0].stop - region[0].start, : region[1].stop - region[1].start]
+
+
+def _fast_score(gray: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+    """Return the scores of FAST corners that are the best within a pixel, and 0 elsewhere."""
+    found = cv2.FastFeatureDetector.create(_FAST_THRESHOLD).detect(gray)
+    score = np.zeros(gray.shape, np.float32)
+    if found:
+        column, row = cv2.KeyPoint.convert(found).astype(int).T
+        score[row, column] = [corner.response for corner in found]
+    return score
 
 
 def _rank_at_random(score: Float32[np.ndarray, "cells pixels"], generator: np.random.Generator) -> None:

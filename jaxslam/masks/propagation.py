@@ -28,7 +28,7 @@ from jaxslam_kernels.image.pyramid import Pyramid, build_pyramid
 from jaxslam_kernels.types import Mask, Pixels, Weights
 from jaxtyping import Array, Bool, Float, Float32, Int, Int32, UInt8
 
-from jaxslam.masks.point_sampling import sample_mask
+from jaxslam.masks.point_sampling import CornerKind, sample_mask
 from jaxslam.runtime.aligned_memory import aligned_array
 from jaxslam.runtime.compiled import compiled
 
@@ -96,16 +96,19 @@ class MaskFlow(NamedTuple):
     label: Int[Array, " n"]
 
 
-def make_origin(mask: Bool[np.ndarray, "h w"], gray: UInt8[np.ndarray, "h w"], seed: int) -> TrackedMask:
+def make_origin(
+    mask: Bool[np.ndarray, "h w"], gray: UInt8[np.ndarray, "h w"], seed: int, corners: CornerKind = "shi-tomasi"
+) -> TrackedMask:
     """Sample the points by which a mask is tracked.
 
     Args:
         mask: `(h, w)` mask of a frame.
         gray: `(h, w)` gray image of the frame.
         seed: Seed of the random choices.
+        corners: Score of a corner, as in `sample_mask`.
     """
     # Sampling (III-C.3): one point in each cell of the mask.
-    sampled = sample_mask(mask, gray, CAPACITY, seed)
+    sampled = sample_mask(mask, gray, CAPACITY, seed, corners)
     count, region = sampled.uv.shape[1], _bounded(mask)
     uv, spacing = (aligned_array(shape, np.float32) for shape in ((2, CAPACITY), ()))
     ok = aligned_array((CAPACITY,), np.bool_)

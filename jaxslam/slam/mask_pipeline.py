@@ -115,6 +115,7 @@ class MaskPipeline:
         """
         self._propagate, self._new_surfaces = config.semantics.propagate, config.dynamics.new_surfaces
         self._dilate_px, self._seed = config.semantics.dilate_px, config.run.seed
+        self._corners = config.semantics.mask_corners
         self._reduced = Downscaler(ImageGrid.of(camera), WIDTH_PX)
         self._semantics = None if detector is None else SemanticThread(detector, self._reduced, config, times)
         self._farthest_m = max_valid_depth(camera, config.track)
@@ -258,7 +259,7 @@ class MaskPipeline:
         before = self._seen.get(frame - 1)
         if before is None or not self._propagate or not self._mask.any():
             return None
-        return DetectedMask(frame - 1, make_origin(self._mask, before.gray, self._seed + frame))
+        return DetectedMask(frame - 1, make_origin(self._mask, before.gray, self._seed + frame, self._corners))
 
     def _carried(self, found: DetectedMask, frame: int) -> np.ndarray:
         if found.frame == frame or not self._propagate:

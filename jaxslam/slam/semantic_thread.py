@@ -103,7 +103,7 @@ class SemanticThread:
         self._offered: int | None = None
         self._detector, self._reduced, self._seed = detector, reduced, config.run.seed
         self._focal_px, self._numbers_objects = float(reduced.raster.intrinsics.fx), config.dynamics.motion.enabled
-        latency_frames = config.semantics.latency_frames
+        latency_frames, self._corners = config.semantics.latency_frames, config.semantics.mask_corners
         self._all_wait, self._begun, self._failures = latency_frames == 0, False, ErrorLog()
         self._worker: Worker[DetectionJob, DetectedMask] = make_worker(
             (times or StageTimes()).timed("detector", self._look),
@@ -143,7 +143,7 @@ class SemanticThread:
         found, focal_px = reduced_detections(self._detector(job.image), self._reduced), self._focal_px
         mask = mask_of_detections(found, job.depth, focal_px, dilate_px=0)
         labels = instance_labels(found, job.depth, focal_px) if self._numbers_objects else None
-        return DetectedMask(job.frame, make_origin(mask, job.gray, self._seed + job.frame), labels)
+        return DetectedMask(job.frame, make_origin(mask, job.gray, self._seed + job.frame, self._corners), labels)
 
     def _newest(self, frame: int) -> tuple[DetectedMask | None, str]:
         try:

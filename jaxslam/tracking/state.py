@@ -131,7 +131,8 @@ class TrackPlan(NamedTuple):
         cell_px: Side of the cells that each get at most one new corner, pixels, even.
         new_points: Frames in which new points are detected: `always` for every frame with too few points, or
             `keyframes` for keyframes only.
-        flow: Settings of the optical flow from frame to frame.
+        flow: Settings of the optical flow from frame to frame. `Slam` searches all points of stereo pairs from the
+            coarsest level.
         look_up: Settings of the alignment of keyframe points. A window of 21 takes 1 ms more per frame and is not more
             accurate; 17, 15 and 13 are alike: TUM `fr1_rpy` 10.2, 10.2, 10.2 mm, Bonn `crowd` (start) 9.7, 9.6, 9.5.
         cues: Functions that find dynamic points (`dynamics.cue.Cue`), in the order of `TrackParams.cues`.
@@ -157,7 +158,7 @@ class TrackPlan(NamedTuple):
     num_hypotheses: int = _SETTINGS.num_hypotheses
     cell_px: int = _SETTINGS.cell_px
     new_points: Literal["always", "keyframes"] = _SETTINGS.new_points
-    flow: FlowPlan = FlowPlan()
+    flow: FlowPlan = FlowPlan(seeds=64)
     look_up: LevelPlan = LevelPlan(15, 8, 0.05)
     cues: tuple[Cue, ...] = ()
     regions: RegionPlan | None = None

@@ -73,7 +73,7 @@ def _points(way: Route | Way, roads: Mapping[str, Road], key: str) -> np.ndarray
 
 
 def _people_of(group: Group, rng: np.random.Generator) -> list[Person]:
-    """The people of a group, evenly around the place where they meet."""
+    """The people of a group, who stand evenly around the place where they meet."""
     start = rng.uniform(0.0, 2.0 * np.pi)
     walk_s = (group.come_from_m - group.radius_m) / group.speed_m_per_s
     round_s = 2.0 * (walk_s + group.stay_s)
@@ -81,7 +81,11 @@ def _people_of(group: Group, rng: np.random.Generator) -> list[Person]:
     for number in range(group.people):
         angle = start + 2.0 * np.pi * number / group.people
         direction = np.array([np.cos(angle), np.sin(angle)])
-        far, near = (np.array(group.at_m) + distance * direction for distance in (group.come_from_m, group.radius_m))
+        near = np.array(group.at_m) + group.radius_m * direction
+        if group.come_from_deg:
+            side = np.radians(group.come_from_deg[number % len(group.come_from_deg)])
+            direction = np.array([np.cos(side), np.sin(side)])
+        far = near + (group.come_from_m - group.radius_m) * direction
         late_s = _ARRIVE_WITHIN_S * rng.uniform() if number else 0.0
         route = Route(
             (tuple(far), tuple(near)),
@@ -102,7 +106,7 @@ def placed(world: World, place: Place) -> World:
         roads={name: replace(road, points_m=_moved(road.points_m, place)) for name, road in world.roads.items()},
         things=tuple(_placed_thing(thing, place) for thing in world.things),
         people=tuple(_placed_thing(person, place) for person in world.people),
-        groups=tuple(replace(group, at_m=_moved((group.at_m,), place)[0]) for group in world.groups),
+        groups=tuple(_placed_group(group, place) for group in world.groups),
     )
 
 
@@ -127,6 +131,11 @@ def _turned(opening: Opening) -> Opening:
     """An opening after a quarter turn: +x along the walls north and south becomes +y, and +y along the others -x."""
     sign = 1.0 if opening.wall in {"north", "south"} else -1.0
     return replace(opening, wall=_TURNED[opening.wall], along_m=sign * opening.along_m)
+
+
+def _placed_group(group: Group, place: Place) -> Group:
+    sides = tuple(side + place.turn_deg for side in group.come_from_deg)
+    return replace(group, at_m=_moved((group.at_m,), place)[0], come_from_deg=sides)
 
 
 def _placed_thing(each: _Placed, place: Place) -> _Placed:

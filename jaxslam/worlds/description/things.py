@@ -183,7 +183,7 @@ class Person(ValidatedConfig):
 
 @dataclass(frozen=True)
 class Group(ValidatedConfig):
-    """People who come from all sides, stand together facing each other, and part again.
+    """People who come from all or some sides, stand together facing each other, and part again.
 
     Attributes:
         people: Number of people.
@@ -193,6 +193,8 @@ class Group(ValidatedConfig):
         meet_s: Time at which the first one arrives; the others follow within three seconds.
         stay_s: Time for which each of them stands there, then goes back and comes again after as long.
         speed_m_per_s: Speed at which they walk.
+        come_from_deg: Directions from which they come, in turn, from x toward y, such as `[0, 180]` along a corridor;
+            empty for all sides. They come side by side, so `come_from_m` is how far along the direction.
     """
 
     people: Annotated[int, Range(at_least=1, at_most=40)]
@@ -202,6 +204,7 @@ class Group(ValidatedConfig):
     meet_s: Annotated[float, Range(at_least=0)] = 5.0
     stay_s: Annotated[float, Range(at_least=0)] = 6.0
     speed_m_per_s: Annotated[float, Range(above=0, at_most=5)] = 1.0
+    come_from_deg: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()

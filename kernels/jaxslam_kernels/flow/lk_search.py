@@ -18,13 +18,18 @@ from jaxslam_kernels.image import patches
 from jaxslam_kernels.image.patches import Window
 from jaxslam_kernels.image.pyramid import Pyramid
 from jaxslam_kernels.program_parts import apart
+from jaxslam_kernels.robust import masked_median
 from jaxslam_kernels.types import Flag, Mask, Pixels, Scalar
 
-_NEAR_PX = 1.0
-"""How far from its start a point may be found at the finest level alone. A window of 21 draws from further, but not all
-the way to the right place: with 3.0, errors in the room `xyz` with two people are 1.12 times those without seeds (20
-runs each), with 1.0 they are 0.97 times. Those of the room `rpy` are 1.05 and 1.23 times as large, but with 1.0 those
-of three other rooms 1.0, 0.85 and 0.93 times (5 runs each): small changes of flow change each path by that much."""
+_NEAR_PX = 2.0
+"""How far from its start a point may be found at the finest level alone, and `_WORST_FIT` the largest residual it may
+have there, as a multiple of the seeds' median. The window draws from further, but what moves unlike its seed is then
+found where it fits badly: more than half a pixel off are, in a room with two people and in Bonn `crowd`, 0.43 and
+0.56 % of the points with 3 px and 32 seeds, 0.05 and 0.35 % with 2 px, 64 seeds and the largest residual."""
+_WORST_FIT = 2.0
+_PLENTY = 4
+"""How many times the number of seeds is enough points to search the others near them. Fewer are all searched from the
+coarsest level: in Bonn `crowd` the tracker loses its place in front of people who leave it ever fewer points."""
 
 
 class LevelPlan(NamedTuple):
@@ -69,13 +74,13 @@ class FlowPlan(NamedTuple):
             page faults alone.
         along_rows: Whether points only move along their row, as from left to right in a rectified pair. What the two
             images differ by in brightness over a window does not count then: two cameras expose apart.
-        seeds: Number of points that are searched from the coarsest level; 0 for all. The others begin at the finest
-            where the nearest seed has moved, and at the coarsest if they are not found within `_NEAR_PX` of there. A
+        seeds: Number of points that are searched from the coarsest level; 0 for all, and all are if there are at most
+            `_PLENTY` times as many. The others begin at the finest where the nearest seed has moved, and at the
+            coarsest if they do not fit well within `_NEAR_PX` of there. A
             handheld camera leaves the prediction by 4.5 pixels in the median, but nearly all points by the same
-            (fr1_rpy): with 32 seeds it is 0.4 from the nearest, and a frame takes 11.3 to 13.2 ms instead of 14.6 to
-            17.8 (Bonn crowd: 12.2 instead of 12.7; medians of runs in turn, AMD EPYC, one thread). Along a road,
-            neighbors at other depths move far apart: with `_NEAR_PX` of 3, KITTI 06 has 38 mm instead of 34 (medians of
-            30 seeds).
+            (fr1_rpy): with 64 seeds, live at 30 Hz, a frame has 0.85 of ORB-SLAM3's median time instead of 0.91, and
+            0.75 of its processor time instead of 0.80 (five runs in turn, AMD EPYC). Along a road, neighbors at other
+            depths move far apart: with 3 px and 32 seeds, KITTI 06 has 38 mm instead of 34 (medians of 30 seeds).
     """
 
     coarsest: LevelPlan = LevelPlan(21, 12, 0.2)
@@ -331,7 +336,8 @@ def _search_from_seeds(
 
     The three passes are one loop, so that the search is compiled once.
     """
-    is_seed = _evenly_chosen(usable, plan.seeds)
+    plenty = jnp.sum(usable, dtype=jnp.int32) > _PLENTY * plan.seeds
+    is_seed = jnp.where(plenty, _evenly_chosen(usable, plan.seeds), usable)
     far_chunk = partial(chunk, from_coarsest=jnp.array(True))
     shapes = jax.eval_shape(lambda: in_chunks(far_chunk, (points, guess, usable), usable, plan.chunk))
     nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
@@ -345,7 +351,8 @@ def _search_from_seeds(
         start = guess + shift
         found = in_chunks(partial(chunk, from_coarsest=~is_near), (points, start, wanted), wanted, plan.chunk)
         moved = jnp.sum(jnp.square(found.position - start), axis=0)
-        is_close = (found.last_step < plan.finest.accepted**2) & (moved < _NEAR_PX**2)
+        fits = found.residual < _WORST_FIT * masked_median(solution.residual, _found(solution, is_seed, plan))
+        is_close = (found.last_step < plan.finest.accepted**2) & (moved < _NEAR_PX**2) & fits
         known = wanted & (is_close | ~is_near)
         return (jax.tree.map(partial(jnp.where, known), found, solution), done | known), None
 
@@ -360,9 +367,14 @@ def _evenly_chosen(mask: Mask, number: int) -> Mask:
     return mask & (rank % stride == 0)
 
 
+def _found(solution: Solution, is_seed: Mask, plan: FlowPlan) -> Mask:
+    """Tell which points are seeds that were found."""
+    return is_seed & (solution.last_step < plan.finest.accepted**2) & (solution.texture > 0)
+
+
 def _shift_of_nearest(solution: Solution, points: Pixels, guess: Pixels, is_seed: Mask, plan: FlowPlan) -> Pixels:
     """For each point, the offset from its guess at which the nearest seed was found from its own; 0 if none was."""
-    found = is_seed & (solution.last_step < plan.finest.accepted**2) & (solution.texture > 0)
+    found = _found(solution, is_seed, plan)
     rank = jnp.cumsum(found, dtype=jnp.int32) - 1
     place = jnp.where(found, rank, plan.seeds)
     listed = lambda array: jnp.zeros((2, plan.seeds), array.dtype).at[:, place].set(array, mode="drop")
@@ -404,7 +416,7 @@ def search(
     def search_all(previous, current, points, guess, usable, min_texture):
         fixed = {"previous": previous, "current": current, "plan": plan, "min_texture": min_texture, "settle": settle}
         chunk = partial(_search_chunk, **fixed)
-        if plan.seeds > 0 and plan.seeds + plan.chunk < points.shape[1]:
+        if 0 < _PLENTY * plan.seeds < points.shape[1]:
             return _search_from_seeds(chunk, points, guess, usable, plan)
         return in_chunks(chunk, (points, guess, usable), usable, plan.chunk)
 

@@ -241,6 +241,25 @@ class TestSampleMask:
             best = masked.reshape(HEIGHT // CELL_PX, CELL_PX, -1, CELL_PX).max(axis=(1, 3)).ravel()
             np.testing.assert_array_equal(score[row, column], best[best >= 0])
 
+    def test_fast_corners_of_the_whole_image(self) -> None:
+        """The strongest one of each cell that has any, and a random pixel of other cells."""
+        gray = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH), np.uint8)
+        gray[:, : WIDTH // 2] = 90
+        gray[40:60, 50:90] = 200
+        score = np.zeros(gray.shape)
+        for corner in cv2.FastFeatureDetector.create(20).detect(gray):
+            column, row = map(int, corner.pt)
+            score[row, column] = corner.response
+        for rows, columns in ((slice(33, 120), slice(43, 230)), (slice(0, 240),) * 2):
+            mask = np.zeros(gray.shape, bool)
+            mask[rows, columns] = True
+            column, row = sample_mask(mask, gray, WIDTH * HEIGHT, 0, "fast").uv.astype(int)
+            masked = np.where(mask, score, -1)[:, : WIDTH // CELL_PX * CELL_PX]
+            best = masked.reshape(HEIGHT // CELL_PX, CELL_PX, -1, CELL_PX).max(axis=(1, 3)).ravel()
+            assert mask[row, column].all()
+            assert 4 < np.count_nonzero(best > 0) < np.count_nonzero(best >= 0)
+            np.testing.assert_array_equal(score[row, column], best[best >= 0])
+
     def test_fewer_than_cells(self) -> None:
         """They are all over the mask, not only where the picture has most texture."""
         gray, everywhere = np.zeros((HEIGHT, WIDTH), np.uint8), np.ones((HEIGHT, WIDTH), bool)

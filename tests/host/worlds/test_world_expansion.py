@@ -115,6 +115,18 @@ def test_a_group_meets_at_its_time_and_faces_its_middle():
         assert speed < 0.05
 
 
+def test_a_group_comes_along_a_corridor_side_by_side():
+    group = Group(4, (1.0, 0.3), radius_m=0.4, come_from_m=4.0, meet_s=8.0, stay_s=6.0, come_from_deg=(0, 180))
+    recording = WorldRecording(dataclasses.replace(SMALL, groups=(group,)))
+    walks = [each.walk for each in recording.instances[-4:]]
+    at = lambda time_s: np.array([walk(np.array([time_s])).position[0, :2] for walk in walks]) - group.at_m
+    many = np.array([at(time_s) for time_s in np.arange(0, 40, 0.25)])
+    assert np.abs(many[:, :, 1]).max() < 0.41
+    assert (np.sign(at(3.0)[:, 0]) == [1, -1, 1, -1]).all()
+    assert np.abs(at(3.0)[:, 0]).min() > 3.0
+    assert np.linalg.norm(at(12.0), axis=1).max() < 0.45
+
+
 def test_someone_sits_and_sways():
     seated = dataclasses.replace(SMALL, people=(Person((1.5, -0.3), 180.0, sits=True),), way=WAY)
     recording = WorldRecording(seated)

@@ -1,7 +1,5 @@
 """Optical flow against OpenCV's and against known warps, in batches, and its failures."""
 
-from functools import partial
-
 import cv2
 import jax
 import jax.numpy as jnp
@@ -106,9 +104,7 @@ class TestMatchesReference:
         truth = known.move(points) + np.where(moved, np.array([[13.0], [-9.0]]), 0)
         sure = known.visible(points) & (moved | ~within(known.move(points), (80, 40), (240, 210)))
         inputs = Inputs(known.previous.astype(np.float32), current, points, points, sure, np.float32(1))
-        by_seeds, by_all = (
-            quick_compile(flow_of(partial(lk_flow, plan=FlowPlan(seeds=seeds)), 4))(inputs) for seeds in (32, 0)
-        )
+        by_seeds, by_all = (quick_compile(flow_of(lk_flow, 4, FlowPlan(seeds=seeds)))(inputs) for seeds in (32, 0))
         for part in (sure & moved, sure & ~moved):
             right, expected = (distances(flow.points, truth)[part] < 1 for flow in (by_seeds, by_all))
             assert part.sum() > 15
@@ -116,6 +112,18 @@ class TestMatchesReference:
             both = np.asarray(by_seeds.ok & by_all.ok)[part] & right & expected
             apart = distances(by_seeds.points, by_all.points)[part][both]
             assert np.mean(apart < 0.05) > 0.98
+
+    def test_few_points_are_all_searched_from_the_coarsest_level(self):
+        """Where masks leave fewer than four times the number of seeds: to the byte as without seeds."""
+        image = picture(320, 240)
+        points = corners(image, 300, distance=5)
+        known = warp(image, 9, seed=3)
+        previous, current = known.previous.astype(np.float32), known.current.astype(np.float32)
+        by_seeds, by_all = (quick_compile(flow_of(lk_flow, 4, FlowPlan(seeds=seeds))) for seeds in (32, 0))
+        for kept, same in ((128, True), (300, False)):
+            inputs = Inputs(previous, current, points, points, np.arange(points.shape[1]) < kept, np.float32(1))
+            found, expected = (np.asarray(flow(inputs).points)[:, :kept] for flow in (by_seeds, by_all))
+            assert np.array_equal(found, expected) == same
 
     def test_guess_carries_a_large_motion(self):
         """From a good guess a motion is found that is out of reach otherwise."""
