@@ -78,8 +78,8 @@ class FlowPlan(NamedTuple):
             `_PLENTY` times as many. The others begin at the finest where the nearest seed has moved, and at the
             coarsest if they do not fit well within `_NEAR_PX` of there. A
             handheld camera leaves the prediction by 4.5 pixels in the median, but nearly all points by the same
-            (fr1_rpy): with 64 seeds, live at 30 Hz, a frame has 0.85 of ORB-SLAM3's median time instead of 0.91, and
-            0.75 of its processor time instead of 0.80 (five runs in turn, AMD EPYC). Along a road, neighbors at other
+            (fr1_rpy): with 64 seeds, live at 30 Hz, a frame has 0.86 of ORB-SLAM3's median time instead of 0.91, and
+            0.77 of its processor time instead of 0.80 (five runs in turn, AMD EPYC). Along a road, neighbors at other
             depths move far apart: with 3 px and 32 seeds, KITTI 06 has 38 mm instead of 34 (medians of 30 seeds).
     """
 
