@@ -142,8 +142,8 @@ def _noisier(key: Key[Array, ""], frame: PointSamples, noise: Scalar) -> PointSa
     uneven = jax.random.uniform(of_regions, (2, num + 1), dtype, -0.5, 0.5) * noise
     factor = jnp.exp(whole + uneven)[:, jnp.where(frame.region_of >= 0, frame.region_of, num)]
     px, sigmas = frame.points[_PIXELS], frame.points[_SIGMAS]
-    px = jnp.log1p(jnp.expm1(px) * factor[0])
-    sigmas = jnp.arcsinh(jnp.sinh(2 * sigmas) * factor[1]) / 2
+    px = jnp.log1p(jnp.expm1(px) * factor[:1])
+    sigmas = jnp.arcsinh(jnp.sinh(2 * sigmas) * factor[1:]) / 2
     return frame._replace(points=frame.points.at[_PIXELS].set(px).at[_SIGMAS].set(sigmas))
 
 
