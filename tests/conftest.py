@@ -5,8 +5,8 @@ import os
 from pathlib import Path
 
 import jax
-import jaxlib.version
 import pytest
+from fast_compile_flags import FAST_COMPILE_FLAGS
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -19,15 +19,6 @@ _FOR_ALL = (
 )
 
 
-_OLDER_GENERATOR = "--xla_cpu_use_fusion_emitters=false"
-"""XLA's older generator of code, which the tracker is compiled by. XLA ends a process that names an unknown option."""
-_COMPILES_FAST = [
-    *([_OLDER_GENERATOR] if jaxlib.version.__version_info__ < (0, 11, 1) else []),
-    "--xla_cpu_parallel_codegen_split_count=1",  # a program as one module: 6 % faster
-]
-"""As in `.ci/run`, whose gates load what tests have compiled."""
-
-
 def pytest_configure(config: pytest.Config) -> None:
     """Tests compile more than they compute, so they compile fast; benchmarks have kernels as users have them.
 
@@ -35,7 +26,7 @@ def pytest_configure(config: pytest.Config) -> None:
     """
     if "benchmark" not in config.option.markexpr.replace("not benchmark", ""):
         flags = os.environ.get("XLA_FLAGS", "").split()
-        os.environ["XLA_FLAGS"] = " ".join([*flags, *(flag for flag in _COMPILES_FAST if flag not in flags)])
+        os.environ["XLA_FLAGS"] = " ".join([*flags, *(flag for flag in FAST_COMPILE_FLAGS if flag not in flags)])
 
 
 def pytest_sessionstart() -> None:

@@ -33,8 +33,8 @@ def collector_paused() -> Iterator[None]:
                 gc.enable()
 
 
-_NO_ONES = 1000
-"""Frozen objects that a program has not frozen itself: Python 3.12 starts with 375."""
+_FROZEN_BY_PYTHON = 1000
+"""More objects than Python itself freezes as it starts: 375 in Python 3.12."""
 
 
 @contextmanager
@@ -43,7 +43,7 @@ def garbage_frozen() -> Iterator[None]:
 
     Python thaws all objects or none: in a program that has frozen its own, these stay frozen too.
     """
-    is_own = gc.get_freeze_count() < _NO_ONES
+    is_own = gc.get_freeze_count() < _FROZEN_BY_PYTHON
     gc.collect()
     gc.freeze()
     try:

@@ -11,12 +11,13 @@ quick_compile = partial(jax.jit, compiler_options={"xla_backend_optimization_lev
 """Compiling is what such tests cost: less than half of it so, and the code LLVM leaves as it is runs as correctly."""
 
 
-def quick_compile_nested(function: Callable[..., Any]) -> Callable[..., Any]:
+def quick_compile_nested(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
     """`quick_compile` for a function that is also differentiated, batched or called by other compiled functions.
 
-    JAX takes compiler options at the outermost call only: where an argument is traced, the function has none.
+    JAX takes compiler options at the outermost call only: where an argument is traced, the function has none. Other
+    options of `jax.jit` hold for both.
     """
-    outermost, part = quick_compile(function), jax.jit(function)
+    outermost, part = quick_compile(function, **options), jax.jit(function, **options)
 
     @wraps(function)
     def call(*arguments: Any, **named: Any) -> Any:

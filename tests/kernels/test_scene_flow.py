@@ -39,20 +39,14 @@ def _scene(seed=0, dtype: Any = np.float64):
     return X_world.astype(dtype), X_cam.astype(dtype), pose.astype(dtype), group.astype(np.int32)
 
 
+@partial(quick_compile_nested, static_argnames="robust")
 def _state(X_world, X_cam, pose, group, robust=True) -> tuple[jax.Array, GroupMotion]:
     """The limit of the points of the first groups, and how all groups move by it."""
-    return _STATES[robust](X_world, X_cam, pose, group)
-
-
-def _state_of(X_world, X_cam, pose, group, robust) -> tuple[jax.Array, GroupMotion]:
     flow = scene_flow(jnp.asarray(X_world), jnp.asarray(X_cam), SE3(jnp.asarray(pose)))
     length = flow_length(flow)
     limit = upper_limit(length, (jnp.asarray(group) < K - 1).astype(flow.dtype), 3.0, robust=robust)
     moves = (length > limit).astype(flow.dtype)
     return limit, group_motion(flow, moves, jnp.ones(N, bool), jnp.asarray(group), K)
-
-
-_STATES = {robust: quick_compile_nested(partial(_state_of, robust=robust)) for robust in (True, False)}
 
 
 def test_shapes():

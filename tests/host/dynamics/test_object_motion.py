@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from jaxlie import SE3
 from parked_object import WITHIN, verdicts
+from quick_compile import quick_compile_nested
 
 from jaxslam import Slam, load_config
 from jaxslam.dynamics.object_motion import (
@@ -46,7 +47,7 @@ def _motion(**changes: float) -> Any:
     return PARAMS.motion._replace(**{key: jnp.asarray(value) for key, value in changes.items()})
 
 
-_classify = jax.jit(classify_motion, static_argnames="as_published")
+_classify = quick_compile_nested(classify_motion, static_argnames="as_published")
 
 
 def _judged(

@@ -114,7 +114,7 @@ class TestMatchesReference:
             assert np.mean(apart < 0.05) > 0.98
 
     def test_few_points_are_all_searched_from_the_coarsest_level(self):
-        """Where masks leave fewer than four times the number of seeds: to the byte as without seeds."""
+        """At most four times the number of seeds, such as masks leave, are found to the byte as without seeds."""
         image = picture(320, 240)
         points = corners(image, 300, distance=5)
         known = warp(image, 9, seed=3)
