@@ -123,7 +123,7 @@ def _fast_score(gray: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
     found = cv2.FastFeatureDetector.create(_FAST_THRESHOLD).detect(gray)
     score = np.zeros(gray.shape, np.float32)
     if found:
-        column, row = cv2.KeyPoint.convert(found).astype(int).T
+        column, row = np.array(cv2.KeyPoint.convert(found)).astype(int).T
         score[row, column] = [corner.response for corner in found]
     return score
 

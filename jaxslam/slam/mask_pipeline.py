@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, UInt8
 from jaxslam.config.schema import Config
 from jaxslam.masks.background_depth import SurfaceMemory
 from jaxslam.masks.box_to_mask import dilated
+from jaxslam.masks.point_sampling import CornerKind
 from jaxslam.masks.propagation import PYRAMID_LEVELS, follow, make_origin, predicted_mask
 from jaxslam.runtime.aligned_memory import aligned_array
 from jaxslam.runtime.compiled import committed, compiled
@@ -115,7 +116,7 @@ class MaskPipeline:
         """
         self._propagate, self._new_surfaces = config.semantics.propagate, config.dynamics.new_surfaces
         self._dilate_px, self._seed = config.semantics.dilate_px, config.run.seed
-        self._corners = config.semantics.mask_corners
+        self._corners: CornerKind = config.semantics.mask_corners
         self._reduced = Downscaler(ImageGrid.of(camera), WIDTH_PX)
         self._semantics = None if detector is None else SemanticThread(detector, self._reduced, config, times)
         self._farthest_m = max_valid_depth(camera, config.track)

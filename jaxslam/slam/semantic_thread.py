@@ -13,6 +13,7 @@ from jaxtyping import UInt8
 
 from jaxslam.config.schema import Config
 from jaxslam.masks.box_to_mask import instance_labels, mask_of_detections, reduced_detections
+from jaxslam.masks.point_sampling import CornerKind
 from jaxslam.masks.propagation import TrackedMask, make_origin
 from jaxslam.runtime.stage_timer import StageTimes
 from jaxslam.runtime.worker import InlineWorker, Worker, make_worker
@@ -103,7 +104,8 @@ class SemanticThread:
         self._offered: int | None = None
         self._detector, self._reduced, self._seed = detector, reduced, config.run.seed
         self._focal_px, self._numbers_objects = float(reduced.raster.intrinsics.fx), config.dynamics.motion.enabled
-        latency_frames, self._corners = config.semantics.latency_frames, config.semantics.mask_corners
+        latency_frames = config.semantics.latency_frames
+        self._corners: CornerKind = config.semantics.mask_corners
         self._all_wait, self._begun, self._failures = latency_frames == 0, False, ErrorLog()
         self._worker: Worker[DetectionJob, DetectedMask] = make_worker(
             (times or StageTimes()).timed("detector", self._look),
