@@ -16,6 +16,7 @@ _FOR_ALL = (
     "jax_persistent_cache_min_compile_time_secs",
     "jax_numpy_dtype_promotion",
     "jax_numpy_rank_promotion",
+    "jax_traceback_in_locations_limit",
 )
 
 
@@ -29,6 +30,11 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ["XLA_FLAGS"] = " ".join([*flags, *(flag for flag in FAST_COMPILE_FLAGS if flag not in flags)])
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Do not import benchmarks that will not run: six seconds of each process."""
+    return True if collection_path.name == "benchmarks" and "not benchmark" in config.option.markexpr else None
+
+
 def pytest_sessionstart() -> None:
     """One thread for each worker, and every program compiled once for all processes: pytest's, and those tests start.
 
@@ -38,7 +44,8 @@ def pytest_sessionstart() -> None:
     from jaxslam.runtime.threads import prefer_one_thread  # noqa: PLC0415 - before it there are no type checks
 
     prefer_one_thread()
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # a small one is loaded in a tenth of its time
+    jax.config.update("jax_traceback_in_locations_limit", 0)  # lines of Python in programs: a tenth of the time
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)  # to store a smaller one takes as long
     enable_compile_cache()
     for name in _FOR_ALL:
         os.environ[name.upper()] = str(jax.config.values[name])

@@ -21,10 +21,13 @@ SETTINGS = [
 ]
 """The same as overrides of a preset: pictures of this size need no other tracker."""
 
+_SOURCE = SyntheticDataset(SyntheticConfig(width=WIDTH, height=HEIGHT, frames=FRAMES, people=0, path="loop", fps=FPS))
+CAMERA = _SOURCE.camera
+
 
 def room() -> Clip:
-    """The recording; the list of frames is the caller's own."""
-    return Clip(_source(), _frames())
+    """The recording, rendered once a process; the list of frames is the caller's own."""
+    return Clip(_SOURCE, _frames())
 
 
 @functools.cache
@@ -37,10 +40,5 @@ def other_room() -> Clip:
 
 
 @functools.cache
-def _source() -> SyntheticDataset:
-    return SyntheticDataset(SyntheticConfig(width=WIDTH, height=HEIGHT, frames=FRAMES, people=0, path="loop", fps=FPS))
-
-
-@functools.cache
 def _frames() -> tuple[Frame, ...]:
-    return tuple(_source()[index] for index in range(FRAMES))
+    return tuple(_SOURCE[index] for index in range(FRAMES))

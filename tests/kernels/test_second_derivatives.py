@@ -233,6 +233,7 @@ class TestThroughScan:
         np.testing.assert_allclose(second, curvature(self.unrolled), rtol=1e-6, atol=1e-9 * np.abs(second).max())
 
 
+@pytest.mark.slow
 def test_of_what_is_undetermined():
     """Points on one line, or too few: no derivative, and no NaN."""
     T, X_world, uv = pose_inputs()

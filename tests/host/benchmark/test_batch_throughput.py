@@ -98,6 +98,7 @@ class TestTrackClips:
         np.testing.assert_allclose(found.T_world_cam[0], alone.T_world_cam[0], atol=SAME_M)
         assert found.status.tolist() == [alone.status[0].tolist(), [TrackStatus.LOST] * FRAMES]
 
+    @pytest.mark.slow
     def test_seeds_of_each(self, task: Task, alone: TrackedClips) -> None:
         """Pose hypotheses are drawn anew, and the poses are as good."""
         clip = task.rooms[0].frames
@@ -106,6 +107,7 @@ class TestTrackClips:
         off = np.linalg.norm(found.T_world_cam[1, :, 4:] - found.T_world_cam[0, :, 4:], axis=1)
         assert 0 < off.max() < 0.02
 
+    @pytest.mark.slow
     def test_same_bytes_again(self, task: Task, alone: TrackedClips) -> None:
         clips = [room.frames for room in task.rooms[:2]]
         first, second = (track_clips(clips, task.params, task.plan) for _ in range(2))
@@ -211,6 +213,7 @@ class TestMeasure:
         monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
         assert ways(16) == [Way(16, 1)]
 
+    @pytest.mark.slow
     def test_difference_is_seen(self, task: Task, alone: TrackedClips, monkeypatch: pytest.MonkeyPatch) -> None:
         """A loop that is 1 cm and a status off."""
         moved = TrackedClips(alone.T_world_cam + np.eye(7)[6] * 0.01, np.full_like(alone.status, TrackStatus.WEAK))

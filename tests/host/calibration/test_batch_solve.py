@@ -98,6 +98,7 @@ def test_noise_is_found(fitted: tuple[BatchProblem, BatchSolution]) -> None:
     assert noisy.noise.depth == pytest.approx(0.5, rel=0.15)  # the simulation states twice its noise
 
 
+@pytest.mark.slow
 def test_what_the_depths_of_a_point_share_is_found() -> None:
     """Shared errors of twice the single ones are told from those, and fewer of them make the offset surer."""
     rng, given = np.random.default_rng(5), problem(TRUTH)
@@ -138,6 +139,7 @@ def test_no_residual_knows_the_scale() -> None:
     np.testing.assert_allclose(larger[seen], same[seen], atol=2e-3)
 
 
+@pytest.mark.slow
 def test_gate_takes_what_is_wrong_and_leaves_what_is_right() -> None:
     truth = TRUTH.copy()
     truth[11] = 0.0  # a global shutter, as the start says

@@ -82,6 +82,7 @@ class TestOwnCue:
         np.testing.assert_allclose(passed.T_world_cam.wxyz_xyz, without.T_world_cam.wxyz_xyz, atol=1e-6)
         assert without.cue_results == ()
 
+    @pytest.mark.slow
     def test_parameters_do_not_compile_anew(self) -> None:
         traces = 0
 

@@ -223,6 +223,7 @@ def test_too_little_to_be_certain(round_map):
         assert (matched is not None) == certain
 
 
+@pytest.mark.slow
 def test_compiles_once(round_map, monkeypatch):
     for module, name in ((view_matching, "_agreed"), (feature_pose, "_refined")):
         monkeypatch.setattr(

@@ -71,17 +71,22 @@ def test_a_keyframe_that_shares_few_points_leaves_where_others_show_its_view(num
 
 
 @pytest.mark.parametrize(
-    ("slam_map", "latest", "what"),
+    ("pose", "num_shown", "latest", "what"),
     [
-        (isolated(at(), 15), 1 + KEEP_LATEST, "it shares enough points"),
-        (isolated(BEHIND, 0), 1 + KEEP_LATEST, "nothing else shows its view"),
-        (isolated(at(), 0), KEEP_LATEST, "the root of the submap"),
-        (isolated(at(), 0), KEEP_LATEST - 5, "a young one"),
-        (without_isolated(isolated(at(), 0), 1 + KEEP_LATEST), 1 + KEEP_LATEST, "it has left"),
+        (at(), 15, 1 + KEEP_LATEST, "it shares enough points"),
+        (BEHIND, 0, 1 + KEEP_LATEST, "nothing else shows its view"),
+        (at(), 0, KEEP_LATEST, "the root of the submap"),
+        (at(), 0, KEEP_LATEST - 5, "a young one"),
     ],
 )
-def test_a_keyframe_stays(slam_map: Map, latest: int, what: str) -> None:
+def test_a_keyframe_stays(pose: np.ndarray, num_shown: int, latest: int, what: str) -> None:
+    slam_map = isolated(pose, num_shown)
     assert without_isolated(slam_map, latest) is slam_map, what
+
+
+def test_a_keyframe_leaves_once() -> None:
+    slam_map = without_isolated(isolated(at(), 0), 1 + KEEP_LATEST)
+    assert without_isolated(slam_map, 1 + KEEP_LATEST) is slam_map
 
 
 @pytest.mark.slow

@@ -582,6 +582,7 @@ class TestRoomWithPeople:
         np.testing.assert_array_equal(one.trajectory, off.trajectory)
         assert same(one.map.with_arrays(points=one.map.points._replace(state=off.map.points.state)), off.map)
 
+    @pytest.mark.slow
     def test_off_computes_nothing(self, monkeypatch: pytest.MonkeyPatch) -> None:
         def never(*_: object, **__: object) -> None:
             raise AssertionError("states were followed")

@@ -73,6 +73,7 @@ def test_the_images_tell_the_bias() -> None:
     assert after < 5e-4
 
 
+@pytest.mark.slow
 def test_it_is_believed_by_how_well_it_has_done() -> None:
     """Images that are apart from it by a millirad each time, as those of another clock, make it uncertain by that."""
     gyro, random = Gyro(SHEET), np.random.default_rng(0)

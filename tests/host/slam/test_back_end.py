@@ -119,7 +119,8 @@ def write_run(folder: Path) -> None:
 
 
 class TestCompiling:
-    @pytest.mark.parametrize("config", [pytest.param(INLINE, marks=pytest.mark.slow), LIVE], ids=["inline", "live"])
+    @pytest.mark.slow
+    @pytest.mark.parametrize("config", [INLINE, LIVE], ids=["inline", "live"])
     def test_nothing_while_frames_come(self, compiled: list[str], config: Config) -> None:
         """Not for the work of mapping, a loss and a place recognized, corrections and recalls."""
         jax.clear_caches()
@@ -151,7 +152,7 @@ class TestClose:
         ("owner", "method"),
         [
             (LocalMapping, "add"),
-            (LoopClosing, "look"),
+            pytest.param(LoopClosing, "look", marks=pytest.mark.slow),
             pytest.param(LocalMapping, "close_loop", marks=pytest.mark.slow),
         ],
     )

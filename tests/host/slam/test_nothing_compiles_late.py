@@ -122,9 +122,8 @@ def test_loops_of_a_loaded_map(monkeypatch: pytest.MonkeyPatch) -> None:
     assert sizes == [64, 256]
 
 
-@pytest.mark.parametrize(
-    "num_keyframes", [65, pytest.param(257, marks=pytest.mark.slow), pytest.param(1025, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("num_keyframes", [65, 257, 1025])
 def test_loops_of_a_map_that_grows(compiled: list[str], num_keyframes: int) -> None:
     """The graph that a map outgrows its last one with is there when it does: it was begun at half of that."""
     slam_map = small_map(num_keyframes)

@@ -131,6 +131,7 @@ class TestCompiling:
         assert len(compiled) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 class TestMemory:
     def test_is_flat(self, slam: Slam) -> None:

@@ -46,6 +46,7 @@ def test_of_zeros_and_ones_is_as_of_bool(frames: FrameArrays, hard: tuple[TrackS
     assert not (hard[0].points.valid & (hard[0].points.uv[0] < WIDTH // 3 - 1)).any()
 
 
+@pytest.mark.slow
 def test_between_them_points_count_in_part(frames: FrameArrays, hard: tuple[TrackState, TrackOutput]) -> None:
     """A mask of 0.25 leaves all points with three quarters of their weight, in the pose and in keyframes."""
     quarter = jnp.full(frames.ignore.shape, 0.25)

@@ -351,6 +351,7 @@ def test_a_start_at_a_recognized_place_keeps_the_velocity(counted: Counted, fram
     assert not np.asarray(output.twist).any()
 
 
+@pytest.mark.slow
 def test_pairs_are_matched_by_the_plan(monkeypatch: pytest.MonkeyPatch) -> None:
     """Followed points, those looked up and new ones; with `exact` to the end: derivatives by pictures were 27 % off."""
     given: list[FlowPlan] = []
@@ -383,6 +384,7 @@ def step() -> Step:
     return quick_compile(lambda s, f, p: track_step(s, f, p, ALONE))
 
 
+@pytest.mark.slow
 class TestFollowingAlone:
     """As the preset `static` has it: nothing is looked up, and new points come in keyframes only."""
 
@@ -406,7 +408,6 @@ class TestFollowingAlone:
             seen |= now
         return np.array(new)
 
-    @pytest.mark.slow
     def test_nothing_is_looked_up(self, step: Step) -> None:
         outputs = self.outputs(step, keyframe_points_below=0.5, keyframe_weak_after_s=0.0)
         assert [int(output.status) for output in outputs] == [TrackStatus.STARTED] + [TrackStatus.OK] * (LONGER - 1)

@@ -154,7 +154,9 @@ def test_missing_depth_of_people_stays_missing(crowded):
     assert max(missing) < 0.2
 
 
-@pytest.mark.parametrize("network", ["yolov8n-seg_int8", "deeplabv3_mobilenetv2_dm05_voc"])
+@pytest.mark.parametrize(
+    "network", [pytest.param("yolov8n-seg_int8", marks=pytest.mark.slow), "deeplabv3_mobilenetv2_dm05_voc"]
+)
 def test_networks_find_the_people(people, network):
     world = dataclasses.replace(ROOM, seconds=10.0, real_people=dataclasses.replace(people, from_s=12.0))
     recording = WorldRecording(dataclasses.replace(world, camera=WorldCamera(fx=555.0)))

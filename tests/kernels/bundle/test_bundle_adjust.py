@@ -215,7 +215,9 @@ def _pose_errors(poses, others) -> float:
     return max(max(pose_error(a, b)) for a, b in zip(poses, others, strict=True))
 
 
-LOSSES = [pytest.param(loss, marks=pytest.mark.slow) if loss == "geman_mcclure" else loss for loss in get_args(Loss)]
+LOSSES = [
+    loss if loss in ("squared", "cauchy") else pytest.param(loss, marks=pytest.mark.slow) for loss in get_args(Loss)
+]
 """SciPy takes a minute with the one that is marked."""
 
 

@@ -126,8 +126,15 @@ def test_shapes():
 
 
 class TestMatchesReference:
-    @pytest.mark.parametrize("sim3", [False, True])
-    @pytest.mark.parametrize("loss", ["squared", "cauchy"])
+    @pytest.mark.parametrize(
+        ("sim3", "loss"),
+        [
+            (False, "squared"),
+            (True, "cauchy"),
+            pytest.param(False, "cauchy", marks=pytest.mark.slow),
+            pytest.param(True, "squared", marks=pytest.mark.slow),
+        ],
+    )
     def test_matches_reference(self, sim3, loss):
         """The optimum of `scipy.optimize.least_squares` with differences for derivatives."""
         graph = loop_graph(1, 14, sim3=sim3)
