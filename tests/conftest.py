@@ -16,7 +16,6 @@ _FOR_ALL = (
     "jax_persistent_cache_min_compile_time_secs",
     "jax_numpy_dtype_promotion",
     "jax_numpy_rank_promotion",
-    "jax_traceback_in_locations_limit",
 )
 
 
@@ -44,8 +43,7 @@ def pytest_sessionstart() -> None:
     from jaxslam.runtime.threads import prefer_one_thread  # noqa: PLC0415 - before it there are no type checks
 
     prefer_one_thread()
-    jax.config.update("jax_traceback_in_locations_limit", 0)  # lines of Python in programs: a tenth of the time
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)  # to store a smaller one takes as long
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # a small one is loaded in a tenth of its time
     enable_compile_cache()
     for name in _FOR_ALL:
         os.environ[name.upper()] = str(jax.config.values[name])
