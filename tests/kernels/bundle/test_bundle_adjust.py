@@ -218,7 +218,7 @@ def _pose_errors(poses, others) -> float:
 LOSSES = [
     loss if loss in ("squared", "cauchy") else pytest.param(loss, marks=pytest.mark.slow) for loss in get_args(Loss)
 ]
-"""SciPy takes a minute with the one that is marked."""
+"""SciPy takes a minute with `geman_mcclure`."""
 
 
 @pytest.fixture(params=[True, pytest.param(False, marks=pytest.mark.slow)], ids=["double", "single"])
