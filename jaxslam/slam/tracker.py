@@ -152,8 +152,8 @@ class Tracker:
         params = track_params(camera, with_dense_keyframes(config))._replace(restart_after=jnp.float32(jnp.inf))
         self.params = with_cue_params(params, config.dynamics)
         self.plan = with_cues(track_plan(config.track), config.dynamics, pairs=camera.is_stereo)
-        if camera.is_stereo:  # along a road, neighbors at other depths move far apart
-            self.plan = self.plan._replace(flow=self.plan.flow._replace(seeds=0))
+        if camera.is_stereo:  # along a road, neighbors at other depths move far apart; for brightness see FlowPlan
+            self.plan = self.plan._replace(flow=self.plan.flow._replace(seeds=0, ignores_brightness=False))
         # ORB-SLAM's local mapping does not accept keyframes either while it is busy.
         patient_s = max(_PATIENT_S, config.track.keyframe_weak_after_s)
         self._params_for = {

@@ -132,7 +132,7 @@ class TrackPlan(NamedTuple):
         new_points: Frames in which new points are detected: `always` for every frame with too few points, or
             `keyframes` for keyframes only.
         flow: Settings of the optical flow from frame to frame. `Slam` searches all points of stereo pairs from the
-            coarsest level.
+            coarsest level, and lets their brightness count.
         look_up: Settings of the alignment of keyframe points. A window of 21 takes 1 ms more per frame and is not more
             accurate; 17, 15 and 13 are alike: TUM `fr1_rpy` 10.2, 10.2, 10.2 mm, Bonn `crowd` (start) 9.7, 9.6, 9.5.
         cues: Functions that find dynamic points (`dynamics.cue.Cue`), in the order of `TrackParams.cues`.

@@ -43,8 +43,8 @@ track = jax.jit(flow_of(lk_flow, 2))
 
 def weighted_sum(flow, weights):
     """A loss that touches every differentiable output of every point."""
-    terms = (weights[:2] * flow.points, weights[2:3] * flow.residual[None], weights[3:] * flow.texture[None])
-    return sum(jnp.sum(term) for term in terms)
+    outputs = (*flow.points, flow.residual, flow.texture, flow.correlation)
+    return sum(jnp.sum(weight * output) for weight, output in zip(weights, outputs, strict=True))
 
 
 def with_gradient(run):
@@ -58,8 +58,8 @@ def with_gradient(run):
 
 
 def random_weights(seed, dtype: type = np.float64):
-    scale = np.array([[1.0], [1.0], [0.1], [0.01]])
-    return (np.random.default_rng(seed).normal(size=(4, N)) * scale).astype(dtype)
+    scale = np.array([[1.0], [1.0], [0.1], [0.01], [10.0]])
+    return (np.random.default_rng(seed).normal(size=(5, N)) * scale).astype(dtype)
 
 
 def image_pair(seed=0, shift_px=4.0, dtype: type = np.float32):

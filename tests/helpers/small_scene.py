@@ -28,6 +28,7 @@ TRACK = TrackConfig(
     points_per_source=64,
     num_hypotheses=32,
     cell_px=10,
+    weak_inliers=30,
 )
 SETTINGS = [
     f"track.{field.name}={getattr(TRACK, field.name)}"

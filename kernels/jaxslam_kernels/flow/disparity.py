@@ -28,7 +28,7 @@ class Disparities(NamedTuple):
     Attributes:
         disparity: `(n,)` disparity in pixels; 0 where it was not found.
         found: `(n,)` true where it was found and the search back ended at the point.
-        residual: `(n,)` mean absolute difference of intensity over the window.
+        residual: `(n,)` mean absolute difference of intensity over the window, from the mean difference.
     """
 
     disparity: Weights

@@ -233,7 +233,7 @@ class TestFewFeatures:
         def off_and_sigma_m() -> np.ndarray:
             """Root mean squares over some frames."""
             each = []
-            for index in range(LATER - 6, LATER + 1):
+            for index in range(LATER - 13, LATER - 6):
                 found, true = match(mapped()[0], index, np.zeros(6), self.within(50, 30, 1000, index))
                 assert found is not None
                 off_m = np.linalg.norm(between(true, found.T_origin_cam)[4:])

@@ -261,8 +261,7 @@ class TestGlobalAdjustment:
             LoopClosing, "look", lambda self, slam_map, number: loop_at(slam_map, number) if number in (1, 2) else None
         )
         with new_slam() as slam:
-            for frame in _frames()[: third + 20]:
-                slam.track(frame)
+            *_, before = [slam.track(frame) for frame in _frames()[: third + 20]]
             assert third - second < 10 * INLINE.mapping.latency_frames
             slam.finish()
             assert slam.loops_closed == 2
@@ -271,8 +270,12 @@ class TestGlobalAdjustment:
             there = np.isin(taken[0].keyframes, slam.map.ids)
             poses = np.array([slam.map.pose(int(number)) for number in taken[0].keyframes[there]])
             np.testing.assert_allclose(poses, taken[0].T_world_cam[there], atol=0.02)  # local adjustment came after it
+            truth = recording().ground_truth
+            assert truth is not None
+            moved = between(truth.T_world_cam[third + 19], truth.T_world_cam[third + 20])
             last = slam.track(_frames()[third + 20])
-            assert np.linalg.norm(last.correction[4:]) < 0.02
+            seen = between(compose(last.correction, before.T_world_cam), last.T_world_cam)
+            assert np.linalg.norm(seen[4:] - moved[4:]) < 0.01
             assert problems(slam.map) == []
 
     def test_on_request_and_not_without_the_setting(self, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -68,7 +68,7 @@ class TestGradient:
             np.testing.assert_allclose(reverse, weighted_sum(forward, weights), rtol=1e-9)
             name = inputs._fields[which]
             ahead, behind = (_exact(inputs._replace(**{name: inputs[which] + e * direction})) for e in (eps, -eps))
-            for output, atol in (("points", 1e-7), ("residual", 1e-6), ("texture", 1e-5)):
+            for output, atol in (("points", 1e-7), ("residual", 1e-6), ("texture", 1e-5), ("correlation", 1e-8)):
                 numeric = (getattr(ahead, output) - getattr(behind, output))[..., tracked] / (2 * eps)
                 np.testing.assert_allclose(getattr(forward, output)[..., tracked], numeric, rtol=1e-6, atol=atol)
 
