@@ -16,6 +16,7 @@ _FOR_ALL = (
     "jax_persistent_cache_min_compile_time_secs",
     "jax_numpy_dtype_promotion",
     "jax_numpy_rank_promotion",
+    "jax_traceback_in_locations_limit",
 )
 
 
@@ -44,6 +45,7 @@ def pytest_sessionstart() -> None:
 
     prefer_one_thread()
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # a small one is loaded in a tenth of its time
+    jax.config.update("jax_traceback_in_locations_limit", 0)  # 10 % of the time of the kernels' tests
     enable_compile_cache()
     for name in _FOR_ALL:
         os.environ[name.upper()] = str(jax.config.values[name])

@@ -94,12 +94,17 @@ class TestWritten:
 class TestCompiled:
     @pytest.fixture(autouse=True)
     def _cached_with_its_origin(self) -> Iterator[None]:
-        """Without it the cache gives a program whose functions are those of another checkout that compiled the same."""
-        name = "jax_compilation_cache_include_metadata_in_key"
-        before = jax.config.values[name]
-        jax.config.update(name, True)
+        """Without it the cache gives a program whose functions are those of another checkout that compiled the same.
+
+        Other tests trace without locations.
+        """
+        settings = {"jax_compilation_cache_include_metadata_in_key": True, "jax_traceback_in_locations_limit": 100}
+        before = {name: jax.config.values[name] for name in settings}
+        for name, value in settings.items():
+            jax.config.update(name, value)
         yield
-        jax.config.update(name, before)
+        for name, value in before.items():
+            jax.config.update(name, value)
 
     def test_one_addition(self) -> None:
         def plus_one(x: jax.Array) -> jax.Array:
