@@ -243,6 +243,7 @@ class TestSamePlan:
         with pytest.raises(BenchmarkError, match=r"sequences\.room\.room\.frames: 12, now 4; runs: 2, now 1"):
             check_same_plan(baseline(), other)
 
-    def test_that_of_the_project_is_what_its_suite_runs_now(self) -> None:
-        ours = load_baseline(ROOT / ".ci" / "baseline.json")
+    @pytest.mark.parametrize("name", ["rooms", "worlds"])
+    def test_those_of_the_project_are_what_their_suites_run_now(self, name: str) -> None:
+        ours = load_baseline(ROOT / ".ci" / f"{name}.json")
         check_same_plan(ours, fingerprint(plan(load_suite(ours.suite), presets=ours.presets, runs=ours.runs)))
