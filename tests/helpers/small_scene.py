@@ -28,7 +28,7 @@ TRACK = TrackConfig(
     points_per_source=64,
     num_hypotheses=32,
     cell_px=10,
-    weak_inliers=30,
+    weak_inliers=30,  # it begins with some 40, as many as make a frame of 640x480 weak
 )
 SETTINGS = [
     f"track.{field.name}={getattr(TRACK, field.name)}"

@@ -41,7 +41,7 @@ class FlowStatus(enum.IntEnum):
     INCONSISTENT = 6
     """Tracked back, it does not return to where it came from."""
     DISSIMILAR = 7
-    """What is there looks unlike the point: it is covered, or the image is black."""
+    """Its window correlates too little with what is there: the point is covered, or the image is black."""
 
 
 class Flow(NamedTuple):

@@ -218,14 +218,14 @@ def look(position: Pixels, level: Float[Array, "h w"], border: int, window: Wind
     return Sight(patches.cut(level, corner, window.side + 2, window.stride), fraction)
 
 
-def _seen(sight: Sight, window: Window) -> Float[Array, "n l"]:
+def seen(sight: Sight, window: Window) -> Float[Array, "n l"]:
     """Current intensities over the window; columns past it hold something, but have no gradient."""
     return patches.bilinear(patches.flattened(sight.cut), sight.fraction, window.stride, window.length)
 
 
 def difference(sight: Sight, patch: Float[Array, "n l"], window: Window) -> Float[Array, "n l"]:
-    """Current minus previous intensity over the window; columns past it hold something, but have no gradient."""
-    return _seen(sight, window) - patch
+    """Current minus previous intensity over the window."""
+    return seen(sight, window) - patch
 
 
 def likeness(sight: Sight, patch: Float[Array, "n l"], window: Window) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
@@ -235,11 +235,11 @@ def likeness(sight: Sight, patch: Float[Array, "n l"], window: Window) -> tuple[
         Mean absolute difference from the mean difference, and correlation: 0 if one of the windows is uniform.
     """
     share = window.columns().astype(patch.dtype) / window.side**2
-    seen = apart(lambda: _seen(sight, window))
-    mean_seen, mean_patch = (jnp.einsum("nl,l->n", values, share)[:, None] for values in (seen, patch))
+    current = apart(lambda: seen(sight, window))
+    mean_current, mean_patch = (jnp.einsum("nl,l->n", values, share)[:, None] for values in (current, patch))
 
     def products() -> Float[Array, "4 n l"]:
-        here, there = seen - mean_seen, patch - mean_patch
+        here, there = current - mean_current, patch - mean_patch
         return jnp.stack([here * there, jnp.square(here), jnp.square(there), jnp.abs(here - there)])
 
     # In one loop: 0.4 ms for 640 points; the mean difference alone takes 0.2, each product by itself 0.6.

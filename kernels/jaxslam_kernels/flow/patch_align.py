@@ -14,7 +14,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Num
 
 from jaxslam_kernels.checks import checked
-from jaxslam_kernels.flow.lk_search import LevelPlan, Search, Template, in_chunks, iterate, look, template_with
+from jaxslam_kernels.flow.lk_search import LevelPlan, Search, Template, in_chunks, iterate, look, seen, template_with
 from jaxslam_kernels.image import patches
 from jaxslam_kernels.image.patches import Window
 from jaxslam_kernels.image.pyramid import Pyramid
@@ -151,9 +151,7 @@ def _matched(
 
 def _there(position: Pixels, inputs: _Inputs, window: Window, border: int) -> Float[Array, "n l"]:
     """Sample the current image around positions."""
-    sight = apart(lambda: look(position, inputs.current, border, window))
-    flat = patches.flattened(sight.cut)
-    return patches.bilinear(flat, sight.fraction, window.stride, window.length)
+    return seen(apart(lambda: look(position, inputs.current, border, window)), window)
 
 
 def _rows(counts: Float[Array, "n l"], patch: Float[Array, "n l"], there: Float[Array, "n l"]) -> _Rows:

@@ -136,7 +136,7 @@ class TestMatchesReference:
 
     @pytest.mark.parametrize("gain", [0.75, 1.3])
     def test_a_step_of_exposure_hardly_moves_points(self, gain):
-        """Where OpenCV's move by much more."""
+        """OpenCV's points move by much more."""
         plain, exposed, theirs, lost, num_found = [], [], [], 0, 0
         for seed in range(8):
             inputs, known = image_pair(seed)
@@ -172,22 +172,21 @@ class TestMatchesReference:
         assert np.mean(np.asarray(both_ways.ok)[right]) > 0.95
 
     def test_forward_backward_finds_what_was_covered(self):
-        """At most one point in 200 returns by chance, and resembles what covers it."""
-        other, found, unlike, missed, num_covered = picture(WIDTH, HEIGHT)[::-1, ::-1], 0, 0, 0, 0
-        for seed in range(20):
+        """Most are unlike what covers them; of the others, none returns."""
+        other, found, unlike = picture(WIDTH, HEIGHT)[::-1, ::-1], 0, 0
+        for seed in range(5):
             inputs, known = image_pair(seed)
             inputs.current[30:110, 40:130] = other[30:110, 40:130]
             covered = within(known.move(inputs.points), (46, 36), (123, 103))
             forward, both_ways = track(inputs), _both_ways(inputs)
-            num_covered += int(np.sum(covered))
-            missed += int(np.sum(both_ways.ok & covered))
-            found += int(np.sum(forward.ok & ~both_ways.ok & covered))
-            unlike += int(np.sum((forward.status == FlowStatus.DISSIMILAR) & covered))
+            assert not np.any(both_ways.ok & covered)
+            found += np.sum(forward.ok & covered)
+            unlike += np.sum((forward.status == FlowStatus.DISSIMILAR) & covered)
             changed = np.asarray(both_ways.status != forward.status)
             assert np.all(np.asarray(both_ways.status)[changed] == FlowStatus.INCONSISTENT)
             np.testing.assert_allclose(both_ways.points, forward.points, atol=1e-3)
-        assert missed <= num_covered / 200
-        assert min(found, unlike) >= 10, "nothing to find"
+        assert found >= 5, "nothing to find"
+        assert unlike > found
 
 
 def test_vmap_equals_loop():
@@ -297,7 +296,7 @@ class TestDegenerate:
         assert np.all(np.asarray(any_will_do.ok) == (status == FlowStatus.DISSIMILAR))
 
     def test_correlation(self):
-        """That of OpenCV, in a window that only moves."""
+        """It equals that of OpenCV, for windows that only move."""
         inputs, _ = image_pair()
         shift = np.array([[3], [-2]])
         current = np.roll(inputs.previous, shift[::-1, 0], axis=(0, 1))
