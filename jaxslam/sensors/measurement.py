@@ -10,6 +10,7 @@ from jaxslam_kernels.depth.sampling import sample_depth, valid_depth
 from jaxslam_kernels.flow.disparity import ROW_PLAN, row_disparities
 from jaxslam_kernels.flow.lk_flow import FlowPlan
 from jaxslam_kernels.image.pyramid import Pyramid, build_pyramid
+from jaxslam_kernels.program_parts import apart
 from jaxslam_kernels.rolling_shutter import as_if_at_once, image_velocity, row_time
 from jaxslam_kernels.se3 import to_camera
 from jaxslam_kernels.types import DepthImage, Flag, Mask, Pixels, Points, Scalar, Weights
@@ -96,7 +97,7 @@ class PreparedFrame(NamedTuple):
     def _ignore_at(self, uv: Pixels) -> Mask | Weights:
         """Return the `(n,)` mask at the nearest pixels, of its own type; true or 1 outside the image."""
         column, row = jnp.round(lax.stop_gradient(uv)).astype(jnp.int32)
-        return self.frame.ignore.at[row, column].get(mode="fill", fill_value=True)
+        return apart(lambda: self.frame.ignore.at[row, column].get(mode="fill", fill_value=True))
 
 
 class Measurements(NamedTuple):

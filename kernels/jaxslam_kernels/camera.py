@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 
 from jaxslam_kernels.checks import checked
 from jaxslam_kernels.derivative_rules import custom_jvp
+from jaxslam_kernels.program_parts import apart
 from jaxslam_kernels.types import Mask, Pixels, Points, Scalar, Weights
 
 MIN_DEPTH = 0.01
@@ -28,7 +29,7 @@ _NEWTON_STEPS = 5  # 4 reach float64 accuracy for the cameras of TUM and Bonn, 5
 _MAX_SLOPE = 10.0  # normalized coordinates, 84 degrees off the axis: keeps a diverging iteration finite
 
 _Planes: TypeAlias = tuple[Array, Array]
-_Coefficients: TypeAlias = tuple[Array, ...]
+_Coefficients: TypeAlias = Float[Array, "5"]
 
 
 class Intrinsics(NamedTuple):
@@ -111,7 +112,7 @@ def distort(intrinsics: Intrinsics, xy: Pixels) -> Pixels:
     """Distorted normalized coordinates of undistorted ones."""
     if intrinsics.distortion is None:
         return xy
-    return jnp.stack(_distort(tuple(intrinsics.distortion), xy[0], xy[1]))
+    return jnp.stack(_distort(intrinsics.distortion, xy[0], xy[1]))
 
 
 @checked
@@ -128,7 +129,7 @@ def normalize(intrinsics: Intrinsics, uv: Pixels) -> Pixels:
         jnp.where(known, (u - intrinsics.cx) / intrinsics.fx, 0.0),
         jnp.where(known, (v - intrinsics.cy) / intrinsics.fy, 0.0),
     )
-    x, y = target if intrinsics.distortion is None else _undistort(tuple(intrinsics.distortion), target)
+    x, y = target if intrinsics.distortion is None else _undistort(intrinsics.distortion, target)
     return jnp.stack([jnp.where(known, x, 0.0), jnp.where(known, y, 0.0)])
 
 
@@ -198,7 +199,8 @@ def _newton(coefficients: _Coefficients, target: _Planes, num_steps: int) -> _Pl
     """Newton's method on `_distort` from the target."""
 
     def step(_: Array, xy: _Planes) -> _Planes:
-        return _newton_step(coefficients, *xy, _distort(coefficients, *xy), target)
+        # Apart: XLA would take slices and products of coefficients out of the loop, a dozen small kernels.
+        return apart(lambda: _newton_step(coefficients, *xy, _distort(coefficients, *xy), target))
 
     # A loop, not unrolled: XLA's CPU backend fuses unrolled steps into one kernel and evaluates an earlier step
     # again for each of its uses, 4^steps times in all (200 ms for 500 points instead of 10 us). No step stands behind

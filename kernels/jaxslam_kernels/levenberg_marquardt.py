@@ -17,6 +17,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
@@ -74,7 +75,9 @@ class ManifoldLevenbergMarquardt(optx.AbstractMinimiser):
         """The state before the first step, which evaluates `y` itself."""
         del fn, args, options, tags
         zeros = jnp.zeros(aux_struct.gradient.shape, aux_struct.gradient.dtype)
-        model = _model(jnp.zeros(f_struct.shape, f_struct.dtype), zeros, jnp.diag(zeros))
+        model = _model(
+            jnp.zeros(f_struct.shape, f_struct.dtype), zeros, jnp.zeros((zeros.size, zeros.size), zeros.dtype)
+        )
         return _State(
             first_step=jnp.array(True),
             trial=y,
@@ -137,6 +140,6 @@ def _model(cost: Array, gradient: Array, hessian: Array) -> Any:
 
 def _unit(hessian: Array) -> Array:
     """Units in which the diagonal is `1 / _INITIAL_DAMPING`: the trust region starts with a damping of one."""
-    diagonal = jnp.diagonal(hessian)
+    diagonal = jnp.sum(jnp.where(np.eye(len(hessian), dtype=bool), hessian, 0), axis=0)
     floor = jnp.finfo(hessian.dtype).eps * jnp.max(diagonal) + jnp.finfo(hessian.dtype).tiny * 1e8
     return jax.lax.rsqrt(_INITIAL_DAMPING * jnp.maximum(diagonal, floor))

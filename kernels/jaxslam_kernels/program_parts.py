@@ -16,6 +16,9 @@ def apart(compute: Callable[[], T]) -> T:
     a depth that is sampled, a mask, or a projection stood up to eight times in the tracker's step. Here it becomes a
     computation of its own, which is called. `lax.optimization_barrier` does not help, since XLA drops it before fusion.
 
+    It also keeps a program in its thread. Of more than nine parts that could run at once, XLA hands half to its pool of
+    threads, where they may wait for other programs; what is called counts as one.
+
     Values and derivatives are those of `compute`; where XLA does not know the hint, only the program is longer.
 
     Args:

@@ -8,6 +8,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int, Key
 
 from jaxslam_kernels.checks import checked
+from jaxslam_kernels.program_parts import apart
 from jaxslam_kernels.types import Weights
 
 _MAX_COMPARED = 2**15
@@ -49,7 +50,7 @@ def draw_samples(key: Key[Array, ""], weights: Weights, num_samples: int, size: 
         chosen = jnp.minimum(chosen, weights.size - 1)
         return _inserted(taken, starts[chosen], weights[chosen]), chosen
 
-    return lax.scan(draw, _Taken(none, jnp.zeros_like(none)), uniform)[1]
+    return apart(lambda: lax.scan(draw, _Taken(none, jnp.zeros_like(none)), uniform)[1])
 
 
 class _Taken(NamedTuple):

@@ -45,6 +45,7 @@ from jaxslam_kernels.derivative_rules import implicit_shift, only_derivative
 from jaxslam_kernels.pose.pose_cost import UNKNOWN_CHI2
 from jaxslam_kernels.pose.pose_refine import usable_pose
 from jaxslam_kernels.pose_graph.cost import PoseGraphEdges, graph_problem
+from jaxslam_kernels.program_parts import apart
 from jaxslam_kernels.robust import Loss
 from jaxslam_kernels.types import Code, Flag, Mask, Points, Scalar, Weights
 
@@ -147,15 +148,21 @@ def bundle_adjust(
     dtype, n = X_world.dtype, X_world.shape[1]
     fixed_points = jnp.zeros(n, bool) if fixed_points is None else fixed_points
     point_weights = jnp.ones(n, dtype) if point_weights is None else point_weights
-    cameras, X_world, observations, usable = _usable(Cameras(poses, lenses), X_world, observations)
-    problem, slot = bundle_problem(observations, point_weights, jnp.asarray(scale, dtype), ~fixed_poses, ~fixed_points)
-    if lenses is not None:
-        free_lens = jnp.ones_like(fixed_poses) if fixed_lenses is None else ~fixed_lenses
-        problem = problem._replace(free_lens=free_lens)
-    problem = problem._replace(
-        two_sided=jnp.array(True) if two_sided else None,
-        edges=None if edges is None else graph_problem(edges, usable, 1.0, 6),
-    )
+
+    def prepare() -> tuple[Cameras, Points, Observations, BundleProblem, Int[Array, " m"]]:
+        cameras, points, seen, usable = _usable(Cameras(poses, lenses), X_world, observations)
+        problem, slot = bundle_problem(seen, point_weights, jnp.asarray(scale, dtype), ~fixed_poses, ~fixed_points)
+        if lenses is not None:
+            free_lens = jnp.ones_like(fixed_poses) if fixed_lenses is None else ~fixed_lenses
+            problem = problem._replace(free_lens=free_lens)
+        problem = problem._replace(
+            two_sided=jnp.array(True) if two_sided else None,
+            edges=None if edges is None else apart(partial(graph_problem, edges, usable, 1.0, 6)),
+        )
+        return cameras, points, seen, problem, slot
+
+    # Apart, with the edges by themselves: else more than nine parts could run at once before the solve.
+    cameras, X_world, observations, problem, slot = apart(prepare)
     solution = solve_bundle(cameras, X_world, problem, loss, jnp.asarray(tolerance, dtype), max_steps)
     # What is fixed keeps its derivative, what is free gets that of the optimum.
     relative = _on_grid(clean_weights(observations.weights), slot, problem)
@@ -237,17 +244,17 @@ def solve_bundle(
 
 def _cost(cameras: Cameras, views: Views, problem: BundleProblem, loss: Loss) -> Scalar:
     """The cost of the observations and of the edges."""
-    cost = bundle_cost(views, problem, loss)
-    return cost if problem.edges is None else cost + edge_cost(cameras, problem.edges)
+    cost, edges = bundle_cost(views, problem, loss), problem.edges
+    return cost if edges is None else cost + apart(lambda: edge_cost(cameras, edges))
 
 
 def _equations(cameras: Cameras, views: Views, problem: BundleProblem) -> BundleEquations:
     """The exact gradient of the cost, and the Hessian of iteratively reweighted least squares."""
-    equations = normal_equations(views)
-    if problem.edges is None:
+    equations, edges = normal_equations(views), problem.edges
+    if edges is None:
         return equations
-    gradient = equations.camera_gradient + edge_gradient(cameras, problem.edges)
-    return equations._replace(camera_gradient=gradient, edges=edge_hessian(cameras, problem.edges))
+    gradient, hessian = apart(lambda: (edge_gradient(cameras, edges), edge_hessian(cameras, edges)))
+    return equations._replace(camera_gradient=equations.camera_gradient + gradient, edges=hessian)
 
 
 def _where_free(problem: BundleProblem, new: Cameras, old: Cameras) -> Cameras:
@@ -413,6 +420,6 @@ def _predicted_decrease(
     """Decrease of the cost that the quadratic model predicts for a damped step."""
     slope = jnp.sum(equations.camera_gradient * tangents) + jnp.sum(equations.point_gradient * shifts)
     camera_diagonal = equations.camera_diagonal()
-    point_diagonal = jnp.diagonal(equations.point_hessian).T
+    point_diagonal = jnp.stack([equations.point_hessian[j, j] for j in range(3)])
     raised = jnp.sum(camera_diagonal * jnp.square(tangents)) + jnp.sum(point_diagonal * jnp.square(shifts))
     return 0.5 * (damping * raised - slope)

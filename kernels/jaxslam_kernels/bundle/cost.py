@@ -23,6 +23,7 @@ from jaxslam_kernels.camera import MIN_DEPTH, Intrinsics, normalize
 from jaxslam_kernels.checks import checked
 from jaxslam_kernels.pose.pose_cost import UNKNOWN_CHI2, positive
 from jaxslam_kernels.pose_graph.cost import GraphProblem
+from jaxslam_kernels.program_parts import apart
 from jaxslam_kernels.robust import Loss, loss_value, loss_weight
 from jaxslam_kernels.types import Flag, Mask, Pixels, Points, Scalar, Weights
 
@@ -192,7 +193,7 @@ class Views(NamedTuple):
 def bundle_views(cameras: Cameras, X_world: Points, problem: BundleProblem, loss: Loss) -> Views:
     """Evaluates all slots."""
     poses = cameras.poses
-    R = jax.vmap(lambda pose: SE3(pose).rotation().as_matrix())(poses)
+    R = apart(lambda: jax.vmap(lambda pose: SE3(pose).rotation().as_matrix())(poses))
     offset = [X_world[j][None, :] - poses[:, 4 + j, None] for j in range(3)]
     X, Y, Z = (sum((R[:, j, i, None] * offset[j] for j in (1, 2)), R[:, 0, i, None] * offset[0]) for i in range(3))
     seen = problem.known & _in_view(Z, problem)

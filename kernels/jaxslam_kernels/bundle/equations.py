@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from jaxslam_kernels.bundle.cost import BundleProblem, Plane, Views, bundle_views
 from jaxslam_kernels.bundle.edges import EdgeHessian
 from jaxslam_kernels.bundle.lens import Cameras, LensPart, lens_gradient, lens_hessian, shift_cameras
+from jaxslam_kernels.program_parts import apart
 from jaxslam_kernels.robust import Loss
 from jaxslam_kernels.types import Points
 
@@ -46,28 +47,40 @@ def normal_equations(views: Views) -> BundleEquations:
     R, (X, Y, Z), (x, y), (mu, mv, md), pull = views.R, views.X_cam, views.slope, views.information, views.pull
     k, n = x.shape
     column = lambda i, j: R[:, j, i, None]  # Rᵀ, spread over the points
-    first = [mu * (column(0, j) - x * column(2, j)) for j in range(3)]  # rows of M Rᵀ
-    second = [mv * (column(1, j) - y * column(2, j)) for j in range(3)]
-    if views.skew is not None:
-        first, second = (
-            [a + views.skew * (column(1, j) - y * column(2, j)) for j, a in enumerate(first)],
-            [a + views.skew * (column(0, j) - x * column(2, j)) for j, a in enumerate(second)],
-        )
-    third = [md * column(2, j) - x * first[j] - y * second[j] for j in range(3)]
-    turn = zip(first, second, third, strict=True)
-    turned = [(Z * b - Y * c, X * c - Z * a, Y * a - X * b) for a, b, c in turn]  # (M Rᵀ) × X, by columns
-    rows = [[-v for v in row] for row in (first, second, third)] + [list(row) for row in zip(*turned, strict=True)]
+
+    def weighted_rotation() -> tuple[Array, ...]:
+        """The rows of M Rᵀ, element by element."""
+        first = [mu * (column(0, j) - x * column(2, j)) for j in range(3)]
+        second = [mv * (column(1, j) - y * column(2, j)) for j in range(3)]
+        if views.skew is not None:
+            first, second = (
+                [a + views.skew * (column(1, j) - y * column(2, j)) for j, a in enumerate(first)],
+                [a + views.skew * (column(0, j) - x * column(2, j)) for j, a in enumerate(second)],
+            )
+        third = [md * column(2, j) - x * first[j] - y * second[j] for j in range(3)]
+        return (*first, *second, *third)
+
+    by_row = apart(weighted_rotation)
+
+    def turned() -> Float[Array, "k 9 n"]:
+        """The rows of (M Rᵀ) × X, element by element."""
+        columns = [by_row[j::3] for j in range(3)]
+        by_column = [(Z * b - Y * c, X * c - Z * a, Y * a - X * b) for a, b, c in columns]
+        return jnp.stack([v for row in zip(*by_column, strict=True) for v in row], axis=1)
+
+    parts = [-apart(lambda: jnp.stack(by_row, axis=1)), apart(turned)]  # nine planes each: of more, see `apart`
     if views.lens is not None:
-        rows = rows + _lens_rows(views, views.lens)
-    cross = jnp.stack([v for row in rows for v in row], axis=1)
+        parts.append(jnp.stack([v for row in _lens_rows(views, views.lens) for v in row], axis=1))
+    cross = jnp.concatenate(parts, axis=1)
+    num_rows = cross.shape[1] // 3
     moments = jnp.einsum("kan,kbn->kab", cross, jnp.stack([X, Y, Z, jnp.ones_like(X)], axis=1))
-    cross = cross.reshape(k, len(rows), 3, n)
+    cross = cross.reshape(k, num_rows, 3, n)
     # R M Rᵀ summed over the cameras: its rows but R are minus the first ones of `cross`.
     point_hessian = -jnp.einsum("kia,kajn->ijn", R, cross[:, :3])
     along_pose = [-sum_ for sum_ in map(partial(jnp.sum, axis=1), pull)]
     turning = (pull[1] * Z - pull[2] * Y, pull[2] * X - pull[0] * Z, pull[0] * Y - pull[1] * X)
     gradient = jnp.stack([*along_pose, *(jnp.sum(t, axis=1) for t in turning)], axis=1)
-    columns = _pose_columns(moments.reshape(k, len(rows), 3, 4), R)
+    columns = _pose_columns(moments.reshape(k, num_rows, 3, 4), R)
     hessian = 0.5 * (columns[:, :6] + jnp.swapaxes(columns[:, :6], 1, 2))
     if views.lens is not None:
         gradient = jnp.concatenate([gradient, lens_gradient(views.lens)], axis=1)

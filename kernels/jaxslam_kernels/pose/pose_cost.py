@@ -235,19 +235,31 @@ def _linearize(T_world_cam: SE3, problem: PoseProblem) -> tuple[Float[Array, "7 
     inverse_z = 1.0 / jnp.where(front, Z, 1.0)
     x, y = apart(lambda: (X * inverse_z, Y * inverse_z))
 
-    def rows() -> Float[Array, "7 3 n"]:
-        fu, fv, fd = problem.precision
-        zero = jnp.zeros_like(x)
-        each = (
-            *(-fu * inverse_z, zero, zero),
-            *(zero, -fv * inverse_z, zero),
-            *(fu * inverse_z * x, fv * inverse_z * y, -fd),
-            *(fu * x * y, fv * (1.0 + y * y), -fd * Y),
-            *(-fu * (1.0 + x * x), -fv * x * y, fd * X),
-            *(fu * y, -fv * x, zero),
-            *((x - problem.xy[0]) * fu, (y - problem.xy[1]) * fv, (Z - problem.depth) * fd),
+    fu, fv, fd = problem.precision
+    zero = jnp.zeros_like(x)
+
+    def along_translation() -> Array:
+        return jnp.concatenate(
+            [
+                *(-fu * inverse_z, zero, zero),
+                *(zero, -fv * inverse_z, zero),
+                *(fu * inverse_z * x, fv * inverse_z * y, -fd),
+            ]
         )
-        return jnp.concatenate(each).reshape(7, 3, -1)
+
+    def along_rotation() -> Array:
+        return jnp.concatenate(
+            [
+                *(fu * x * y, fv * (1.0 + y * y), -fd * Y),
+                *(-fu * (1.0 + x * x), -fv * x * y, fd * X),
+                *(fu * y, -fv * x, zero),
+            ]
+        )
+
+    def rows() -> Float[Array, "7 3 n"]:
+        residuals = ((x - problem.xy[0]) * fu, (y - problem.xy[1]) * fv, (Z - problem.depth) * fd)
+        # Nine planes at a time: of more, see `apart`.
+        return jnp.concatenate([apart(along_translation), apart(along_rotation), *residuals]).reshape(7, 3, -1)
 
     return apart(rows), front
 
@@ -267,7 +279,7 @@ def _prior_error(T_world_cam: SE3, prior: PosePrior) -> tuple[Float[Array, "6"],
 def _quaternion_basis(T: SE3) -> Float[Array, "4 3"]:
     """The quaternion q of a pose times i, j and k. Against another quaternion p it gives the vector part of `q⁻¹ p`."""
     w, x, y, z = T.wxyz_xyz[:4]
-    return jnp.stack([-x, -y, -z, w, -z, y, z, w, -x, -y, x, w]).reshape(4, 3)
+    return apart(lambda: jnp.stack([-x, -y, -z, w, -z, y, z, w, -x, -y, x, w])).reshape(4, 3)
 
 
 def positive(values: Array) -> Array:

@@ -35,6 +35,7 @@ from jaxslam_kernels.pose.pose_cost import (
     with_idle,
 )
 from jaxslam_kernels.positive_definite import is_determined, solve_determined, solve_exact
+from jaxslam_kernels.program_parts import apart
 from jaxslam_kernels.robust import Loss
 from jaxslam_kernels.types import Code, Flag, Pixels, Points, Scalar, Weights
 
@@ -149,7 +150,9 @@ def refine_pose(
     """
     if solver is not None and tolerance is not None:
         raise ValueError(f"refine_pose: tolerance: expected None, as the solver has its own, got {tolerance:g}")
-    problem, idle = pose_problem(X_world, uv, intrinsics, weights, depth, sigma_px, sigma_depth, scale, prior)
+    problem, idle = apart(
+        lambda: pose_problem(X_world, uv, intrinsics, weights, depth, sigma_px, sigma_depth, scale, prior)
+    )
     return refine_problem(T_world_cam, problem, idle, loss, max_steps, tolerance, solver)
 
 

@@ -16,12 +16,14 @@ from typing import Annotated, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxlie import SE3
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam_kernels.derivative_rules import only_derivative
 from jaxslam_kernels.pose.pose_cost import retract, shifted
+from jaxslam_kernels.program_parts import apart
 from jaxslam_kernels.robust import LARGEST_SQUARED, Loss, loss_value, loss_weight
 from jaxslam_kernels.se3 import between, cross_matrix
 from jaxslam_kernels.types import Scalar
@@ -237,8 +239,8 @@ def _jacobians(source: Array, target: Array, measured: Array) -> tuple[Float[Arr
     E, T_ab, u = _difference(source, target, measured)
     w, v = E.wxyz_xyz[0], E.wxyz_xyz[1:4]
     sign = jnp.where(w < 0, -1.0, 1.0)
-    identity, zero, column = jnp.eye(3, dtype=w.dtype), jnp.zeros((3, 3), w.dtype), jnp.zeros((3, 1), w.dtype)
-    R_measured = SE3(measured[:7]).rotation().as_matrix().T
+    identity, zero, column = np.eye(3, dtype=w.dtype), jnp.zeros((3, 3), w.dtype), jnp.zeros((3, 1), w.dtype)
+    R_measured = apart(SE3(measured[:7]).rotation().as_matrix).T
     to_error = R_measured * jnp.exp(-measured[7])
     shrink = jnp.exp(-source[7])
     one = jnp.ones((1, 1), w.dtype)
@@ -248,7 +250,7 @@ def _jacobians(source: Array, target: Array, measured: Array) -> tuple[Float[Arr
         [column.T, column.T, -one],
     ]
     by_target = [
-        [shrink * to_error @ T_ab.rotation().as_matrix(), zero, column],
+        [shrink * to_error @ apart(T_ab.rotation().as_matrix), zero, column],
         [zero, sign * (w * identity + cross_matrix(v)), column],
         [column.T, column.T, one],
     ]

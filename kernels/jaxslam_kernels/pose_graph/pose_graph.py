@@ -50,6 +50,7 @@ from jaxslam_kernels.pose_graph.cost import (
     shift_nodes,
 )
 from jaxslam_kernels.pose_graph.sparse_solve import solve_on_host
+from jaxslam_kernels.program_parts import apart
 from jaxslam_kernels.robust import Loss
 from jaxslam_kernels.types import Code, Flag, Scalar
 
@@ -177,7 +178,8 @@ def optimize_pose_graph(
     """
     mask = jnp.ones_like(fixed) if mask is None else mask
     initial, usable = graph_nodes(T_world_cam, scales)
-    problem, idle = graph_problem_and_idle(edges, mask & usable, loss_scale, 6 if scales is None else 7)
+    dimension = 6 if scales is None else 7
+    problem, idle = apart(lambda: graph_problem_and_idle(edges, mask & usable, loss_scale, dimension))
     anchored = _anchored(problem, fixed & mask & usable)
     solver = _Solver(loss, max_steps, max_iterations, group_size, elimination)
     bad_initial = (mask & ~usable).any()
