@@ -62,13 +62,15 @@ def match_descriptors(
     if not len(a.descriptor) or not len(b.descriptor):
         return np.zeros((2, 0), np.int64)
     distance = hamming(a.descriptor, b.descriptor)
-    best = distance.argmin(axis=1)
-    least = np.partition(distance, min(1, len(b.descriptor) - 1), axis=1)[:, :2]
-    index = np.arange(len(best))
-    good = (distance.argmin(axis=0)[best] == index) & (least[:, 0] <= max_distance)
+    best, row = distance.argmin(axis=1), np.arange(len(a.descriptor))
+    least = distance[row, best]
+    good = least <= max_distance
     if len(b.descriptor) > 1:
-        good &= least[:, 0] < ratio * least[:, 1]
-    pairs = np.stack([index[good], best[good]])
+        distance[row, best] = _BITS + 1  # what is left is the second best: a tenth of the time of a partition
+        good &= least < ratio * distance.min(axis=1)
+        distance[row, best] = least
+    row, best = row[good], best[good]
+    pairs = np.stack([row, best])[:, distance[:, best].argmin(axis=0) == row]
     return pairs[:, same_turn(b.angle[pairs[1]] - a.angle[pairs[0]])] if check_turn else pairs
 
 
