@@ -41,7 +41,7 @@ def test_frames_from_everywhere(name: str, frames: int, monkeypatch: pytest.Monk
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
         wall, cpu = process.submit(times_ms, name, frames).result()
     median, p95 = np.percentile(wall, [50, 95])
-    camera = WorldRecording(name).camera
+    camera = load_world(name).camera
     print(
         f"\n{name}, {camera.width}x{camera.height}: median {median:.0f} ms a frame, p95 {p95:.0f};"
         f" processor time {np.median(cpu):.0f} ms"

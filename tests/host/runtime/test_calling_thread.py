@@ -22,15 +22,16 @@ _POOL = "tf_XLAEigen"
 
 def pool_s() -> float:
     """Processor time that the threads of XLA's pool have taken so far, in seconds."""
-    ticks = 0
+    ticks = []
     for thread in Path("/proc/self/task").iterdir():
         try:
             name, numbers = (thread / "stat").read_text().split("(", 1)[1].rsplit(")", 1)
         except (FileNotFoundError, ProcessLookupError):
             continue  # it has ended; the pool does not
         if name.startswith(_POOL):
-            ticks += sum(map(int, numbers.split()[11:13]))
-    return ticks / os.sysconf("SC_CLK_TCK")
+            ticks.append(sum(map(int, numbers.split()[11:13])))
+    assert ticks, f"expected threads named {_POOL}..., got none"
+    return sum(ticks) / os.sysconf("SC_CLK_TCK")
 
 
 def test_tracking_and_mapping_leave_the_pool_alone() -> None:
