@@ -59,6 +59,14 @@ def prefer_one_thread() -> None:
     _bound_xla(1)
 
 
+def start_with_one_thread() -> None:
+    """Have XLA compute in the calling thread if JAX has not begun to compute, as `Slam` does; say nothing if it has."""
+    from jax._src import xla_bridge  # noqa: PLC0415 - nothing public tells whether JAX has begun to compute
+
+    if not xla_bridge.backends_are_initialized():
+        _bound_xla(1)
+
+
 def shorten_switch_interval() -> None:
     """Have Python's threads give way to each other after 0.2 ms instead of 5, in the whole process; never later.
 

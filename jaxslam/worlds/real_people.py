@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import cv2
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
@@ -113,11 +112,11 @@ class PeopleCutter:
             number: Number of the people in masks.
         """
         cut, exact = self.cut_out(time_s), taken.exact
-        shown = cut.mask & (cut.filled_m < np.asarray(exact.depth_m))
+        shown = cut.mask & (cut.filled_m < exact.depth_m)
         return taken._replace(
             exact=exact._replace(
-                depth_m=jnp.asarray(np.where(shown, cut.depth_m, np.asarray(exact.depth_m))),
-                owner=jnp.asarray(np.where(shown, np.int32(number), np.asarray(exact.owner))),
+                depth_m=np.where(shown, cut.depth_m, exact.depth_m),
+                owner=np.where(shown, np.int32(number), exact.owner),
             ),
             rgb=np.where(shown[..., None], cut.rgb, taken.rgb),
             depth_m=np.where(shown, cut.depth_m, taken.depth_m),

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-import jax
 import numpy as np
 
 from jaxslam.datasets.synthetic.dataset import DEPTH_COUNTS_PER_M
@@ -19,6 +18,7 @@ from jaxslam.datasets.synthetic.virtual_camera import (
     VirtualCamera,
     automatic_gain,
     frame_times_us,
+    noise_key,
 )
 from jaxslam.errors import ConfigError
 from jaxslam.sensors.camera import Camera
@@ -181,7 +181,7 @@ class WorldRecording:
         if self._has_fault("black", now)[0]:
             rgb, depth_m = np.zeros_like(rgb), np.zeros_like(depth_m)
             right = None if right is None else np.zeros_like(right)
-        instance_mask = np.maximum(np.asarray(taken.exact.owner), 0)
+        instance_mask = np.maximum(taken.exact.owner, 0)
         moves, poses = self._moves.copy(), self._poses.copy()
         for number, instance in enumerate(self.instances, 1):
             if not instance.rests:
@@ -190,7 +190,7 @@ class WorldRecording:
             timestamp_ns=int(self.timestamps_ns[index]),
             rgb=rgb,
             depth_m=depth_m,
-            exact_depth_m=_without_backdrop(np.asarray(taken.exact.depth_m), taken),
+            exact_depth_m=_without_backdrop(taken.exact.depth_m, taken),
             instance_mask=instance_mask,
             moving_mask=moves.take(instance_mask),
             T_world_cam=self.ground_truth.T_world_cam[index].copy(),
@@ -206,8 +206,8 @@ class WorldRecording:
 
     def _take(self, index: int) -> TakenPicture:
         time_s = float(self._time_s[index])
-        key = jax.random.key(self.world.seed)  # not made before: arrays start JAX
-        taken = self._filming.take(time_s, jax.random.fold_in(key, int(self._numbers[index])))
+        # Not made before: arrays start JAX.
+        taken = self._filming.take(time_s, noise_key(self.world.seed, int(self._numbers[index])))
         if self._real_people is None:
             return taken
         return self._real_people.set_into(taken, time_s, len(self.labels))
@@ -279,5 +279,5 @@ def _outline(placed: PlacedSolid) -> np.ndarray:
 def _without_backdrop(depth_m: np.ndarray, taken: TakenPicture) -> np.ndarray:
     """Depth `(height, width)`, 0 where the picture shows nothing but the backdrop."""
     kept = depth_m.copy()
-    kept[np.asarray(taken.exact.owner) == BACKDROP] = 0.0
+    kept[taken.exact.owner == BACKDROP] = 0.0
     return kept

@@ -10,7 +10,7 @@ from jaxslam.datasets.synthetic.camera_path_kind import CameraPathKind
 from jaxslam.datasets.synthetic.room import furnish
 from jaxslam.datasets.synthetic.sensor_noise import SensorConfig
 from jaxslam.datasets.synthetic.shading import ROOM_LIGHT
-from jaxslam.datasets.synthetic.virtual_camera import START_NS, Optics, Stage, VirtualCamera, frame_times_us
+from jaxslam.datasets.synthetic.virtual_camera import START_NS, Optics, Stage, VirtualCamera, frame_times_us, noise_key
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame
 from jaxslam.trajectory.trajectory import Trajectory
@@ -66,7 +66,7 @@ class MiscalibratedRoom:
 
     def __getitem__(self, index: int) -> Frame:
         index = range(len(self))[index]
-        time_s, key = float(self._time_s[index]), jax.random.fold_in(jax.random.key(self._seed), index)
+        time_s, key = float(self._time_s[index]), noise_key(self._seed, index)
         rgb = self._color.take(time_s, key).rgb
         depth_m = self._depth.take(time_s + self._truth.depth_delay_s, jax.random.fold_in(key, 1)).depth_m
         longer = np.where(depth_m > 0, depth_m + np.float32(self._truth.depth_offset_m), np.float32(0))

@@ -3,7 +3,6 @@
 from dataclasses import dataclass, field
 from typing import Annotated
 
-import jax
 import numpy as np
 
 from jaxslam.config.validation import Range, ValidatedConfig
@@ -14,7 +13,14 @@ from jaxslam.datasets.synthetic.room import furnish
 from jaxslam.datasets.synthetic.seated_people import MAX_SEATED, chairs
 from jaxslam.datasets.synthetic.sensor_noise import SensorConfig
 from jaxslam.datasets.synthetic.shading import ROOM_LIGHT
-from jaxslam.datasets.synthetic.virtual_camera import START_NS, Stage, VirtualCamera, automatic_gain, frame_times_us
+from jaxslam.datasets.synthetic.virtual_camera import (
+    START_NS,
+    Stage,
+    VirtualCamera,
+    automatic_gain,
+    frame_times_us,
+    noise_key,
+)
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame import Frame
 from jaxslam.trajectory.trajectory import Trajectory
@@ -162,14 +168,14 @@ class SyntheticDataset:
         """
         index = range(len(self))[index]
         time_s = float(self._time_s[index])
-        key = jax.random.fold_in(jax.random.key(self.config.seed), index)  # not made before: arrays start JAX
-        taken = self._filming.take(time_s, key)
+        # Not made before: arrays start JAX.
+        taken = self._filming.take(time_s, noise_key(self.config.seed, index))
         return SyntheticFrame(
             timestamp_ns=int(self.timestamps_ns[index]),
             rgb=taken.rgb,
             depth_m=taken.depth_m,
-            exact_depth_m=np.asarray(taken.exact.depth_m),
-            instance_mask=np.asarray(taken.exact.owner),
+            exact_depth_m=taken.exact.depth_m,
+            instance_mask=taken.exact.owner,
             T_world_cam=self.T_world_cam[index].copy(),
             T_world_actor=self.T_world_actor(np.array([time_s]))[0],
             right=taken.right,

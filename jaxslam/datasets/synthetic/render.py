@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxslam_kernels.program_parts import apart
 from jaxtyping import Array, Bool, Float, Int, UInt
 
 from jaxslam.datasets.synthetic.culling import (
@@ -23,7 +24,7 @@ from jaxslam.datasets.synthetic.raycast import Rays, Shapes, nearest_solid, unpa
 from jaxslam.datasets.synthetic.shading import Hits, Light, shade
 from jaxslam.datasets.synthetic.texture import N_WORDS
 from jaxslam.runtime.compiled import compiled
-from jaxslam.runtime.compiler_options import FUSION_EMITTERS
+from jaxslam.runtime.compiler_options import FUSION_EMITTERS, SINGLE_THREAD
 
 BACKDROP = -1
 """Owner of the solid behind everything, such as the sky."""
@@ -182,7 +183,7 @@ def _sizes_and_stems(scene: RenderScene) -> tuple[Float[Array, "n 3"], Float[Arr
     return size, jnp.concatenate([jnp.zeros(len(scene.box_size), scene.capsule_stem.dtype), scene.capsule_stem])
 
 
-@compiled(when="first use", static=("height", "width", "rows"), options=FUSION_EMITTERS)
+@compiled(when="first use", static=("height", "width", "rows"), options=FUSION_EMITTERS | SINGLE_THREAD)
 def render(
     scene: RenderScene,
     view: CameraView,
@@ -205,16 +206,17 @@ def render(
         width: Columns of the image, static.
     """
     n_boxes, tiling = scene.box_size.shape[0], Tiling.of(height, width)
-    size, stem = _sizes_and_stems(scene)
     rolls = view.solid_from_cam.ndim == 4
-    unit_from_cam = view.solid_from_cam / (size[None, :, :, None] if rolls else size[:, :, None])
-    turned = (view.solid_from_cam[tiling.rows // 2] if rolls else view.solid_from_cam)[:, :, :3]
-    sun = jnp.einsum("nij,kj,k->ni", turned, view.world_from_cam[:, :3], scene.light.towards_sun)
-    # Nothing turns the sky towards the sun.
-    sun = jnp.where((scene.owner == BACKDROP)[:, None], 0.0, sun)
-    own = jnp.concatenate([size, stem[:, None], sun], axis=1)
-    first_pose = unit_from_cam[0] if rolls else unit_from_cam
-    table = jnp.concatenate([first_pose.reshape(-1, 12), own], axis=1)
+
+    def prepared() -> tuple[Array, Array, Array, tuple[Array, Array]]:
+        unit_from_cam, stem, own = _tables(scene, view, tiling.rows // 2 if rolls else None)
+        table = own if rolls else jnp.concatenate([unit_from_cam.reshape(-1, 12), own], axis=1)
+        tiles = (jnp.arange(tiling.rows * tiling.columns, dtype=jnp.int32), candidates.begins)
+        start, count = first * tiling.columns, rows * tiling.columns
+        return unit_from_cam, stem, table, jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, count), tiles)
+
+    # In one part, so that XLA leaves the program in the thread that calls it: see `compiler_options.SINGLE_THREAD`.
+    unit_from_cam, stem, table, tiles = apart(prepared)
 
     def shapes_and_looks(row: Array) -> tuple[Shapes, Array, Array | None]:
         """Shapes of the solids as a row of tiles sees them, their rows of the table, and what those change by."""
@@ -222,7 +224,7 @@ def render(
             return Shapes(unit_from_cam, stem), table, None
         above = unit_from_cam[row]
         change = unit_from_cam[row + 1] - above
-        looks = jnp.concatenate([above.reshape(-1, 12), own], axis=1)
+        looks = jnp.concatenate([above.reshape(-1, 12), table], axis=1)
         return Shapes(above, stem, change), looks, change.reshape(-1, 12)
 
     def render_tile(tile: tuple[Array, Array]) -> tuple[Array, ...]:
@@ -238,22 +240,39 @@ def render(
             scene.owner[which],
         )
 
-    tiles = (jnp.arange(tiling.rows * tiling.columns, dtype=jnp.int32), candidates.begins)
-    start, count = first * tiling.columns, rows * tiling.columns
-    tiles = jax.tree.map(lambda each: jax.lax.dynamic_slice_in_dim(each, start, count), tiles)
     planes = jax.lax.map(render_tile, tiles)
     return Rendering(*(plane.reshape(rows, tiling.columns, tiling.height, tiling.width) for plane in planes))
+
+
+def _tables(scene: RenderScene, view: CameraView, middle: int | None) -> tuple[Array, Array, Array]:
+    """Maps from camera to unit coordinates, stems, and what else the colors of solids need: size, stem, sun.
+
+    Args:
+        scene: Solids and light of the scene.
+        view: From where it is seen.
+        middle: With a rolling shutter, the row of tiles whose time the sun stands for; `None` without.
+    """
+    size, stem = _sizes_and_stems(scene)
+    unit_from_cam = view.solid_from_cam / (size[:, :, None] if middle is None else size[None, :, :, None])
+    turned = (view.solid_from_cam if middle is None else view.solid_from_cam[middle])[:, :, :3]
+    sun = jnp.einsum("nij,kj,k->ni", turned, view.world_from_cam[:, :3], scene.light.towards_sun)
+    # Nothing turns the sky towards the sun.
+    sun = jnp.where((scene.owner == BACKDROP)[:, None], 0.0, sun)
+    return unit_from_cam, stem, jnp.concatenate([size, stem[:, None], sun], axis=1)
 
 
 def untiled(parts: Sequence[np.ndarray | Array], height: int, width: int) -> np.ndarray:
     """Put a plane of `render` together, `(height, width)`; its parts are below each other."""
     tiling = Tiling.of(height, width)
-    plane = np.empty((tiling.rows, tiling.height, tiling.columns, tiling.width), parts[0].dtype)
-    first = 0
-    for part in parts:
-        plane[first : first + len(part)] = np.swapaxes(np.asarray(part), 1, 2)
-        first += len(part)
-    return np.ascontiguousarray(plane.reshape(tiling.rows * tiling.height, -1)[:height, :width])
+    whole, rest = divmod(width, tiling.width)
+    plane = np.empty((height, width), parts[0].dtype)
+    row_of_tiles = (tiles for part in parts for tiles in np.asarray(part))
+    for top, tiles in zip(range(0, height, tiling.height), row_of_tiles, strict=False):
+        band = plane[top : top + tiling.height]
+        across = np.swapaxes(tiles[:, : len(band)], 0, 1)
+        band[:, : width - rest].reshape(len(band), whole, tiling.width)[:] = across[:, :whole]
+        band[:, width - rest :] = across[:, -1, :rest]
+    return plane
 
 
 def _corners(

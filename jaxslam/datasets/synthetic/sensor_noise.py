@@ -7,13 +7,15 @@ from typing import Annotated, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, UInt, UInt8
+from jaxslam_kernels.program_parts import apart
+from jaxtyping import Array, Bool, Float, Int, UInt, UInt8
 
 from jaxslam.config.validation import Range, ValidatedConfig
+from jaxslam.datasets.synthetic.noise import normal_noise
 from jaxslam.datasets.synthetic.shading import unpack_color
 from jaxslam.errors import ConfigError
 from jaxslam.runtime.compiled import compiled
-from jaxslam.runtime.compiler_options import FUSION_EMITTERS
+from jaxslam.runtime.compiler_options import FUSION_EMITTERS, SINGLE_THREAD
 
 
 @dataclass(frozen=True)
@@ -126,34 +128,49 @@ def depth_params(config: SensorConfig) -> DepthParams:
     )
 
 
-@compiled(when="first use", options=FUSION_EMITTERS)
+@compiled(when="first use", static=("height", "width"), options=FUSION_EMITTERS | SINGLE_THREAD)
 def measure_color(
-    exposures: tuple[UInt[Array, "h w"], ...],
+    exposures: tuple[UInt[Array, "rows columns h w"], ...],
+    first: int,
     gain: float | np.ndarray,
     image_noise: float,
     key: Array,
     lens: LensParams | None = None,
-) -> UInt8[Array, "3 h w"]:
-    """Return red, green and blue of eight bits.
+    *,
+    height: int,
+    width: int,
+) -> UInt8[Array, "3 rows columns h w"]:
+    """Return red, green and blue of eight bits, in tiles as they were rendered: pixels have no neighbors here.
 
     Args:
-        exposures: Packed colors at the moments that are averaged.
-        gain: Brightness factor of this frame, or of each row, `(1, h, 1)`.
+        exposures: Packed colors at the moments that are averaged: rows of tiles of the picture.
+        first: First row of tiles.
+        gain: Brightness factor of this frame, or of each row, `(1, rows, 1, h, 1)`.
         image_noise: Standard deviation of the noise in gray levels.
         key: Random key of this frame.
         lens: Faults of the lens; `None` for none.
+        height: Rows of the picture, static.
+        width: Columns of the picture, static.
     """
     # All in one type: a recording is the same bytes where float64 is enabled.
     numbers = (gain, image_noise, lens)
     gain, image_noise, lens = jax.tree.map(lambda number: jnp.asarray(number, jnp.float32), numbers)
     color_key, _ = jax.random.split(key)
     mean = sum(map(unpack_color, exposures[1:]), start=unpack_color(exposures[0])) / len(exposures)
-    noise = image_noise * jax.random.normal(color_key, mean.shape, mean.dtype)
-    bright = 255.0 * gain * mean if lens is None else 255.0 * _through_lens(gain * mean, lens)
+    rows, columns, tile_height, tile_width = exposures[0].shape
+    v = (first + jnp.arange(rows))[:, None] * tile_height + jnp.arange(tile_height)[None]
+    v, u = v.reshape(rows, 1, tile_height, 1), jnp.arange(columns * tile_width).reshape(1, columns, 1, tile_width)
+    planes = jnp.arange(3, dtype=jnp.uint32).reshape(3, 1, 1, 1, 1) * np.uint32(height * width)
+    places = planes + (v * width + u).astype(jnp.uint32)[None]
+    noise = image_noise * normal_noise(color_key, places)
+    if lens is None:
+        bright = 255.0 * gain * mean
+    else:
+        bright = 255.0 * _through_lens(gain * mean, _place(v, height), _place(u, width), height, width, lens)
     return jnp.clip(jnp.round(bright + noise), 0.0, 255.0).astype(jnp.uint8)
 
 
-@compiled(when="first use", options=FUSION_EMITTERS)
+@compiled(when="first use", options=FUSION_EMITTERS | SINGLE_THREAD)
 def measure_depth(
     depth_m: Float[Array, "h w"], incidence: Float[Array, "h w"], fx: float, params: DepthParams, key: Array
 ) -> Float[Array, "h w"]:
@@ -168,19 +185,26 @@ def measure_depth(
     """
     # All in the depth's type: a recording is the same bytes where float64 is enabled.
     fx, params = jax.tree.map(lambda number: jnp.asarray(number, depth_m.dtype), (fx, params))
-    _, depth_key = jax.random.split(key)
-    kept = _inside_limits(depth_m, incidence, params) & _lit(depth_m, fx, params.shadow_baseline_m)
-    kept = kept & ~_on_edge(depth_m, params.edge_jump)
-    measured = _noisy_depth(depth_m, jax.random.normal(depth_key, depth_m.shape, depth_m.dtype), params)
+    # Else XLA makes the noise again for each of its uses, and leaves the thread that called it.
+    lit = apart(lambda: _lit(depth_m, fx, params.shadow_baseline_m))
+    on_edge = apart(lambda: _on_edge(depth_m, params.edge_jump))
+    kept = _inside_limits(depth_m, incidence, params) & lit & ~on_edge
+    places = jax.lax.iota(jnp.uint32, depth_m.size).reshape(depth_m.shape)
+    noise = apart(lambda: normal_noise(jax.random.split(key)[1], places))
+    measured = _noisy_depth(depth_m, noise, params)
     return jnp.where(kept, measured, 0.0)
 
 
-def _through_lens(light: Array | np.ndarray, lens: LensParams) -> Float[Array, "3 h w"]:
+def _place(index: Int[Array, "..."], count: int) -> Float[Array, "..."]:
+    """Pixels from the middle of the picture to a row or column of `count`."""
+    from_middle = jnp.linspace(-1.0, 1.0, count, dtype=jnp.float32) * (0.5 * count)
+    return from_middle[jnp.minimum(index, count - 1)]
+
+
+def _through_lens(light: Array | np.ndarray, v: Array, u: Array, height: int, width: int, lens: LensParams) -> Array:
     """Brightness as amplified, darker the farther from the middle of the picture."""
-    height, width = light.shape[1:]
-    v, u = (jnp.linspace(-1.0, 1.0, count, dtype=light.dtype) * (0.5 * count) for count in (height, width))
     corner = 0.25 * (height**2 + width**2)
-    kept = 1.0 - lens.vignetting * (v[:, None] ** 2 + u[None] ** 2) / corner
+    kept = 1.0 - lens.vignetting * (v**2 + u**2) / corner
     return jnp.maximum(kept[None] * light, 0.0) ** (1.0 / lens.gamma)
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import cv2
 import jax
@@ -31,7 +31,8 @@ from jaxslam.datasets.synthetic.sensor_noise import (
     measure_depth,
 )
 from jaxslam.datasets.synthetic.shading import Light
-from jaxslam.runtime.threads import usable_cores
+from jaxslam.runtime.freed_memory import keep_freed_memory
+from jaxslam.runtime.threads import start_with_one_thread, usable_cores
 from jaxslam.sensors.camera import Camera
 
 START_NS = 1_600_000_000_000_000_000
@@ -41,6 +42,16 @@ START_NS = 1_600_000_000_000_000_000
 def frame_times_us(num_frames: int, fps: float) -> np.ndarray:
     """Return the times of frames since the first, `(n,)` int64 microseconds: six decimals of a second hold them."""
     return np.round(np.arange(num_frames) * (1e6 / fps)).astype(np.int64)
+
+
+def noise_key(seed: int, number: int) -> jax.Array:
+    """Return the random key of the noise of a frame, by its number.
+
+    Often the first array of a process, with which XLA begins. It does with one thread, as a `Slam` would ask for, since
+    parts of pictures have threads of their own: with two of XLA as well, a pair of a road takes 142 ms instead of 118.
+    """
+    start_with_one_thread()
+    return jax.random.fold_in(jax.random.key(seed), number)
 
 
 def automatic_gain(time_s: float, swing: float, phases: np.ndarray) -> float:
@@ -154,17 +165,30 @@ def _next_power_of_2(count: int) -> int:
     return 1 << max(count - 1, 63).bit_length()
 
 
+class ExactPicture(NamedTuple):
+    """What a picture shows in the middle of its exposure.
+
+    Attributes:
+        depth_m: `(height, width)` float32 depth along the optical axis; every ray hits something.
+        owner: `(height, width)` int32, 0 on static things, `BACKDROP` on the backdrop, otherwise the number of the
+            actor.
+    """
+
+    depth_m: np.ndarray
+    owner: np.ndarray
+
+
 class TakenPicture(NamedTuple):
     """A picture as measured, and the exact one of its moment.
 
     Attributes:
-        exact: Depth, owners and color of the middle of the exposure.
+        exact: Depth and owners in the middle of the exposure.
         rgb: `(height, width, 3)` uint8.
         depth_m: `(height, width)` float32, 0 where missing.
         right: `(height, width, 3)` uint8 of the right camera of a pair; `None` without one.
     """
 
-    exact: Rendering
+    exact: ExactPicture
     rgb: np.ndarray
     depth_m: np.ndarray
     right: np.ndarray | None = None
@@ -204,6 +228,7 @@ class VirtualCamera:
             gain_at: Factor of brightness at a time.
             optics: How it exposes.
         """
+        keep_freed_memory()
         self._optics = optics or Optics()
         self._stage, self._camera, self._sensor = stage, camera, sensor
         self._pose_at, self._gain_at = pose_at, gain_at
@@ -219,33 +244,50 @@ class VirtualCamera:
         to_the_right_m = (0.0,) if baseline_m is None else (0.0, baseline_m)
         keys = [key, *(jax.random.fold_in(key, number) for number in range(1, len(to_the_right_m)))]
         scene, cameras = self._expose(time_s, to_the_right_m)
-        middle = len(cameras[0]) // 2
+        middle, cores = len(cameras[0]) // 2, usable_cores()
         # What waits for pictures does so in threads of its own, so that no core does.
-        with ThreadPoolExecutor(usable_cores()) as pool, ThreadPoolExecutor(1 + len(cameras)) as sensors:
+        with ThreadPoolExecutor(cores) as pool, ThreadPoolExecutor(1 + len(cameras) * cores) as sensors:
             renderers = [_Renderer(pool, scene, moments, self._camera) for moments in cameras]
             exact = renderers[0].submit(cameras[0][middle])
-            depth_m = sensors.submit(self._depth, exact, key)
+            depth = sensors.submit(self._depth, exact, key)
             colors = []
             for renderer, moments, its_key in zip(renderers, cameras, keys, strict=True):
                 pictures = [exact if view is cameras[0][middle] else renderer.submit(view) for view in moments]
-                colors.append(sensors.submit(self._color, time_s, pictures, its_key))
-            left, *right = (color.result() for color in colors)
-            return TakenPicture(exact.whole, left, depth_m.result(), *right)
+                by_part = zip(renderer.firsts, *pictures, strict=True)
+                colors.append([sensors.submit(self._color, time_s, its_key, *part) for part in by_part])
+            left, *right = (self._put_together(parts) for parts in colors)
+            whole, depth_m = depth.result()
+            return TakenPicture(whole, left, depth_m, *right)
 
-    def _depth(self, picture: "_Picture", key: jax.Array) -> np.ndarray:
-        params, exact = depth_params(self._sensor), picture.whole
-        return np.asarray(measure_depth(exact.depth_m, exact.incidence, self._camera.fx, params, key))
+    def _depth(self, picture: "_Parts", key: jax.Array) -> tuple[ExactPicture, np.ndarray]:
+        camera, parts = self._camera, [part.result() for part in picture]
+        depth_m, incidence, owner = (
+            untiled(planes, camera.height, camera.width)
+            for planes in zip(*((part.depth_m, part.incidence, part.owner) for part in parts), strict=True)
+        )
+        measured = measure_depth(depth_m, incidence, camera.fx, depth_params(self._sensor), key)
+        return ExactPicture(depth_m, owner), np.asarray(measured)
 
-    def _color(self, time_s: float, moments: list["_Picture"], key: jax.Array) -> np.ndarray:
-        rows = self._row_times(np.arange(self._camera.height))
-        gain = self._gain_of_rows(time_s + rows) if self._rolls else self._gain_at(time_s)
-        colors = tuple(moment.color for moment in moments)
-        channels = measure_color(colors, gain, self._sensor.image_noise, key, self._optics.lens)
-        # XLA needs as long to interleave the channels as to render a moment.
-        return cv2.merge(list(np.asarray(channels)))
+    def _color(self, time_s: float, key: jax.Array, first: int, *moments: "Future[Rendering]") -> np.ndarray:
+        """Measure some rows of tiles, those below the `first`."""
+        size = {"height": self._camera.height, "width": self._camera.width}
+        exposures = tuple(moment.result().color for moment in moments)
+        gain = self._gain_at(time_s)
+        if self._rolls:
+            height, count = Tiling.of(**size).height, len(exposures[0])
+            since_s = self._row_times(np.arange(first * height, (first + count) * height))
+            gain = self._gain_of_rows(time_s + since_s).reshape(1, count, 1, height, 1)
+        noise = self._sensor.image_noise
+        return np.asarray(measure_color(exposures, first, gain, noise, key, self._optics.lens, **size))
 
     def _gain_of_rows(self, times_s: np.ndarray) -> np.ndarray:
-        return np.array([self._gain_at(float(time_s)) for time_s in times_s])[None, :, None]
+        return np.array([self._gain_at(float(time_s)) for time_s in times_s])
+
+    def _put_together(self, parts: "list[Future[np.ndarray]]") -> np.ndarray:
+        """Picture `(height, width, 3)` of parts `(3, rows, columns, h, w)` below each other."""
+        by_channel = zip(*(part.result() for part in parts), strict=True)
+        # XLA needs as long to interleave the channels as to render a moment.
+        return cv2.merge([untiled(channel, self._camera.height, self._camera.width) for channel in by_channel])
 
     def _expose(self, time_s: float, to_the_right_m: Sequence[float]) -> tuple[RenderScene, list[list[CameraView]]]:
         """The moments of one exposure, evenly in time, each on its own row and column within the pixel, by camera."""
@@ -286,6 +328,15 @@ class VirtualCamera:
         return scene, [CameraView(solids, place, intrinsics, shift) for solids, place, shift in arrays]
 
 
+_PART_PIXELS = 160_000
+"""Pixels of a part of a picture at most. XLA clears planes of more than a megabyte, 262,000 pixels, in its pool of
+threads, and the rest of a program stays in it, where programs wait for each other.
+"""
+
+_Parts: TypeAlias = "list[Future[Rendering]]"
+"""Parts of a picture, rows of tiles below each other, that are being rendered."""
+
+
 class _Renderer:
     """Renders what one camera sees over an exposure, on all processor cores: XLA renders one picture at a time."""
 
@@ -300,43 +351,28 @@ class _Renderer:
         """
         self._pool, self._scene = pool, scene
         self._size = {"height": camera.height, "width": camera.width}
+        tiling = Tiling.of(**self._size)
+        self._rows = tiling.rows
+        pixels = tiling.columns * tiling.height * tiling.width
+        self._share = max(min(_PART_PIXELS // pixels, -(-tiling.rows // usable_cores())), 1)
         self._candidates = pool.submit(self._find, moments)
 
-    def submit(self, view: CameraView) -> "_Picture":
+    @property
+    def firsts(self) -> range:
+        """First rows of tiles of the parts of a picture."""
+        return range(0, self._rows, self._share)
+
+    def submit(self, view: CameraView) -> _Parts:
         """Begin to render a view in parts, rows of tiles below each other."""
-        rows = Tiling.of(**self._size).rows
-        share = -(-rows // usable_cores())
-        firsts = range(0, rows, share)
-        parts = [self._pool.submit(self._render_part, view, first, min(share, rows - first)) for first in firsts]
-        return _Picture(parts, **self._size)
+        # A program that is given large NumPy arrays runs in XLA's pool of threads, one after the other.
+        view = jax.block_until_ready(jax.device_put(view))
+        return [self._pool.submit(self._render_part, view, first) for first in self.firsts]
 
     def _find(self, moments: list[CameraView]) -> Candidates:
         solid_from_cam = np.stack([np.asarray(view.solid_from_cam) for view in moments])
         return find_candidates(self._scene, solid_from_cam, np.asarray(moments[0].intrinsics), **self._size)
 
-    def _render_part(self, view: CameraView, first: int, rows: int) -> Rendering:
+    def _render_part(self, view: CameraView, first: int) -> Rendering:
+        rows = min(self._share, self._rows - first)
         part = render(self._scene, view, self._candidates.result(), first, rows=rows, **self._size)
         return jax.block_until_ready(part)
-
-
-class _Picture:
-    """A picture that is being rendered: what asks for it waits.
-
-    Most pictures are one moment of an exposure, of which only the color is put together.
-    """
-
-    def __init__(self, parts: "list[Future[Rendering]]", height: int, width: int) -> None:
-        """Take the parts, below each other, and the size of the picture."""
-        self._parts, self._height, self._width = parts, height, width
-
-    @property
-    def color(self) -> np.ndarray:
-        """`Rendering.color`."""
-        return untiled([part.result().color for part in self._parts], self._height, self._width)
-
-    @cached_property
-    def whole(self) -> Rendering:
-        """All of it."""
-        by_plane = zip(*(part.result() for part in self._parts), strict=True)
-        planes: Any = (untiled(plane, self._height, self._width) for plane in by_plane)
-        return Rendering(*planes)

@@ -77,6 +77,19 @@ def test_another_number_later_is_said() -> None:
     assert last == "threads 1 2 False"
 
 
+def test_rendered_frames_before_the_first_tracker() -> None:
+    """They are the first arrays of the process, and do not take the choice from the tracker."""
+    rendered = "from jaxslam.datasets.synthetic import *; SyntheticDataset(SyntheticConfig(width=64, height=48))[0]"
+    assert said(f"{rendered}; begin(1)") == ["threads 1 1 False"]
+
+
+def test_frames_rendered_after_other_arrays() -> None:
+    """Nothing is said: only trackers are told of XLA's threads."""
+    rendered = "from jaxslam.datasets.synthetic import *; SyntheticDataset(SyntheticConfig(width=64, height=48))[0]"
+    (last,) = said(f"jnp.zeros(3).block_until_ready(); {rendered}", NPROC="2")
+    assert last.startswith("threads 2")
+
+
 def test_preferred_before_the_first_array() -> None:
     assert said("import jaxslam; jaxslam.prefer_one_thread(); jnp.zeros(3); begin(1)") == ["threads 1 1 False"]
 

@@ -1,6 +1,7 @@
 """The faults of the synthetic camera: each one as large as configured, each one on its own switch."""
 
 import dataclasses
+from typing import Any
 
 import cv2
 import jax
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxslam.datasets.synthetic import PERFECT_SENSOR, SensorConfig, SyntheticConfig, SyntheticDataset
-from jaxslam.datasets.synthetic.sensor_noise import depth_params, measure_color, measure_depth
+from jaxslam.datasets.synthetic.sensor_noise import LensParams, depth_params, measure_color, measure_depth
 
 SHAPE = (120, 160)
 GRAY = np.uint32(400 | 400 << 10 | 400 << 20)
@@ -19,9 +20,14 @@ def measured(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Channels and depth of a gray picture."""
     cosines, random = np.full(SHAPE, incidence, np.float32), jax.random.key(key)
-    channels = measure_color((np.full(SHAPE, GRAY),), gain, config.image_noise, random)
+    channels = measured_color(np.full((1, 1, *SHAPE), GRAY), 0, gain, config.image_noise, random)[:, 0, 0]
     result = measure_depth(depth.astype(np.float32), cosines, 525.0, depth_params(config), random)
     return np.asarray(channels), np.asarray(result)
+
+
+def measured_color(tiles: np.ndarray, first: int, *args: Any, **kwargs: Any) -> np.ndarray:
+    """Color of rows of tiles of one moment."""
+    return np.asarray(measure_color((tiles,), first, *args, **kwargs, height=SHAPE[0], width=SHAPE[1]))
 
 
 def wall(depth_m: float) -> np.ndarray:
@@ -111,6 +117,23 @@ class TestColor:
         assert (bright == 153).all()
         assert (dark == 102).all()
         assert (measured(wall(2.0), PERFECT_SENSOR, gain=5.0)[0] == 255).all()
+
+    @pytest.mark.parametrize("lens", [None, LensParams(vignetting=0.4, gamma=2.2)])
+    def test_tiles_in_parts_are_the_whole_picture(self, lens: LensParams | None):
+        """Of 50 x 64 pixels, so that the last ones reach beyond the picture."""
+        key, rows = jax.random.key(3), np.linspace(0.8, 1.2, 150)
+        one = np.full((1, 1, *SHAPE), GRAY)
+        whole = measured_color(one, 0, rows[: SHAPE[0]].reshape(1, 1, 1, -1, 1), 2.0, key, lens)[:, 0, 0]
+        parts = [
+            measured_color(np.full((count, 3, 50, 64), GRAY), first, gain, 2.0, key, lens)
+            for first, count in ((0, 2), (2, 1))
+            for gain in [rows[50 * first : 50 * (first + count)].reshape(1, count, 1, 50, 1)]
+        ]
+        tiles = np.concatenate(parts, axis=1)
+        put_together = tiles.transpose(0, 1, 3, 2, 4).reshape(3, 150, 192)[:, : SHAPE[0], : SHAPE[1]]
+        difference = np.abs(put_together.astype(int) - whole)
+        assert difference.max() <= 1  # of a product and a sum, rounded once or twice
+        assert np.mean(difference > 0) < 1e-4
 
 
 class TestInARecording:
