@@ -15,6 +15,9 @@ from jaxslam.io.atomic_files import make_folder
 if TYPE_CHECKING:
     from jaxslam.benchmark.live.program import Program
 
+_SLACK_S, _SLOWEST = 300.0, 10.0
+"""A program is killed five minutes after ten times the time that the frames of the recording take."""
+
 # Heavy modules are imported where a command runs: `--help` needs none of them.
 
 
@@ -40,6 +43,9 @@ class Live(WithJson):
     """Index after the last frame; by default, the end."""
     every: int = 1
     """Step between frames, such as 3 for every third one."""
+    limit: float | None = None
+    """Seconds after which a program that has not ended is killed; by default, five minutes and ten times the length of
+    the recording."""
     preset: str = "default"
     """Preset to start from."""
     out: Path = Path("results") / "bench" / "live"
@@ -51,8 +57,9 @@ class Live(WithJson):
         """Run the command."""
         for name, value, least in (("rounds", self.rounds, 1), ("start", self.start, 0), ("every", self.every, 1)):
             check_at_least(f"--{name}", value, least)
-        if self.rate is not None and not 0 < self.rate < float("inf"):
-            raise BenchmarkError(f"--rate: expected frames a second, more than 0, got {self.rate:g}")
+        for option, value, what in (("rate", self.rate, "frames a second"), ("limit", self.limit, "seconds")):
+            if value is not None and not 0 < value < float("inf"):
+                raise BenchmarkError(f"--{option}: expected {what}, more than 0, got {value:g}")
         from jaxslam.benchmark.live.program import ours, parse_program  # noqa: PLC0415
         from jaxslam.benchmark.reports.live import MEANING, conditions, markdown_report, picture  # noqa: PLC0415
         from jaxslam.cli.measurement_files import write_measurements  # noqa: PLC0415
@@ -73,7 +80,8 @@ class Live(WithJson):
         others = [parse_program(text, values) for text in self.others]
         make_folder(self.out, BenchmarkError)
         own = ours({**values, "preset": self.preset}, flat(self.set))
-        runs = self._measured([own, *others])
+        limit_s = _SLACK_S + _SLOWEST * len(dataset) / rate_hz if self.limit is None else self.limit
+        runs, problems = self._measured([own, *others], limit_s)
         content = {
             **machine(),
             "recording": dataset.name,
@@ -89,24 +97,41 @@ class Live(WithJson):
             _print_tables(runs)
             plain_console.print(f"{conditions(content)} {MEANING}")
         write_measurements(self.out, "live", content, markdown_report(content), picture(content))
+        if problems:
+            raise BenchmarkError("; ".join([*problems, f"the other runs are in {self.out}"]))
 
-    def _measured(self, programs: "Sequence[Program]") -> list[dict[str, Any]]:
-        """Run all programs in turn, with a progress bar; the first run of jaxslam compiles, and is not counted."""
+    def _measured(self, programs: "Sequence[Program]", limit_s: float) -> tuple[list[dict[str, Any]], list[str]]:
+        """Run all programs in turn, with a progress bar; the first run of jaxslam compiles, and is not counted.
+
+        Returns:
+            What was measured, and what went wrong in runs that are left out.
+
+        Raises:
+            BenchmarkError: If a program fails in its first run.
+        """
         from jaxslam.benchmark.live.program import run_program  # noqa: PLC0415
 
         runs: list[dict[str, Any]] = []
+        problems: list[str] = []
         with progress_bar("{task.description}", redraw=False) as progress:
             bar = progress.add_task("compiling", total=1 + self.rounds * len(programs))
             progress.refresh()
-            run_program(programs[0])
+            run_program(programs[0], limit_s=limit_s)
             progress.advance(bar)
             for number in range(self.rounds):
                 for program in programs:
                     progress.update(bar, description=f"round {number + 1}, {program.name}", refresh=True)
-                    runs.append({"program": program.name, "round": number, **asdict(run_program(program))})
+                    try:
+                        figures = run_program(program, limit_s=limit_s)
+                    except BenchmarkError as problem:
+                        if number == 0:  # as wrong in every round
+                            raise
+                        problems.append(f"round {number + 1}: {problem}")
+                    else:
+                        runs.append({"program": program.name, "round": number, **asdict(figures)})
                     progress.advance(bar)
             progress.update(bar, description="Live", refresh=True)
-        return runs
+        return runs, problems
 
 
 def _print_tables(runs: Sequence[dict[str, Any]]) -> None:

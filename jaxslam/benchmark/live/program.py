@@ -26,14 +26,20 @@ def parse_program(text: str, values: Mapping[str, str]) -> Program:
     return Program(name, command_words(command, values, "--with"))
 
 
-def run_program(program: Program) -> LiveFigures:
+def run_program(program: Program, *, limit_s: float | None = None) -> LiveFigures:
     """Run a program to its end, and return what it printed of itself with its peak memory.
 
+    Args:
+        program: Program to run.
+        limit_s: Time after which it is killed with all its children, seconds; `None` for no limit.
+
     Raises:
-        BenchmarkError: If it cannot be started, fails, or prints no figures.
+        BenchmarkError: If it cannot be started, fails, is killed, or prints no figures.
     """
     with tempfile.TemporaryFile() as printed, tempfile.TemporaryFile() as errors:
-        ended = run_to_its_end(program, printed, errors)
+        ended = run_to_its_end(program, printed, errors, limit_s=limit_s)
+        if ended.exit_code is None:
+            raise BenchmarkError(f"{program.name}: timed out after {limit_s:g} s and was killed")
         if ended.exit_code:
             raise BenchmarkError(f"{program.name}: exit code {ended.exit_code}: {last_words(_text(errors))}")
         return replace(parse_figures(program.name, _text(printed)), peak_mb=ended.peak_mb)

@@ -68,6 +68,10 @@ class TestProgram:
         with pytest.raises(BenchmarkError, match="other: exit code 1: ValueError: no vocabulary"):
             run_program(python("raise ValueError('no vocabulary')"))
 
+    def test_a_program_that_hangs(self) -> None:
+        with pytest.raises(BenchmarkError, match=r"other: timed out after 0\.5 s and was killed"):
+            run_program(python("import time; time.sleep(600)"), limit_s=0.5)
+
     def test_no_such_program(self) -> None:
         with pytest.raises(BenchmarkError, match="other: '/nowhere/slam' cannot be run"):
             run_program(Program("other", ("/nowhere/slam",)))
@@ -115,6 +119,7 @@ class TestReport:
         (["--with", "orb"], "--with: expected NAME=COMMAND, got 'orb'"),
         (["--set", "track.points=3"], "track.points"),
         (["--start", "500"], "expected a part of"),
+        (["--limit", "0"], "--limit: expected seconds, more than 0, got 0"),
     ],
 )
 def test_bad_options(words: list[str], message: str, data_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -144,3 +149,28 @@ def test_a_whole_measurement(data_dir: Path, tmp_path: Path) -> None:
     assert own["ate_m"] < 0.02
     assert (tmp_path / "live.md").is_file()
     assert (tmp_path / "live.png").is_file()
+
+
+FAILS_LATER = """
+import pathlib, sys
+seen = pathlib.Path(sys.argv[1])
+assert not seen.exists(), "out of memory"
+seen.touch()
+print("12 frames, 11 OK; median 9.0 ms, p95 12.0; processor time 20.0 ms")
+"""
+
+
+@pytest.mark.slow
+def test_a_program_that_fails_later(data_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What was measured of it and of the others is kept, and the failure is said."""
+    words = ["--rounds", "2", "--stop", "20", "--out", str(tmp_path / "out"), "--set", "semantics.model=null"]
+    program = tmp_path / "program.py"
+    program.write_text(FAILS_LATER)
+    other = f"other={sys.executable} {program} {tmp_path / 'seen'}"
+    recording = data_dir / "tum/rgbd_dataset_freiburg1_rpy_excerpt"
+    with pytest.raises(SystemExit, match="1"):
+        main(["bench", "live", str(recording), *words, "--with", other])
+    said = " ".join(capsys.readouterr().err.split())
+    assert "round 2: other: exit code 1: AssertionError: out of memory; the other runs are in" in said
+    content = json.loads((tmp_path / "out" / "live.json").read_text())
+    assert [(run["program"], run["round"]) for run in content["runs"]] == [("jaxslam", 0), ("other", 0), ("jaxslam", 1)]
