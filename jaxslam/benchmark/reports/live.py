@@ -40,8 +40,9 @@ def ratio_rows(runs: Runs) -> list[list[str]]:
 
 
 def ratio(own: Runs, theirs: Runs, field: str) -> float:
-    """Return the median over rounds of the ratio of a figure of two programs in the same round."""
-    return statistics.median(ours[field] / their[field] for ours, their in zip(own, theirs, strict=True))
+    """Return the median of the ratios of a figure of two programs within each round that both have ended."""
+    by_round = {run["round"]: run for run in theirs}
+    return statistics.median(ours[field] / by_round[ours["round"]][field] for ours in own if ours["round"] in by_round)
 
 
 def _row(program: str, runs: Runs) -> list[str]:
