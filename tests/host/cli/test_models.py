@@ -273,6 +273,11 @@ class TestCheck:
 class TestVerdict:
     """Without an image, the command says whether a network is good."""
 
+    @pytest.fixture(autouse=True)
+    def elsewhere(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+        """Picture files of failing commands have no option `--out` here."""
+        monkeypatch.chdir(tmp_path)
+
     def check(self, *arguments: str | Path, out: Path) -> None:
         main(["models", "check", *map(str, arguments), "--out", str(out / "out.png")])
 
