@@ -166,7 +166,7 @@ def _next_power_of_2(count: int) -> int:
 
 
 class ExactPicture(NamedTuple):
-    """What a picture shows in the middle of its exposure.
+    """Exact depth and owners of a picture in the middle of its exposure.
 
     Attributes:
         depth_m: `(height, width)` float32 depth along the optical axis; every ray hits something.
@@ -323,7 +323,6 @@ class VirtualCamera:
         places = world_from_cam.reshape(num_views, len(since_s), 4, 4)[:, len(since_s) // 2, :3].astype(np.float32)
         intrinsics: Any = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
         shifts = np.tile(offsets.astype(np.float32), (len(to_the_right_m), 1))
-        # NumPy arrays, which a compiled function takes sooner than JAX puts them on the device.
         arrays: Any = zip(by_view if self._rolls else by_view[:, 0], places, shifts, strict=True)
         return scene, [CameraView(solids, place, intrinsics, shift) for solids, place, shift in arrays]
 

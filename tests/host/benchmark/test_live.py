@@ -162,7 +162,7 @@ print("12 frames, 11 OK; median 9.0 ms, p95 12.0; processor time 20.0 ms")
 
 @pytest.mark.slow
 def test_a_program_that_fails_later(data_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """What was measured of it and of the others is kept, and the failure is said."""
+    """Runs that ended are kept, of it and of the others, and the failure is said."""
     words = ["--rounds", "2", "--stop", "20", "--out", str(tmp_path / "out"), "--set", "semantics.model=null"]
     program = tmp_path / "program.py"
     program.write_text(FAILS_LATER)

@@ -120,7 +120,7 @@ class TestColor:
 
     @pytest.mark.parametrize("lens", [None, LensParams(vignetting=0.4, gamma=2.2)])
     def test_tiles_in_parts_are_the_whole_picture(self, lens: LensParams | None):
-        """Of 50 x 64 pixels, so that the last ones reach beyond the picture."""
+        """The last tiles, of 50 x 64 pixels, reach beyond the picture."""
         key, rows = jax.random.key(3), np.linspace(0.8, 1.2, 150)
         one = np.full((1, 1, *SHAPE), GRAY)
         whole = measured_color(one, 0, rows[: SHAPE[0]].reshape(1, 1, 1, -1, 1), 2.0, key, lens)[:, 0, 0]
