@@ -48,6 +48,8 @@ class Soak(WithJson):
     """Share of the calls of the detector that fail."""
     live: bool = False
     """Give each module its own thread, and frames as fast as they are tracked; otherwise all run in turn."""
+    realtime: bool = False
+    """Give each module its own thread, and frames at the rate of the recording. Late frames are dropped."""
     out: Path = Path("results") / "bench" / "soak"
     """Folder for the table, the plot, and the figures. Those of an earlier test are replaced."""
     set: Settings = ()
@@ -65,8 +67,9 @@ class Soak(WithJson):
         from jaxslam.slam.slam import Slam  # noqa: PLC0415
 
         enable_compile_cache()
-        live = ("run.deterministic=false",) if self.live else ()
-        config = load_config(self.preset, None, (*live, *flat(self.set)))
+        threads = ("run.deterministic=false",) if self.live else ()
+        rate = ("run.realtime=true",) if self.realtime else ()
+        config = load_config(self.preset, None, (*threads, *rate, *flat(self.set)))
         recording, detector = self._opened(config)
         make_folder(self.out, BenchmarkError)
         with Slam(recording.camera, config, detector=detector) as slam:
@@ -85,6 +88,7 @@ class Soak(WithJson):
             "recording": recording.name,
             "preset": self.preset,
             "live": self.live,
+            "realtime": self.realtime,
             "frames": self.frames,
             "window": self.window,
             "covered_every": self.covered_every,

@@ -9,7 +9,8 @@ from jaxslam.benchmark.reports.document import Heading, Paragraph, Table, to_mar
 from jaxslam.benchmark.soak.meter import Window
 from jaxslam.visualization.plots import png
 
-COLUMNS = ("frames", "keyframes", "points", "MB", "lost", "covered", "median", "p95", "max, ms", "CPU, ms", "ATE, mm")
+_COUNTS = ("frames", "keyframes", "points", "MB", "lost", "covered", "dropped")
+COLUMNS = (*_COUNTS, "median", "p95", "max, ms", "CPU, ms", "ATE, mm")
 _SIZE_IN, _DPI = (7.2, 8.4), 120
 _COLOR, _OTHER_COLOR = "#0072b2", "#d55e00"
 
@@ -24,6 +25,7 @@ def cells(window: Mapping[str, Any]) -> list[str]:
         f"{window['rss_mb']:.0f}",
         str(window["lost"]),
         str(window["made_lost"]),
+        str(window["dropped"]),
         *(f"{window[name]:.1f}" for name in ("median_ms", "p95_ms", "max_ms", "cpu_ms")),
         "-" if ate_m is None else f"{1e3 * ate_m:.1f}",
     ]
@@ -39,6 +41,7 @@ def summary(windows: Sequence[Window]) -> dict[str, Any]:
         "p95_ratio": round(last.p95_ms / first.p95_ms, 3),
         "max_ms": max(window.max_ms for window in windows),
         "lost": sum(window.lost for window in windows),
+        "dropped": sum(window.dropped for window in windows),
         "ate_ratio": round((last.ate_m or 0.0) / first.ate_m, 3) if both and first.ate_m else None,
     }
 
@@ -50,13 +53,14 @@ def markdown_report(content: Mapping[str, Any]) -> str:
 
 
 def _how(content: Mapping[str, Any]) -> str:
-    threads = "each module in its thread" if content["live"] else "all modules in turn"
+    threads = "each module in its thread" if content["live"] or content["realtime"] else "all modules in turn"
+    threads += ", frames at the rate of the recording" if content["realtime"] else ""
     fails = content["detector_fails"]
     return (
         f"Preset {content['preset']}, {threads}. Each row sums up the frames since the one before: keyframes and points"
         " of the map and resident memory of the process at its end; frames that were lost though the lens was free, and"
-        " while it was covered or in the second after; milliseconds of a frame, and processor time of all that the"
-        " process did; RMSE of the poses as they were given out. "
+        " while it was covered or in the second after; frames that came too late to be tracked; milliseconds of a"
+        " frame, and processor time of all that the process did; RMSE of the poses as they were given out. "
         + (f"The lens is covered every {content['covered_every']} frames. " if content["covered_every"] else "")
         + (f"{fails:.1%} of the calls of the detector fail. " if fails else "")
         + f"Last row against the first: {content['keyframes_ratio']:g} times the keyframes,"

@@ -30,6 +30,7 @@ class Window:
         rss_mb: Resident memory of the process, megabytes.
         lost: Number of lost frames although the lens was not covered.
         made_lost: Number of lost frames while the lens was covered, or right after.
+        dropped: Number of frames that came too late to be tracked; only with `run.realtime`.
         median_ms: Median time of a frame, milliseconds.
         p95_ms: 95th percentile of it.
         max_ms: Largest.
@@ -45,6 +46,7 @@ class Window:
     rss_mb: float
     lost: int
     made_lost: int
+    dropped: int
     median_ms: float
     p95_ms: float
     max_ms: float
@@ -82,6 +84,8 @@ class SoakMeter:
         self._slam, self._truth, self._window, self._may_be_lost = slam, truth, window, may_be_lost
         self._table = table
         self._frames = 0
+        if truth is not None:  # compile: after the first window, that would hold frames up for a second
+            self._ate_m(truth.timestamps_ns[:window], truth.T_world_cam[:window])
         self._append([field.name for field in dataclasses.fields(Window)], mode="w")
         self._begin()
 
@@ -90,6 +94,7 @@ class SoakMeter:
         if result.status in (TrackStatus.LOST, TrackStatus.REJECTED):
             may = self._may_be_lost(self._frames)
             self._made_lost, self._lost = self._made_lost + may, self._lost + (not may)
+        self._dropped += result.status == TrackStatus.DROPPED
         if isinstance(result, FrameResult):
             self._ms.append(result.track_ms)
             if result.status != TrackStatus.LOST and result.in_map_frame:
@@ -111,11 +116,12 @@ class SoakMeter:
             rss_mb=round(rss_mb(), 1),
             lost=self._lost,
             made_lost=self._made_lost,
+            dropped=self._dropped,
             median_ms=round(float(np.median(ms)), 3),
             p95_ms=round(float(np.percentile(ms, 95)), 3),
             max_ms=round(float(ms.max()), 3),
             cpu_ms=round(1e3 * (time.process_time() - self._since_s) / len(ms), 3),
-            ate_m=self._ate_m(),
+            ate_m=self._ate_m(np.array(self._times, np.int64), np.array(self._poses)),
             submaps=len(set(slam_map.submap.tolist())),
             loops=self._slam.loops_closed,
         )
@@ -127,15 +133,14 @@ class SoakMeter:
         self._ms: list[float] = []
         self._times: list[int] = []
         self._poses: list[np.ndarray] = []
-        self._lost = self._made_lost = 0
+        self._lost = self._made_lost = self._dropped = 0
         self._since_s = time.process_time()
 
-    def _ate_m(self) -> float | None:
-        if self._truth is None or not self._times:
+    def _ate_m(self, timestamps_ns: np.ndarray, T_world_cam: np.ndarray) -> float | None:
+        if self._truth is None or not len(timestamps_ns):
             return None
         try:
-            given = Trajectory(np.array(self._times, np.int64), np.array(self._poses))
-            return round(evaluate(given, self._truth).ate_rmse_m, 6)
+            return round(evaluate(Trajectory(timestamps_ns, T_world_cam), self._truth).ate_rmse_m, 6)
         except TrajectoryError:  # too few poses with a truth
             return None
 

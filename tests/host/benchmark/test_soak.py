@@ -150,11 +150,13 @@ def test_a_world_without_room_for_people_is_an_error() -> None:
 
 
 @pytest.mark.slow
-def test_files_of_the_command(room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("rate", [[], ["--realtime"]])
+def test_files_of_the_command(room: Path, tmp_path: Path, rate: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     wanted = ["--frames", "50", "--window", "20", "--covered-every", "25", "--size", "160x120", "--people", "2"]
-    main(["bench", "soak", str(room), *wanted, "--out", str(tmp_path), "--json"])
+    main(["bench", "soak", str(room), *wanted, *rate, "--out", str(tmp_path), "--json"])
     content = json.loads(capsys.readouterr().out)
     assert [window["frames"] for window in content["windows"]] == [20, 40, 50]
+    assert rate or not content["dropped"]
     assert all(window["ate_m"] < 0.05 for window in content["windows"][:1])
     with (tmp_path / "soak.csv").open() as file:
         assert [int(row["frames"]) for row in csv.DictReader(file)] == [20, 40, 50]
