@@ -41,7 +41,8 @@ class TrackConfig(ValidatedConfig):
     """Frames in which new points are detected where there are few: all frames, or keyframes only."""
     match_map: Literal["weak", "keyframes", "always"] = "weak"
     """Frames that are also matched with the map by ORB features: frames with few tracked points (`weak`), keyframes
-    too, or all frames. Frames that optical flow has lost are matched in any case."""
+    too, or all frames. Frames that optical flow has lost are matched in any case, and so are those in which hardly any
+    point agrees of the keyframes that show the view."""
 
     depth_sigma_m: Annotated[float, Positive] = 0.005
     """Standard deviation of measured depth close to the camera, meters."""

@@ -11,8 +11,8 @@ from jaxslam_kernels.pose.pose_refine import PoseRefinement, PoseStatus, refine_
 from jaxslam_kernels.types import Pixels, Points, Weights
 from jaxtyping import Float, Float32, Float64, Int, Int64
 
-from jaxslam.features.orb import FeaturePlan, Features
-from jaxslam.geometry.se3 import to_local
+from jaxslam.features.orb import FeaturePlan, Features, no_features
+from jaxslam.geometry.se3 import IDENTITY, to_local
 from jaxslam.geometry.types import Pose
 from jaxslam.runtime.compiled import compiled
 from jaxslam.runtime.compiler_options import FAST_COMPILE
@@ -147,8 +147,10 @@ def fit_pose(
         sensor: Camera, of which ideal pixels leave the pinhole, and the error model of its depth.
         gates: What the pose must meet.
     """
-    refined: PoseRefinement = jax.device_get(_refined(SE3(jnp.asarray(T_origin_cam, jnp.float32)), matches, sensor))
     used = np.asarray(matches.weight) > 0
+    if np.count_nonzero(used) < gates.min_inliers:
+        return None
+    refined = _fitted(T_origin_cam, matches, sensor)
     gate = np.where(np.asarray(matches.depth) > 0, _CHI2_GATES[1], _CHI2_GATES[0])
     agree = np.flatnonzero(used & (np.asarray(refined.chi2) < gate))
     share = len(agree) / max(np.count_nonzero(used), 1)
@@ -164,6 +166,16 @@ def fit_pose(
     num_cells = _cells(np.asarray(matches.uv)[:, agree], sensor)
     found = FeaturePose(pose, covariance, agree, share, num_cells, float(sigma_m / depth_m))
     return found if found.meets(gates) else None
+
+
+def compile_pose_fit(sensor: SensorModel, plan: FeaturePlan) -> None:
+    """Compile what `fit_pose` needs for matches of the default capacity."""
+    nothing = np.zeros(0, np.int64)
+    _fitted(IDENTITY, matches_of(np.zeros((3, 0)), np.zeros(0), no_features(), nothing, plan), sensor)
+
+
+def _fitted(T_origin_cam: Pose, matches: Matches, sensor: SensorModel) -> PoseRefinement:
+    return jax.device_get(_refined(SE3(jnp.asarray(T_origin_cam, jnp.float32)), matches, sensor))
 
 
 def matches_depth_sigma(matches: Matches, sensor: SensorModel) -> Weights:

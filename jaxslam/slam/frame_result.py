@@ -25,7 +25,7 @@ class FrameResult:
         twist: `(6,)` velocity of the camera in its own axes: m/s, then rad/s.
         num_inliers: Number of tracked points that agree with the pose.
         inlier_ratio: Inliers as a share of the points that could be tracked.
-        num_keyframe_matches: Number of points matched with the images of keyframes.
+        num_keyframe_matches: Number of points matched with the images of keyframes that agree with the pose.
         num_matched: Number of map points that were matched by descriptor and agree with the pose; 0 unless the frame
             was matched with the map, as weak and lost frames are.
         residual_px: Robust standard deviation of the reprojection errors of the inliers, pixels.

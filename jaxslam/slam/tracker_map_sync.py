@@ -71,7 +71,8 @@ class TrackerMapSync:
         """
         identity, nothing = IDENTITY.astype(np.float32), np.zeros(self._plan.num_points, np.float32)
         still = np.zeros(6, np.float32)
-        state = _carried(_relocated(state, identity, still), identity, np.tile(identity, (len(self._slots), 1)))
+        state = _relocated(state, identity, still, np.bool_(False))
+        state = _carried(state, identity, np.tile(identity, (len(self._slots), 1)))
         if self._plan.num_reloaded:
             plane, image = np.tile(nothing, (3, 1)), np.zeros(state.keyframes.images.shape[1:], np.uint8)
             places = (identity, plane[:2], plane)
@@ -109,10 +110,20 @@ class TrackerMapSync:
         self.reference = keyframe_id
         self._believed.setdefault(keyframe_id, self.map.pose(keyframe_id))
 
-    def reset_at_pose(self, state: TrackState, T_world_cam: Pose, twist: Float[np.ndarray, "6"]) -> TrackState:
-        """The tracker's state reset to a pose `(7,)` and a velocity `(6,)`, without its keyframes."""
-        self._slots = [NONE] * len(self._slots)
-        return _relocated(state, T_world_cam.astype(np.float32), twist.astype(np.float32))
+    def reset_at_pose(
+        self, state: TrackState, T_world_cam: Pose, twist: Float[np.ndarray, "6"], *, keep_keyframes: bool = False
+    ) -> TrackState:
+        """The tracker's state reset to a pose and a velocity.
+
+        Args:
+            state: The state.
+            T_world_cam: `(7,)` pose of the camera.
+            twist: `(6,)` velocity of the camera in its own axes, m/s, then rad/s.
+            keep_keyframes: Whether the tracker still looks into the same keyframes.
+        """
+        if not keep_keyframes:
+            self._slots = [NONE] * len(self._slots)
+        return _relocated(state, T_world_cam.astype(np.float32), twist.astype(np.float32), np.bool_(keep_keyframes))
 
     def submap_now(self) -> int:
         """Number of the submap that the frames are in."""

@@ -43,6 +43,7 @@ class FrameEstimate(NamedTuple):
     Attributes:
         refined: Refinement of the pose.
         matches: Keyframe points aligned with the frame.
+        matched: `(m,)` mask of those that agree with the pose.
         kept: Tracked points, updated.
         outcome: Whether the frame was tracked.
         rejection: Combined result of the dynamic cues.
@@ -50,6 +51,7 @@ class FrameEstimate(NamedTuple):
 
     refined: PoseRefinement
     matches: KeyframeMatches
+    matched: Mask
     kept: KeptPoints
     outcome: Outcome
     rejection: DynamicRejection
@@ -219,7 +221,7 @@ def _new_state(step: StepContext, estimate: FrameEstimate, motion: _Motion, endi
 
 def _output(step: StepContext, estimate: FrameEstimate, motion: _Motion, ending: _Ending) -> TrackOutput:
     """Make the output for the frame."""
-    refined, matches, kept, outcome, rejection = estimate
+    refined, matches, matched, kept, outcome, rejection = estimate
     lost, points, dtype = outcome.lost, ending.points, motion.twist.dtype
     statuses = (TrackStatus.STARTED, TrackStatus.LOST, TrackStatus.WEAK)
     matches = matches._replace(weight=jnp.where(lost, 0, matches.weight))
@@ -232,7 +234,7 @@ def _output(step: StepContext, estimate: FrameEstimate, motion: _Motion, ending:
         reason=ending.reason,
         num_inliers=jnp.where(lost, 0, jnp.sum(kept.tracked)),
         inlier_ratio=jnp.where(lost, 0, outcome.inlier_ratio),
-        num_keyframe_matches=jnp.sum(matches.weight > 0),
+        num_keyframe_matches=jnp.where(lost, 0, jnp.sum(matched)),
         residual_px=refined.residual_scale * step.params.pixel_sigma,
         uv=points.uv,
         weights=jnp.where(points.has_position() & ending.at_rest & (~lost | motion.start), weights, 0),

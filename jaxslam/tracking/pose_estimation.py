@@ -86,7 +86,7 @@ def refined_pose(
     matches_seen: Measurements,
     coarse: SE3,
     prior: PosePrior | None = None,
-) -> tuple[PoseRefinement, Mask]:
+) -> tuple[PoseRefinement, Mask, Mask]:
     """Refine the coarse pose from tracked points and keyframe matches together.
 
     Args:
@@ -99,7 +99,7 @@ def refined_pose(
         prior: Pose known beforehand, one more term; `None` if nothing is known.
 
     Returns:
-        The refinement, and the `(n,)` mask of the tracked points that agree with it.
+        The refinement, the `(n,)` mask of the tracked points that agree with it, and the `(m,)` mask of the matches.
     """
     params = step.params
     X_world = jnp.concatenate([step.state.points.X_world, matches.X_world], axis=1)
@@ -121,7 +121,8 @@ def refined_pose(
         tolerance=step.plan.pose_tolerance,
     )
     close = reprojects(refined.T_world_cam, X_world, seen.xy, params)
-    return refined, (trust > 0) & close[: trust.shape[0]]
+    agreeing = (weights > 0) & close
+    return refined, agreeing[: trust.shape[0]], agreeing[trust.shape[0] :]
 
 
 def worse_status(coarse: Code, refined: Code) -> Code:

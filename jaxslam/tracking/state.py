@@ -328,7 +328,7 @@ class TrackOutput(NamedTuple):
         reason: A `TrackReason`.
         num_inliers: Number of tracked points that agree with the pose.
         inlier_ratio: Share of inliers among the points found by optical flow.
-        num_keyframe_matches: Number of keyframe points matched in the frame.
+        num_keyframe_matches: Number of keyframe points matched in the frame that agree with the pose.
         residual_px: Robust standard deviation of the reprojection errors of the inliers, pixels.
         uv: `(2, n)` positions of the points in this frame, new ones included, pixels.
         weights: `(n,)` final weights of the points, 0 to 1: 0 for an outlier, the given weight for a new point.

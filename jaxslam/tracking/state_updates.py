@@ -6,7 +6,7 @@ import numpy as np
 from jax import lax
 from jaxlie import SE3
 from jaxslam_kernels.se3 import compose, to_world
-from jaxslam_kernels.types import Code, Pixels, Points, Weights
+from jaxslam_kernels.types import Code, Flag, Pixels, Points, Weights
 from jaxtyping import Array, Bool, Float, Int, Num
 
 from jaxslam.tracking.state import TrackPhase, TrackState
@@ -113,16 +113,18 @@ def drop_points(state: TrackState, ids: Int[Array, " m"]) -> TrackState:
     )
 
 
-def reset_at_pose(state: TrackState, T_world_cam: Float[Array, "7"], twist: Float[Array, "6"]) -> TrackState:
+def reset_at_pose(
+    state: TrackState, T_world_cam: Float[Array, "7"], twist: Float[Array, "6"], keep_keyframes: Flag | bool = False
+) -> TrackState:
     """Reset a lost tracker at a pose and a velocity: the next step starts there at once.
 
-    Its keyframes are dropped, because their poses relative to the new start are not known. Keyframes of the map can be
-    loaded again with `load_keyframe`.
+    Keyframes of the map can be loaded again with `load_keyframe`.
 
     Args:
         state: The state.
         T_world_cam: `(7,)` pose to start from, `wxyz_xyz`.
         twist: `(6,)` velocity of the camera in its own axes, m/s, then rad/s; 0 if it is not known.
+        keep_keyframes: Whether to keep the keyframes, as their poses relative to the new start are known.
 
     Raises:
         ValueError: While tracing, if the pose or the velocity has another shape.
@@ -134,6 +136,6 @@ def reset_at_pose(state: TrackState, T_world_cam: Float[Array, "7"], twist: Floa
         T_world_cam=SE3(T_world_cam),
         twist=twist,
         points=state.points._replace(valid=jnp.zeros_like(state.points.valid)),
-        keyframes=state.keyframes._replace(weight=jnp.zeros_like(state.keyframes.weight)),
+        keyframes=state.keyframes._replace(weight=jnp.where(keep_keyframes, state.keyframes.weight, 0)),
         phase=jnp.full_like(state.phase, TrackPhase.START),
     )

@@ -224,7 +224,7 @@ def track_followed(
     matches = align_keyframe_points(step._replace(view=static_view), coarse, twist)
     # 7. Refinement of the pose by tracked points and keyframe points together.
     counting, matches_seen = jnp.where(agreeing, trust, 0), measure_matches(step, matches, coarse, twist)
-    refined, inliers = refined_pose(step, seen, counting, matches, matches_seen, coarse, prior)
+    refined, inliers, matched = refined_pose(step, seen, counting, matches, matches_seen, coarse, prior)
     outcome = judge_frame(step, refined, background & rejection.counts(), inliers)
     # 8. Points at the refined pose; new ones, and a keyframe, if they are needed.
     monitored = rejection.monitor_points(uv, state.points.anchor_age, background & ~inliers)
@@ -232,7 +232,7 @@ def track_followed(
     seen = step.measured(rays, X_world, pose, step.twist_to(pose))
     kept = update_points(step, uv, seen, inliers, monitored, pose)
     kept = with_located(kept, step, uv, seen, waiting & ~monitored & rejection.at_rest(uv), pose)
-    new_state, output = conclude(step, FrameEstimate(refined, matches, kept, outcome, rejection))
+    new_state, output = conclude(step, FrameEstimate(refined, matches, matched, kept, outcome, rejection))
     if plan.pose_steps > DEFAULT_PLAN.pose_steps:
         # Not always: one more use of the coarse pose's status has XLA round the pose itself in another way.
         output = output._replace(pose_status=worse_status(coarse_status, refined.status))

@@ -28,6 +28,7 @@ from jaxslam.mapping.local_mapping import mapping_plan
 from jaxslam.sensors.frame import Frame
 from jaxslam.sensors.frame_arrays import frame_arrays
 from jaxslam.sensors.sensor_model import sensor_model
+from jaxslam.slam import localization_stage
 from jaxslam.slam.frame_result import FrameResult
 from jaxslam.slam.slam import Slam
 from jaxslam.slam.tracker import KeyframeDemand
@@ -297,6 +298,24 @@ class TestWeakFrames:
         off = np.linalg.norm(between(mapped()[1][LATER].T_world_cam, result.T_world_cam)[4:])
         print(f"{off * 1e3:.1f} mm off")
         assert off < 0.015
+
+
+class TestFramesThatDisagreeWithTheMap:
+    @pytest.mark.parametrize("min_views", [localization_stage._MIN_VIEWS, 1000])
+    def test_are_matched_with_it(self, min_views: int, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Flow goes on from a state that is 10 cm off, and finds enough points for a frame that is `OK`."""
+        monkeypatch.setattr(localization_stage, "_MIN_VIEWS", min_views)
+        with Slam(CAMERA, CONFIG) as slam:
+            for frame in room().frames[:LATER]:
+                slam.track(frame)
+            pose = slam._localization.predicted()
+            off = compose(compose(pose, np.array([1.0, 0, 0, 0, 0.1, 0, 0])), inverse(pose))
+            slam._tracker.state = slam._back._link.apply_correction(slam._tracker.state, off, is_keyframe=False)
+            result = slam.track(room()[LATER])
+        off_m = np.linalg.norm(between(mapped()[1][LATER].T_world_cam, result.T_world_cam)[4:])
+        print(f"{result.num_keyframe_matches} of {result.num_inliers} matched, {1e3 * off_m:.1f} mm off")
+        assert result.status is TrackStatus.OK
+        assert (result.num_matched > 0) == (off_m < 0.02) == (min_views < 1000)
 
 
 class TestLostFrames:

@@ -122,3 +122,8 @@ class TestRelocated:
         assert not np.asarray(after.keyframes.weight).any()
         np.testing.assert_array_equal(after.twist, twist)
         assert int(after.phase) == TrackPhase.START
+
+    def test_keeps_keyframes_that_are_known_there(self, state: Any) -> None:
+        there = pose(np.random.default_rng(7))
+        after: Any = reset_at_pose(state, float32(there), float32(np.arange(1.0, 7.0)), keep_keyframes=True)
+        assert changed(state, after) == {".T_world_cam", ".twist", ".points.valid", ".phase"}
