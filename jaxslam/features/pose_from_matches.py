@@ -148,12 +148,13 @@ def fit_pose(
         gates: What the pose must meet.
     """
     used = np.asarray(matches.weight) > 0
-    if np.count_nonzero(used) < gates.min_inliers:
+    num_used = int(np.count_nonzero(used))
+    if num_used < gates.min_inliers:
         return None
     refined = _fitted(T_origin_cam, matches, sensor)
     gate = np.where(np.asarray(matches.depth) > 0, _CHI2_GATES[1], _CHI2_GATES[0])
     agree = np.flatnonzero(used & (np.asarray(refined.chi2) < gate))
-    share = len(agree) / max(np.count_nonzero(used), 1)
+    share = len(agree) / num_used
     if refined.status != PoseStatus.OK or not len(agree):
         return None
     pose = np.asarray(refined.T_world_cam.wxyz_xyz, np.float64)

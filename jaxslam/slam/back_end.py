@@ -146,6 +146,10 @@ class BackEnd:
         """Number of keyframes that the detector skipped because too many waited."""
         return 0 if self._semantics is None else self._semantics.num_passed_over
 
+    def count_views(self, T_world_cam: Pose) -> int:
+        """Count the keyframes of the map that show the view from a pose `(7,)` in the submap of the frame."""
+        return self._coverage.num_views(self.map, T_world_cam, self._link.submap_now())
+
     @property
     def num_views(self) -> int:
         """Number of keyframes of the map that showed the view of the latest frame."""
@@ -344,7 +348,7 @@ class BackEnd:
         T_world_cam = tracked.T_world_cam
         self._localizer.frame_tracked(arrays, anchored, tracked.twist)
         if not self._localize_only:
-            self._map_views = self._coverage.num_views(self.map, T_world_cam, self._link.submap_now())
+            self._map_views = self.count_views(T_world_cam)
         if frame % _RELOAD_EVERY == 0 or self._has_jumped:
             self._has_jumped = False
             looks = not self._localize_only and arrays.right is None and tracked.status == TrackStatus.OK

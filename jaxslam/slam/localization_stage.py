@@ -132,7 +132,8 @@ class LocalizationStage:
             return None
         self._tracker.state = back.reset_after_motion(self._tracker.state, found.T_world_cam, twist)
         flow = self._tracker.follow(arrays)
-        return TrackedAgain(flow, self._at_matched_pose(self._restarted(arrays, flow), found))
+        views = back.count_views(found.T_world_cam)
+        return TrackedAgain(flow, self._at_matched_pose(self._restarted(arrays, flow, views), found))
 
     def localize(
         self, arrays: FrameArrays, output: TrackOutput, dt_s: float, outside: Pose | None = None
@@ -202,7 +203,8 @@ class LocalizationStage:
         if found is not None:
             twist = self._velocity_to(found.anchored, dt_s)
             self._tracker.state = self._back.reset_at_pose(self._tracker.state, found.anchored, twist)
-            return self._relocalized(self._track_again(arrays), found, lost)
+            views = self._back.count_views(self._back.pose(found.anchored))
+            return self._relocalized(self._track_again(arrays, views), found, lost)
         if self._may_begin_submap and self._unrecognized > self._restart_after:
             pose = np.asarray(lost.T_world_cam.wxyz_xyz)
             self._tracker.state = self._back.start_submap(self._tracker.state, pose)
@@ -222,12 +224,12 @@ class LocalizationStage:
         """Tell whether the camera may move at a velocity."""
         return bool((np.linalg.norm(twist.reshape(2, 3), axis=1) < self._fastest).all())
 
-    def _track_again(self, arrays: FrameArrays) -> TrackOutput:
-        """Track the frame from the state that was just reset."""
-        return self._restarted(arrays, self._tracker.follow(arrays))
+    def _track_again(self, arrays: FrameArrays, num_views: int = 0) -> TrackOutput:
+        """Track the frame from the state that was just reset, where this number of keyframes show the view."""
+        return self._restarted(arrays, self._tracker.follow(arrays), num_views)
 
-    def _restarted(self, arrays: FrameArrays, flow: FlowResult) -> TrackOutput:
-        output = self._tracker.advance(arrays, flow, MapWishes(self._back.wishes.demand))
+    def _restarted(self, arrays: FrameArrays, flow: FlowResult, num_views: int) -> TrackOutput:
+        output = self._tracker.advance(arrays, flow, MapWishes(self._back.wishes.demand, num_views))
         if int(output.status) != TrackStatus.STARTED:
             self._tracker.await_relocalization()  # not to start by itself
         return output

@@ -85,7 +85,9 @@ def keyframe_reason(state: TrackState, frame: KeyframeCandidate, params: TrackPa
     conditions = [condition if reason in urgent else condition & may for condition, reason in causes]
     conditions = [condition & frame.has_depth for condition in conditions]
     codes = [code(reason) for reason in (KeyframeReason.STARTED, *(reason for _, reason in causes))]
-    return jnp.select([frame.started, *conditions], codes, code(KeyframeReason.NONE))
+    # Where the map shows a place at which tracking starts again, its keyframes are loaded, and this one is no news.
+    started = frame.started & (params.map_views < params.keyframe_views)
+    return jnp.select([started, *conditions], codes, code(KeyframeReason.NONE))
 
 
 def _adds_information(keyframes: KeyframeRing, frame: KeyframeCandidate, params: TrackParams, plan: TrackPlan) -> Flag:
