@@ -151,11 +151,6 @@ class BackEnd:
         return self._coverage.num_views(self.map, T_world_cam, self._link.submap_now())
 
     @property
-    def num_views(self) -> int:
-        """Number of keyframes of the map that showed the view of the latest frame."""
-        return self._map_views
-
-    @property
     def wishes(self) -> MapWishes:
         """Wishes of the maps for the next frame."""
         return MapWishes(self._keyframe_demand(), self._map_views, self._changes.pending)
