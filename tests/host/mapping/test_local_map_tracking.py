@@ -317,6 +317,12 @@ class TestFramesThatDisagreeWithTheMap:
         assert result.status is TrackStatus.OK
         assert (result.num_matched > 0) == (off_m < 0.02) == (min_views < 1000)
 
+    def test_none_does_if_no_keyframe_is_looked_into(self) -> None:
+        with Slam(CAMERA, replace(CONFIG, track=replace(TRACK, num_sources=0))) as slam:
+            results = [slam.track(frame) for frame in room().frames[:NUM_FRAMES]]
+        assert {result.status for result in results[1:]} == {TrackStatus.OK}
+        assert not any(result.num_keyframe_matches or result.num_matched for result in results)
+
 
 class TestLostFrames:
     def test_are_sought_in_the_local_map_first(self, monkeypatch: pytest.MonkeyPatch) -> None:
