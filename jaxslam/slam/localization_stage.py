@@ -175,13 +175,13 @@ class LocalizationStage:
         self._motion.lost(dt_s, correction)
 
     def _needs_map_match(self, output: TrackOutput) -> bool:
-        """Whether a frame that was tracked is matched with the map too."""
+        """Tell whether a frame that was tracked is matched with the map too."""
         status = int(output.status)
         chosen = self._match_map == "always" or (self._match_map == "keyframes" and bool(output.keyframe))
         return status == TrackStatus.WEAK or (chosen and status != TrackStatus.STARTED)
 
     def _disagrees_with_map(self, output: TrackOutput) -> bool:
-        """Whether keyframes of the map show the view, but hardly any of their points agrees with the pose."""
+        """Tell whether keyframes of the map show the view, but hardly any of their points agrees with the pose."""
         self._unknown_for += 1
         # A tracker that looks into no keyframes, as `ngd-published`, cannot tell: 64 mm in a room instead of 2.
         expected = min(int(output.num_inliers), int(output.keyframe_matches.num_sought))

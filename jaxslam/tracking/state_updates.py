@@ -124,7 +124,7 @@ def reset_at_pose(
         state: The state.
         T_world_cam: `(7,)` pose to start from, `wxyz_xyz`.
         twist: `(6,)` velocity of the camera in its own axes, m/s, then rad/s; 0 if it is not known.
-        keep_keyframes: Whether to keep the keyframes, as their poses relative to the new start are known.
+        keep_keyframes: Whether to keep the keyframes: only where their poses relative to the new start are known.
 
     Raises:
         ValueError: While tracing, if the pose or the velocity has another shape.

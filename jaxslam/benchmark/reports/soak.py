@@ -53,7 +53,7 @@ def markdown_report(content: Mapping[str, Any]) -> str:
 
 
 def _how(content: Mapping[str, Any]) -> str:
-    threads = "each module in its thread" if content["live"] or content["realtime"] else "all modules in turn"
+    threads = "each module in its thread" if content["live"] else "all modules in turn"
     threads += ", frames at the rate of the recording" if content["realtime"] else ""
     fails = content["detector_fails"]
     return (
