@@ -4,21 +4,24 @@ Points without depth have no vote in the pose. With a sensor that reaches 2 m, i
 points are on the people, they agree with each other, and the camera seems to walk. The background in the picture tells:
 seen from a pose that moved by `t`, a corner at inverse depth `rho` moves along the epipolar line by `rho t`, and one
 that does not would have to be very far away. Over a short way the background tells little, so that what the camera has
-moved since it last had its say is unsure.
+moved since it last had its say is unsure. It is sure again where the background has depth and points that the map had
+before agree with the pose, or where the place is recognized.
 """
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from jaxslam.geometry.se3 import between, compose, rotate
 from jaxslam.geometry.types import Pose
+from jaxslam.mapping.track_table import TrackId
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame_arrays import FrameArrays
 from jaxslam.sensors.sensor_model import SensorModel
 from jaxslam.slam.frame_result import FrameResult
-from jaxslam.tracking.state import TrackReason, TrackStatus
+from jaxslam.tracking.state import TrackOutput, TrackReason, TrackStatus
 
 _MEASURED = 0.65
 """Share of the picture with depth from which on the background has its vote in the pose already. Recordings of sensors
@@ -42,6 +45,29 @@ _MIN_MOVED = 0.2
 around the background sees it as one at rest does: with 0, wrong poses were confirmed in 7 of 12 rendered rooms."""
 _MAX_FRAMES = 90
 """That corners are followed for before others are taken."""
+_MIN_KNOWN = 30
+"""Number of points found before a doubt that must agree with a pose to end it. Where somebody passed too near for the
+sensor, and so was taken for the background of a rendered flat, 12,000 frames were weak after that, 10 mm off."""
+
+
+class _KnownPoints(NamedTuple):
+    """Points that were found before some frame.
+
+    Attributes:
+        next_track: Least id that the tracker gives to a point found later.
+        next_point: Least id of a map point made later.
+    """
+
+    next_track: int
+    next_point: int
+
+    def count_agreeing(self, output: TrackOutput) -> int:
+        """Return the least number of them that agree with the pose of a frame: as if all that disagree were of them."""
+        matches = output.keyframe_matches
+        ids = np.asarray(matches.id)[np.asarray(matches.weight) > 0].astype(np.int64)
+        of_map = TrackId.is_map_point(ids)
+        known = np.where(of_map, TrackId.map_points(ids) < self.next_point, ids < self.next_track)
+        return int(known.sum()) - (len(ids) - int(output.num_keyframe_matches))
 
 
 @dataclass(frozen=True)
@@ -79,22 +105,32 @@ class BackgroundConsistency:
     def forget(self) -> None:
         """Begin anew: the pose is that of a place that was recognized, or the origin of a submap."""
         self._unsure_m = self._depth_m = 0.0
+        self._known = _KnownPoints(0, 0)
         self._stop()
 
-    def check(self, tracked: FrameResult, arrays: FrameArrays) -> FrameResult:
+    def check(self, tracked: FrameResult, arrays: FrameArrays, output: TrackOutput, next_point: int) -> FrameResult:
         """Return the result with the covariance and the status that the background leaves it.
 
         Args:
             tracked: Result of a frame.
             arrays: The frame, with its mask.
+            output: Output of the tracker for it.
+            next_point: Id of the next point of the map.
         """
         if tracked.status == TrackStatus.LOST:
             return tracked
         if tracked.status in (TrackStatus.STARTED, TrackStatus.RELOCALIZED):
             self.forget()
         gray, depth, ignore = np.asarray(arrays.image), np.asarray(arrays.depth), np.asarray(arrays.ignore)
+        if (
+            self._unsure_m
+            and self._measured(depth)[1] >= _MEASURED
+            and self._known.count_agreeing(output) >= _MIN_KNOWN
+        ):
+            self._unsure_m = 0.0
         doubt = self._compare(gray, depth, ignore, tracked.T_world_cam, tracked.correction)
         if not doubt.unsure_m:
+            self._known = _KnownPoints(int(np.max(output.id)) + 1, next_point)
             return tracked
         covariance = tracked.covariance + np.diag(np.repeat(np.array([doubt.unsure_m**2, 0], np.float32), 3))
         if not doubt.is_weak or tracked.status != TrackStatus.OK:
@@ -113,12 +149,11 @@ class BackgroundConsistency:
             T_world_cam: `(7,)` pose of the camera.
             correction: `(7,)` by which the world changed since the frame before, see `Tracked.correction`.
         """
-        some = depth_m[::_STEP, ::_STEP]
-        near = some[(some > self._nearest_m) & (some < self._farthest_m)]
-        if near.size >= _MEASURED * some.size or not near.size:
+        near_m, share = self._measured(depth_m)
+        if share >= _MEASURED or not near_m.size:
             self._stop()
             return self._doubt(0.0)
-        self._depth_m = float(np.median(near))
+        self._depth_m = float(np.median(near_m))
         without = self._without_depth(depth_m, ignore)
         if self._previous is None:
             self._begin(gray, without, T_world_cam)
@@ -134,6 +169,12 @@ class BackgroundConsistency:
             self._unsure_m += moved_m
         self._begin(gray, without, T_world_cam)
         return self._doubt(0.0)
+
+    def _measured(self, depth_m: np.ndarray) -> tuple[np.ndarray, float]:
+        """Return some depths within the reach of the sensor, and the share of the picture that has such a depth."""
+        some = depth_m[::_STEP, ::_STEP]
+        near_m = some[(some > self._nearest_m) & (some < self._farthest_m)]
+        return near_m, near_m.size / some.size
 
     def _doubt(self, moved_m: float) -> PoseDoubt:
         """Add the motion since the background last confirmed a pose to the uncertainty."""

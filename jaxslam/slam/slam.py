@@ -256,7 +256,7 @@ class Slam:
         result = frame_result(frame.timestamp_ns, output, correction, num_matched, mask, share)
         result = self._in_submap(result)
         if self._background is not None:
-            result = self._background.check(result, arrays)
+            result = self._background.check(result, arrays, output, self._back.map.next_point)
         self._clock.advance(frame.timestamp_ns)
         result = self._recorded(result, dt_s, arrays)
         covariance = self._uncertainty.of_pose(result, output, self._tracker.state.keyframes)

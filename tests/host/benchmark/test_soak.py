@@ -18,6 +18,7 @@ from jaxslam.errors import ConfigError, DatasetError, ModelError
 from jaxslam.semantics import Detections, no_detections
 from jaxslam.sensors.frame import Frame
 from jaxslam.worlds.library import load_world
+from jaxslam.worlds.motion import RouteWalk
 from jaxslam.worlds.passing_people import PassingPeople, without_people
 from jaxslam.worlds.recording import WorldRecording
 
@@ -135,6 +136,18 @@ def test_people_are_others_each_time_and_all_else_stays(room: Path) -> None:
         shares.append(mask.mean())
     assert max(shares) > 0.005
     assert shares[0] != shares[1]
+
+
+def test_nobody_walks_through_the_camera(room: Path) -> None:
+    """A lens that is covered by somebody is no test of a map."""
+    alone = WorldRecording(without_people(load_world(room)))
+    people = PassingPeople(alone, 3)
+    times_s, camera_m = 1e-9 * (alone.timestamps_ns - alone.timestamps_ns[0]), alone.ground_truth.T_world_cam[:, 4:6]
+    for seed in range(4):
+        for person in people.people_of(seed):
+            assert person.route is not None
+            apart_m = np.linalg.norm(RouteWalk(person.route)(times_s).position - camera_m, axis=1)
+            assert apart_m.min() >= 0.8
 
 
 def test_the_detector_of_a_world_sees_the_people_of_each_way(room: Path) -> None:

@@ -81,3 +81,29 @@ class TestOrdinary:
             assert slam._background._previous is None
         assert {result.status for result in results[1:]} == {TrackStatus.OK}
         assert max(map(sigma_m, results[1:])) < 0.02
+
+
+class TestSomethingNear:
+    """What is too near for the sensor has no depth either, and moves as it likes."""
+
+    def test_doubt_ends_where_the_background_is_seen_again(self) -> None:
+        """Something passes before the left half of the picture; the right half agrees with the map all the time."""
+        frames, passes = 60, range(10, 35)
+        room = SyntheticDataset(SyntheticConfig(width=320, height=240, frames=frames, path="xyz", seed=3, fps=30.0))
+        rng = np.random.default_rng(0)
+        texture = np.repeat(np.repeat(rng.integers(0, 255, (30, 80, 3), dtype=np.uint8), 8, axis=0), 8, axis=1)
+        statuses = []
+        with Slam(room.camera, CONFIG) as slam:
+            for index in range(frames):
+                frame = room[index]
+                if index in passes:
+                    image, depth_m = frame.image.copy(), np.array(frame.depth_m)
+                    moved = 12 * (index - passes.start)
+                    image[:, :160], depth_m[:, :160] = texture[:, moved : moved + 160], 0
+                    frame = replace(frame, image=image, depth_m=depth_m)
+                result = slam.track(frame)
+                statuses.append((result.status, result.reason))
+        unconfirmed = [index for index, status in enumerate(statuses) if status[1] == TrackReason.UNCONFIRMED.text]
+        assert unconfirmed
+        assert max(unconfirmed) < passes.stop + 20
+        assert {status for status, _ in statuses[passes.stop + 20 :]} == {TrackStatus.OK}
