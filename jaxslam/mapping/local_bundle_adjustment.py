@@ -279,6 +279,7 @@ def _adjust(
         X,
         observations,
         fixed_poses=fixed,
+        num_movable=poses.shape[0] - _NUM_FIXED,
         edges=edges,
         scale=loss_scale,
         tolerance=_TOLERANCE,

@@ -43,6 +43,8 @@ class TrackTable:
     def __init__(self) -> None:
         """Start with no tracks."""
         self._point_of: dict[int, int] = {}
+        self._tracks_of: dict[int, set[int]] = {}
+        """Tracks by their map point."""
         self._last_keyframe: dict[int, int] = {}
         self._latest = NONE
 
@@ -54,12 +56,13 @@ class TrackTable:
 
     def tracks_of(self, points: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " m"]:
         """List the tracks whose map point is one of `points`."""
-        wanted = set(points.tolist())
-        return np.array([track for track, point in self._point_of.items() if point in wanted], np.int64)
+        found = (sorted(self._tracks_of.get(point, ())) for point in points.tolist())
+        return np.array([track for tracks in found for track in tracks], np.int64)
 
     def add(self, tracks: Int[np.ndarray, " n"], points: Int64[np.ndarray, " n"]) -> None:
         """Record that tracks have become map points."""
-        self._point_of.update(zip(tracks.tolist(), points.tolist(), strict=True))
+        for track, point in zip(tracks.tolist(), points.tolist(), strict=True):
+            self._set(track, point)
 
     def observed(self, tracks: Int[np.ndarray, " n"], keyframe: int) -> None:
         """Record that tracks were observed in a keyframe."""
@@ -69,23 +72,38 @@ class TrackTable:
     def mark_removed(self, tracks: Int[np.ndarray, " n"], keyframe: int) -> None:
         """Keep tracks that were on a movable object in a keyframe from becoming map points."""
         for track in tracks[~TrackId.is_map_point(tracks)].tolist():
-            self._point_of.setdefault(track, REMOVED)
+            if track not in self._point_of:
+                self._set(track, REMOVED)
             self._last_keyframe.setdefault(track, keyframe)
 
     def fuse(self, into: Mapping[int, int]) -> None:
         """Follow map points that were fused: each key of `into` has become its value, which may be a key as well."""
         gone = np.fromiter(into, np.int64, len(into))
         for track, point in zip(TrackId.of_map_points(gone).tolist(), gone.tolist(), strict=True):
-            self._point_of.setdefault(track, point)
+            if track not in self._point_of:
+                self._set(track, point)
             self._last_keyframe.setdefault(track, self._latest)
-        for track, point in self._point_of.items() if into else ():
-            while point in into:
-                point = into[point]  # noqa: PLW2901 - one may have been fused with a third
-            self._point_of[track] = point
+        for point, into_point in into.items():
+            last = into_point
+            while last in into:  # it may have been fused with a third
+                last = into[last]
+            for track in tuple(self._tracks_of.get(point, ())):
+                self._set(track, last)
 
     def forget(self, keyframe: int) -> None:
         """Forget tracks that have not been observed in the last 64 keyframes before `keyframe`."""
         old = [track for track, last in self._last_keyframe.items() if last < keyframe - _SPAN]
         for track in old:
             del self._last_keyframe[track]
-            self._point_of.pop(track, None)
+            self._set(track, None)
+
+    def _set(self, track: int, point: int | None) -> None:
+        """Note the map point of a track; `None` to forget the track."""
+        before = self._point_of.pop(track, None)
+        if before is not None:
+            self._tracks_of[before].remove(track)
+            if not self._tracks_of[before]:
+                del self._tracks_of[before]
+        if point is not None:
+            self._point_of[track] = point
+            self._tracks_of.setdefault(point, set()).add(track)

@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxlie import SE3
 from jaxtyping import Array, Bool, Float, Int
@@ -104,6 +105,7 @@ def bundle_adjust(
     observations: Observations,
     *,
     fixed_poses: Bool[Array, " k"],
+    num_movable: int | None = None,
     fixed_points: Mask | None = None,
     point_weights: Weights | None = None,
     lenses: Lenses | None = None,
@@ -126,6 +128,8 @@ def bundle_adjust(
         X_world: Initial points, meters.
         observations: Observations of the points in the cameras.
         fixed_poses: Poses that do not move.
+        num_movable: Number of poses that may move, static: the first ones, so that those after them take part in less
+            of the work; they are taken for fixed. `None` for all.
         fixed_points: Points that do not move; `None` for none.
         point_weights: Factor of all observations of a point, not negative; `None` for one each. A point of weight 0
             stays where it starts and has no influence; the derivative by its weight is the limit from above.
@@ -145,7 +149,9 @@ def bundle_adjust(
     Returns:
         A `BundleAdjustment`; everything in it is finite, and so are its derivatives.
     """
-    dtype, n = X_world.dtype, X_world.shape[1]
+    dtype, (k, n) = X_world.dtype, (poses.shape[0], X_world.shape[1])
+    if num_movable is not None:
+        fixed_poses = fixed_poses | (np.arange(k) >= num_movable)
     fixed_points = jnp.zeros(n, bool) if fixed_points is None else fixed_points
     point_weights = jnp.ones(n, dtype) if point_weights is None else point_weights
 
@@ -163,17 +169,17 @@ def bundle_adjust(
 
     # Apart, with the edges by themselves: else more than nine parts could run at once before the solve.
     cameras, X_world, observations, problem, slot = apart(prepare)
-    solution = solve_bundle(cameras, X_world, problem, loss, jnp.asarray(tolerance, dtype), max_steps)
+    solution = solve_bundle(cameras, X_world, problem, loss, jnp.asarray(tolerance, dtype), max_steps, num_movable)
     # What is fixed keeps its derivative, what is free gets that of the optimum.
     relative = _on_grid(clean_weights(observations.weights), slot, problem)
     inputs = _Inputs(cameras, X_world, problem, relative)
     start, start_points = _start(solution, inputs)
     c = 6 if lenses is None else 9
-    like = jnp.zeros((poses.shape[0], c), dtype), jnp.zeros_like(X_world)
+    like = jnp.zeros((k, c), dtype), jnp.zeros_like(X_world)
     tangents, shifts = implicit_shift(partial(_slope, loss), partial(_solve_exact, loss), like, solution, inputs)
     optimum, optimal_points = shift_cameras(start, tangents), start_points + shifts
     initial_cost = _cost(cameras, bundle_views(cameras, X_world, problem, loss), problem, loss)
-    result = _report(optimum, optimal_points, problem, slot, loss, initial_cost, solution)
+    result = _report(optimum, optimal_points, problem, slot, loss, initial_cost, solution, num_movable)
     more_cost = only_derivative(partial(_idle_cost, loss), result.cost, optimum, optimal_points, inputs)
     return result._replace(cost=result.cost + more_cost)
 
@@ -198,7 +204,13 @@ class _State(NamedTuple):
 
 
 def solve_bundle(
-    cameras: Cameras, X_world: Points, problem: BundleProblem, loss: Loss, tolerance: Scalar, max_steps: int
+    cameras: Cameras,
+    X_world: Points,
+    problem: BundleProblem,
+    loss: Loss,
+    tolerance: Scalar,
+    max_steps: int,
+    num_movable: int | None = None,
 ) -> Solution:
     """The optimum from finite cameras and points."""
     cameras, X_world, problem, tolerance = lax.stop_gradient((cameras, X_world, problem, tolerance))
@@ -206,11 +218,13 @@ def solve_bundle(
 
     def step(state: _State) -> _State:
         views = bundle_views(state.cameras, state.X_world, problem, loss)
-        equations = _equations(state.cameras, views, problem)
+        equations = _equations(state.cameras, views, problem, num_movable)
         reduced = eliminate(equations, problem, state.damping)
         tangents, shifts = solve_reduced(reduced, equations.camera_gradient, equations.point_gradient)
         predicted = _predicted_decrease(equations, tangents, shifts, state.damping)
-        cameras = _where_free(problem, move_cameras(state.cameras, tangents), state.cameras)
+        num_fixed = problem.free_pose.shape[0] - tangents.shape[0]
+        moved = move_cameras(state.cameras, jnp.pad(tangents, ((0, num_fixed), (0, 0))))
+        cameras = _where_free(problem, moved, state.cameras)
         X_world = state.X_world + shifts
         cost = _cost(cameras, bundle_views(cameras, X_world, problem, loss), problem, loss)
         finite = jnp.isfinite(cost) & jnp.isfinite(X_world).all()
@@ -248,12 +262,14 @@ def _cost(cameras: Cameras, views: Views, problem: BundleProblem, loss: Loss) ->
     return cost if edges is None else cost + apart(lambda: edge_cost(cameras, edges))
 
 
-def _equations(cameras: Cameras, views: Views, problem: BundleProblem) -> BundleEquations:
+def _equations(
+    cameras: Cameras, views: Views, problem: BundleProblem, num_movable: int | None = None
+) -> BundleEquations:
     """The exact gradient of the cost, and the Hessian of iteratively reweighted least squares."""
-    equations, edges = normal_equations(views), problem.edges
+    equations, edges, m = normal_equations(views, num_movable), problem.edges, num_movable
     if edges is None:
         return equations
-    gradient, hessian = apart(lambda: (edge_gradient(cameras, edges), edge_hessian(cameras, edges)))
+    gradient, hessian = apart(lambda: (edge_gradient(cameras, edges)[:m], edge_hessian(cameras, edges)[:m, :, :m]))
     return equations._replace(camera_gradient=equations.camera_gradient + gradient, edges=hessian)
 
 
@@ -362,10 +378,11 @@ def _report(
     loss: Loss,
     initial_cost: Scalar,
     solution: Solution,
+    num_movable: int | None,
 ) -> BundleAdjustment:
     """Everything that is said of the final values, evaluated there."""
     views = bundle_views(cameras, X_world, problem, loss)
-    equations = lax.stop_gradient(_equations(cameras, views, problem))
+    equations = lax.stop_gradient(_equations(cameras, views, problem, num_movable))
     counts = (problem.weights > 0) & (views.robust_weights > 0)
     free_camera = free_cameras(problem).any(axis=1)
     adjusts = (counts & (free_camera[:, None] | problem.free_point[None, :])).any()

@@ -270,7 +270,8 @@ def _lens_part(
 
 def bundle_cost(views: Views, problem: BundleProblem, loss: Loss) -> Scalar:
     """`½ Σ w ρ(s)` over all observations, those behind the camera too."""
-    return 0.5 * jnp.sum(problem.weights * jnp.where(problem.known, loss_value(views.chi2, problem.scale, loss), 0.0))
+    value = lambda: problem.weights * jnp.where(problem.known, loss_value(views.chi2, problem.scale, loss), 0.0)
+    return 0.5 * jnp.sum(apart(value))  # a sum of what is computed on the way takes 0.4 instead of 0.1 ms
 
 
 def _known(observations: Observations, k: int, n: int) -> Bool[Array, " m"]:

@@ -18,6 +18,8 @@ from jaxslam_kernels.types import Points
 class BundleEquations(NamedTuple):
     """A quadratic model of the cost: gradients, and the blocks of a Hessian that no two points share.
 
+    The cameras are all of the problem, or the first ones of it if the others cannot move.
+
     Attributes:
         camera_gradient: Gradient along the right tangents of the poses, then by the lenses.
         camera_hessian: Hessian block of each camera.
@@ -42,10 +44,17 @@ class BundleEquations(NamedTuple):
         return diagonal + jnp.einsum("kckc->kc", self.edges)
 
 
-def normal_equations(views: Views) -> BundleEquations:
-    """The exact gradient, and the Hessian of iteratively reweighted least squares."""
-    R, (X, Y, Z), (x, y), (mu, mv, md), pull = views.R, views.X_cam, views.slope, views.information, views.pull
+def normal_equations(views: Views, num_movable: int | None = None) -> BundleEquations:
+    """The exact gradient, and the Hessian of iteratively reweighted least squares.
+
+    Args:
+        views: Every point seen from every camera.
+        num_movable: Number of cameras in the equations, the first ones; the others only hold the points. `None` for
+            all.
+    """
+    R, (x, y), (mu, mv, md) = views.R, views.slope, views.information
     k, n = x.shape
+    m = k if num_movable is None else num_movable
     column = lambda i, j: R[:, j, i, None]  # Rᵀ, spread over the points
 
     def weighted_rotation() -> tuple[Array, ...]:
@@ -61,47 +70,48 @@ def normal_equations(views: Views) -> BundleEquations:
         return (*first, *second, *third)
 
     by_row = apart(weighted_rotation)
+    (X, Y, Z), pull = ([plane[:m] for plane in planes] for planes in (views.X_cam, views.pull))
 
-    def turned() -> Float[Array, "k 9 n"]:
+    def turned() -> Float[Array, "m 9 n"]:
         """The rows of (M Rᵀ) × X, element by element."""
-        columns = [by_row[j::3] for j in range(3)]
+        columns = [[plane[:m] for plane in by_row[j::3]] for j in range(3)]
         by_column = [(Z * b - Y * c, X * c - Z * a, Y * a - X * b) for a, b, c in columns]
         return jnp.stack([v for row in zip(*by_column, strict=True) for v in row], axis=1)
 
-    parts = [-apart(lambda: jnp.stack(by_row, axis=1)), apart(turned)]  # nine planes each: of more, see `apart`
+    information = apart(lambda: jnp.stack(by_row, axis=1))
+    parts = [-information[:m], apart(turned)]  # nine planes each: of more, see `apart`
     if views.lens is not None:
-        parts.append(jnp.stack([v for row in _lens_rows(views, views.lens) for v in row], axis=1))
+        parts.append(jnp.stack([v for row in _lens_rows(views, views.lens) for v in row], axis=1)[:m])
     cross = jnp.concatenate(parts, axis=1)
     num_rows = cross.shape[1] // 3
     moments = jnp.einsum("kan,kbn->kab", cross, jnp.stack([X, Y, Z, jnp.ones_like(X)], axis=1))
-    cross = cross.reshape(k, num_rows, 3, n)
-    # R M Rᵀ summed over the cameras: its rows but R are minus the first ones of `cross`.
-    point_hessian = -jnp.einsum("kia,kajn->ijn", R, cross[:, :3])
+    cross = cross.reshape(m, num_rows, 3, n)
+    point_hessian = jnp.einsum("kia,kajn->ijn", R, information.reshape(k, 3, 3, n))
     along_pose = [-sum_ for sum_ in map(partial(jnp.sum, axis=1), pull)]
     turning = (pull[1] * Z - pull[2] * Y, pull[2] * X - pull[0] * Z, pull[0] * Y - pull[1] * X)
     gradient = jnp.stack([*along_pose, *(jnp.sum(t, axis=1) for t in turning)], axis=1)
-    columns = _pose_columns(moments.reshape(k, num_rows, 3, 4), R)
+    columns = _pose_columns(moments.reshape(m, num_rows, 3, 4), R[:m])
     hessian = 0.5 * (columns[:, :6] + jnp.swapaxes(columns[:, :6], 1, 2))
     if views.lens is not None:
-        gradient = jnp.concatenate([gradient, lens_gradient(views.lens)], axis=1)
-        hessian = _with_lens_blocks(hessian, columns[:, 6:], views.lens)
+        gradient = jnp.concatenate([gradient, lens_gradient(views.lens)[:m]], axis=1)
+        hessian = _with_lens_blocks(hessian, columns[:, 6:], lens_hessian(views.lens)[:m])
     return BundleEquations(
         camera_gradient=gradient,
         camera_hessian=hessian,
-        point_gradient=jnp.einsum("kia,kan->in", R, jnp.stack(pull, axis=1)),
+        point_gradient=jnp.einsum("kia,kan->in", R, jnp.stack(views.pull, axis=1)),
         point_hessian=point_hessian,
         cross=cross,
     )
 
 
 def _with_lens_blocks(
-    hessian: Float[Array, "k 6 6"], mixed: Float[Array, "k 3 6"], lens: LensPart
+    hessian: Float[Array, "k 6 6"], mixed: Float[Array, "k 3 6"], of_lens: Float[Array, "k 3 3"]
 ) -> Float[Array, "k 9 9"]:
     """Extend each pose's Hessian by the lens: the mixed second derivatives, and those by the lens alone."""
     return jnp.concatenate(
         [
             jnp.concatenate([hessian, jnp.swapaxes(mixed, 1, 2)], axis=2),
-            jnp.concatenate([mixed, lens_hessian(lens)], axis=2),
+            jnp.concatenate([mixed, of_lens], axis=2),
         ],
         axis=1,
     )

@@ -39,12 +39,13 @@ class Reduced(NamedTuple):
 def eliminate(equations: BundleEquations, problem: BundleProblem, damping: Scalar) -> Reduced:
     """Eliminates the points from equations whose diagonal is raised by the fraction `damping`."""
     (k, c, _), n = equations.camera_hessian.shape, equations.point_hessian.shape[2]
-    units = _units(apart(equations.camera_diagonal), free_cameras(problem))
+    units = _units(apart(equations.camera_diagonal), free_cameras(problem)[:k])
     root = apart(lambda: inverse_root(equations.point_hessian, problem.free_point, damping))
-    cross = equations.cross * units[:, :, None, None]
-    # Row by row, and only below the diagonal: as sums over whole columns of the root, 0.5 ms instead of 0.2.
-    rows = [sum(cross[:, :, j] * root[i, j][None, None] for j in range(i + 1)) for i in range(3)]
-    coupling = jnp.stack(rows, axis=2).reshape(c * k, 3 * n)
+    # Row by row, and only below the diagonal: as sums over whole columns of the root, 0.5 ms instead of 0.07. So too if
+    # they were put together as an axis of their own, 0.19 ms.
+    along = lambda i: sum(equations.cross[:, :, j] * root[i, j][None, None] for j in range(i + 1))
+    rows = [(units[:, :, None] * along(i)).reshape(c * k, n) for i in range(3)]
+    coupling = jnp.concatenate(rows, axis=1)
     cameras = equations.camera_hessian * units[:, :, None] * units[:, None, :]
     diagonal = jnp.where(units > 0, damping, 1.0)  # and 1 for what does not move
     cameras = cameras + np.eye(c, dtype=units.dtype)[None] * diagonal[:, :, None]
