@@ -80,7 +80,8 @@ class TrackConfig(ValidatedConfig):
     min_inliers: Annotated[float, Range(at_least=4)] = 15
     """Minimum number of inliers of a valid pose."""
     weak_inliers: Annotated[float, Range(at_least=4)] = 40
-    """Number of inliers below which the status of a pose is `WEAK`; after a lost frame, fewer are none."""
+    """Number of points that agree with a pose, those of keyframes included, below which its status is `WEAK`. After a
+    lost frame, fewer tracked ones are no pose at all."""
     gyro: bool = True
     """Use the angular rates of an IMU, where the frames have any, to tell how the camera turns."""
     min_share: Annotated[float, Share] = 0.3
@@ -92,7 +93,7 @@ class TrackConfig(ValidatedConfig):
     unless `keyframe_views` keyframes show the view."""
     keyframe_followed_below: Annotated[float, Share] = 0.1
     """A keyframe is made when less than this share of the tracked points already existed at the last keyframe, unless
-    `keyframe_views` keyframes show the view."""
+    `keyframe_views` keyframes show the view or many of their points are found."""
     keyframe_views: Annotated[int, Range(at_least=1)] = 4
     """Number of keyframes with `keyframe_below` of their points in view from which on another one is no news; four
     times as many where hardly a point of them is found, as in a crowd or in another light."""
@@ -100,7 +101,8 @@ class TrackConfig(ValidatedConfig):
     """A keyframe is made when less than this share of `num_points` is still tracked and `keyframe_weak_after_s` has
     passed; below half of the share, it is made at once."""
     keyframe_weak_after_s: Annotated[float, Positive] = 0.3
-    """While tracking is weak or has few points, a keyframe is made when the last one is older than this, seconds."""
+    """While tracking is weak or has few points, a keyframe is made when the last one is older than this, seconds; while
+    it is weak, only if fewer than `keyframe_views` keyframes show the view."""
     keyframe_policy: Literal["as_needed", "sparing"] = "as_needed"
     """When to make a keyframe for which there is a reason: at once (`as_needed`), or at the right moment after that
     (`sparing`, USD-SLAM). Few points or weak tracking never wait; the next four settings apply to `sparing` only."""

@@ -26,7 +26,7 @@ class Outcome(NamedTuple):
     inlier_ratio: Scalar
 
 
-def judge_frame(step: StepContext, refined: PoseRefinement, tracked: Mask, inliers: Mask) -> Outcome:
+def judge_frame(step: StepContext, refined: PoseRefinement, tracked: Mask, inliers: Mask, matched: Mask) -> Outcome:
     """Judge the refined pose of a frame.
 
     Args:
@@ -34,6 +34,8 @@ def judge_frame(step: StepContext, refined: PoseRefinement, tracked: Mask, inlie
         refined: Refinement of the pose.
         tracked: `(n,)` mask of the tracked background points that no cue rejects.
         inliers: `(n,)` mask of the points that agree with the pose.
+        matched: `(m,)` mask of the keyframe points that agree with it. Where few points are tracked, they tell it as
+            well: after somebody has covered the lens, 22 points and 119 of keyframes did.
     """
     params, dtype = step.params, step.state.twist.dtype
     num_tracked, num_inliers = (jnp.sum(mask, dtype=dtype) for mask in (tracked, inliers))
@@ -52,7 +54,7 @@ def judge_frame(step: StepContext, refined: PoseRefinement, tracked: Mask, inlie
     )
     conditions = [condition for condition, _ in causes]
     lost = jnp.any(jnp.stack(conditions))
-    weak = num_inliers < params.weak_inliers
+    weak = num_inliers + jnp.sum(matched, dtype=dtype) < params.weak_inliers
     mild = jnp.where(weak, code(TrackReason.FEW_INLIERS), code(TrackReason.NONE))
     codes = [code(reason) for _, reason in causes]
     return Outcome(lost, weak & ~lost, jnp.select(conditions, codes, mild), ratio)

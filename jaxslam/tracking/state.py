@@ -50,9 +50,9 @@ class KeyframeReason(enum.IntEnum):
     NEW_AREA = 2
     """No keyframe that the tracker holds shows enough of the view, and few of the map do."""
     FEW_FOLLOWED = 3
-    """Few of the tracked points were tracked at the last keyframe, and few keyframes show the view."""
+    """Few of the tracked points were tracked at the last keyframe, and what the frame shows is hardly in the map."""
     WEAK = 4
-    """Tracking is weak and needs more points."""
+    """Tracking is weak, and few keyframes show the view from which it could get points."""
     FEW_POINTS = 5
     """Few points are still tracked."""
     CHANGED = 6
@@ -206,13 +206,15 @@ class TrackParams(NamedTuple):
             calm scene.
         min_correlation: Smallest correlation of an accepted match with a keyframe.
         min_inliers: Smallest number of inliers of a pose.
-        weak_inliers: Number of inliers below which the status is `WEAK`; the smallest number after a lost frame.
+        weak_inliers: Number of points that agree with the pose, those of keyframes included, below which the status is
+            `WEAK`; the smallest number of inliers after a lost frame.
         min_share: Smallest share of the tracked points that are inliers of the pose.
         detect_below: Share of the capacity below which new points are detected.
         keyframe_below: Share of a keyframe's points in view from which on it shows the view. A keyframe is made if none
             does that the tracker holds (`NEW_AREA`), unless `keyframe_views` keyframes of the map do.
         keyframe_followed_below: Share of the tracked points. A keyframe is made if fewer of them were tracked at the
-            last keyframe (`FEW_FOLLOWED`), unless `keyframe_views` keyframes show the view.
+            last keyframe (`FEW_FOLLOWED`), unless tracking is weak, `keyframe_views` keyframes show the view, or many
+            of their points are found.
         keyframe_views: Number of keyframes that show a view from which on another one is no news; four times as many
             where hardly a point of them is found.
         map_views: Number of keyframes of a map that show the view. Those that the state itself holds are counted by the
@@ -220,8 +222,8 @@ class TrackParams(NamedTuple):
         map_changed: 1 if many points of a map are gone, and no keyframe was made since (`CHANGED`), else 0.
         keyframe_points_below: Share of the capacity. A keyframe is made if fewer points are still tracked
             (`FEW_POINTS`); right after a keyframe, half this share.
-        keyframe_weak_after_s: Time after which the next keyframe is made while tracking is weak (`WEAK`) or has few
-            points, seconds.
+        keyframe_weak_after_s: Time after which the next keyframe is made while tracking has few points, or is weak
+            (`WEAK`) and fewer than `keyframe_views` keyframes show the view, seconds.
         keyframe_min_s: Shortest time between keyframes with the `sparing` policy, seconds.
         keyframe_motion: Smallest motion of the points between keyframes with the `sparing` policy, in the camera frame,
             as a share of their depth.

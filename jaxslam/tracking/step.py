@@ -225,7 +225,7 @@ def track_followed(
     # 7. Refinement of the pose by tracked points and keyframe points together.
     counting, matches_seen = jnp.where(agreeing, trust, 0), measure_matches(step, matches, coarse, twist)
     refined, inliers, matched = refined_pose(step, seen, counting, matches, matches_seen, coarse, prior)
-    outcome = judge_frame(step, refined, background & rejection.counts(), inliers)
+    outcome = judge_frame(step, refined, background & rejection.counts(), inliers, matched)
     # 8. Points at the refined pose; new ones, and a keyframe, if they are needed.
     monitored = rejection.monitor_points(uv, state.points.anchor_age, background & ~inliers)
     pose = refined.T_world_cam
