@@ -83,11 +83,12 @@ def test_a_new_area_is_a_reason(plan) -> None:
 @pytest.mark.parametrize("plan", [AS_NEEDED, SPARING])
 def test_a_turnover_of_points_is_one_until_keyframes_enough_show_the_view(plan) -> None:
     views = CONFIG.track.keyframe_views
-    turned_over = partial(_reason, plan, new=int(0.95 * N))
+    turned_over = partial(_reason, plan, new=int(0.95 * N), recognized=0.2)
     assert turned_over(overlap=0.9) == KeyframeReason.FEW_FOLLOWED
     assert turned_over(overlap=0.9, map_views=views - 1) == KeyframeReason.FEW_FOLLOWED
     assert turned_over(overlap=0.9, map_views=views) == KeyframeReason.NONE
     assert turned_over(overlap=(0.9,) * views) == KeyframeReason.NONE
+    assert turned_over(overlap=0.9, recognized=0.5) == KeyframeReason.NONE  # the map shows what the frame does
     assert _reason(plan, overlap=0.9, new=N // 2) == KeyframeReason.NONE
 
 
@@ -101,6 +102,17 @@ def test_more_keyframes_where_the_view_is_hardly_recognized(plan) -> None:
 
 
 @pytest.mark.parametrize("plan", [AS_NEEDED, SPARING])
+def test_weak_tracking_is_one_unless_keyframes_enough_show_the_view(plan) -> None:
+    """Points come from those keyframes; a frame with hardly any of its own has none for the map."""
+    views = CONFIG.track.keyframe_views
+    weak = partial(_reason, plan, overlap=0.9, new=int(0.95 * N), recognized=0.2, weak=True)
+    assert weak() == KeyframeReason.WEAK
+    assert weak(since_s=0.1) == KeyframeReason.NONE
+    assert weak(map_views=views - 1) == KeyframeReason.WEAK
+    assert weak(map_views=views) == KeyframeReason.NONE
+
+
+@pytest.mark.parametrize("plan", [AS_NEEDED, SPARING])
 def test_a_change_of_the_map_is_one(plan) -> None:
     changed = partial(_reason, plan, overlap=0.9, map_changed=True)
     assert changed() == KeyframeReason.CHANGED
@@ -111,7 +123,8 @@ def test_a_change_of_the_map_is_one(plan) -> None:
 
 @pytest.mark.parametrize("plan", [AS_NEEDED, SPARING])
 def test_it_waits_for_depth(plan) -> None:
-    for cause in ({}, {"overlap": 0.9, "new": int(0.95 * N)}, {"weak": True}, {"overlap": 0.9, "map_changed": True}):
+    turned_over = {"overlap": 0.9, "new": int(0.95 * N), "recognized": 0.2}
+    for cause in ({}, turned_over, {"overlap": 0.9, "weak": True}, {"overlap": 0.9, "map_changed": True}):
         assert _reason(plan, **cause) != KeyframeReason.NONE
         assert _reason(plan, **cause, has_depth=False) == KeyframeReason.NONE
 

@@ -281,6 +281,22 @@ class TestReason:
         assert self.reason(counted, frame._replace(ignore=jnp.ones_like(frame.ignore))) is TrackReason.NO_CORNERS
 
 
+class TestStatus:
+    def test_points_of_keyframes_count(self, counted: Counted, frames: FrameArrays) -> None:
+        """Where few points are followed, those of keyframes that agree tell the pose as well."""
+        state, _ = track(counted.step, frames)
+        kept = state.points.valid & (jnp.cumsum(state.points.valid) <= int(0.8 * TRACK.weak_inliers))
+        no_keyframes = state.keyframes._replace(weight=jnp.zeros_like(state.keyframes.weight))
+        few = state._replace(points=state.points._replace(valid=kept))
+        frame = at(frames, COUNT - 1)
+        _, output = counted.step(few, frame, params())
+        assert int(output.num_inliers) < TRACK.weak_inliers <= int(output.num_inliers + output.num_keyframe_matches)
+        assert int(output.status) == TrackStatus.OK
+        _, alone = counted.step(few._replace(keyframes=no_keyframes), frame, params())
+        assert int(alone.num_keyframe_matches) == 0
+        assert int(alone.status) == TrackStatus.WEAK
+
+
 class TestPoseStatus:
     def test_of_tracked_frames(self, counted: Counted, frames: FrameArrays) -> None:
         _, outputs = track(counted.step, frames)

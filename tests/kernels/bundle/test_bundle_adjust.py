@@ -282,6 +282,19 @@ class TestReference:
         np.testing.assert_allclose(result.X_world[:, :2], window.inputs.X_world[:, :2], atol=1e-6)
         assert np.abs(result.X_world[:, 2:] - window.inputs.X_world[:, 2:]).min() > 0
 
+    def test_poses_after_the_movable_ones_stay(self):
+        """`num_movable` is less work for the same optimum as with these poses fixed."""
+        window, movable = make_window(8), K - 1
+        fixed = window.links._replace(fixed_poses=window.links.fixed_poses | (np.arange(K) >= movable))
+        with jax.enable_x64(True):
+            usual, *_ = _run(window.inputs, fixed)
+            adjust = quick_compile(partial(_adjust, num_movable=movable))
+            result = adjust(_arrays(window.inputs), _arrays(window.links))
+        assert result.status == usual.status == BundleStatus.OK
+        np.testing.assert_allclose(result.poses[movable:], window.inputs.poses[movable:], atol=1e-12)
+        np.testing.assert_allclose(result.poses, usual.poses, atol=1e-9)
+        np.testing.assert_allclose(result.X_world, usual.X_world, atol=1e-9)
+
     @pytest.mark.usefixtures("precision")
     def test_point_seen_twice_counts_once(self):
         """The last observation with weight has the slot, whatever others say."""
