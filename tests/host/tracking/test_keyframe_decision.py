@@ -88,7 +88,7 @@ def test_a_turnover_of_points_is_one_until_keyframes_enough_show_the_view(plan) 
     assert turned_over(overlap=0.9, map_views=views - 1) == KeyframeReason.FEW_FOLLOWED
     assert turned_over(overlap=0.9, map_views=views) == KeyframeReason.NONE
     assert turned_over(overlap=(0.9,) * views) == KeyframeReason.NONE
-    assert turned_over(overlap=0.9, recognized=0.5) == KeyframeReason.NONE  # the map shows what the frame does
+    assert turned_over(overlap=0.9, recognized=0.65) == KeyframeReason.NONE  # the map shows what the frame does
     assert _reason(plan, overlap=0.9, new=N // 2) == KeyframeReason.NONE
 
 
