@@ -22,8 +22,8 @@ _RECOGNIZED, _MORE_VIEWS = 0.05, 4.0
 blurred images, in another light. Then so many times more keyframes may show it."""
 _KNOWN = 0.6
 """Share of the keyframe points looked for from which on the map shows what the frame does, however few points are still
-followed. Half of the frames of Bonn `crowd` have 0.7 or more. Played to and fro five times, it ends with 9, 11 and 13
-keyframes instead of 16, 16 and 12 (seeds 0 to 2), with the same error. With 0.5, a room with people has 13 % more."""
+followed. Half of the frames of Bonn `crowd` have 0.7 or more. Played to and fro five times, it ends with 9 keyframes
+instead of 16 (seed 0), with the same error. With 0.5, a rendered room with two people has 13 % more error."""
 
 
 class KeyframeCandidate(NamedTuple):
