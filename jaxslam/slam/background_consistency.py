@@ -45,9 +45,10 @@ _MIN_MOVED = 0.2
 around the background sees it as one at rest does: with 0, wrong poses were confirmed in 7 of 12 rendered rooms."""
 _MAX_FRAMES = 90
 """That corners are followed for before others are taken."""
-_MIN_KNOWN = 30
-"""Number of points found before a doubt that must agree with a pose to end it. Where somebody passed too near for the
-sensor, and so was taken for the background of a rendered flat, 12,000 frames were weak after that, 10 mm off."""
+_MIN_KNOWN = 15
+"""Number of points found before a doubt that must agree with a pose to end it: as many as make a pose. Where somebody
+passed too near for the sensor, and so was taken for the background of a rendered flat, 12,000 frames were weak after
+that, 10 mm off."""
 
 
 class _KnownPoints(NamedTuple):
