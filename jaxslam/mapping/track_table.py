@@ -72,20 +72,18 @@ class TrackTable:
     def mark_removed(self, tracks: Int[np.ndarray, " n"], keyframe: int) -> None:
         """Keep tracks that were on a movable object in a keyframe from becoming map points."""
         for track in tracks[~TrackId.is_map_point(tracks)].tolist():
-            if track not in self._point_of:
-                self._set(track, REMOVED)
+            self._set_new(track, REMOVED)
             self._last_keyframe.setdefault(track, keyframe)
 
     def fuse(self, into: Mapping[int, int]) -> None:
         """Follow map points that were fused: each key of `into` has become its value, which may be a key as well."""
         gone = np.fromiter(into, np.int64, len(into))
         for track, point in zip(TrackId.of_map_points(gone).tolist(), gone.tolist(), strict=True):
-            if track not in self._point_of:
-                self._set(track, point)
+            self._set_new(track, point)
             self._last_keyframe.setdefault(track, self._latest)
-        for point, into_point in into.items():
-            last = into_point
-            while last in into:  # it may have been fused with a third
+        for point in into:
+            last = point
+            while last in into:  # what it was fused with may have been fused with a third
                 last = into[last]
             for track in tuple(self._tracks_of.get(point, ())):
                 self._set(track, last)
@@ -96,6 +94,11 @@ class TrackTable:
         for track in old:
             del self._last_keyframe[track]
             self._set(track, None)
+
+    def _set_new(self, track: int, point: int) -> None:
+        """Note the map point of a track that has none."""
+        if track not in self._point_of:
+            self._set(track, point)
 
     def _set(self, track: int, point: int | None) -> None:
         """Note the map point of a track; `None` to forget the track."""

@@ -45,10 +45,6 @@ _MIN_MOVED = 0.2
 around the background sees it as one at rest does: with 0, wrong poses were confirmed in 7 of 12 rendered rooms."""
 _MAX_FRAMES = 90
 """That corners are followed for before others are taken."""
-_MIN_KNOWN = 15
-"""Number of points found before a doubt that must agree with a pose to end it: as many as make a pose. Where somebody
-passed too near for the sensor, and so was taken for the background of a rendered flat, 12,000 frames were weak after
-that, 10 mm off."""
 
 
 class _KnownPoints(NamedTuple):
@@ -91,15 +87,18 @@ class BackgroundConsistency:
     be `OK` (four camera paths, two seeds), none is wrong by more than 5 standard deviations, where all were.
     """
 
-    def __init__(self, camera: Camera, sensor: SensorModel) -> None:
+    def __init__(self, camera: Camera, sensor: SensorModel, min_inliers: float) -> None:
         """Begin with nothing to compare with.
 
         Args:
             camera: Camera that takes the frames.
             sensor: Camera with the limits of its depth.
+            min_inliers: Number of points found before a doubt that must agree with a pose to end it: as many as make
+                one.
         """
         self._K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
         self._distortion = np.array(camera.distortion)
+        self._min_inliers = min_inliers
         self._nearest_m, self._farthest_m = float(sensor.min_depth_m), float(sensor.max_depth_m)
         self.forget()
 
@@ -123,13 +122,7 @@ class BackgroundConsistency:
         if tracked.status in (TrackStatus.STARTED, TrackStatus.RELOCALIZED):
             self.forget()
         gray, depth, ignore = np.asarray(arrays.image), np.asarray(arrays.depth), np.asarray(arrays.ignore)
-        if (
-            self._unsure_m
-            and self._measured(depth)[1] >= _MEASURED
-            and self._known.count_agreeing(output) >= _MIN_KNOWN
-        ):
-            self._unsure_m = 0.0
-        doubt = self._compare(gray, depth, ignore, tracked.T_world_cam, tracked.correction)
+        doubt = self._compare(gray, depth, ignore, tracked, output)
         if not doubt.unsure_m:
             self._known = _KnownPoints(int(np.max(output.id)) + 1, next_point)
             return tracked
@@ -139,7 +132,7 @@ class BackgroundConsistency:
         return replace(tracked, covariance=covariance, status=TrackStatus.WEAK, reason=TrackReason.UNCONFIRMED.text)
 
     def _compare(
-        self, gray: np.ndarray, depth_m: np.ndarray, ignore: np.ndarray, T_world_cam: Pose, correction: Pose
+        self, gray: np.ndarray, depth_m: np.ndarray, ignore: np.ndarray, tracked: FrameResult, output: TrackOutput
     ) -> PoseDoubt:
         """Compare a frame that was tracked with those before.
 
@@ -147,19 +140,26 @@ class BackgroundConsistency:
             gray: `(h, w)` uint8; it is copied where it is needed.
             depth_m: `(h, w)` meters; 0 or not finite where nothing was measured.
             ignore: `(h, w)` true where nothing is to be trusted.
-            T_world_cam: `(7,)` pose of the camera.
-            correction: `(7,)` by which the world changed since the frame before, see `Tracked.correction`.
+            tracked: Result of the frame.
+            output: Output of the tracker for it.
         """
-        near_m, share = self._measured(depth_m)
-        if share >= _MEASURED or not near_m.size:
+        T_world_cam = tracked.T_world_cam
+        some = depth_m[::_STEP, ::_STEP]
+        near = some[(some > self._nearest_m) & (some < self._farthest_m)]
+        is_measured = near.size >= _MEASURED * some.size
+        if is_measured or not near.size:
             self._stop()
+            # For one, somebody who passes too near for the sensor is taken for the background: in a rendered flat,
+            # 12,000 frames were weak after that, 10 mm off.
+            if is_measured and self._unsure_m and self._known.count_agreeing(output) >= self._min_inliers:
+                self._unsure_m = 0.0
             return self._doubt(0.0)
-        self._depth_m = float(np.median(near_m))
+        self._depth_m = float(np.median(near))
         without = self._without_depth(depth_m, ignore)
         if self._previous is None:
             self._begin(gray, without, T_world_cam)
             return self._doubt(0.0)
-        self._T_world_first = compose(correction, self._T_world_first)
+        self._T_world_first = compose(tracked.correction, self._T_world_first)
         self._follow(gray, without)
         T_first_cam = between(self._T_world_first, T_world_cam)
         moved_m = float(np.linalg.norm(T_first_cam[4:]))
@@ -170,12 +170,6 @@ class BackgroundConsistency:
             self._unsure_m += moved_m
         self._begin(gray, without, T_world_cam)
         return self._doubt(0.0)
-
-    def _measured(self, depth_m: np.ndarray) -> tuple[np.ndarray, float]:
-        """Return some depths within the reach of the sensor, and the share of the picture that has such a depth."""
-        some = depth_m[::_STEP, ::_STEP]
-        near_m = some[(some > self._nearest_m) & (some < self._farthest_m)]
-        return near_m, near_m.size / some.size
 
     def _doubt(self, moved_m: float) -> PoseDoubt:
         """Add the motion since the background last confirmed a pose to the uncertainty."""

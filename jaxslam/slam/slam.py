@@ -435,7 +435,9 @@ class Slam:
         self._outside_motion = OutsideMotion(self._imu if self.config.track.gyro else None)
         self._frame = 0
         self._clock = FrameClock(self.camera.fps, self._warnings)
-        self._background = None if self.camera.is_stereo else BackgroundConsistency(self.camera, sensor)
+        self._background = None
+        if not self.camera.is_stereo:
+            self._background = BackgroundConsistency(self.camera, sensor, self.config.track.min_inliers)
         self._uncertainty = PoseUncertainty(self.camera, sensor, self.config.track.pixel_sigma)
         self._history = PoseHistory()
         self._status_log = StatusLog()

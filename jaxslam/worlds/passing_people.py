@@ -86,7 +86,7 @@ class PassingPeople:
     def _in_view(self, people: WorldRecording, index: int) -> bool:
         """Tell whether somebody is in the picture, or behind something there."""
         camera, scale = self.recording.camera, self.recording.world.scale
-        time_s = 1e-9 * (people.timestamps_ns[index : index + 1] - people.timestamps_ns[0])
+        time_s = self._times_s[index : index + 1]
         X_world = np.stack([instance.poses(time_s)[0, 4:] for instance in people.instances], axis=1)
         X_cam = to_local(self.recording.ground_truth.T_world_cam[index], X_world)
         away_m = np.linalg.norm(X_cam, axis=0)

@@ -210,7 +210,7 @@ def solve_bundle(
     loss: Loss,
     tolerance: Scalar,
     max_steps: int,
-    num_movable: int | None = None,
+    num_movable: int | None,
 ) -> Solution:
     """The optimum from finite cameras and points."""
     cameras, X_world, problem, tolerance = lax.stop_gradient((cameras, X_world, problem, tolerance))

@@ -283,7 +283,7 @@ class TestReason:
 
 class TestStatus:
     def test_points_of_keyframes_count(self, counted: Counted, frames: FrameArrays) -> None:
-        """Where few points are followed, those of keyframes that agree tell the pose as well."""
+        """Keyframe points that agree tell the pose as well, however few points are followed."""
         state, _ = track(counted.step, frames)
         kept = state.points.valid & (jnp.cumsum(state.points.valid) <= int(0.8 * TRACK.weak_inliers))
         no_keyframes = state.keyframes._replace(weight=jnp.zeros_like(state.keyframes.weight))
