@@ -12,6 +12,7 @@ from jaxslam_kernels.types import Pixels, Weights
 from jaxtyping import Array, Bool, Float, Float32, Int64, Integer, UInt8
 
 from jaxslam.config.schema import MappingConfig
+from jaxslam.features.sorting import sorted_together
 from jaxslam.runtime.compiled import compiled
 from jaxslam.runtime.padding import padded
 from jaxslam.sensors.frame_arrays import FrameArrays
@@ -212,14 +213,14 @@ def _spread(
     column, row = (uv / side).astype(np.int64)
     cell = row * (int(shape[1] / side) + 1) + column
     weakness = 255 - response.astype(np.int64)
-    order = np.argsort(256 * cell + weakness, kind="stable")
-    first = np.flatnonzero(np.diff(cell[order], prepend=-1))
+    cell, weakness, order = sorted_together(cell, weakness, np.arange(len(cell)))
+    first = np.flatnonzero(np.diff(cell, prepend=-1))
     size = np.diff(first, append=len(order))
     rank = np.arange(len(order)) - np.repeat(first, size)
-    best = np.repeat(response[order][first], size)
-    allowed = (response[order] >= fast_threshold) | (best < fast_threshold)
-    order, rank = order[allowed], rank[allowed]
-    return order[np.argsort(256 * rank + weakness[order], kind="stable")][:quota]
+    strongest = np.repeat(weakness[first], size)
+    least = 255 - fast_threshold
+    allowed = np.flatnonzero((weakness <= least) | (strongest > least))
+    return order[allowed[sorted_together(rank[allowed], weakness[allowed], np.arange(len(allowed)))[2][:quota]]]
 
 
 def no_features() -> Features:

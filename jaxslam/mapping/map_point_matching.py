@@ -1,18 +1,20 @@
 """Match map points with the features of a keyframe, and fuse points that are in the map twice."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int, Int32, Int64, UInt8
+from jaxtyping import Bool, Float32, Float64, Int, Int32, Int64, UInt8
 
 from jaxslam.features.matching import NEAR, match_by_projection
 from jaxslam.features.orb import FeaturePlan, Features
 from jaxslam.geometry.se3 import to_local
-from jaxslam.geometry.types import Ids, Pose
+from jaxslam.geometry.types import Ids, Pose, Transforms
 from jaxslam.map.edit import with_observations
 from jaxslam.map.point_fusion import with_fused_points
-from jaxslam.map.point_records import NONE, Observations, empty_observations, has, joined, observations_at, rows
+from jaxslam.map.point_records import NONE, Observations, has, observations_at, rows
 from jaxslam.map.types import Map
+from jaxslam.sensors.camera import Camera
 
 _MARGIN_PX = 1.0
 _SAME_PX = 2.0
@@ -133,38 +135,107 @@ def find_points(
     Returns:
         `(2, m)` index in `points` and in `features` of each match.
     """
-    camera = slam_map.camera
-    X = to_local(T_world_cam, points.X_world)
+    everywhere = np.ones((1, len(points.ids)), bool)
+    _, index, feature = _find_in_images(
+        slam_map.camera,
+        points,
+        everywhere,
+        _together([features]),
+        T_world_cam[None],
+        plan,
+        radius_px=radius_px,
+        max_distance=max_distance,
+    )
+    return np.stack([index, feature])
+
+
+class _Images(NamedTuple):
+    """Features of `v` images.
+
+    Attributes:
+        features: The `n` features of the images, one image after the other.
+        image: `(n,)` number of the image of each feature.
+        first: `(v,)` index of the first feature of each image.
+    """
+
+    features: Features
+    image: Int64[np.ndarray, " n"]
+    first: Int64[np.ndarray, " v"]
+
+
+def _together(features: Sequence[Features]) -> _Images:
+    """Put the features of images into one array each."""
+    size = np.array([len(each.octave) for each in features])
+    uv_raw, uv, *columns = zip(*features, strict=True)
+    positions = np.concatenate(uv_raw, axis=1), np.concatenate(uv, axis=1)
+    return _Images(
+        Features(*positions, *map(np.concatenate, columns)),
+        np.repeat(np.arange(len(features)), size),
+        np.cumsum(size) - size,
+    )
+
+
+def _find_in_images(
+    camera: Camera,
+    points: DescribedPoints,
+    wanted: Bool[np.ndarray, "v r"],
+    images: _Images,
+    T_world_cam: Transforms,
+    plan: FeaturePlan,
+    *,
+    radius_px: float,
+    max_distance: int = NEAR,
+) -> Int[np.ndarray, "3 m"]:
+    """Match map points with the features of several images; arguments as in `find_points`.
+
+    Args:
+        camera: Camera of the images.
+        points: Points to match.
+        wanted: Which points to match with each image.
+        images: Features of the images.
+        T_world_cam: `(v, 7)` approximate poses of the images.
+        plan: Settings of feature extraction.
+        radius_px: Search radius around the predicted pixel at octave 0.
+        max_distance: Maximum Hamming distance of a match, in bits.
+
+    Returns:
+        `(3, m)` image, index in `points`, and index in the features of that image of each match.
+    """
+    image, index = np.nonzero(wanted)
+    X = np.concatenate(
+        [to_local(T, points.X_world[:, mine]) for T, mine in zip(T_world_cam, wanted, strict=True)], axis=1
+    )
     front = X[2] > 0
     X = np.where(front, X, 1.0)
     uv = camera.project(X)
     inside = front & (uv > -_MARGIN_PX).all(axis=0) & (uv < [[camera.width], [camera.height]]).all(axis=0)
-    octave = np.log(points.size / np.linalg.norm(X, axis=0)) / np.log(plan.scale_factor)
+    image, index, X, uv = image[inside], index[inside], X[:, inside], uv[:, inside]
+    octave = np.log(points.size[index] / np.linalg.norm(X, axis=0)) / np.log(plan.scale_factor)
     octave = np.clip(np.round(octave), 0, plan.num_levels - 1).astype(np.int64)
-    where = np.flatnonzero(inside)
-    match = match_by_projection(
-        uv[:, where],
-        octave[where],
-        points.descriptor[where],
-        features,
+    row, feature = match_by_projection(
+        uv,
+        octave,
+        points.descriptor[index],
+        images.features,
         radius_px=radius_px,
         max_distance=max_distance,
         plan=plan,
+        images=(image, images.image),
     )
-    index, feature = where[match[0]], match[1]
-    measured = features.depth[feature]
-    agrees = (measured <= 0) | (np.abs(measured - X[2, index]) < _MAX_DEPTH_ERROR * X[2, index])
-    return np.stack([index, feature])[:, agrees]
+    measured, expected = images.features.depth[feature], X[2, row]
+    agrees = (measured <= 0) | (np.abs(measured - expected) < _MAX_DEPTH_ERROR * expected)
+    row, feature = row[agrees], feature[agrees]
+    return np.stack([image[row], index[row], feature - images.first[image[row]]])
 
 
 def feature_observations(
-    keyframe_id: int,
+    keyframe_id: int | Ids,
     features: Features,
     point_ids: Int[np.ndarray, " m"],
     feature: Int[np.ndarray, " m"],
     plan: FeaturePlan,
 ) -> Observations:
-    """Make observations of points at features of a keyframe."""
+    """Make observations of points at features of a keyframe, or of one keyframe each."""
     return Observations(
         keyframe=np.full(len(feature), keyframe_id, np.int64),
         point=point_ids.astype(np.int64),
@@ -192,19 +263,28 @@ def fuse_duplicates(
     Returns:
         The map, and the fused points: the ids kept, and for each the id dropped.
     """
+    if not len(neighbors):
+        return slam_map, neighbors, neighbors
     points = described_points_in(slam_map, np.array([keyframe_id]), plan)
-    kept, dropped, new = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [empty_observations()]
-    for neighbor in neighbors.tolist():
-        features = slam_map.keyframe(neighbor).features
-        wanted = points.without(slam_map.observations.point[slam_map.observations.keyframe == neighbor])
-        index, feature = find_points(slam_map, wanted, features, slam_map.pose(neighbor), plan, radius_px=radius_px)
-        there = points_of_features(slam_map, neighbor, len(features.octave))[feature]
-        mine = wanted.ids[index]
-        free = there == NONE
-        new.append(feature_observations(neighbor, features, mine[free], feature[free], plan))
-        kept.append(np.minimum(there, mine)[~free])
-        dropped.append(np.maximum(there, mine)[~free])
-    slam_map = with_observations(slam_map, joined(new))
-    drop, first = np.unique(np.concatenate(dropped), return_index=True)
-    keep = np.concatenate(kept)[first]
+    images = _together([slam_map.keyframe(neighbor).features for neighbor in neighbors.tolist()])
+    seen = observations_at(slam_map.observations, np.isin(slam_map.observations.keyframe, neighbors))
+    order = np.argsort(neighbors)
+    seen_in = order[np.searchsorted(neighbors, seen.keyframe, sorter=order)]
+    # 1. Match the points with the features of the neighbors that do not observe them.
+    wanted = np.ones((len(neighbors), len(points.ids)), bool)
+    shared = has(points.ids, seen.point)
+    wanted[seen_in[shared], rows(points.ids, seen.point[shared])] = False
+    poses = slam_map.T_world_cam[rows(slam_map.ids, neighbors)]
+    image, index, feature = _find_in_images(slam_map.camera, points, wanted, images, poses, plan, radius_px=radius_px)
+    # 2. A feature that shows no point shows the one matched; one that shows another point shows that it is the same.
+    shown = np.full(len(images.image), NONE, np.int64)
+    at_feature = seen.feature != NONE
+    shown[images.first[seen_in[at_feature]] + seen.feature[at_feature]] = seen.point[at_feature]
+    at, mine = images.first[image] + feature, points.ids[index]
+    there = shown[at]
+    free = there == NONE
+    new = feature_observations(neighbors[image[free]], images.features, mine[free], at[free], plan)
+    slam_map = with_observations(slam_map, new._replace(feature=feature[free].astype(np.int32)))
+    drop, first = np.unique(np.maximum(there, mine)[~free], return_index=True)
+    keep = np.minimum(there, mine)[~free][first]
     return with_fused_points(slam_map, keep, drop), keep, drop

@@ -153,6 +153,27 @@ def test_projection_matches_an_exhaustive_search(ratio):
     assert len(set(found[1])) == found.shape[1]
 
 
+def test_several_images_match_as_one_after_the_other():
+    random = np.random.default_rng(6)
+    features = some_features(800, random)
+    source = random.integers(0, 800, 900)
+    of_feature = random.integers(0, 8, 800)  # one of eight images
+    of_point = np.where(random.random(900) < 0.8, of_feature[source], random.integers(0, 8, 900))
+    uv = features.uv[:, source] + random.normal(0, 4, (2, 900))
+    octave = features.octave[source].astype(int)
+    descriptor = flipped(features.descriptor[source], 40, random)
+    apart = []
+    for image in range(8):
+        points, there = np.flatnonzero(of_point == image), np.flatnonzero(of_feature == image)
+        alone = Features(*(array.take(there, axis=-1 if array is not features.descriptor else 0) for array in features))
+        found = match_by_projection(uv[:, points], octave[points], descriptor[points], alone, radius_px=6.0)
+        apart.append(np.stack([points[found[0]], there[found[1]]]))
+    expected = np.concatenate(apart, axis=1)
+    found = match_by_projection(uv, octave, descriptor, features, radius_px=6.0, images=(of_point, of_feature))
+    np.testing.assert_array_equal(found, expected[:, np.argsort(expected[0])])
+    assert 400 < found.shape[1] < 800
+
+
 @pytest.fixture(scope="module")
 def pair() -> tuple[Features, Features, np.ndarray, np.ndarray]:
     """Two pictures taken a second apart; where the features of the first are in the second, and their depth there."""

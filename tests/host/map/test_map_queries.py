@@ -35,6 +35,18 @@ def test_rows_and_has():
         rows(ids, np.array([2, 3]))
 
 
+@pytest.mark.parametrize("span", [6000, 10**12])
+def test_rows_and_has_of_many(span):
+    random = np.random.default_rng(0)
+    ids = np.unique(random.integers(-span, span, 3000))
+    row = random.integers(0, len(ids), 5000)
+    np.testing.assert_array_equal(rows(ids, ids[row]), row)
+    wanted = np.append(random.integers(-2 * span, 2 * span, 4000), [ids[0], ids[-1], ids[0] - 1, ids[-1] + 1])
+    np.testing.assert_array_equal(has(ids, wanted), np.isin(wanted, ids))
+    with pytest.raises(KeyError, match="not in the map"):
+        rows(ids, wanted)
+
+
 class TestPose:
     def test_of_one_that_was_never_there(self):
         with pytest.raises(KeyError, match="keyframe 9 was never in this map"):
