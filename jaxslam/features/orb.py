@@ -94,7 +94,11 @@ DEFAULT_PLAN = FeaturePlan()
 
 
 def features_of(
-    frame: FrameArrays, twist: Float[np.ndarray, "6"], sensor: SensorModel, plan: FeaturePlan = DEFAULT_PLAN
+    frame: FrameArrays,
+    twist: Float[np.ndarray, "6"],
+    sensor: SensorModel,
+    plan: FeaturePlan = DEFAULT_PLAN,
+    patches: Patches | None = None,
 ) -> Features:
     """Extract the features of a frame, remove distortion and rolling shutter, and read their depth.
 
@@ -103,12 +107,18 @@ def features_of(
         twist: `(6,)` velocity of the camera in its own axes, in meters per second, then radians per second.
         sensor: Camera, readout time, and the range of valid depths.
         plan: Settings of feature extraction.
+        patches: Result of `patches_of` for the frame, if it is known already.
     """
-    patches = extract(np.asarray(frame.image), np.asarray(frame.ignore), plan)
+    patches = patches_of(frame, plan) if patches is None else patches
     num = len(patches.octave)
     fixed_size = padded(patches.uv_raw, plan.num_features, axis=1)  # so that it is compiled once
     uv, depth = jax.device_get(_ideal(fixed_size, twist.astype(np.float32), frame, sensor))
     return Features(patches.uv_raw, uv[:, :num], depth[:num], *patches[1:])
+
+
+def patches_of(frame: FrameArrays, plan: FeaturePlan = DEFAULT_PLAN) -> Patches:
+    """Extract the features of a frame without geometry, which is most of the time of `features_of`."""
+    return extract(np.asarray(frame.image), np.asarray(frame.ignore), plan)
 
 
 def extract(

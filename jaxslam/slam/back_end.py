@@ -293,6 +293,10 @@ class BackEnd:
             return None
         return self._states.see(self.map, anchored.keyframe, anchored.T_keyframe_cam, np.asarray(output.twist), arrays)
 
+    def turn_to(self, arrays: FrameArrays, T_last_cam: Pose) -> Pose | None:
+        """Estimate how the camera turned since the last tracked frame; see `FrameLocalizer.turn_to`."""
+        return self._localizer.turn_to(arrays, T_last_cam)
+
     def motion_to(self, arrays: FrameArrays, T_last_cam: Pose) -> FeatureMotion | None:
         """Estimate the motion from the last tracked frame to a lost one; see `FrameLocalizer.motion_to`."""
         return self._localizer.motion_to(arrays, T_last_cam)

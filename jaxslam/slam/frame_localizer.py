@@ -8,10 +8,11 @@ import numpy as np
 from jaxlie import SE3
 from jaxtyping import Float
 
-from jaxslam.features.orb import FeaturePlan, Features, features_of
+from jaxslam.features.image_shift import turn_between
+from jaxslam.features.orb import FeaturePlan, Features, Patches, features_of, patches_of
 from jaxslam.features.pose_from_matches import PLACE_GATES, PoseGates
 from jaxslam.features.view_matching import match_views, match_views_near
-from jaxslam.geometry.se3 import compose, inverse, transform
+from jaxslam.geometry.se3 import angle, between, compose, inverse, transform
 from jaxslam.geometry.types import Pose
 from jaxslam.loop_closing.place_index import PlaceIndex
 from jaxslam.loop_closing.place_recognition import recognize
@@ -28,6 +29,9 @@ _PATIENCE_S = 0.02
 _MOTION_GATES = PoseGates(min_inliers=20, min_cells=8, max_sigma=0.0125)
 """Those of a motion, fewer than of a place: it is predicted, or optical flow goes on from there and finds out if it is
 right. On KITTI 06 with every 4th pair, 25 features in 10 cells agree with some motions that are right."""
+
+_MIN_TURN_RAD = 0.03
+"""Smallest turn that was not predicted from which it can be why optical flow failed: 16 of 640 pixels."""
 
 
 class LocalizedPose(NamedTuple):
@@ -123,12 +127,13 @@ class FrameLocalizer:
         self._index, self._states = index, states
         self.features: Features | None = None
         self._of_lost: Features | None = None
+        self._extracted: tuple[FrameArrays, Patches] | None = None
         self._last: _TrackedFrame | None = None
         self._of_last: Features | None = None
 
     def begin_frame(self) -> None:
         """Forget the features of the frame before."""
-        self.features = self._of_lost = None
+        self.features = self._of_lost = self._extracted = None
 
     def frame_tracked(self, arrays: FrameArrays, anchored: AnchoredPose, twist: Float[np.ndarray, "6"]) -> None:
         """Keep a frame that was tracked.
@@ -140,6 +145,22 @@ class FrameLocalizer:
         """
         # A weak frame has features already; often it is the last one before a loss, which then costs 14 ms less.
         self._last, self._of_last = _TrackedFrame(arrays, twist, anchored), self.features
+
+    def turn_to(self, arrays: FrameArrays, T_last_cam: Pose) -> Pose | None:
+        """Estimate how the camera turned since the last tracked frame, from the shift of the whole image.
+
+        Args:
+            arrays: The frame.
+            T_last_cam: `(7,)` predicted pose of the frame in the axes of the last tracked one.
+
+        Returns:
+            `(7,)` pose of the frame in the axes of the last tracked one; `None` if the images do not tell, or tell the
+            turn that was predicted.
+        """
+        if self._last is None:
+            return None
+        turn = turn_between(np.asarray(self._last.arrays.image), np.asarray(arrays.image), self._sensor)
+        return None if turn is None or angle(between(turn, T_last_cam)) < _MIN_TURN_RAD else turn
 
     def motion_to(self, arrays: FrameArrays, T_last_cam: Pose) -> FeatureMotion | None:
         """Estimate the motion from the last tracked frame to a lost one; `None` if features do not tell.
@@ -181,7 +202,8 @@ class FrameLocalizer:
             weak_inliers: Number of matches from which the frame is no longer `WEAK`.
             radii_px: Search radius of each pass around the predicted pixels at octave 0.
         """
-        self.features = features_of(arrays, np.asarray(output.twist), self._sensor, self._plan)
+        twist = np.asarray(output.twist)
+        self.features = features_of(arrays, twist, self._sensor, self._plan, self._patches_of(arrays))
         localized = self._in_local_map(self.features, pose_of(output), radii_px)
         if localized is None:
             return state, output, 0
@@ -235,8 +257,15 @@ class FrameLocalizer:
     def _features_of_lost(self, arrays: FrameArrays) -> Features:
         """Extract the features of the current frame, once, as of a camera at rest."""
         if self._of_lost is None:
-            self._of_lost = features_of(arrays, np.zeros(6, np.float32), self._sensor, self._plan)
+            still = np.zeros(6, np.float32)
+            self._of_lost = features_of(arrays, still, self._sensor, self._plan, self._patches_of(arrays))
         return self._of_lost
+
+    def _patches_of(self, arrays: FrameArrays) -> Patches:
+        """Extract the features of the current frame, once for each mask of it."""
+        if self._extracted is None or self._extracted[0].ignore is not arrays.ignore:
+            self._extracted = arrays, patches_of(arrays, self._plan)
+        return self._extracted[1]
 
     def _fits_map(self, arrays: FrameArrays, found: LocalizedPose) -> bool:
         """Return whether the frame does not see through the map at a pose; without a depth image nothing tells."""

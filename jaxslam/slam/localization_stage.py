@@ -61,7 +61,7 @@ class TrackedAgain(NamedTuple):
 class LocalizationStage:
     """Relocalizes frames that are lost, and matches frames that are weak with the local map.
 
-    The order of calls for a frame is `track_by_features` if it is lost, `localize`, then `frame_tracked` or
+    The order of calls for a frame is `track_again` if it is lost, `localize`, then `frame_tracked` or
     `frame_lost`.
     """
 
@@ -101,10 +101,13 @@ class LocalizationStage:
         """Predict the pose of the latest frame: as measured outside, else by constant velocity for at most a second."""
         return self._motion.now() if self._outside is None else self._outside
 
-    def track_by_features(
+    def track_again(
         self, arrays: FrameArrays, flow: FlowResult, measured: MeasuredMotion | None
     ) -> TrackedAgain | None:
-        """Track a lost frame again, from the motion since the last tracked frame that its features tell.
+        """Track a lost frame again, from the motion since the last tracked frame that was not predicted.
+
+        The shift of the whole image tells a turn of the camera for 1 ms; if that does not explain the frame, matches of
+        features tell any motion for 50.
 
         Args:
             arrays: The frame.
@@ -116,17 +119,35 @@ class LocalizationStage:
         """
         if not self._any_tracked or not self._programs.can_map():
             return None
-        back, predicted = self._back, np.asarray(flow.predicted.wxyz_xyz, np.float64)
-        found = back.motion_to(arrays, between(self._tracker.last_pose(), predicted))
+        predicted = np.asarray(flow.predicted.wxyz_xyz, np.float64)
+        T_last_cam = between(self._tracker.last_pose(), predicted)
+        return self._from_turn(arrays, T_last_cam, measured) or self._from_features(arrays, T_last_cam, measured)
+
+    def _from_turn(self, arrays: FrameArrays, T_last_cam: Pose, measured: MeasuredMotion | None) -> TrackedAgain | None:
+        """Track a lost frame again if the whole image shifted; `None`, and the state as it was, if it stays lost."""
+        turn = self._back.turn_to(arrays, T_last_cam)
+        if turn is None:
+            return None
+        state = self._tracker.copied_state()
+        again = self._from_motion(arrays, turn, measured)
+        if int(again.output.status) == TrackStatus.OK:
+            return again
+        self._tracker.state = state
+        return None
+
+    def _from_features(
+        self, arrays: FrameArrays, T_last_cam: Pose, measured: MeasuredMotion | None
+    ) -> TrackedAgain | None:
+        """Track a lost frame again if its features tell the motion; `None` if it stays lost."""
+        back, elapsed_s = self._back, self._tracker.elapsed_s()
+        found = back.motion_to(arrays, T_last_cam)
         if found is None:
             return None
-        self._tracker.before(arrays)
-        elapsed_s = self._tracker.elapsed_s() + float(arrays.dt_s)
-        flow = self._tracker.follow(arrays, found.T_last_cam, measured)
-        output = self._tracker.advance(arrays, flow, back.wishes)
+        again = self._from_motion(arrays, found.T_last_cam, measured)
         # Where two places look alike, few points of optical flow agree with a wrong motion too: 18 did, 2.8 m off.
-        if int(output.status) != TrackStatus.LOST and (found.is_certain or int(output.status) == TrackStatus.OK):
-            return TrackedAgain(flow, output)
+        status = int(again.output.status)
+        if status != TrackStatus.LOST and (found.is_certain or status == TrackStatus.OK):
+            return again
         # Nearer points look too different for optical flow: a car at 5 m a frame has 15 of 150 that agree.
         twist = displacement(IDENTITY, found.T_last_cam) / elapsed_s
         if not (found.is_certain and self._is_plausible(twist)):
@@ -135,6 +156,12 @@ class LocalizationStage:
         flow = self._tracker.follow(arrays)
         views = back.count_views(found.T_world_cam)
         return TrackedAgain(flow, self._at_matched_pose(self._restarted(arrays, flow, views), found))
+
+    def _from_motion(self, arrays: FrameArrays, T_last_cam: Pose, measured: MeasuredMotion | None) -> TrackedAgain:
+        """Track a lost frame again from another motion `(7,)` than the predicted one."""
+        self._tracker.before(arrays)
+        flow = self._tracker.follow(arrays, T_last_cam, measured)
+        return TrackedAgain(flow, self._tracker.advance(arrays, flow, self._back.wishes))
 
     def localize(
         self, arrays: FrameArrays, output: TrackOutput, dt_s: float, outside: Pose | None = None

@@ -241,7 +241,7 @@ class Slam:
         outside = None
         if int(output.status) == TrackStatus.LOST:
             outside = None if measured is None else np.asarray(flow.predicted.wxyz_xyz, np.float64)
-            again = self._localization.track_by_features(arrays, flow, measured)
+            again = self._localization.track_again(arrays, flow, measured)
             flow, output = again or (flow, output)
         if int(output.status) != TrackStatus.LOST:  # cues go by a wrong motion while the pose is not known
             arrays, mask = self._masks.exclude_moving(arrays, mask, flow, output)

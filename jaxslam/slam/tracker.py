@@ -233,6 +233,12 @@ class Tracker:
         """Return the time since the last tracked frame, in seconds."""
         return float(np.asarray(self.state.elapsed_s))
 
+    def copied_state(self) -> TrackState:
+        """Return a copy of the state, as of before an attempt; `advance` takes the memory of the state over."""
+        state = _without_pyramid(self.state)
+        copied = jax.device_put(state, *self.state.twist.devices(), may_alias=False)
+        return copied._replace(pyramid=self.state.pyramid)
+
     def before(self, frame: FrameArrays) -> None:
         """Go back in time to before a frame that was lost, so that it can be tracked again."""
         dt_s, devices = np.float32(frame.dt_s), self.state.twist.devices()
