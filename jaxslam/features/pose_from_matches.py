@@ -176,7 +176,8 @@ def compile_pose_fit(sensor: SensorModel, plan: FeaturePlan) -> None:
 
 
 def _fitted(T_origin_cam: Pose, matches: Matches, sensor: SensorModel) -> PoseRefinement:
-    return jax.device_get(_refined(SE3(jnp.asarray(T_origin_cam, jnp.float32)), matches, sensor))
+    start: Any = T_origin_cam.astype(np.float32)
+    return jax.device_get(_refined(SE3(start), matches, sensor))
 
 
 def matches_depth_sigma(matches: Matches, sensor: SensorModel) -> Weights:
@@ -193,7 +194,8 @@ def pinhole(sensor: SensorModel) -> tuple[Float64[np.ndarray, "2 1"], Float64[np
 def _cells(uv: Float32[np.ndarray, "2 n"], sensor: SensorModel) -> int:
     """Count the image cells that contain at least one of the pixels."""
     focal, center = pinhole(sensor)
-    return np.unique(np.floor((uv - center) / (_CELL * focal)), axis=1).shape[1]
+    column, row = np.floor((uv - center) / (_CELL * focal)).astype(np.int64).tolist()
+    return len(set(zip(column, row, strict=True)))  # a tenth of the time of `np.unique` with an axis
 
 
 @compiled(when="warm-up", options=FAST_COMPILE)

@@ -30,8 +30,8 @@ _MOTION_GATES = PoseGates(min_inliers=20, min_cells=8, max_sigma=0.0125)
 """Those of a motion, fewer than of a place: it is predicted, or optical flow goes on from there and finds out if it is
 right. On KITTI 06 with every 4th pair, 25 features in 10 cells agree with some motions that are right."""
 
-_MIN_TURN_RAD = 0.03
-"""Smallest turn that was not predicted from which it can be why optical flow failed: 16 of 640 pixels."""
+_MIN_TURN_RAD = 0.02
+"""Smallest turn that was not predicted from which it can be why optical flow failed: 10 of 640 pixels."""
 
 
 class LocalizedPose(NamedTuple):
