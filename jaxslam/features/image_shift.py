@@ -12,6 +12,7 @@ from jaxslam.sensors.sensor_model import SensorModel
 _SIDE_PX = 60
 """Shorter side of the images that are compared: 0.2 ms, and 0.8 ms to make both from 640 x 480 pixels."""
 _LEAST_PX = 16
+"""Shortest side of an image that has a shift to tell."""
 _BLUR_PX = 1.0
 _MIN_RESPONSE = 0.3
 """Smallest share of the spectral energy in the peak of the correlation. Of pairs of every 6th, 8th and 12th image of
@@ -50,6 +51,6 @@ def turn_between(last: UInt8[np.ndarray, "h w"], image: UInt8[np.ndarray, "h w"]
 def _small(image: UInt8[np.ndarray, "h w"]) -> Float32[np.ndarray, "_h _w"]:
     """Return the image in the size to compare, less its mean, which would correlate at no shift."""
     ratio = max(min(image.shape) / _SIDE_PX, 1.0)
-    size = (max(round(image.shape[1] / ratio), 1), max(round(image.shape[0] / ratio), 1))
+    size = round(image.shape[1] / ratio), round(image.shape[0] / ratio)
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     return cv2.GaussianBlur(small - small.mean(), (0, 0), _BLUR_PX)

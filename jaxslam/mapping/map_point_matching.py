@@ -186,7 +186,7 @@ def _find_in_images(
     radius_px: float,
     max_distance: int = NEAR,
 ) -> Int[np.ndarray, "3 m"]:
-    """Match map points with the features of several images; arguments as in `find_points`.
+    """Match map points with the features of several images by projection from approximate poses.
 
     Args:
         camera: Camera of the images.
@@ -264,7 +264,8 @@ def fuse_duplicates(
         The map, and the fused points: the ids kept, and for each the id dropped.
     """
     if not len(neighbors):
-        return slam_map, neighbors, neighbors
+        nothing = np.zeros(0, np.int64)
+        return slam_map, nothing, nothing
     points = described_points_in(slam_map, np.array([keyframe_id]), plan)
     images = _together([slam_map.keyframe(neighbor).features for neighbor in neighbors.tolist()])
     seen = observations_at(slam_map.observations, np.isin(slam_map.observations.keyframe, neighbors))

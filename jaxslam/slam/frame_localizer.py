@@ -29,7 +29,6 @@ _PATIENCE_S = 0.02
 _MOTION_GATES = PoseGates(min_inliers=20, min_cells=8, max_sigma=0.0125)
 """Those of a motion, fewer than of a place: it is predicted, or optical flow goes on from there and finds out if it is
 right. On KITTI 06 with every 4th pair, 25 features in 10 cells agree with some motions that are right."""
-
 _MIN_TURN_RAD = 0.02
 """Smallest turn that was not predicted from which it can be why optical flow failed: 10 of 640 pixels."""
 
@@ -127,7 +126,8 @@ class FrameLocalizer:
         self._index, self._states = index, states
         self.features: Features | None = None
         self._of_lost: Features | None = None
-        self._extracted: tuple[FrameArrays, Patches] | None = None
+        self._extracted: tuple[Any, Patches] | None = None
+        """The mask of the current frame, and the features extracted where it ignores nothing."""
         self._last: _TrackedFrame | None = None
         self._of_last: Features | None = None
 
@@ -263,8 +263,8 @@ class FrameLocalizer:
 
     def _patches_of(self, arrays: FrameArrays) -> Patches:
         """Extract the features of the current frame, once for each mask of it."""
-        if self._extracted is None or self._extracted[0].ignore is not arrays.ignore:
-            self._extracted = arrays, patches_of(arrays, self._plan)
+        if self._extracted is None or self._extracted[0] is not arrays.ignore:
+            self._extracted = arrays.ignore, patches_of(arrays, self._plan)
         return self._extracted[1]
 
     def _fits_map(self, arrays: FrameArrays, found: LocalizedPose) -> bool:
