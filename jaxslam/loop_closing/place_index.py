@@ -28,6 +28,10 @@ INDEX_BYTES = 52
 """Memory that a feature of a keyframe takes here, bytes."""
 _ALIKE_BITS = 40
 """Maximum Hamming distance for a vote. Scores of right and wrong keyframes: 4.5 to 1 with 50, 7.7 to 1 with 40."""
+_MIN_VOTES = 4
+"""Minimum number of votes of a result. Of 1,461 pairs of frames whose relative pose could be found, of TUM `fr1_rpy`,
+Bonn `crowd` and a rendered flat, all had 5 or more. Of the five best results at the first visit of the flat, 83 % have
+fewer than 4, and each would take 15 to 25 ms to verify."""
 
 
 class _Block(NamedTuple):
@@ -124,8 +128,9 @@ class PlaceIndex:
             limit: Maximum number of results.
 
         Returns:
-            Ids and scores, best first. A score sums, over the image features with a similar feature in the keyframe,
-            the logarithm of the number of all keyframes over the number of those that have one.
+            Ids and scores of those that share at least a few features with it, best first. A score sums, over the image
+            features with a similar feature in the keyframe, the logarithm of the number of all keyframes over the
+            number of those that have one.
         """
         votes = [_votes(block, features.descriptor) for block in self._blocks]
         feature, keyframe = np.concatenate([np.zeros((2, 0), np.int64), *votes], axis=1)
@@ -135,8 +140,9 @@ class PlaceIndex:
         holders = np.bincount(feature, minlength=len(features.descriptor))
         rarity = np.log((len(self._alive) + 1) / np.maximum(holders, 1))
         score = np.bincount(voted, rarity[feature], minlength=len(known))
-        best = (index for index in np.lexsort((known, -score)) if score[index] > 0 and int(known[index]) not in exclude)
-        return [(int(known[index]), float(score[index])) for index in islice(best, limit)]
+        enough = np.bincount(voted, minlength=len(known)) >= _MIN_VOTES
+        best = (at for at in np.lexsort((known, -score)) if enough[at] and int(known[at]) not in exclude)
+        return [(int(known[at]), float(score[at])) for at in islice(best, limit)]
 
 
 def _block(keyframe_id: int, descriptor: UInt8[np.ndarray, "n 32"]) -> _Block:
