@@ -135,9 +135,11 @@ class TestTrackClips:
 
 
 class TestCommand:
+    @pytest.mark.slow
     def test_prints_its_figures_alone(self, out: Path, content: dict[str, Any]) -> None:
         assert json.loads((out.parent / PRINTED).read_text()) == content
 
+    @pytest.mark.slow
     def test_figures(self, content: dict[str, Any]) -> None:
         assert content["size"] == [WIDTH, HEIGHT]
         assert (content["frames"], content["rounds"], content["different"]) == (FRAMES, 3, 2)
@@ -150,6 +152,7 @@ class TestCommand:
         assert row["compile_s"] > 1 / row["frames_per_s"]
         assert row["peak_rss_mb"] > 100
 
+    @pytest.mark.slow
     def test_vmap_equals_loop(self, content: dict[str, Any]) -> None:
         for row in content["rows"]:
             assert row["same_statuses"]
@@ -159,6 +162,7 @@ class TestCommand:
             assert 0 < row["ate_rmse_m"] < 0.02
             assert row["tracked_percent"] == 100
 
+    @pytest.mark.slow
     def test_report(self, out: Path, content: dict[str, Any]) -> None:
         assert {path.name for path in out.iterdir()} == FILES
         text = (out / "batch.md").read_text()
@@ -168,6 +172,7 @@ class TestCommand:
         assert rows == [cells(row) for row in content["rows"]]
         assert "2 rendered rooms, different in motion, textures and people. " in text
 
+    @pytest.mark.slow
     def test_picture(self, out: Path, content: dict[str, Any]) -> None:
         with Image.open(out / "batch.png") as drawn:
             assert min(drawn.size) > 400

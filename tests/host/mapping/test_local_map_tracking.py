@@ -317,6 +317,7 @@ class TestFramesThatDisagreeWithTheMap:
         assert result.status is TrackStatus.OK
         assert (result.num_matched > 0) == (off_m < 0.02) == (min_views < 1000)
 
+    @pytest.mark.slow
     def test_none_does_if_no_keyframe_is_looked_into(self) -> None:
         with Slam(CAMERA, replace(CONFIG, track=replace(TRACK, num_sources=0))) as slam:
             results = [slam.track(frame) for frame in room().frames[:NUM_FRAMES]]

@@ -51,7 +51,7 @@ def test_tracking_and_mapping_leave_the_pool_alone() -> None:
     assert in_pool_s < 0.1 * took_s
 
 
-@pytest.mark.parametrize("world", ["flat", "road"])
+@pytest.mark.parametrize("world", ["flat", pytest.param("road", marks=pytest.mark.slow)])
 def test_rendering_leaves_the_pool_alone(world: str) -> None:
     recording = WorldRecording(world)
     indices = range(0, len(recording), len(recording) // 8)

@@ -42,12 +42,12 @@ def said(body: str, **environment: str) -> list[str]:
     return done.stdout.splitlines()
 
 
-@pytest.mark.parametrize("number", [1, 2])
+@pytest.mark.parametrize("number", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_set_by_the_first_tracker(number: int) -> None:
     assert said(f"begin({number})") == [f"threads {number} {number} False"]
 
 
-@pytest.mark.parametrize("number", [1, 2])
+@pytest.mark.parametrize("number", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_of_blas(number: int) -> None:
     """Of NumPy, and of SciPy, which is loaded for the map."""
     found = said(
@@ -83,6 +83,7 @@ def test_rendered_frames_before_the_first_tracker() -> None:
     assert said(f"{rendered}; begin(1)") == ["threads 1 1 False"]
 
 
+@pytest.mark.slow
 def test_frames_rendered_after_other_arrays() -> None:
     """Nothing is said: only trackers are told of XLA's threads."""
     rendered = "from jaxslam.datasets.synthetic import *; SyntheticDataset(SyntheticConfig(width=64, height=48))[0]"
@@ -95,7 +96,11 @@ def test_preferred_before_the_first_array() -> None:
 
 
 @pytest.mark.parametrize(
-    "opened", ["datasets.synthetic import SyntheticDataset as Opened", "worlds import WorldRecording as Opened"]
+    "opened",
+    [
+        pytest.param("datasets.synthetic import SyntheticDataset as Opened", marks=pytest.mark.slow),
+        "worlds import WorldRecording as Opened",
+    ],
 )
 def test_a_rendered_recording_may_be_opened_first(opened: str) -> None:
     """As in the README: the recording, then the tracker of its camera."""
