@@ -29,7 +29,7 @@ INDEX_BYTES = 52
 _ALIKE_BITS = 40
 """Maximum Hamming distance for a vote. Scores of right and wrong keyframes: 4.5 to 1 with 50, 7.7 to 1 with 40."""
 _MIN_VOTES = 4
-"""Minimum number of votes of a result. Of 1,461 pairs of frames whose relative pose could be found, of TUM `fr1_rpy`,
+"""Minimum number of votes of a result. Of 1,456 pairs of frames whose relative pose could be found, of TUM `fr1_rpy`,
 Bonn `crowd` and a rendered flat, all had 5 or more. Of the five best results at the first visit of the flat, 83 % have
 fewer than 4, and each would take 15 to 25 ms to verify."""
 
