@@ -134,12 +134,11 @@ class TestTrackClips:
             track_clips([clip], params, threads=0)
 
 
+@pytest.mark.slow
 class TestCommand:
-    @pytest.mark.slow
     def test_prints_its_figures_alone(self, out: Path, content: dict[str, Any]) -> None:
         assert json.loads((out.parent / PRINTED).read_text()) == content
 
-    @pytest.mark.slow
     def test_figures(self, content: dict[str, Any]) -> None:
         assert content["size"] == [WIDTH, HEIGHT]
         assert (content["frames"], content["rounds"], content["different"]) == (FRAMES, 3, 2)
@@ -152,7 +151,6 @@ class TestCommand:
         assert row["compile_s"] > 1 / row["frames_per_s"]
         assert row["peak_rss_mb"] > 100
 
-    @pytest.mark.slow
     def test_vmap_equals_loop(self, content: dict[str, Any]) -> None:
         for row in content["rows"]:
             assert row["same_statuses"]
@@ -162,7 +160,6 @@ class TestCommand:
             assert 0 < row["ate_rmse_m"] < 0.02
             assert row["tracked_percent"] == 100
 
-    @pytest.mark.slow
     def test_report(self, out: Path, content: dict[str, Any]) -> None:
         assert {path.name for path in out.iterdir()} == FILES
         text = (out / "batch.md").read_text()
@@ -172,7 +169,6 @@ class TestCommand:
         assert rows == [cells(row) for row in content["rows"]]
         assert "2 rendered rooms, different in motion, textures and people. " in text
 
-    @pytest.mark.slow
     def test_picture(self, out: Path, content: dict[str, Any]) -> None:
         with Image.open(out / "batch.png") as drawn:
             assert min(drawn.size) > 400
@@ -182,6 +178,8 @@ class TestCommand:
             assert min(drawn.size) > 400
         assert other != (out / "batch.png").read_bytes()
 
+
+class TestErrors:
     @pytest.mark.parametrize(
         ("arguments", "complaint"),
         [

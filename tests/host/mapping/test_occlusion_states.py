@@ -610,7 +610,6 @@ class TestRoomWithPeople:
             slam.finish()
             assert compiled == []
 
-    @pytest.mark.slow
     def test_last_changes_are_in_the_map(self) -> None:
         """Those since the last keyframe; to finish again finds nothing new."""
         last = max(index for index, result in enumerate(as_published().results) if not result.is_keyframe)
