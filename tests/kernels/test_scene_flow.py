@@ -79,7 +79,7 @@ def test_matches_reference(x64, robust):
     assert (state.share[: K - 1] < 0.3).all()
 
 
-@pytest.mark.parametrize("robust", [True, False])
+@pytest.mark.parametrize("robust", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_gradient(x64, robust):
     X_world, X_cam, pose, group = _scene(1)
 
@@ -97,6 +97,7 @@ def test_gradient(x64, robust):
         check_grads(jax.jit(loss), at, order=1, modes=("fwd", "rev"), eps=1e-7, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_gradient_without_motion(x64):
     X_world, _, _pose, group = _scene(1)
 

@@ -28,6 +28,7 @@ def test_the_gate_tracks_a_small_part_of_each_suite_that_needs_no_data():
     assert not missing(load_suite("worlds"), ())
 
 
+@pytest.mark.slow
 def test_a_small_part_of_a_room_with_real_people_is_tracked(monkeypatch):
     """The camera moves by more than the error allowed, which is a hundredth of that or 1 cm."""
     monkeypatch.setenv("JAXSLAM_MODELS", str(real_network("deeplabv3_mobilenetv2_voc").parent))

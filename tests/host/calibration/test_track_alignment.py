@@ -85,6 +85,7 @@ def spread_px(block: TrackBlock) -> float:
     return float(np.nanmean(np.nanstd(places, axis=0)))
 
 
+@pytest.mark.slow
 def test_drift_is_undone(seen_plane: SeenPlane) -> None:
     block, state, images = seen_plane
     found = aligned(block, state, vector_of(CAMERA), images)

@@ -92,6 +92,7 @@ def test_results_are_on_disk(
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
 
 
+@pytest.mark.slow
 def test_poses_are_those_of_a_whole_run(tmp_path: Path) -> None:
     """To the byte, as they were given out."""
     recording = Stopping(lambda: None)

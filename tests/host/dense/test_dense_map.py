@@ -151,6 +151,7 @@ class TestGhosts:
 
     @pytest.mark.parametrize("carve", [False, True])
     @pytest.mark.parametrize("late", [False, True])
+    @pytest.mark.slow
     def test_masks(self, late: bool, carve: bool) -> None:
         source, frames = _room(people=2)
         dense = _made(source, frames, replace(SMALL, carve=carve), masks=True, late=late)
@@ -198,6 +199,7 @@ class TestCorrections:
 
 
 class TestBounds:
+    @pytest.mark.slow
     def test_full_grid_gets_larger_voxels(self) -> None:
         source, frames = _room(people=0)
         dense = _made(source, frames, replace(SMALL, max_points=12_000))
@@ -270,6 +272,7 @@ def test_the_whole_path_is_in_the_picture() -> None:
         assert 5 < rows.min() < rows.max() < len(panel) - 5
 
 
+@pytest.mark.slow
 def test_key_objects_are_dense() -> None:
     """Inside the box of an object there are more points than voxels, also from a frame before the keyframe."""
     source, frames = _room(people=0)

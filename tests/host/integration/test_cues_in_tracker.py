@@ -97,6 +97,7 @@ class TestOwnCue:
 
 
 class TestMaskedPoints:
+    @pytest.mark.slow
     def test_cues_decide_where_masks_would(self) -> None:
         """The left half is masked; a cue finds its left quarter moving, and the points between are used."""
         frames, state, output = stacked(clip(0).frames[:FRAMES]), new_state(), None

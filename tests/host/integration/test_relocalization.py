@@ -42,7 +42,14 @@ BEFORE, AFTER = list(range(60)), list(range(15, 50))
 
 
 class TestKidnap:
-    @pytest.mark.parametrize("config", [HOLD, PREDICT, SUBMAP], ids=["hold", "predict", "submap"])
+    @pytest.mark.parametrize(
+        "config",
+        [
+            pytest.param(HOLD, id="hold"),
+            pytest.param(PREDICT, marks=pytest.mark.slow, id="predict"),
+            pytest.param(SUBMAP, marks=pytest.mark.slow, id="submap"),
+        ],
+    )
     def test_black_frames(self, config: Config) -> None:
         """Sixty black frames, then a place seen before: the same world within 15 frames, and right in it."""
         played = play([*BEFORE, *[BLACK] * 60, *AFTER], config)
@@ -56,6 +63,7 @@ class TestKidnap:
         assert errors.max() < 0.03
         assert np.unique(played.slam.map.submap).tolist() == [0]
 
+    @pytest.mark.slow
     def test_cut(self) -> None:
         """A jump in time and place without any black frame."""
         played = play([*BEFORE, *AFTER], gap_s=2.0)
@@ -86,6 +94,7 @@ class TestKidnap:
         ]
         assert max(apart) < 0.03
 
+    @pytest.mark.slow
     def test_keyframes_are_at_hand_at_once(self) -> None:
         """Those that show the place are reloaded with the relocalization: their points are found again."""
         played = play([*BEFORE, *[BLACK] * 3, *AFTER])
@@ -163,6 +172,7 @@ class TestPolicies:
         assert errors.max() < 0.05
         assert problems(slam.map) == []
 
+    @pytest.mark.slow
     def test_localizing_begins_no_submap(self) -> None:
         """A place that is not in the map stays unknown, whatever the policy."""
         start = play(range(120, 140)).slam.map

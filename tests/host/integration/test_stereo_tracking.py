@@ -83,6 +83,7 @@ class TestRoughDepth:
         with pytest.raises(CameraError, match=message):
             RoughDepth(dataclasses.replace(PAIR, **change))
 
+    @pytest.mark.slow
     def test_features_are_matched(self) -> None:
         """Depth of features is matched, not read from the rough one: half the error, or less."""
         *pair, true = stereo_motorcycle()

@@ -80,6 +80,7 @@ def naive_ate_m(scene: Scene) -> float:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.slow
 def test_people_do_not_lead_astray(slam: Slam, seed: int) -> None:
     """With default settings and without masks."""
     crowded = scene(seed, people=2)

@@ -45,7 +45,7 @@ def test_zero_with_a_finite_derivative_at_the_truth(loss: Callable[..., Any], tr
     assert float(jnp.abs(slope).max()) < 1e-5
 
 
-@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("loss", [LOSSES[0], *(pytest.param(loss, marks=pytest.mark.slow) for loss in LOSSES[1:])])
 def test_derivatives_equal_differences(loss: Callable[..., Any], truth: SE3, noise: jax.Array) -> None:
     with jax.enable_x64(True):
         exact = SE3(truth.wxyz_xyz.astype(jnp.float64))
@@ -66,6 +66,7 @@ def test_known_values(truth: SE3) -> None:
 
 
 @pytest.mark.parametrize("loss", [relative_pose_loss, ate_loss])
+@pytest.mark.slow
 def test_no_world_matters(loss: Callable[..., Any], truth: SE3, noise: jax.Array) -> None:
     estimated = moved(truth, noise)
     world = retract(SE3(jnp.array([1.0, 0, 0, 0, 0, 0, 0])), jnp.array([1.0, 2.0, -3.0, 0.4, 0.5, -0.6]))

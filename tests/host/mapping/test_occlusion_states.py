@@ -529,6 +529,7 @@ class MappingError(Exception):
     """What goes wrong in these tests."""
 
 
+@pytest.mark.slow
 class TestRoomWithPeople:
     @pytest.mark.slow
     def test_points_that_people_passed(self) -> None:

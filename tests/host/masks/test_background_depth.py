@@ -432,6 +432,7 @@ class TestPeople:
         ("path", "seed", "walker", "first", "last"),
         [("xyz", 0, 2, 60, 70), *(pytest.param(*clip, marks=pytest.mark.slow) for clip in MORE_PEOPLE)],
     )
+    @pytest.mark.slow
     def test_are_found_when_they_come_in(
         self, path: CameraPathKind, seed: int, walker: int, first: int, last: int
     ) -> None:
@@ -448,7 +449,14 @@ class TestPeople:
         assert {mask.source for mask in masks} == {MaskSource.NONE, MaskSource.DEPTH}
         assert {mask.age for mask in masks} == {-1}
 
-    @pytest.mark.parametrize(("path", "seed"), [("xyz", 0), ("static", 0), ("xyz", 1)])
+    @pytest.mark.parametrize(
+        ("path", "seed"),
+        [
+            ("xyz", 0),
+            pytest.param("static", 0, marks=pytest.mark.slow),
+            pytest.param("xyz", 1, marks=pytest.mark.slow),
+        ],
+    )
     def test_little_else_is(self, path: CameraPathKind, seed: int) -> None:
         frames = rendered(path, 30.0, 2, seed, 3.0)
         masks = masks_at_true_poses(room(path, 30.0, 2, seed, 3.0), frames)

@@ -371,6 +371,7 @@ class TestPropagation:
         depth = np.where(near, 1.2, np.where(far, 3.5, 5.0)).astype(np.float32)
         np.testing.assert_array_equal(predicted_mask(*moved(near | far, (0, 0), depth), depth, FARTHEST_M), near | far)
 
+    @pytest.mark.slow
     def test_people_are_followed(self) -> None:
         """Better than the mask left where it was."""
         new, _, _ = carried(FIRST, LAST)

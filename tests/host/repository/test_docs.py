@@ -23,8 +23,8 @@ from jaxslam.semantics.prompted import read_examples
 CONTRIBUTING = ROOT / ".github" / "CONTRIBUTING.md"
 _GETTING_STARTED = DOCS / "getting-started.md"
 _RECORDING = "recordings/room"
-_QUICK = {"cameras-and-recordings", "command-line", "determinism-and-caches"}
-"""Pages whose blocks take less than 20 s; all others are `slow`."""
+_QUICK = {"command-line", "determinism-and-caches"}
+"""Pages whose blocks take less than 5 s; all others are `slow`."""
 _BRITISH = re.compile(
     r"\b\w*(?:colour|centre|neighbour|behaviour|favour|grey|licence|catalogue|labelled|modelled|travell|cancell"
     r"|[a-z]+metre|metres?\b|[a-z]{3,}(?:nis|lis|tis|ris|mis|sis|dis)(?:e[sd]?|ing|ation)\b|analys(?:e[sd]?|ing)\b)\w*",

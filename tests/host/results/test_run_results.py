@@ -170,6 +170,7 @@ class TestSmallScene:
         np.testing.assert_array_equal(written.timestamps_ns, slam.trajectory.timestamps_ns)
         np.testing.assert_allclose(written.T_world_cam, slam.trajectory.T_world_cam, atol=1e-8)
 
+    @pytest.mark.slow
     def test_masks_of_this_run_only(self, tmp_path: Path) -> None:
         """Their pictures are there if there were masks, and go with the next run that has none."""
         recording, slam = clip(), Slam(clip().camera, CONFIG)
@@ -200,7 +201,10 @@ class TestSmallScene:
 class TestRealRecordings:
     @pytest.mark.parametrize(
         ("recording", "frames", "limit_m"),
-        [("tum/rgbd_dataset_freiburg1_rpy_excerpt", 160, 0.040), ("bonn/rgbd_bonn_crowd", 220, 0.025)],
+        [
+            ("tum/rgbd_dataset_freiburg1_rpy_excerpt", 160, 0.040),
+            pytest.param("bonn/rgbd_bonn_crowd", 220, 0.025, marks=pytest.mark.slow),
+        ],
     )
     def test_run(self, data_dir: Path, tmp_path: Path, recording: str, frames: int, limit_m: float) -> None:
         main(["run", str(data_dir / recording), "--out", str(tmp_path), "--max-frames", str(frames)])
@@ -211,6 +215,7 @@ class TestRealRecordings:
         assert summary["ate_rmse_m"] <= limit_m
         assert len(check_against_evo(tmp_path / "trajectory.txt")) == frames
 
+    @pytest.mark.slow
     def test_masks(self, data_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         """Two people in the picture, and a network that finds them."""
         model = Path(MODELS or "nowhere", "yolox_nano.onnx")

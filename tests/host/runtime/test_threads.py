@@ -70,6 +70,7 @@ def test_too_late_is_said_once() -> None:
     assert len(rest) == 1
 
 
+@pytest.mark.slow
 def test_another_number_later_is_said() -> None:
     """A second tracker of the same process cannot have other threads."""
     warned, last = said("begin(1); begin(2)")
@@ -77,6 +78,7 @@ def test_another_number_later_is_said() -> None:
     assert last == "threads 1 2 False"
 
 
+@pytest.mark.slow
 def test_rendered_frames_before_the_first_tracker() -> None:
     """They are the first arrays of the process, and do not take the choice from the tracker."""
     rendered = "from jaxslam.datasets.synthetic import *; SyntheticDataset(SyntheticConfig(width=64, height=48))[0]"
@@ -102,6 +104,7 @@ def test_preferred_before_the_first_array() -> None:
         "worlds import WorldRecording as Opened",
     ],
 )
+@pytest.mark.slow
 def test_a_rendered_recording_may_be_opened_first(opened: str) -> None:
     """As in the README: the recording, then the tracker of its camera."""
     name = "'flat'" if "worlds" in opened else ""

@@ -413,6 +413,7 @@ class TestSettings:
         with pytest.raises(ModelError, match="nowhere"):
             networks_sha256(SemanticsConfig(model=yolox, **pair))
 
+    @pytest.mark.slow
     def test_mask_of_a_frame(self, pair: dict[str, Any], yolox: str) -> None:
         """What the tracker leaves out is the box of the network in front, by the mask that is prompted for."""
         room = SyntheticDataset(SyntheticConfig(frames=1, width=192, height=128, people=0))

@@ -254,6 +254,7 @@ def loop_at(slam_map: Map, keyframe_id: int) -> LoopClosure | None:
 
 
 class TestGlobalAdjustment:
+    @pytest.mark.slow
     def test_follows_a_loop_and_ends_for_a_newer_one(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Of two loops close to each other, the map after the second one counts; the tracker moves along with it."""
         second, third = keyframe_frames()[1:3]

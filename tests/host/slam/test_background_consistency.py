@@ -86,6 +86,7 @@ class TestOrdinary:
 class TestSomethingNear:
     """Something too near for the sensor has no depth either, and moves as it likes."""
 
+    @pytest.mark.slow
     def test_doubt_ends_where_the_background_is_seen_again(self) -> None:
         """Something passes before the left half of the picture; the right half agrees with the map all the time."""
         frames, passes = 60, range(10, 35)

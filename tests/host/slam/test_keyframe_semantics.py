@@ -193,6 +193,7 @@ class TestRun:
         for keyframe in (*slam_map.keyframes, *blind_run().keyframes):
             assert index.query(keyframe.features) == expected.query(keyframe.features)
 
+    @pytest.mark.slow
     def test_same_bytes_twice(self, tmp_path: Path) -> None:
         for name in ("one", "two"):
             with Slam(source().camera, config(), detector=Looks()) as slam:
@@ -202,6 +203,7 @@ class TestRun:
         for file in ("{}", "{}.npy"):
             assert (tmp_path / file.format("one")).read_bytes() == (tmp_path / file.format("two")).read_bytes()
 
+    @pytest.mark.slow
     def test_every_frame(self) -> None:
         """The other setting: the detector looks at frames whether they are kept or not, and no point is taken back."""
         assert SemanticsConfig().frames == "keyframes"
@@ -214,6 +216,7 @@ class TestRun:
         assert set(looks.frames) - set(keyframes(results))
         assert all(result.dynamic_mask.any() for result in results)
 
+    @pytest.mark.slow
     def test_in_the_summary(self, tmp_path: Path) -> None:
         with Slam(source().camera, config(), detector=Looks()) as slam:
             clip = Clip(source(), rendered()[0].frames[:30])

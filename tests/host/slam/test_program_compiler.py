@@ -145,6 +145,7 @@ class TestErrors:
 
 
 class TestClose:
+    @pytest.mark.slow
     def test_in_two_seconds_and_what_is_compiled_is_used_again(self, gate: Gate, compiled: list[str]) -> None:
         jax.clear_caches()
         slam = Slam(clip().camera, LIVE)

@@ -95,6 +95,7 @@ class TestDeterminism:
 
 
 class TestCompiling:
+    @pytest.mark.slow
     def test_everything_before_the_first_frame(self, slam: Slam, compiled: list[str]) -> None:
         """Making and warming up compile a known number of programs, as in a new process; tracking then none.
 

@@ -484,6 +484,7 @@ def slam_results(config: Config, num: int = LONGER, detector: Callable | None = 
 
 class TestHeldToMap:
     @pytest.mark.parametrize("which", ["weak", "keyframes", "always"])
+    @pytest.mark.slow
     def test_which_frames(self, which: str) -> None:
         """Matching begins as soon as the map has a keyframe."""
         track = replace(TRACK, match_map=which, keyframe_below=1.0)

@@ -218,6 +218,7 @@ class TestParams:
 class TestPrecision:
     """One floating-point type for state, parameters and frames; float32 wherever none is asked for."""
 
+    @pytest.mark.slow
     def test_mixed(self, frame: FrameArrays) -> None:
         with jax.enable_x64(True):
             state, given, double = new_state(np.float64), params(np.float64), stacked(clip().frames[:1], np.float64)

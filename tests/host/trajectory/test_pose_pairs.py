@@ -126,6 +126,7 @@ class TestNotes:
             for note in notes
         )
 
+    @pytest.mark.slow
     def test_real_path_with_losses(self, data_dir: Path) -> None:
         """Ground truth of fr2_desk pauses, for up to 12 s."""
         estimate, reference = (

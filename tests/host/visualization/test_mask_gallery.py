@@ -130,6 +130,7 @@ class TestFiles:
         expected = np.array(MASK_RGB[MaskSource.DETECTOR]) / 2
         assert np.abs(shown[BAR + 120, 80] - expected).max() < 16
 
+    @pytest.mark.slow
     def test_animation_stays_small(self, tmp_path: Path) -> None:
         """Noise does not compress: fewer frames of it fit."""
         random = np.random.default_rng(0)

@@ -141,6 +141,7 @@ def test_depth_grows_with_the_world(crowded, people):
     np.testing.assert_array_equal(big.depth_m[both], 2 * frame.depth_m[both])
 
 
+@pytest.mark.slow
 def test_frozen_pictures_hold_the_people_of_their_moment(crowded, people):
     frozen = WorldRecording(dataclasses.replace(ROOM, real_people=people, faults=(Fault(0.5, 0.7, "frozen"),)))
     np.testing.assert_array_equal(frozen.render(20).rgb, crowded.render(14).rgb)
@@ -157,6 +158,7 @@ def test_missing_depth_of_people_stays_missing(crowded):
 @pytest.mark.parametrize(
     "network", [pytest.param("yolov8n-seg_int8", marks=pytest.mark.slow), "deeplabv3_mobilenetv2_dm05_voc"]
 )
+@pytest.mark.slow
 def test_networks_find_the_people(people, network):
     world = dataclasses.replace(ROOM, seconds=10.0, real_people=dataclasses.replace(people, from_s=12.0))
     recording = WorldRecording(dataclasses.replace(world, camera=WorldCamera(fx=555.0)))

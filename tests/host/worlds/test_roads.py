@@ -100,6 +100,7 @@ def test_a_smaller_share_leaves_the_others_where_they_are():
     assert set(some) < set(every)
 
 
+@pytest.mark.slow
 def test_the_camera_drives_on_the_right_and_a_car_comes_on_the_left():
     street = WorldRecording(WORLD)
     path = street.ground_truth.T_world_cam[:, 4:]

@@ -151,6 +151,7 @@ def test_what_a_world_needs_and_is_not_there(tmp_path, monkeypatch):
     assert "JAXSLAM_DATA" in str(why_not_here(dataclasses.replace(ROOM, way=Way(file="$JAXSLAM_DATA/way.txt"))))
 
 
+@pytest.mark.slow
 def test_processes_share_a_cache(tmp_path):
     code = (
         "import sys\n"

@@ -215,9 +215,7 @@ def _pose_errors(poses, others) -> float:
     return max(max(pose_error(a, b)) for a, b in zip(poses, others, strict=True))
 
 
-LOSSES = [
-    loss if loss in ("squared", "cauchy") else pytest.param(loss, marks=pytest.mark.slow) for loss in get_args(Loss)
-]
+LOSSES = [loss if loss == "cauchy" else pytest.param(loss, marks=pytest.mark.slow) for loss in get_args(Loss)]
 """SciPy takes a minute with `geman_mcclure`."""
 
 
@@ -246,6 +244,7 @@ class TestReference:
         assert result.cost == pytest.approx(cost, rel=1e-9)
         assert result.cost < (1.0 if loss == "geman_mcclure" else 0.5) * result.initial_cost
 
+    @pytest.mark.slow
     def test_truth_without_noise(self):
         window = make_window(2, noise=0.0, outliers=0.0)
         with jax.enable_x64(True):

@@ -152,7 +152,7 @@ def _scipy_optimum(inputs: Inputs, loss: Loss) -> tuple[np.ndarray, np.ndarray, 
 
 
 class TestReference:
-    @pytest.mark.parametrize("loss", ["squared", "cauchy"])
+    @pytest.mark.parametrize("loss", ["cauchy", pytest.param("squared", marks=pytest.mark.slow)])
     def test_matches_reference(self, loss):
         inputs = make_scene(1).inputs
         with jax.enable_x64(True):
@@ -185,6 +185,7 @@ class TestReference:
         assert float(single.cost) == pytest.approx(float(double.cost), rel=0.01)
         assert all(np.isfinite(x).all() for x in jax.tree.leaves((single, gradient)))
 
+    @pytest.mark.slow
     def test_fixed_lens_without_distortion_is_an_ideal_camera(self):
         """Of the same focal length: the same poses from pixels as from directions."""
         inputs = make_scene(4).inputs
@@ -209,7 +210,7 @@ class TestReference:
         np.testing.assert_allclose(result.cost, expected.cost, rtol=1e-10)
         assert _pose_errors(result.poses, expected.poses) < 1e-7
 
-    @pytest.mark.parametrize("two_sided", [False, True])
+    @pytest.mark.parametrize("two_sided", [pytest.param(False, marks=pytest.mark.slow), True])
     def test_behind(self, two_sided):
         """A camera that looks the other way: its pixels are where the lines of sight meet the image."""
         scene = make_scene(5)

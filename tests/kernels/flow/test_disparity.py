@@ -118,6 +118,7 @@ class TestMatchesReference:
         assert not np.any(np.asarray(found.found) & covered & ~wrong)
         assert np.mean(np.asarray(found.found)[covered]) < 0.3
 
+    @pytest.mark.slow
     def test_what_was_expected_needs_no_way_back(self):
         """One way only near the guess: the same disparities, and whatever is further off still has to come back."""
         left, right, points, guess, mask = _pair()
@@ -163,6 +164,7 @@ class TestGradient:
         assert not np.any(gradient[2])
 
 
+@pytest.mark.slow
 def test_vmap_equals_loop():
     pairs = [_pair(seed=seed) for seed in range(2)]
     batched = quick_compile(jax.vmap(_run()))(*(np.stack(arrays) for arrays in zip(*pairs, strict=True)))

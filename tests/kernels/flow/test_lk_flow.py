@@ -95,6 +95,7 @@ class TestMatchesReference:
         assert np.mean(ours < 1) >= np.mean(theirs < 1)
         assert np.median(ours) <= np.median(theirs) * 1.02  # both are limited by the rotation of the window
 
+    @pytest.mark.slow
     def test_seeds_find_what_all_levels_find(self):
         """A camera that turns and a part of the picture that moves another way: neighbors do not mislead points."""
         image = picture(320, 240)
@@ -115,6 +116,7 @@ class TestMatchesReference:
             apart = distances(by_seeds.points, by_all.points)[part][both]
             assert np.mean(apart < 0.05) > 0.98
 
+    @pytest.mark.slow
     def test_few_points_are_all_searched_from_the_coarsest_level(self):
         """At most four times the number of seeds, such as masks leave, are found to the byte as without seeds."""
         image = picture(320, 240)
@@ -189,6 +191,7 @@ class TestMatchesReference:
         assert unlike > found
 
 
+@pytest.mark.slow
 def test_vmap_equals_loop():
     """Flows and gradients of a batch of image pairs."""
     weights = random_weights(0, np.float32)

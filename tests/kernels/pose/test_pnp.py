@@ -310,6 +310,7 @@ class TestRansac:
             without.append(pose_error(_run(seed, no_depth)[0].T_world_cam.wxyz_xyz, scene.pose)[0])
         assert np.median(with_depth) < 0.9 * np.median(without)
 
+    @pytest.mark.slow
     def test_a_prior_contradicts_a_crowd_that_carries_the_votes(self):
         """Three in five points move together; what a gyro knows of the rotation alone makes the others win."""
         rotation_only = np.diag([0.0] * 3 + [1e8] * 3)
@@ -396,6 +397,7 @@ class TestRansac:
         assert helped.num_inliers < 8  # so that no consensus is claimed with the default of min_inliers
         assert helped.status == PoseStatus.NO_CONSENSUS
 
+    @pytest.mark.slow
     def test_gradient(self):
         """Which points are inliers is constant; forward = reverse = finite differences through the refinement."""
         scene = make_scene(4, N, noise_px=0.5, outliers=0.5)
@@ -418,6 +420,7 @@ class TestRansac:
         np.testing.assert_allclose(forward, numeric, rtol=2e-5)
         np.testing.assert_allclose(reverse, forward, rtol=1e-9)
 
+    @pytest.mark.slow
     def test_expected_depth_replaces_the_closed_form(self):
         """Half of the points wrong, depth 10 % off at best: found every time, as accurately as by the closed form."""
         solve = quick_compile(lambda key, near, X, uv: ransac_pnp(key, X, uv, camera(), expected_depth=near))

@@ -197,6 +197,7 @@ class TestReference:
         assert distance < 1e-6
         assert angle < 1e-6
 
+    @pytest.mark.slow
     def test_matches_reference_with_prior(self):
         scene = make_scene(2, N)
         with jax.enable_x64(True):
@@ -207,6 +208,7 @@ class TestReference:
         assert max(pose_error(result.T_world_cam.wxyz_xyz, expected)) < 1e-6
         assert max(pose_error(free.T_world_cam.wxyz_xyz, expected)) > 1e-5  # the prior has its say
 
+    @pytest.mark.slow
     def test_covariance_matches_the_spread_of_estimates(self):
         """Over many scenes the squared error in units of the covariance averages to its six degrees of freedom."""
         normalized = []
@@ -460,6 +462,7 @@ class TestDegenerate:
         assert after < before
 
     @pytest.mark.parametrize("tolerance", [0.1, 0.01])
+    @pytest.mark.slow
     def test_tolerance_ends_early_within_as_many_deviations(self, tolerance):
         scene = make_scene(23, N)
         X_world, uv, _, _ = scene.arrays()

@@ -129,8 +129,8 @@ class TestMatchesReference:
     @pytest.mark.parametrize(
         ("sim3", "loss"),
         [
-            (False, "squared"),
             (True, "cauchy"),
+            pytest.param(False, "squared", marks=pytest.mark.slow),
             pytest.param(False, "cauchy", marks=pytest.mark.slow),
             pytest.param(True, "squared", marks=pytest.mark.slow),
         ],
@@ -264,6 +264,7 @@ def test_vmap_equals_loop():
         np.testing.assert_allclose(together.cost[i], alone.cost, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_single_trace():
     """Values, masks, weights, fixed nodes and the order change; nothing is traced again."""
 
@@ -338,6 +339,7 @@ class TestDegenerate:
             expected[3] = [1, 0, 0, 0, 0, 0, 0]
         np.testing.assert_allclose(result.T_world_cam.wxyz_xyz, expected, atol=1e-6)
 
+    @pytest.mark.slow
     def test_degenerate_disconnected(self):
         """A part without a fixed node stays; the other is as if it were alone."""
         inputs = _inputs(loop_graph(7, 10))
@@ -380,12 +382,14 @@ class TestDegenerate:
         assert all(np.isfinite(x).all() for x in jax.tree.leaves((result, gradient)))
         assert _largest_difference(result.T_world_cam.wxyz_xyz, graph.truth[:, :7]) < 1e-4
 
+    @pytest.mark.slow
     def test_steps_run_out(self):
         result = _optimized(_inputs(loop_graph(10, 14)), "squared", 1)
         assert PoseGraphStatus(int(result.status)) == PoseGraphStatus.NOT_CONVERGED
         assert float(result.cost) < float(result.cost_before)
 
 
+@pytest.mark.slow
 def test_wrong_loop_is_rejected_by_a_robust_loss():
     """An edge that is meters off pulls in least squares and not under Geman and McClure's loss."""
     graph = loop_graph(11, 14)
@@ -432,6 +436,7 @@ class TestHostElimination:
                 assert np.abs(band).max() > 1e-6
                 np.testing.assert_allclose(host, band, rtol=1e-5, atol=1e-6 * float(np.abs(band).max()))
 
+    @pytest.mark.slow
     def test_vmap_equals_loop(self):
         several = [_inputs(loop_graph(seed, 10)) for seed in range(2)]
         batch = jax.tree.map(lambda *x: jnp.stack(x), *several)
@@ -539,6 +544,7 @@ class TestInvariance:
 
     @few_examples
     @any_seed
+    @pytest.mark.slow
     def test_rigid_motion(self, seed):
         rng = np.random.default_rng(seed)
         graph = loop_graph(seed % 1000, 10)

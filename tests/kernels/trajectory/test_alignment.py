@@ -461,6 +461,7 @@ class TestRpe:
         np.testing.assert_allclose(after.translations, before.translations, atol=1e-10)
         np.testing.assert_allclose(after.rotations, before.rotations, atol=1e-7)
 
+    @pytest.mark.slow
     def test_far_from_the_origin_in_float32(self):
         """Positions are subtracted before they are rotated."""
         P, Q = _poses(0), _poses(1)

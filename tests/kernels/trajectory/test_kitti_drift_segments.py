@@ -108,7 +108,9 @@ class TestSegmentErrors:
         np.testing.assert_allclose(errors.translations, translations, atol=1e-10)
         np.testing.assert_allclose(errors.rotations, rotations, atol=1e-9)
 
-    @pytest.mark.parametrize("noise", [0.02, 1e-6], ids=["far", "nearly equal"])
+    @pytest.mark.parametrize(
+        "noise", [pytest.param(0.02, marks=pytest.mark.slow, id="far"), pytest.param(1e-6, id="nearly equal")]
+    )
     def test_gradient(self, x64, noise):
         Q, mask = _drive(1), np.arange(N) % 7 > 0
         P = _drifting(Q, 2, noise)

@@ -367,6 +367,7 @@ class TestRansac:
         np.testing.assert_allclose(forward, numeric, rtol=1e-5)
         np.testing.assert_allclose(reverse, forward, rtol=1e-9)
 
+    @pytest.mark.slow
     def test_vmap_equals_loop(self):
         scenes = [make_two_views(seed, N, outliers=0.3) for seed in (10, 11)]
         keys = jax.random.split(jax.random.key(0), 2)
@@ -394,6 +395,7 @@ class TestRansac:
             scene = make_two_views(seed, N, kind=kinds[seed % len(kinds)], outliers=0.5 * (seed % 3 > 0))
             assert _all_finite(_run(seed, _inputs(scene)))
 
+    @pytest.mark.slow
     def test_initial(self):
         """Six matches of ten wrong, and eight samples: lost without a matrix to begin with, found with the true one."""
 
@@ -417,6 +419,7 @@ class TestRansac:
         assert np.median(shares["zero"]) < 0.6
         assert shares["NaN"] == shares["zero"]
 
+    @pytest.mark.slow
     def test_wrong_initial_changes_nothing(self):
         """One matrix more to try, that few matches agree with."""
         scene, other = (make_two_views(seed, N, outliers=0.3) for seed in (3, 4))

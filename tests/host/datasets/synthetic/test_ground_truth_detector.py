@@ -26,6 +26,7 @@ class Rendered:
         monkeypatch.setattr(SyntheticDataset, "render", lambda room, i: (self.indices.append(i), render(room, i))[1])
 
 
+@pytest.mark.slow
 def test_mask_of_every_frame_in_any_order(room: SyntheticDataset) -> None:
     detector = SceneDetector(room)
     for index in (4, 0, 5, 4, 1):

@@ -147,6 +147,7 @@ class TestSuite:
         assert "without a network" not in (tmp_path / "out" / "report.md").read_text()
 
 
+@pytest.mark.slow
 def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     small = ["--frames", "3", "--people", "0", "--boxes", "1", "--seated", "1", "--out", str(tmp_path)]
     main(["demo", *small, "--set", "semantics.model=scene", "--set", "semantics.labels=[person, box]", "--json"])
