@@ -83,7 +83,7 @@ def markdown_report(content: Mapping[str, Any]) -> str:
 
 def section(content: Mapping[str, Any], level: Literal[1, 2] = 2) -> str:
     """Return the tables of `live.json` under a heading, and where they were measured, without what they mean."""
-    title = f"Live: {content['recording']}, {content['rate_hz']:g} Hz"
+    title = f"Live: {content['recording']}, {content['rate_hz']:g} Hz, {content['cpu']}"
     ratios = ratio_rows(content["runs"])
     tables = [Table([COLUMNS, *rows(content["runs"])]), *([Table([RATIO_COLUMNS, *ratios])] if ratios else [])]
     return to_markdown([Heading(title, level), *tables, Paragraph(conditions(content))])

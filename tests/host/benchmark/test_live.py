@@ -105,7 +105,7 @@ class TestReport:
     def test_pages(self, tmp_path: Path) -> None:
         content = self.content()
         report = markdown_report(content)
-        assert report.startswith("# Live: fr1, 30 Hz")
+        assert report.startswith(f"# Live: fr1, 30 Hz, {content['cpu']}\n")
         assert content["cpu"] in report
         (tmp_path / "live.png").write_bytes(picture(content))
         assert np.ptp(imread(tmp_path / "live.png")) > 0
