@@ -74,7 +74,6 @@ def _compare(solve, weights, zeros, status=None, rtol=1e-5):
     return jacobian
 
 
-@pytest.mark.slow
 def test_refine_pose():
     inputs = pose_inputs()
 
@@ -93,7 +92,6 @@ def _refined(weights, inputs, cotangent):
     return pose, pull_back(cotangent)[0]
 
 
-@pytest.mark.slow
 def test_masked_points_stay_out():
     """What is not finite, behind the camera or out of range has derivative 0 by its weight of 0, and hurts no other."""
     inputs = pose_inputs()

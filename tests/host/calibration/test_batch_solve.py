@@ -23,7 +23,6 @@ from jaxslam.calibration.uncertainty import standard_deviations
 from jaxslam.errors import DatasetError
 from jaxslam.geometry.se3 import retract
 
-pytestmark = pytest.mark.slow
 TRUTH = true_vector()
 START = TRUTH * np.array([1.05, 1.05, *15 * [1.0]])
 ALL = group_mask(GROUPS)

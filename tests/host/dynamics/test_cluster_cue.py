@@ -220,7 +220,6 @@ class TestCue:
         assert found.regions.known.tolist() == [False, True, False]
         assert (np.asarray(found.weight) == 1).all()
 
-    @pytest.mark.slow
     def test_bad_values(self) -> None:
         given = in_regions(scene(MOTIONS["all"], (0.15, 0, 0)))
         bad = given._replace(uv=given.uv.at[:, :5].set(jnp.nan), X_anchor=given.X_anchor.at[:, 5:9].set(jnp.inf))

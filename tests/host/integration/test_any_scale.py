@@ -75,7 +75,6 @@ NEW_SURFACES = ["dynamics.new_surfaces=true", "dynamics.cues=[trajectory]"]
         pytest.param(0.12, 16.0, ["dynamics.new_surfaces=false"], id="pair", marks=pytest.mark.slow),
     ],
 )
-@pytest.mark.slow
 def test_room(baseline_m: float | None, factor: float, settings: list[str]) -> None:
     """Frames until the first adjustment of the map, whose solver rounds in another way."""
     size = {"width": 320, "height": 240, "fps": 15.0}

@@ -105,7 +105,6 @@ def tracked(preset: str, detector: SceneDetector | None = None, *, true_masks: b
     return Outcome(error, on_driving / FRAMES, on_parked / FRAMES)
 
 
-@pytest.mark.slow
 def test_a_car_is_segmented_in_its_box_at_any_distance() -> None:
     """By its depth alone; no length is that of a room."""
     world = load_world("road")

@@ -202,7 +202,6 @@ def test_passes_over_what_is_excluded_or_no_longer_in_the_map(round_map, round_i
     assert elsewhere is None or elsewhere.keyframe != best
 
 
-@pytest.mark.slow
 def test_another_room_is_not_recognized(round_map, round_index):
     for seed in range(1, 4):
         for index in range(0, FRAMES, 160):

@@ -67,7 +67,6 @@ def test_a_folder_that_is_not_there_is_an_error(tmp_path: Path) -> None:
         PartialResults(tmp_path / "missing")
 
 
-@pytest.mark.slow
 def test_a_killed_run_leaves_its_frames(tmp_path: Path) -> None:
     ended = subprocess.run([sys.executable, "-c", textwrap.dedent(KILLED), str(tmp_path), str(HELPERS)], check=False)
     assert ended.returncode == -signal.SIGKILL

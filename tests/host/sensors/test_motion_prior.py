@@ -27,7 +27,6 @@ def deviations(T: np.ndarray, tangents: list[np.ndarray]) -> np.ndarray:
     return np.cov(np.array([displacement(T, moved) for moved in tangents]).T)
 
 
-@pytest.mark.slow
 def test_two_motions_in_turn_are_as_uncertain_as_their_products() -> None:
     first, second = MotionPrior(FIRST, spread()), MotionPrior(SECOND, spread())
     both = first.then(second)

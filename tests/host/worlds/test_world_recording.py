@@ -274,7 +274,6 @@ FAST = dataclasses.replace(
 ROLLS = dataclasses.replace(PERFECT, rolling_shutter_s=0.03)
 
 
-@pytest.mark.slow
 def test_each_row_of_a_rolling_shutter_is_taken_from_its_own_pose():
     recording = WorldRecording(dataclasses.replace(FAST, camera=ROLLS))
     turns = [abs(first @ second) for first, second in itertools.pairwise(recording.ground_truth.T_world_cam[:, :4])]

@@ -56,7 +56,6 @@ def whole_step(inputs: BundleInputs) -> tuple[jax.Array, jax.Array, jax.Array]:
     return *solve_reduced(reduced, equations.camera_gradient, equations.point_gradient), equations.camera_gradient
 
 
-@pytest.mark.slow
 def test_is_what_the_grid_gives():
     """The Hessian of the cameras, their step, and the shifts of the points."""
     inputs = make_inputs()

@@ -164,7 +164,6 @@ class TestGradient:
         assert not np.any(gradient[2])
 
 
-@pytest.mark.slow
 def test_vmap_equals_loop():
     pairs = [_pair(seed=seed) for seed in range(2)]
     batched = quick_compile(jax.vmap(_run()))(*(np.stack(arrays) for arrays in zip(*pairs, strict=True)))

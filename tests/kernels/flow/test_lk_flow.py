@@ -191,7 +191,6 @@ class TestMatchesReference:
         assert unlike > found
 
 
-@pytest.mark.slow
 def test_vmap_equals_loop():
     """Flows and gradients of a batch of image pairs."""
     weights = random_weights(0, np.float32)

@@ -290,7 +290,6 @@ class TestAlignPatches:
         np.testing.assert_allclose(reverse, sum(float(jnp.sum(slope)) for slope in forward), rtol=1e-8, atol=1e-8)
         assert (np.abs(forward[0]).max() > 1e-3) == (moved != "guess")
 
-    @pytest.mark.slow
     def test_vmap_equals_loop(self):
         scenes = [_scene(turn, 1.0, 0, gain, seed=turn) for turn, gain in ((0, 1.0), (10, 0.9))]
         batch = [np.stack(arrays) for arrays in zip(*(scene[:-1] for scene in scenes), strict=True)]

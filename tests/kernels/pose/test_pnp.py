@@ -397,7 +397,6 @@ class TestRansac:
         assert helped.num_inliers < 8  # so that no consensus is claimed with the default of min_inliers
         assert helped.status == PoseStatus.NO_CONSENSUS
 
-    @pytest.mark.slow
     def test_gradient(self):
         """Which points are inliers is constant; forward = reverse = finite differences through the refinement."""
         scene = make_scene(4, N, noise_px=0.5, outliers=0.5)

@@ -78,7 +78,6 @@ def test_residuals_have_the_cost(loss: Any) -> None:
     np.testing.assert_allclose(0.5 * (jnp.sum(rows**2) + jnp.sum(of_prior**2)), expected, rtol=1e-5)
 
 
-@pytest.mark.slow
 def test_degenerate() -> None:
     """A batch of problems: one that is fine, two points, no finite pose, all points in one place.
 

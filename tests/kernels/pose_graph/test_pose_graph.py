@@ -264,7 +264,6 @@ def test_vmap_equals_loop():
         np.testing.assert_allclose(together.cost[i], alone.cost, rtol=1e-4)
 
 
-@pytest.mark.slow
 def test_single_trace():
     """Values, masks, weights, fixed nodes and the order change; nothing is traced again."""
 

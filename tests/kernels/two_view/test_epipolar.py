@@ -367,7 +367,6 @@ class TestRansac:
         np.testing.assert_allclose(forward, numeric, rtol=1e-5)
         np.testing.assert_allclose(reverse, forward, rtol=1e-9)
 
-    @pytest.mark.slow
     def test_vmap_equals_loop(self):
         scenes = [make_two_views(seed, N, outliers=0.3) for seed in (10, 11)]
         keys = jax.random.split(jax.random.key(0), 2)
