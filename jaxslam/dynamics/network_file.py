@@ -14,7 +14,7 @@ from jaxtyping import Float32
 from jaxslam.errors import ModelError, brief_repr, one_line
 from jaxslam.io.atomic_files import write_atomically
 
-FORMAT, VERSION = "jaxslam point network", 1
+FORMAT, VERSION = "jaxslam point network", 2
 POINT_FEATURES = (
     "anchor_px",
     "map_px",
@@ -23,19 +23,17 @@ POINT_FEATURES = (
     "map_sigmas",
     "flow_sigmas",
     "drift_px",
-    "motion_px",
     "has_depth",
     "had_depth",
     "agrees",
     "trust",
-    "age",
-    "relative_depth",
 )
 """Features of a point: its distance from where a static point would be, in pixels and in standard deviations of depth,
 for a position measured up to half a second ago, the fused one and that of the last frame; how far the first two are
-apart; its motion in the image; and what else the tracker knows of it."""
-GROUP_FEATURES = ("num_points", "pixels", "relative_depth", "memory")
-"""Features of a region: how many points and pixels it has, its depth, and its weight in the frame before."""
+apart, in pixels; whether depth is measured here and in the frame before; whether it agrees with the coarse pose; and
+the weight that the tracker gives it."""
+GROUP_FEATURES = ("num_points", "memory")
+"""Features of a region: how many points it has, and its weight in the frame before."""
 PACKAGED = Path(__file__).with_name("learned_weights.json")
 _DIGITS = 5
 _MAX_BYTES, _MAX_HIDDEN = 1 << 20, 256

@@ -12,6 +12,7 @@ from jaxslam_kernels.se3 import lenient_promotion
 from jaxslam_kernels.types import Scalar
 from jaxtyping import Array, Float, Key
 
+from jaxslam.dynamics.learned_cue import network_inputs
 from jaxslam.dynamics.network_file import GROUP_FEATURES, POINT_FEATURES
 from jaxslam.learning.point_samples import PointSamples
 from jaxslam.runtime.compiled import compiled
@@ -24,7 +25,8 @@ _POINTS_PER_REGION = 24.0
 """Number of points that make a region count as much as a frame's mean point."""
 
 _PIXELS, _SIGMAS = slice(0, 3), slice(3, 6)
-"""Features that are distances from where a static point would be: `log1p` of pixels, half the `arcsinh` of sigmas."""
+"""Features that are distances from where a static point would be."""
+_MAP_PX, _AGREES = POINT_FEATURES.index("map_px"), POINT_FEATURES.index("agrees")
 
 
 def new_network(seed: int, num_hidden: int) -> PointNetwork:
@@ -119,7 +121,7 @@ def _train(
         network, memory = carry
         order, *keys = jax.random.split(key, _BATCH + 1)
         chosen = jax.random.randint(order, (_BATCH,), 0, num)
-        batch = jax.vmap(_noisier, (0, 0, None))(
+        batch = jax.vmap(noisier, (0, 0, None))(
             jnp.stack(keys), jax.tree.map(lambda array: array[chosen], samples), noise
         )
         value, slope = jax.value_and_grad(loss)(network, batch)
@@ -134,19 +136,23 @@ def _train(
     return network, losses
 
 
-def _noisier(key: Key[Array, ""], frame: PointSamples, noise: Scalar) -> PointSamples:
-    """Return the samples of a frame as a worse camera would give them: longer distances, unevenly over the regions."""
+def noisier(key: Key[Array, ""], frame: PointSamples, noise: Scalar) -> PointSamples:
+    """Return the samples of a frame as a worse camera would give them: longer distances, unevenly over the regions.
+
+    Points that come to be farther from where the map has them than any that agrees with the coarse pose agree no more.
+    """
     num, dtype = frame.regions.shape[1], frame.points.dtype
     of_frame, of_regions = jax.random.split(key)
     whole = jax.random.uniform(of_frame, (2, 1), dtype) * noise
     uneven = jax.random.uniform(of_regions, (2, num + 1), dtype, -0.5, 0.5) * noise
     factor = jnp.exp(whole + uneven)[:, jnp.where(frame.region_of >= 0, frame.region_of, num)]
-    px, sigmas = frame.points[_PIXELS], frame.points[_SIGMAS]
-    px = jnp.log1p(jnp.expm1(px) * factor[:1])
-    sigmas = jnp.arcsinh(jnp.sinh(2 * sigmas) * factor[1:]) / 2
-    return frame._replace(points=frame.points.at[_PIXELS].set(px).at[_SIGMAS].set(sigmas))
+    agrees, map_px = frame.mask & (frame.points[_AGREES] > 0), frame.points[_MAP_PX]
+    limit_px = jnp.max(jnp.where(agrees, map_px, 0))
+    points = frame.points.at[_PIXELS].multiply(factor[:1]).at[_SIGMAS].multiply(factor[1:])
+    return frame._replace(points=points.at[_AGREES].set((agrees & (points[_MAP_PX] <= limit_px)).astype(dtype)))
 
 
 def scores_of(network: PointNetwork, frame: PointSamples) -> PointScores:
     """Score the points of one frame."""
-    return score_points(network, frame.points, frame.regions, frame.region_of, frame.mask)
+    inputs = network_inputs(frame.points, frame.mask)
+    return score_points(network, inputs, frame.regions, frame.region_of, frame.mask)

@@ -92,7 +92,8 @@ class WeightsRecipe(ValidatedConfig):
         moving_weight: Weight of a moving point in it; that of a static one is 1.
         noise: How much the noise of the samples is varied in it: distances of a frame from where static points would be
             are up to `exp(noise)` times as long, and those of a region up to `exp(noise / 2)` times as long or as
-            short. Rendered frames have neither the rolling shutter nor the blur of many cameras.
+            short; points that come to be farther off than any that agreed with the coarse pose agree no more. Rendered
+            frames have neither the rolling shutter nor the blur of many cameras.
         window: Number of frames of a window of the training on poses.
         num_windows: Number of windows, spread over the scenes of the smallest width.
         pose_steps: Largest number of steps of the training on poses; 0 to leave it out.

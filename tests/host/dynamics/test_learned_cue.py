@@ -16,7 +16,7 @@ from quick_compile import quick_compile
 
 from jaxslam.config.cue_sections import LearnedCueConfig
 from jaxslam.dynamics.cue import CueInput
-from jaxslam.dynamics.learned_cue import CUE, LearnedParams, learned_cue, learned_features
+from jaxslam.dynamics.learned_cue import CUE, LearnedParams, learned_cue, learned_features, network_inputs
 from jaxslam.dynamics.network_file import GROUP_FEATURES, PACKAGED, POINT_FEATURES, load_network, save_network
 from jaxslam.dynamics.regions import Regions
 from jaxslam.errors import ModelError
@@ -36,7 +36,6 @@ def full_scene(motion: Any, moved_m: Any = (0, 0, 0), **named: Any) -> CueInput:
     )
     return given._replace(
         regions=regions,
-        age=jnp.full(N, 8, jnp.int32),
         depth_sigma=0.003 * jnp.square(given.depth),
         region_weight=jnp.ones(K),
     )
@@ -85,6 +84,22 @@ def test_scale_of_the_world_does_not_matter() -> None:
         np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-6)
 
 
+def test_a_worse_camera_does_not_matter() -> None:
+    """Three times the distance of every point from where a static one would be, beyond what is usual at least."""
+    random = np.random.default_rng(0)
+    points = np.zeros((len(POINT_FEATURES), N))
+    points[:7] = random.uniform(1, 5, (7, N)) * random.choice([-1, 1], (7, N))
+    points[[0, 1, 2, 6]] = np.abs(points[[0, 1, 2, 6]])
+    points[7:] = 1
+    worse = points.copy()
+    worse[:7] *= 3
+    mask = jnp.ones(N, bool)
+    one, other = (network_inputs(jnp.asarray(each), mask) for each in (points, worse))
+    np.testing.assert_allclose(one, other, rtol=1e-9)
+    assert np.asarray(one[:7]).std(axis=1).min() > 0.1
+    assert not np.asarray(network_inputs(jnp.asarray(points), ~mask)).any()
+
+
 def test_features_have_names() -> None:
     features = learned_features(full_scene(MOTIONS["all"]))
     assert features.points.shape == (len(POINT_FEATURES), N)
@@ -108,7 +123,7 @@ def test_gradient() -> None:
 
 
 class TestDegenerate:
-    @pytest.mark.parametrize("name", ["regions", "age", "depth_sigma", "region_weight"])
+    @pytest.mark.parametrize("name", ["regions", "depth_sigma", "region_weight"])
     def test_something_missing(self, name: str) -> None:
         given = full_scene(MOTIONS["all"])._replace(**{name: None})
         with pytest.raises(ValueError, match=f"scene.{name}: expected a value for the learned cue, got None"):
@@ -178,7 +193,7 @@ class TestFile:
         ("key", "value", "problem"),
         [
             ("format", "map", "format: expected 'jaxslam point network', got 'map'"),
-            ("version", 2, "version: expected 1, got 2"),
+            ("version", 1, "version: expected 2, got 1"),
             ("point_features", ["age"], "point_features: expected "),
             ("weights", [1, 2], r"weights: expected a mapping, got \[1, 2\]"),
             ("provenance", None, "provenance: expected a mapping, got None"),
@@ -191,7 +206,7 @@ class TestFile:
         def change(name: str, value: Any) -> Any:
             return lambda content: content["weights"].update({name: value})
 
-        self.changed(tmp_path, change("embed", [[1.0]]), r"weights.embed: expected numbers \(\d+, 14\), got \(1, 1\)")
+        self.changed(tmp_path, change("embed", [[1.0]]), r"weights.embed: expected numbers \(\d+, 11\), got \(1, 1\)")
         self.changed(tmp_path, change("embed", [[1.0], [1.0, 2.0]]), "weights.embed: expected numbers, got ")
         self.changed(tmp_path, change("group_bias", "a"), "weights.group_bias: expected numbers, got 'a'")
         self.changed(tmp_path, change("group_bias", 1e99), "weights.group_bias: expected finite numbers")

@@ -24,7 +24,7 @@ from jaxslam.learning import (
     tracker_with,
     wrong_points,
 )
-from jaxslam.learning.label_training import label_loss
+from jaxslam.learning.label_training import label_loss, noisier
 from jaxslam.learning.point_samples import PointSamples, edges, true_labels
 
 SMALL = WeightsRecipe(
@@ -69,6 +69,36 @@ class TestLabels:
         assert WrongPoints(1, 2, 10, 20).share == pytest.approx(0.1)
         assert WrongPoints(0, 0, 0, 0).share == 0
         assert WrongPoints(1, 2, 10, 20) + WrongPoints(1, 1, 1, 1) == WrongPoints(2, 3, 11, 21)
+
+
+class TestNoise:
+    frame = PointSamples(
+        points=jnp.stack([*jnp.full((7, 64), 1.0), *jnp.ones((4, 64))]).at[1].set(jnp.linspace(0.1, 3, 64)),
+        regions=jnp.ones((2, 2)),
+        region_of=jnp.arange(64) % 2,
+        mask=jnp.arange(64) < 60,
+        moving=jnp.zeros(64, bool),
+        sure=jnp.ones(64, bool),
+    )
+
+    def test_longer_distances_agree_no_more(self) -> None:
+        """Distances of a region are multiplied by one factor; who is farther than all that agreed before does not."""
+        noisy = noisier(jax.random.key(2), self.frame, jnp.float32(1.5))
+        factors = np.asarray(noisy.points[1] / self.frame.points[1])
+        assert len(np.unique(factors.round(3))) == 2
+        assert factors.min() > np.exp(-0.75)
+        assert factors.max() < np.exp(2.25)
+        assert factors.max() > 2, "this key gives a longer one"
+        farthest = self.frame.points[1][self.frame.mask].max()
+        agrees = np.asarray(noisy.points[9]) > 0
+        np.testing.assert_array_equal(agrees, np.asarray((noisy.points[1] <= farthest) & self.frame.mask))
+        assert 0 < agrees.sum() < 60
+        np.testing.assert_array_equal(noisy.points[6:9], self.frame.points[6:9])
+
+    def test_without_noise_nothing_changes(self) -> None:
+        same = noisier(jax.random.key(3), self.frame, jnp.float32(0))
+        np.testing.assert_allclose(same.points[:9], self.frame.points[:9])
+        np.testing.assert_array_equal(same.points[9] > 0, self.frame.mask)
 
 
 class TestRecipe:
