@@ -28,6 +28,8 @@ from jaxslam.dynamics.cue import CueInput, CueResult, SettingsCue, threshold_evi
 from jaxslam.dynamics.network_file import POINT_FEATURES, load_network
 from jaxslam.dynamics.regions import RegionCueResult, Regions
 
+_DISTANCES_PX = ("anchor_px", "map_px", "flow_px")
+_DISTANCES_SIGMAS = ("anchor_sigmas", "map_sigmas", "flow_sigmas")
 _SOFT_PX, _SOFT_DRIFT_PX = 0.01, 1e-4
 """Lengths to which those of distances and of the drift are rounded up, pixels, so that they are smooth at zero."""
 _MAX_SIGMAS = 100.0
@@ -49,7 +51,7 @@ class LearnedParams(NamedTuple):
 
 
 class LearnedFeatures(NamedTuple):
-    """What the network knows of `n` points and `k` regions.
+    """Features of `n` points and `k` regions, as measured.
 
     Attributes:
         points: `(f, n)` features of the points, in the order of `network_file.POINT_FEATURES`: distances in pixels,
@@ -110,13 +112,13 @@ def network_inputs(points: Float[Array, "f n"], mask: Mask) -> Float[Array, "f n
     row = {name: points[place] for place, name in enumerate(POINT_FEATURES)}
     agrees = mask & (row["agrees"] > 0)
     has_depth = agrees & (row["has_depth"] > 0)
-    usual = lambda name: jnp.maximum(masked_median(row[name], agrees), _USUAL_PX)
-    for name in ("anchor_sigmas", "map_sigmas", "flow_sigmas"):
+    usual_px = {name: jnp.maximum(masked_median(row[name], agrees), _USUAL_PX) for name in _DISTANCES_PX}
+    for name in _DISTANCES_SIGMAS:
         relative = row[name] / jnp.maximum(masked_median(jnp.abs(row[name]), has_depth), _USUAL_SIGMAS)
         row[name] = jnp.arcsinh(jnp.clip(relative, -_MAX_SIGMAS, _MAX_SIGMAS)) / 2
-    row["drift_px"] = jnp.log1p(row["drift_px"] / usual("anchor_px")) / 2
-    for name in ("anchor_px", "map_px", "flow_px"):
-        row[name] = jnp.log1p(row[name] / usual(name))
+    row["drift_px"] = jnp.log1p(row["drift_px"] / usual_px["anchor_px"]) / 2
+    for name in _DISTANCES_PX:
+        row[name] = jnp.log1p(row[name] / usual_px[name])
     return jnp.where(mask[None], jnp.stack([*row.values()]), 0)
 
 
