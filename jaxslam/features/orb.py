@@ -89,6 +89,12 @@ class Patches(NamedTuple):
     angle: Float32[np.ndarray, " n"]
     descriptor: UInt8[np.ndarray, "n 32"]
 
+    def without(self, ignore: Bool[np.ndarray, "h w"]) -> "Patches":
+        """Return the features that do not lie at ignored pixels of their image `(h, w)`."""
+        column, row = np.rint(self.uv_raw).astype(np.int32)
+        kept = ~ignore[row, column]
+        return Patches(self.uv_raw[:, kept], self.octave[kept], self.angle[kept], self.descriptor[kept])
+
 
 DEFAULT_PLAN = FeaturePlan()
 

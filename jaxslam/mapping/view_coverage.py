@@ -73,7 +73,8 @@ class ViewCoverage:
             self._samples = self._samples_of(slam_map, near)
         X_world, then = self._samples.X_world, self._samples.seen_from
         seen = in_view(slam_map.camera, T_world_cam, X_world) & seen_alike(X_world, then, T_world_cam[4:, None])
-        return int((seen.reshape(-1, _NUM_SAMPLES).mean(axis=1) >= self._at_least).sum())
+        num_seen = seen.reshape(-1, _NUM_SAMPLES).sum(axis=1)
+        return int(np.count_nonzero(num_seen >= self._at_least * _NUM_SAMPLES))
 
     def _samples_of(self, slam_map: Map, near: Bool[np.ndarray, " k"]) -> "_Samples":
         """Return the samples of some keyframes in the world."""
@@ -103,9 +104,11 @@ class ViewCoverage:
 def in_view(camera: Camera, T_world_cam: Pose, X_world: Float[np.ndarray, "3 n"]) -> Bool[np.ndarray, " n"]:
     """Tell which points are in the image of a camera, not at its margin."""
     X = to_local(T_world_cam, X_world)
-    u, v = camera.project(np.stack([X[0], X[1], np.where(X[2] > 0, X[2], np.inf)]))
+    in_front = X[2] > 0
+    X[2, ~in_front] = np.inf
+    u, v = camera.project(X)
     right, low = camera.width - _MARGIN_PX, camera.height - _MARGIN_PX
-    return (X[2] > 0) & (u > _MARGIN_PX) & (u < right) & (v > _MARGIN_PX) & (v < low)
+    return in_front & (u > _MARGIN_PX) & (u < right) & (v > _MARGIN_PX) & (v < low)
 
 
 def seen_alike(

@@ -72,7 +72,9 @@ class StageTimes:
 
 
 def _append(durations: dict[str, "array[float]"], stage: str, ms: float) -> None:
-    times = durations.setdefault(stage, array("d"))
+    times = durations.get(stage)
+    if times is None:
+        times = durations[stage] = array("d")
     times.append(ms)
     if len(times) >= 2 * NUM_KEPT:
         del times[:NUM_KEPT]

@@ -184,6 +184,8 @@ class FrameMemory:
 
     def ignoring(self, arrays: FrameArrays, mask: np.ndarray) -> FrameArrays:
         """Return the current arrays with pixels ignored where `mask` `(h, w)` is true."""
+        if mask is arrays.ignore:
+            return arrays
         ignore: Any = self._now.ignore
         np.copyto(ignore, mask)
         return arrays._replace(ignore=ignore)

@@ -145,16 +145,17 @@ class BackgroundConsistency:
         """
         T_world_cam = tracked.T_world_cam
         some = depth_m[::_STEP, ::_STEP]
-        near = some[(some > self._nearest_m) & (some < self._farthest_m)]
-        is_measured = near.size >= _MEASURED * some.size
-        if is_measured or not near.size:
+        is_near = (some > self._nearest_m) & (some < self._farthest_m)
+        num_near = np.count_nonzero(is_near)
+        is_measured = num_near >= _MEASURED * some.size
+        if is_measured or not num_near:
             self._stop()
             # For one, somebody who passes too near for the sensor is taken for the background: in a rendered flat,
             # 12,000 frames were weak after that, 10 mm off.
             if is_measured and self._unsure_m and self._known.count_agreeing(output) >= self._min_inliers:
                 self._unsure_m = 0.0
             return self._doubt(0.0)
-        self._depth_m = float(np.median(near))
+        self._depth_m = float(np.median(some[is_near]))
         without = self._without_depth(depth_m, ignore)
         if self._previous is None:
             self._begin(gray, without, T_world_cam)

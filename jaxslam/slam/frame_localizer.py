@@ -126,14 +126,14 @@ class FrameLocalizer:
         self._index, self._states = index, states
         self.features: Features | None = None
         self._of_lost: Features | None = None
-        self._extracted: tuple[Any, Patches] | None = None
-        """The mask of the current frame, and the features extracted where it ignores nothing."""
+        self._patches: Patches | None = None
+        """Features extracted from the current frame."""
         self._last: _TrackedFrame | None = None
         self._of_last: Features | None = None
 
     def begin_frame(self) -> None:
         """Forget the features of the frame before."""
-        self.features = self._of_lost = self._extracted = None
+        self.features = self._of_lost = self._patches = None
 
     def frame_tracked(self, arrays: FrameArrays, anchored: AnchoredPose, twist: Float[np.ndarray, "6"]) -> None:
         """Keep a frame that was tracked.
@@ -262,10 +262,11 @@ class FrameLocalizer:
         return self._of_lost
 
     def _patches_of(self, arrays: FrameArrays) -> Patches:
-        """Extract the features of the current frame, once for each mask of it."""
-        if self._extracted is None or self._extracted[0] is not arrays.ignore:
-            self._extracted = arrays.ignore, patches_of(arrays, self._plan)
-        return self._extracted[1]
+        """Extract the features of the current frame, once; those that a later mask of it ignores are left out."""
+        if self._patches is None:
+            self._patches = patches_of(arrays, self._plan)
+            return self._patches
+        return self._patches.without(np.asarray(arrays.ignore))
 
     def _fits_map(self, arrays: FrameArrays, found: LocalizedPose) -> bool:
         """Return whether the frame does not see through the map at a pose; without a depth image nothing tells."""

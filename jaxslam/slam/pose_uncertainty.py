@@ -85,8 +85,9 @@ class PoseUncertainty:
         apart = np.asarray(keyframes.T_world_cam)[there, 4:] - tracked.T_world_cam[4:]
         moved_m = math.sqrt((apart * apart).sum(axis=1).min())
         from_camera = np.asarray(output.X_world)[:, seen] - tracked.T_world_cam[4:, None]
-        depths_m = np.sort(matrices(tracked.T_world_cam[:4])[:, 2] @ from_camera)
-        depth_m = float(depths_m[len(depths_m) // 2])
+        depths_m = matrices(tracked.T_world_cam[:4])[:, 2] @ from_camera
+        middle = len(depths_m) // 2
+        depth_m = float(np.partition(depths_m, middle)[middle])
         if depth_m <= 0:
             return residual**2
         depth_error = self._sigma_m / depth_m + self._sigma_per_m2 * depth_m
