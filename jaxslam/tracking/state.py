@@ -167,7 +167,7 @@ class TrackPlan(NamedTuple):
     judge_masked: bool = False
     keyframe_policy: Literal["as_needed", "sparing"] = _SETTINGS.keyframe_policy
     pose_steps: int = 25
-    pose_tolerance: float | None = 0.01
+    pose_tolerance: float | None = 0.03
     pair_flow: FlowPlan = ROW_PLAN
 
     def exact(self) -> "TrackPlan":

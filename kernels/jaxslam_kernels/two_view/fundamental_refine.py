@@ -91,7 +91,7 @@ def solve_matrix(
     epsilon = float(jnp.finfo(F.dtype).eps)
     solution = optx.minimise(
         lambda F, views: _equations(F, views, loss, scale),
-        ManifoldLevenbergMarquardt(retract=_retract, atol=3.0 * epsilon**0.5, rtol=8.0 * epsilon),
+        ManifoldLevenbergMarquardt(retract=_retract, atol=3.0 * epsilon**0.5, rtol=64.0 * epsilon),
         _framed(F),
         views,
         has_aux=True,
