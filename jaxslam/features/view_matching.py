@@ -123,6 +123,25 @@ def match_views_near(
     return found
 
 
+def pixels_apart(source: Features, first: Pose, second: Pose, sensor: SensorModel) -> float:
+    """Return how far apart two motions take the features of a view, median of pixels; infinite without depth.
+
+    Args:
+        source: Features of the view; those with depth count, as far as they stay in front of the camera.
+        first: `(7,)` pose of the camera after a motion, in the axes of the view.
+        second: The same after another one.
+        sensor: Camera, of which ideal pixels leave the pinhole.
+    """
+    X_source = _in_camera(source, sensor)[:, source.depth > 0]
+    X_first, X_second = (to_local(motion, X_source) for motion in (first, second))
+    in_front = (X_first[2] > 0) & (X_second[2] > 0)
+    if not in_front.any():
+        return np.inf
+    focal, _ = pinhole(sensor)
+    slopes = [X[:2, in_front] / X[2, in_front] for X in (X_first, X_second)]
+    return float(np.median(np.linalg.norm((slopes[0] - slopes[1]) * focal, axis=0)))
+
+
 def _by_descriptor(source: Features, features: Features) -> Int64[np.ndarray, "2 k"]:
     """Match features by descriptor, most similar first, where that of the source has depth."""
     pairs = match_descriptors(source, features)

@@ -301,6 +301,10 @@ class BackEnd:
         """Estimate the motion from the last tracked frame to a lost one; see `FrameLocalizer.motion_to`."""
         return self._localizer.motion_to(arrays, T_last_cam)
 
+    def pixels_apart(self, first: Pose, second: Pose) -> float:
+        """Return how far apart two motions take the features of the last frame; see `FrameLocalizer.pixels_apart`."""
+        return self._localizer.pixels_apart(first, second)
+
     def relocalize(self, arrays: FrameArrays, predicted: Pose | None) -> tuple[LocalizedPose | None, bool]:
         """Localize a lost frame in the map; see `FrameLocalizer.relocalize`."""
         return self._localizer.relocalize(arrays, predicted)

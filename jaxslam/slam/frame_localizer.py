@@ -11,7 +11,7 @@ from jaxtyping import Float
 from jaxslam.features.image_shift import turn_between
 from jaxslam.features.orb import FeaturePlan, Features, Patches, features_of, patches_of
 from jaxslam.features.pose_from_matches import PLACE_GATES, PoseGates
-from jaxslam.features.view_matching import match_views, match_views_near
+from jaxslam.features.view_matching import match_views, match_views_near, pixels_apart
 from jaxslam.geometry.se3 import angle, between, compose, inverse, transform
 from jaxslam.geometry.types import Pose
 from jaxslam.loop_closing.place_index import PlaceIndex
@@ -184,6 +184,14 @@ class FrameLocalizer:
         T_world_cam = compose(self._link.pose(self._last.anchored), found.T_source_cam)
         is_certain = near is not None or found.is_place
         return FeatureMotion(found.T_source_cam, T_world_cam, found.covariance, found.pairs.shape[1], is_certain)
+
+    def pixels_apart(self, first: Pose, second: Pose) -> float:
+        """Return how far apart two motions `(7,)` take the features of the last tracked frame, median of pixels.
+
+        `motion_to` must have extracted them; without any, the motions are infinitely far apart.
+        """
+        assert self._of_last is not None
+        return pixels_apart(self._of_last, first, second, self._sensor)
 
     def match_tracked(
         self,

@@ -17,7 +17,7 @@ from jaxslam.slam.pose_history import ConstantVelocity
 from jaxslam.slam.program_compiler import ProgramCompiler
 from jaxslam.slam.tracker import MapWishes, Tracker
 from jaxslam.slam.tracker_map_sync import AnchoredPose, pose_of
-from jaxslam.tracking.state import TrackOutput, TrackReason, TrackStatus
+from jaxslam.tracking.state import TrackOutput, TrackReason, TrackState, TrackStatus
 from jaxslam.tracking.step import FlowResult
 
 _MIN_VIEWS = 2
@@ -28,6 +28,9 @@ that agree are few. Where the camera of fr1_rpy turns fast, a frame comes out 3 
 goes on from there, and agrees with itself. Of 3,200 frames to and fro, 2 % of them dropped, 314 and 92 were 2 cm off
 (seeds 1 and 2); with this, 14 and 12 are. It matched 7 and 2 frames with the map, and none of Bonn `crowd`, KITTI 06,
 the kitchen, and fr1_rpy as recorded."""
+_SAME_START_PX = 10.0
+"""Median distance of starts from which optical flow finds the same: it reaches three times as far. Another flow and
+pose take 25 to 35 ms (fr1_rpy live, AMD EPYC)."""
 _PAUSE = 5
 """Number of frames after which the map is asked again, if it did not know such a frame."""
 
@@ -56,6 +59,20 @@ class TrackedAgain(NamedTuple):
 
     flow: FlowResult
     output: TrackOutput
+
+
+class _Attempt(NamedTuple):
+    """An attempt to track a lost frame that did not do.
+
+    Attributes:
+        T_last_cam: `(7,)` motion from which its points were followed.
+        again: The points and the output.
+        state: State of the tracker after it.
+    """
+
+    T_last_cam: Pose
+    again: TrackedAgain
+    state: TrackState
 
 
 class LocalizationStage:
@@ -121,29 +138,35 @@ class LocalizationStage:
             return None
         predicted = np.asarray(flow.predicted.wxyz_xyz, np.float64)
         T_last_cam = between(self._tracker.last_pose(), predicted)
-        return self._from_turn(arrays, T_last_cam, measured) or self._from_features(arrays, T_last_cam, measured)
+        by_turn = self._from_turn(arrays, T_last_cam, measured)
+        if by_turn is not None and int(by_turn.again.output.status) == TrackStatus.OK:
+            self._tracker.state = by_turn.state
+            return by_turn.again
+        return self._from_features(arrays, T_last_cam, measured, by_turn)
 
-    def _from_turn(self, arrays: FrameArrays, T_last_cam: Pose, measured: MeasuredMotion | None) -> TrackedAgain | None:
-        """Track a lost frame again if the whole image shifted; `None`, and the state as it was, if it stays lost."""
+    def _from_turn(self, arrays: FrameArrays, T_last_cam: Pose, measured: MeasuredMotion | None) -> _Attempt | None:
+        """Try to track a lost frame if the whole image shifted; the state stays as it was."""
         turn = self._back.turn_to(arrays, T_last_cam)
         if turn is None:
             return None
         state = self._tracker.copied_state()
         again = self._from_motion(arrays, turn, measured)
-        if int(again.output.status) == TrackStatus.OK:
-            return again
+        attempt = _Attempt(turn, again, self._tracker.state)
         self._tracker.state = state
-        return None
+        return attempt
 
     def _from_features(
-        self, arrays: FrameArrays, T_last_cam: Pose, measured: MeasuredMotion | None
+        self, arrays: FrameArrays, T_last_cam: Pose, measured: MeasuredMotion | None, before: _Attempt | None
     ) -> TrackedAgain | None:
         """Track a lost frame again if its features tell the motion; `None` if it stays lost."""
         back, elapsed_s = self._back, self._tracker.elapsed_s()
         found = back.motion_to(arrays, T_last_cam)
         if found is None:
             return None
-        again = self._from_motion(arrays, found.T_last_cam, measured)
+        if before is not None and back.pixels_apart(found.T_last_cam, before.T_last_cam) < _SAME_START_PX:
+            again, self._tracker.state = before.again, before.state
+        else:
+            again = self._from_motion(arrays, found.T_last_cam, measured)
         # Where two places look alike, few points of optical flow agree with a wrong motion too: 18 did, 2.8 m off.
         status = int(again.output.status)
         if status != TrackStatus.LOST and (found.is_certain or status == TrackStatus.OK):

@@ -144,7 +144,7 @@ class TrackPlan(NamedTuple):
             information (`sparing`).
         pose_steps: Largest number of cost evaluations in each refinement of the pose; `TrackOutput.pose_status` tells
             whether it was reached.
-        pose_tolerance: Length of the step at which a refinement of the pose stops, in standard deviations of the pose;
+        pose_tolerance: Length of the step with which a refinement of the pose ends, in standard deviations of the pose;
             `None` for what the floating-point type resolves.
         pair_flow: Settings of the matching along the rows of a stereo pair.
     """

@@ -106,6 +106,16 @@ def test_nothing_where_it_is_ignored(gray):
     assert len(patches.octave) > 800
 
 
+def test_without_what_a_later_mask_ignores(gray):
+    patches, ignore = extract(gray), np.zeros(gray.shape, bool)
+    ignore[:, :320] = True
+    left = patches.without(ignore)
+    kept = np.rint(patches.uv_raw[0]) >= 320
+    assert 0 < kept.sum() < len(kept)
+    for some, every in zip(left, patches, strict=True):
+        np.testing.assert_array_equal(some, every.compress(kept, axis=every.shape.index(len(kept))))
+
+
 @pytest.mark.parametrize("shape", [(8, 8), (50, 60), (HEIGHT, WIDTH)])
 def test_nothing_to_see(shape):
     for image, ignore in ((np.zeros(shape, np.uint8), None), (np.eye(*shape, dtype=np.uint8), np.ones(shape, bool))):

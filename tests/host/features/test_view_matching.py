@@ -6,8 +6,8 @@ import pytest
 from room_views import features, room, sensor
 
 from jaxslam.features.pose_from_matches import PLACE_GATES
-from jaxslam.features.view_matching import ViewPose, match_views, match_views_near
-from jaxslam.geometry.se3 import angle, between, retract
+from jaxslam.features.view_matching import ViewPose, match_views, match_views_near, pixels_apart
+from jaxslam.geometry.se3 import IDENTITY, angle, between, retract
 
 SOURCE, VIEW = 0, 20
 
@@ -39,6 +39,19 @@ def test_from_an_approximate_pose(turn_rad: float, found_there: bool) -> None:
     if found is not None:
         assert errors(found) < (0.01, 0.01)
         assert found.pairs.shape[1] >= PLACE_GATES.min_inliers
+
+
+def test_pixels_apart() -> None:
+    """A turn moves all features alike, but for the lens; a shift moves them by focal length x shift / depth."""
+    focal, still = float(sensor().intrinsics.fx), truth()
+    turned = retract(still, np.array([0, 0, 0, 0, 0.02, 0]))
+    assert pixels_apart(features(SOURCE), still, turned, sensor()) == pytest.approx(0.02 * focal, rel=0.25)
+    shifted = retract(IDENTITY, np.array([0.05, 0, 0, 0, 0, 0]))
+    depth = features(SOURCE).depth
+    expected = 0.05 * focal / np.median(depth[depth > 0])
+    assert pixels_apart(features(SOURCE), IDENTITY, shifted, sensor()) == pytest.approx(expected, rel=0.02)
+    nothing = features(SOURCE)._replace(depth=np.zeros_like(depth))
+    assert pixels_apart(nothing, still, turned, sensor()) == np.inf
 
 
 def test_a_pose_that_is_no_place() -> None:

@@ -480,14 +480,15 @@ class TestDegenerate:
 def test_acceleration_saves_evaluations(monkeypatch):
     """With outliers, steps that only reweight grow shorter by a ratio, which two of them tell: the optimum is near."""
 
-    def solve(T: SE3, uv: Any, X_world: Any) -> PoseRefinement:
-        return refine_pose(T, X_world, uv, camera(), tolerance=0.03)
-
     views = [make_scene(seed, 200, outliers=0.3) for seed in range(3)]
-    arguments = [(pose_of(view.initial), view.arrays()[1], view.arrays()[0]) for view in views]
-    accelerated = [quick(*each) for quick in [quick_compile(solve)] for each in arguments]
+
+    def refined() -> list[PoseRefinement]:
+        refine = quick_compile(partial(refine_pose, tolerance=0.03))
+        return [refine(pose_of(view.initial), *view.arrays()[:2], camera()) for view in views]
+
+    accelerated = refined()
     monkeypatch.setattr(levenberg_marquardt, "_accelerated", lambda step, *_: step)
-    plain = [quick(*each) for quick in [quick_compile(lambda *given: solve(*given))] for each in arguments]
+    plain = refined()
     assert all(int(one.num_steps) < int(other.num_steps) for one, other in zip(accelerated, plain, strict=True))
     for one, other in zip(accelerated, plain, strict=True):
         error = _tangent(*(np.asarray(result.T_world_cam.wxyz_xyz) for result in (one, other)))
