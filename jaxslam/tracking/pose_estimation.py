@@ -29,7 +29,7 @@ has 36 mm instead of 16 in the room xyz.
 
 _COARSER = 10.0
 """How much longer the last step to the coarse pose may be than that to the refined one, which begins there: the median
-of its steps on fr1_rpy is 6 instead of 9."""
+of its steps on fr1_rpy is 3 instead of 5."""
 
 
 def coarse_pose(
