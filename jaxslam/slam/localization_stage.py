@@ -62,7 +62,7 @@ class TrackedAgain(NamedTuple):
 
 
 class _Attempt(NamedTuple):
-    """An attempt to track a lost frame that did not do.
+    """An attempt to track a lost frame, which may have failed.
 
     Attributes:
         T_last_cam: `(7,)` motion from which its points were followed.

@@ -56,7 +56,7 @@ class _State(eqx.Module):
     model: Any  # an optx.FunctionInfo.EvalGradHessian at y, in units of `unit`
     unit: Float[Array, " d"]
     search: Any
-    squared: Scalar  # length of the step, in the metric of the Hessian
+    squared: Scalar  # squared length of the step, in the metric of the Hessian
     terminate: Flag
 
 
