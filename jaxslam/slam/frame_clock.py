@@ -188,4 +188,4 @@ class FrameClock:
 def _num_odd(intervals_s: list[float], period_s: float) -> int:
     """Count intervals that are not a whole number of periods, or shorter than one."""
     periods = [interval_s / period_s for interval_s in intervals_s]
-    return len([number for number in periods if abs(number - (round(number) or 1)) > _OFF])
+    return sum(abs(number - max(round(number), 1)) > _OFF for number in periods)

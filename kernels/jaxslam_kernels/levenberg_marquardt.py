@@ -158,7 +158,7 @@ class ManifoldLevenbergMarquardt(optx.AbstractMinimiser):
 def _accelerated(
     step: Float[Array, " d"], hessian: Any, before: _State, scale: Float[Array, " d"]
 ) -> Float[Array, " d"]:
-    """Where this step and the one before lead to, if their ratio stays: the combination of both that cancels them.
+    """Extrapolate this step and the one before: return the move at whose end a combination of both is shortest.
 
     Args:
         step: The damped Newton step.

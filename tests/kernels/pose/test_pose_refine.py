@@ -479,7 +479,6 @@ class TestDegenerate:
 
 def test_acceleration_saves_evaluations(monkeypatch):
     """With outliers, steps that only reweight grow shorter by a ratio, which two of them tell: the optimum is near."""
-
     views = [make_scene(seed, 200, outliers=0.3) for seed in range(3)]
 
     def refined() -> list[PoseRefinement]:
