@@ -35,7 +35,7 @@ from jaxslam.sensors.frame import Frame
 from jaxslam.sensors.frame_arrays import FrameArrays, own_copy
 from jaxslam.sensors.sensor_model import SensorModel
 from jaxslam.slam.dense_thread import dense_mapping_of
-from jaxslam.slam.frame_localizer import FeatureMotion, FrameLocalizer, LocalizedPose
+from jaxslam.slam.frame_localizer import FrameLocalizer
 from jaxslam.slam.frame_result import FrameResult
 from jaxslam.slam.keyframe_semantics import KeyframeSemantics
 from jaxslam.slam.map_adjuster import AdjustResult, MapAdjuster
@@ -64,6 +64,7 @@ class BackEnd:
 
     Attributes:
         dense: Thread of the dense map; `None` without `dense.enabled`, or with `localize_only`.
+        localizer: Tells where a frame was taken by the features it shares with the last one and with the map.
     """
 
     def __init__(
@@ -112,7 +113,7 @@ class BackEnd:
         self._num_tracks = plan.num_points + plan.num_sources * plan.points_per_source  # at most, in a frame
         most, occlusion = config.mapping.num_features + self._num_tracks, config.dynamics.occlusion
         self._states = PointStates(occlusion, sensor, start, most) if occlusion.enabled else None
-        self._localizer = FrameLocalizer(sensor, self._plan.features, self._link, self._index, self._states)
+        self.localizer = FrameLocalizer(sensor, self._plan.features, self._link, self._index, self._states)
         self._arrived: Map | None = None
         self._coverage, self._map_views = ViewCoverage(with_dense_keyframes(config).keyframe_below), 0
         self._changes = MapChanges()
@@ -218,7 +219,7 @@ class BackEnd:
         """
         self.check_open()
         self._adjuster.frame_begun()
-        self._localizer.begin_frame()
+        self.localizer.begin_frame()
         if self._semantics is not None:
             self._take_movers(*self._semantics.collect(frame), frame)
         self._take_places(self._to_places.collect(frame), frame)
@@ -281,7 +282,7 @@ class BackEnd:
             State and output with the refined pose, and the number of map points that agree with it. Unchanged state
             and output, and 0, if too few points agree.
         """
-        return self._localizer.match_tracked(state, arrays, output, self._config.track.weak_inliers, radii_px)
+        return self.localizer.match_tracked(state, arrays, output, self._config.track.weak_inliers, radii_px)
 
     def update_occlusion(self, arrays: FrameArrays, output: TrackOutput) -> float | None:
         """Update the occlusion states of the points of the reference keyframe from a tracked frame.
@@ -292,22 +293,6 @@ class BackEnd:
         if self._states is None or not self._begun or (anchored := self._link.in_map(pose_of(output))) is None:
             return None
         return self._states.see(self.map, anchored.keyframe, anchored.T_keyframe_cam, np.asarray(output.twist), arrays)
-
-    def turn_to(self, arrays: FrameArrays, T_last_cam: Pose) -> Pose | None:
-        """Estimate how the camera turned since the last tracked frame; see `FrameLocalizer.turn_to`."""
-        return self._localizer.turn_to(arrays, T_last_cam)
-
-    def motion_to(self, arrays: FrameArrays, T_last_cam: Pose) -> FeatureMotion | None:
-        """Estimate the motion from the last tracked frame to a lost one; see `FrameLocalizer.motion_to`."""
-        return self._localizer.motion_to(arrays, T_last_cam)
-
-    def pixels_apart(self, first: Pose, second: Pose) -> float:
-        """Return how far apart two motions take the features of the last frame; see `FrameLocalizer.pixels_apart`."""
-        return self._localizer.pixels_apart(first, second)
-
-    def relocalize(self, arrays: FrameArrays, predicted: Pose | None) -> tuple[LocalizedPose | None, bool]:
-        """Localize a lost frame in the map; see `FrameLocalizer.relocalize`."""
-        return self._localizer.relocalize(arrays, predicted)
 
     def reset_at_pose(self, state: TrackState, recognized: AnchoredPose, twist: Float[np.ndarray, "6"]) -> TrackState:
         """Return the tracker's state reset to a recognized pose, with keyframes of that place loaded.
@@ -349,7 +334,7 @@ class BackEnd:
             frame: Number of the frame.
         """
         T_world_cam = tracked.T_world_cam
-        self._localizer.frame_tracked(arrays, anchored, tracked.twist)
+        self.localizer.frame_tracked(arrays, anchored, tracked.twist)
         if not self._localize_only:
             self._map_views = self.count_views(T_world_cam)
         if frame % _RELOAD_EVERY == 0 or self._has_jumped:
@@ -438,7 +423,7 @@ class BackEnd:
             states = None if self._states is None else self._states.handed_over()
             if self.dense is not None:
                 self.dense.insert_keyframe(new, frame.image, pose_of(output), number)
-            self._submit(self._to_mapping, new._replace(features=self._localizer.features, states=states), number)
+            self._submit(self._to_mapping, new._replace(features=self.localizer.features, states=states), number)
         if self._semantics is not None:
             self._semantics.submit(keyframe, frame.image, np.asarray(arrays.depth), tracks_of(output), number)
 

@@ -146,7 +146,7 @@ class LocalizationStage:
 
     def _from_turn(self, arrays: FrameArrays, T_last_cam: Pose, measured: MeasuredMotion | None) -> _Attempt | None:
         """Try to track a lost frame if the whole image shifted; the state stays as it was."""
-        turn = self._back.turn_to(arrays, T_last_cam)
+        turn = self._back.localizer.turn_to(arrays, T_last_cam)
         if turn is None:
             return None
         state = self._tracker.copied_state()
@@ -160,10 +160,10 @@ class LocalizationStage:
     ) -> TrackedAgain | None:
         """Track a lost frame again if its features tell the motion; `None` if it stays lost."""
         back, elapsed_s = self._back, self._tracker.elapsed_s()
-        found = back.motion_to(arrays, T_last_cam)
+        found = back.localizer.motion_to(arrays, T_last_cam)
         if found is None:
             return None
-        if before is not None and back.pixels_apart(found.T_last_cam, before.T_last_cam) < _SAME_START_PX:
+        if before is not None and back.localizer.pixels_apart(found.T_last_cam, before.T_last_cam) < _SAME_START_PX:
             again, self._tracker.state = before.again, before.state
         else:
             again = self._from_motion(arrays, found.T_last_cam, measured)
@@ -252,7 +252,7 @@ class LocalizationStage:
         predicted = None
         if self._any_tracked:
             predicted = self._motion.after(dt_s) if self._outside is None else self._outside
-        found, unknown = self._back.relocalize(arrays, predicted)
+        found, unknown = self._back.localizer.relocalize(arrays, predicted)
         self._unrecognized += unknown
         if found is not None:
             twist = self._velocity_to(found.anchored, dt_s)

@@ -81,7 +81,7 @@ class TestKidnap:
         with Slam(frames.camera, CONFIG) as slam:
             before = Played(slam, frames, range(41), FPS)
             slam._tracker.state = slam._back.start_submap(slam._tracker.state, before.results[-1].T_world_cam)
-            slam._back._localizer._last = None  # nor has the frame before anything in common with it
+            slam._back.localizer._last = None  # nor has the frame before anything in common with it
             after = Played(slam, frames, range(41, 46), FPS)
         assert after.statuses == [*[TrackStatus.RELOCALIZED] * 2, *[TrackStatus.OK] * 3]
         found = after.results[0]

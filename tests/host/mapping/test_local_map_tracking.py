@@ -333,10 +333,10 @@ class TestLostFrames:
             for frame in room().frames[:40]:
                 slam.track(frame)
             last, arrays = slam._localization.predicted(), frame_arrays(room()[40], 1 / 15)
-            placed, _ = slam._back.relocalize(arrays, last)
+            placed, _ = slam._back.localizer.relocalize(arrays, last)
             assert placed is not None
             assert np.linalg.norm((slam._back.pose(placed.anchored) - mapped()[1][40].T_world_cam)[4:]) < 0.015
-            assert slam._back.relocalize(arrays, None) == (None, True)
+            assert slam._back.localizer.relocalize(arrays, None) == (None, True)
 
     @pytest.mark.slow
     def test_go_on_from_there(self, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -34,7 +34,7 @@ def test_the_second_frame_of_a_camera_that_turns_fast(slam: Slam, first: int, se
     wrong = between(moved, between(start.T_world_cam, result.T_world_cam))
     assert np.linalg.norm(wrong[4:]) < 0.03
     assert angle(wrong) < 0.015
-    needs_features = slam._back._localizer._of_lost is not None
+    needs_features = slam._back.localizer._of_lost is not None
     assert needs_features == (first < 60)  # the shift of the whole image does not tell the first two, which roll
 
 
@@ -54,7 +54,7 @@ def test_features_that_confirm_a_failed_turn_do_not_follow_again(
         outputs.append(advance(*arguments))
         return outputs[-1]._replace(status=TrackStatus.LOST) if len(outputs) < starts else outputs[-1]
 
-    monkeypatch.setattr(slam._back, "turn_to", lambda *_: turn)
+    monkeypatch.setattr(slam._back.localizer, "turn_to", lambda *_: turn)
     monkeypatch.setattr(tracker, "follow", follow)
     monkeypatch.setattr(tracker, "advance", lost_but_after_the_reset)
     result = slam.track(SOURCE[32])
