@@ -1,20 +1,22 @@
 """Rewrite the generated tables: results from stored files, and what is differentiable from the cases of the tests.
 
-Run `python docs/make_tables.py` after a file in `configs/benchmarks/baselines`, `configs/benchmarks/published` or
-`docs/performance` has changed, or `derivative_cases.py` or `step_inputs.py` in `tests/helpers`.
+Run `python docs/make_tables.py` after a file in `docs/accuracy`, `docs/performance`, `configs/benchmarks/baselines` or
+`configs/benchmarks/published` has changed, or `derivative_cases.py` or `step_inputs.py` in `tests/helpers`.
 A table stands between the comments `<!-- NAME: begin ... -->` and `<!-- NAME: end -->`; nothing else is touched.
 """
 
 import json
 import re
+import statistics
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from jaxslam.benchmark.reports.document import Table, to_markdown
-from jaxslam.benchmark.reports.live import MEANING, section
+from jaxslam.benchmark.reports.live import MEANING, by_program, ratio, section
 from jaxslam.benchmark.reports.published_tables import comparison_table, described
-from jaxslam.benchmark.suites.accuracy_ruler import AccuracyBaseline, load_accuracy_baseline
+from jaxslam.benchmark.suites.accuracy_ruler import AccuracyBaseline, compare_accuracy, load_accuracy_baseline
 from jaxslam.benchmark.suites.published import published_for
 from jaxslam.benchmark.suites.suite import load_suite
 from jaxslam.config.loading import configs_dir
@@ -28,17 +30,19 @@ PAGES = (
 )
 _HELPERS = DOCS.parent / "tests" / "helpers"
 _SUITE = load_suite("accuracy")
+_FROZEN = configs_dir() / "benchmarks" / "baselines" / "accuracy-8561ab9-epyc.json"
 
 
 def tables() -> dict[str, str]:
     """Make every generated block as Markdown, by the name in its comments."""
-    files = sorted((configs_dir() / "benchmarks" / "baselines").glob("accuracy-*.json"))
-    baselines = [load_accuracy_baseline(file) for file in files]
+    before = load_accuracy_baseline(_FROZEN)
+    measured = [load_accuracy_baseline(file) for file in sorted((DOCS / "accuracy").glob("*.json"))]
     return {
-        "accuracy": "\n".join(map(accuracy_table, baselines)),
-        "published": "\n".join(published_tables(baselines)),
-        "results": results_table(baselines[0]),
+        "accuracy": "\n\n".join(accuracy_table(now, before) for now in measured),
+        "published": "\n".join(published_tables(measured)),
+        "results": results_table(measured[0]),
         "live": live_report(),
+        "live_summary": live_summary(),
         "kernels": kernels_table(),
         "tracker": tracker_table(),
     }
@@ -49,31 +53,50 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return to_markdown([Table([columns, *rows])])
 
 
-def accuracy_table(baseline: AccuracyBaseline) -> str:
-    """Make the table of one accuracy baseline, under a line that says where it was measured."""
+def accuracy_table(now: AccuracyBaseline, before: AccuracyBaseline) -> str:
+    """Make the table of an accuracy measurement, with its ratios to the frozen baseline, under where it was made."""
+    reading = compare_accuracy(now.recordings, now.sequences, before)
     rows = []
-    for name, runs in baseline.recordings.items():
-        low, high = 1e3 * min(runs.ates_m), 1e3 * max(runs.ates_m)
+    for row in reading.recordings:
+        low, high = 1e3 * min(row.now.ates_m), 1e3 * max(row.now.ates_m)
         rows.append(
             [
-                f"`{name}`",
-                described(next(clip for clip in _SUITE.sequences if clip.name == name)),
-                str(runs.frames),
-                str(len(runs.ates_m)),
-                f"{runs.tracked_percent:.4g} %",
-                f"{1e3 * runs.median_m:.2f} mm",
+                f"`{row.name}`",
+                described(next(clip for clip in _SUITE.sequences if clip.name == row.name)),
+                str(row.now.frames),
+                str(len(row.now.ates_m)),
+                f"{row.now.tracked_percent:.4g} %",
+                f"{1e3 * row.now.median_m:.2f} mm",
                 f"{low:.2f}-{high:.2f} mm",
+                "-" if row.ratio is None else f"{row.ratio:.2f}",
             ]
         )
-    columns = ("name", "recording", "frames", "seeds", "tracked", "ATE, median", "ATE, range")
-    measured = f"Commit {baseline.commit}, preset `{baseline.preset}`, on {baseline.machine};\n{baseline.versions}:\n"
-    return f"{measured}\n{table(columns, rows)}"
+    columns = ("name", "recording", "frames", "seeds", "tracked", "ATE, median", "ATE, range", f"of {before.commit}")
+    where = f"Commit {now.commit[:7]}, preset `{now.preset}`, on {now.machine};\n{now.versions}."
+    mean = f"The geometric mean of the medians is {reading.mean_ratio:.3f} of that of the frozen baseline."
+    return f"{where}\n{mean}\n\n{table(columns, rows)}"
 
 
 def live_report() -> str:
     """Make a section of each live measurement, and say what the figures mean."""
-    files = sorted((DOCS / "performance").glob("*.json"))
-    return "\n".join([*(section(json.loads(file.read_text(encoding="utf-8"))) for file in files), MEANING])
+    return "\n".join([*map(section, _live_measurements()), MEANING])
+
+
+def live_summary() -> str:
+    """Make the short table of live measurements for README.md: the time of a frame, and its ratio to ORB-SLAM3's."""
+    rows = []
+    for content in _live_measurements():
+        own, theirs = by_program(content["runs"]).values()
+        ratios = [f"{ratio(own, theirs, field):.2f}" for field in ("median_ms", "p95_ms", "cpu_ms")]
+        median = statistics.median(run["median_ms"] for run in own)
+        recording = f"`{content['recording']}`, {content['rate_hz']:g} Hz"
+        rows.append([recording, content["cpu"], f"{median:.1f} ms", *ratios])
+    columns = ("recording", "CPU", "frame, median", "of ORB-SLAM3's median", "of its p95", "of its processor time")
+    return table(columns, rows)
+
+
+def _live_measurements() -> list[dict[str, Any]]:
+    return [json.loads(file.read_text(encoding="utf-8")) for file in sorted((DOCS / "performance").glob("*.json"))]
 
 
 def kernels_table() -> str:
