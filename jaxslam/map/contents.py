@@ -10,6 +10,7 @@ from jaxslam.geometry.types import Ids
 from jaxslam.map.point_records import (
     MapPoints,
     Observations,
+    distinct,
     empty_observations,
     empty_points,
     has,
@@ -113,7 +114,7 @@ class MapContents:
         """
         if not self.has_blocks:
             return self
-        numbers = set(np.unique(point_ids >> _SPAN_BITS).tolist()) & self.blocks.keys()
+        numbers = set(distinct(point_ids >> _SPAN_BITS)[0].tolist()) & self.blocks.keys()
         numbers.update(*(self._of_keyframe.get(id, frozenset()) for id in keyframe_ids.tolist()))
         return MapContents(*_join([self.blocks[number] for number in sorted(numbers)]))
 
@@ -121,14 +122,14 @@ class MapContents:
         """Replace points and their observations by those of an edited part.
 
         Args:
-            point_ids: Ids of the points to replace.
+            point_ids: Ascending ids of the points to replace.
             part: The points and observations instead of them, as whole arrays.
         """
         blocks, of_keyframe = self.blocks.copy(), self._of_keyframe.copy()
-        numbers = np.union1d(point_ids >> _SPAN_BITS, part.points.ids >> _SPAN_BITS).tolist()
+        numbers = distinct(np.concatenate([point_ids, part.points.ids]) >> _SPAN_BITS)[0].tolist()
         old = {number: blocks.pop(number) for number in numbers if number in blocks}
         points, observations = _join(list(old.values()))
-        stay, seen = ~np.isin(points.ids, point_ids), ~np.isin(observations.point, point_ids)
+        stay, seen = ~has(point_ids, points.ids), ~has(point_ids, observations.point)
         points = joined([points_at(points, stay), part.points])
         order = np.argsort(points.ids, kind="stable")
         observations = joined([observations_at(observations, seen), part.observations])
@@ -173,7 +174,7 @@ def _split(points: MapPoints, observations: Observations) -> dict[int, Block]:
     Arrays are copied: a view would keep all others of its block alive when those have long been replaced.
     """
     of_point = points.ids >> _SPAN_BITS
-    numbers = np.unique(of_point)
+    numbers, _ = distinct(of_point)
     order = np.argsort(observations.point >> _SPAN_BITS, kind="stable")
     of_observation = observations.point[order] >> _SPAN_BITS
     begin, end = (np.searchsorted(of_point, numbers, side).tolist() for side in ("left", "right"))
@@ -182,5 +183,5 @@ def _split(points: MapPoints, observations: Observations) -> dict[int, Block]:
     for row, number in enumerate(numbers.tolist()):
         own = points_at(points, np.arange(begin[row], end[row]))
         seen = observations_at(observations, order[first[row] : last[row]])
-        blocks[number] = Block(own, seen, frozenset(np.unique(seen.keyframe).tolist()))
+        blocks[number] = Block(own, seen, frozenset(distinct(seen.keyframe)[0].tolist()))
     return blocks

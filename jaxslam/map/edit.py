@@ -10,7 +10,17 @@ from jaxtyping import Bool, Float, Float64, Int, UInt8
 from jaxslam.dynamics.occlusion import PointState
 from jaxslam.geometry.se3 import compose, transform
 from jaxslam.geometry.types import Ids, Pose, Poses
-from jaxslam.map.point_records import NONE, MapPoints, Observations, has, joined, observations_at, points_at, rows
+from jaxslam.map.point_records import (
+    NONE,
+    MapPoints,
+    Observations,
+    distinct,
+    has,
+    joined,
+    observations_at,
+    points_at,
+    rows,
+)
 from jaxslam.map.spanning_tree import parents_from
 from jaxslam.map.types import Keyframe, Loops, Map, point_submaps, surviving_keyframes
 from jaxslam.map.validate import Record, number_problems
@@ -75,9 +85,9 @@ def with_observations(slam_map: Map, observations: Observations) -> Map:
     at = rows(slam_map.ids, observations.keyframe)
     if (slam_map.submap[at] != point_submaps(slam_map)[rows(slam_map.points.ids, observations.point)]).any():
         raise ValueError("a keyframe cannot see a point of another submap")
-    involved, which = np.unique(at, return_inverse=True)
+    involved, _ = distinct(at)
     num_features = np.array([len(slam_map.keyframes[row].features.octave) for row in involved], np.int64)
-    wrong = (observations.feature < NONE) | (observations.feature >= num_features[which])
+    wrong = (observations.feature < NONE) | (observations.feature >= num_features[rows(involved, at)])
     if wrong.any():
         raise ValueError(f"keyframe {observations.keyframe[wrong][0]} has no feature {observations.feature[wrong][0]}")
     new = observations_at(observations, ~_conflicts(slam_map, observations))
@@ -88,7 +98,7 @@ def with_observations(slam_map: Map, observations: Observations) -> Map:
 def _conflicts(slam_map: Map, new: Observations) -> Bool[np.ndarray, " n"]:
     """Return which new observations conflict with one of the map."""
     seen = slam_map.observations
-    near = np.flatnonzero(has(np.unique(new.keyframe), seen.keyframe))
+    near = np.flatnonzero(has(distinct(new.keyframe)[0], seen.keyframe))
     shown = near[seen.feature[near] != NONE]
     points = _group(seen.keyframe[near], seen.point[near])
     features = _group(seen.keyframe[shown], seen.feature[shown])
@@ -194,7 +204,7 @@ def without_points(slam_map: Map, point_ids: Ids) -> Map:
     """Remove points and all their observations."""
     stays = np.ones(len(slam_map.points.ids), bool)
     stays[rows(slam_map.points.ids, point_ids)] = False
-    seen = ~np.isin(slam_map.observations.point, point_ids)
+    seen = ~has(np.sort(point_ids), slam_map.observations.point)
     return slam_map.with_arrays(points_at(slam_map.points, stays), observations_at(slam_map.observations, seen))
 
 

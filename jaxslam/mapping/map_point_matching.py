@@ -48,9 +48,8 @@ class DescribedPoints(NamedTuple):
 def described_points_in(slam_map: Map, keyframe_ids: Ids, plan: FeaturePlan) -> DescribedPoints:
     """Return the points with a descriptor that these keyframes observe at a feature."""
     slam_map = slam_map.around(keyframe_ids)
-    seen = np.flatnonzero(
-        np.isin(slam_map.observations.keyframe, keyframe_ids) & (slam_map.observations.feature != NONE)
-    )
+    of_keyframes = has(np.sort(keyframe_ids), slam_map.observations.keyframe)
+    seen = np.flatnonzero(of_keyframes & (slam_map.observations.feature != NONE))
     ids, first = np.unique(slam_map.observations.point[seen], return_index=True)
     seen = seen[first]
     row = rows(slam_map.points.ids, ids)
@@ -268,8 +267,8 @@ def fuse_duplicates(
         return slam_map, nothing, nothing
     points = described_points_in(slam_map, np.array([keyframe_id]), plan)
     images = _together([slam_map.keyframe(neighbor).features for neighbor in neighbors.tolist()])
-    seen = observations_at(slam_map.observations, np.isin(slam_map.observations.keyframe, neighbors))
     order = np.argsort(neighbors)
+    seen = observations_at(slam_map.observations, has(neighbors[order], slam_map.observations.keyframe))
     seen_in = order[np.searchsorted(neighbors, seen.keyframe, sorter=order)]
     # 1. Match the points with the features of the neighbors that do not observe them.
     wanted = np.ones((len(neighbors), len(points.ids)), bool)

@@ -9,7 +9,7 @@ from small_map import CAMERA, keyframe, pose, small_map
 
 from jaxslam.map.edit import with_keyframe, without_observations
 from jaxslam.map.keyframe_removal import without_keyframe
-from jaxslam.map.point_records import NONE, has, rows
+from jaxslam.map.point_records import NONE, distinct, has, rows
 from jaxslam.map.spanning_tree import children, subtree
 from jaxslam.map.types import Map, covisible, empty_map, neighborhood, point_submaps, surviving_keyframes, visibility
 from jaxslam.map.validate import problems
@@ -45,6 +45,14 @@ def test_rows_and_has_of_many(span):
     np.testing.assert_array_equal(has(ids, wanted), np.isin(wanted, ids))
     with pytest.raises(KeyError, match="not in the map"):
         rows(ids, wanted)
+
+
+@pytest.mark.parametrize("span", [1, 6000, 10**12])
+@pytest.mark.parametrize("number", [0, 1, 5000])
+def test_distinct(number, span):
+    ids = np.random.default_rng(0).integers(-span, span, number)
+    for found, expected in zip(distinct(ids), np.unique(ids, return_counts=True), strict=True):
+        np.testing.assert_array_equal(found, expected)
 
 
 class TestPose:
