@@ -13,6 +13,7 @@ from .losses import relative_pose_loss as relative_pose_loss
 from .point_samples import PointSamples as PointSamples
 from .point_samples import TrackedScene as TrackedScene
 from .point_samples import WrongPoints as WrongPoints
+from .point_samples import ate_of as ate_of
 from .point_samples import track_scene as track_scene
 from .point_samples import tracker_with as tracker_with
 from .point_samples import wrong_points as wrong_points

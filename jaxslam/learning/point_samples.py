@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxlie import SE3
 from jaxslam_kernels.types import Pixels
 from jaxtyping import Array, Bool, Float, Int
 
@@ -18,7 +19,8 @@ from jaxslam.dynamics.cue import Cue, CueInput, CueResult
 from jaxslam.dynamics.learned_cue import LearnedFeatures, LearnedParams, learned_cue, learned_features
 from jaxslam.dynamics.regions import of_points
 from jaxslam.learning.labeled_scene import LabeledScene
-from jaxslam.runtime.compiled import compiled
+from jaxslam.learning.losses import ate_loss
+from jaxslam.runtime.compiled import committed, compiled
 from jaxslam.runtime.compiler_options import FAST_COMPILE
 from jaxslam.sensors.camera import Camera
 from jaxslam.sensors.frame_arrays import FrameArrays
@@ -134,7 +136,7 @@ def track_scene(
         seed: Seed of the tracker.
     """
     num, height, width = scene.moving.shape
-    state = init_state(height, width, plan, seed=seed)
+    state, params = committed((init_state(height, width, plan, seed=seed), params))  # whoever made the network
     states, found = [], []
     for start in range(0, num, window):
         states.append(jax.device_get(state))
@@ -223,3 +225,11 @@ def wrong_points(tracked: TrackedScene) -> WrongPoints:
     moving, static = samples.sure & samples.moving, samples.sure & ~samples.moving
     counts = (moving & ~rejected, static & rejected, moving, static)
     return WrongPoints(*(int(np.count_nonzero(each)) for each in counts))
+
+
+def ate_of(tracked: TrackedScene) -> float:
+    """Return the absolute trajectory error of a tracked scene (RMSE after SE(3) alignment), meters."""
+    estimated, truth = (
+        SE3(jnp.asarray(T_world_cam, jnp.float32)) for T_world_cam in (tracked.T_world_cam, tracked.scene.T_world_cam)
+    )
+    return float(jnp.sqrt(ate_loss(estimated, truth)))

@@ -27,10 +27,11 @@ from jaxtyping import Array, Bool, Float
 from jaxslam.learning.fit import fit
 from jaxslam.learning.label_training import joined_samples, new_network, train_on_labels
 from jaxslam.learning.labeled_scene import LabeledScene, open_still, render_room, render_world
-from jaxslam.learning.losses import ate_loss, relative_pose_loss
+from jaxslam.learning.losses import relative_pose_loss
 from jaxslam.learning.point_samples import (
     TrackedScene,
     WrongPoints,
+    ate_of,
     edges,
     track_scene,
     tracker_with,
@@ -170,14 +171,6 @@ def _judged(
     wrong = sum((wrong_points(each) for each in tracked), start=WrongPoints(0, 0, 0, 0))
     errors = [ate_of(each) for each in tracked]
     return StageFigures(stage, wrong, float(np.exp(np.mean(np.log(errors)))))
-
-
-def ate_of(tracked: TrackedScene) -> float:
-    """Return the absolute trajectory error of a tracked scene (RMSE after SE(3) alignment), meters."""
-    estimated, truth = (
-        SE3(jnp.asarray(T_world_cam, jnp.float32)) for T_world_cam in (tracked.T_world_cam, tracked.scene.T_world_cam)
-    )
-    return float(jnp.sqrt(ate_loss(estimated, truth)))
 
 
 class WindowTruth(NamedTuple):

@@ -26,6 +26,7 @@ from jaxslam.learning import (
 )
 from jaxslam.learning.label_training import label_loss, noisier
 from jaxslam.learning.point_samples import PointSamples, edges, true_labels
+from jaxslam.runtime.compiled import committed, programs
 
 SMALL = WeightsRecipe(
     frames=20,
@@ -133,6 +134,17 @@ def test_untrained_network_has_no_opinion() -> None:
     assert all(jax.tree.leaves(jax.tree.map(lambda a, b: bool((a == b).all()), first, same)))
     assert not (first.embed == other.embed).all()
     assert float(jnp.std(first.refine) * jnp.sqrt(36.0)) == pytest.approx(1, rel=0.2)
+
+
+@pytest.mark.slow
+def test_all_networks_are_tracked_by_one_program() -> None:
+    """Those that were trained, which are results of a program, and new ones; each would be compiled for a minute."""
+    scene, network = render_room(SMALL.held_out[0], SMALL.window), new_network(0, 6)
+    program = next(each for each in programs if each.name.endswith("point_samples._track_part"))
+    before = program.num_compiled
+    for each in (network, committed(network)):
+        track_scene(scene, *tracker_with(scene.camera, each), window=SMALL.window)
+    assert program.num_compiled == before + 1
 
 
 @pytest.fixture(scope="module")
