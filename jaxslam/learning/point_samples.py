@@ -136,7 +136,8 @@ def track_scene(
         seed: Seed of the tracker.
     """
     num, height, width = scene.moving.shape
-    state, params = committed((init_state(height, width, plan, seed=seed), params))  # whoever made the network
+    # A trained network is a result of a program, a new one is not: the tracker would be compiled for each.
+    state, params = committed((init_state(height, width, plan, seed=seed), params))
     states, found = [], []
     for start in range(0, num, window):
         states.append(jax.device_get(state))

@@ -64,15 +64,6 @@ def merge_back(whole: Map, before: PartialMap, after: Map) -> Map:
     return after._replace(contents=whole.contents.replaced(before.map.points.ids, after.contents))
 
 
-def most_shared(slam_map: Map, point_ids: Ids, at_most: int) -> Ids:
-    """Return the at most `at_most` keyframes that observe the most of some points, most first; newer first if equal."""
-    slam_map = slam_map.around(point_ids[:0], point_ids)
-    seen = _mask(slam_map.next_point, point_ids)[slam_map.observations.point]
-    counts = np.bincount(slam_map.observations.keyframe[seen], minlength=slam_map.next_keyframe)
-    ids = slam_map.ids[counts[slam_map.ids] > 0]
-    return ids[np.lexsort((-ids, -counts[ids]))][:at_most]
-
-
 def _mask(size: int, ids: Ids) -> Bool[np.ndarray, " size"]:
     """Return a `(size,)` mask that is true at these ids; looking up an id takes one step instead of a search."""
     mask = np.zeros(size, bool)

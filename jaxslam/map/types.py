@@ -240,11 +240,21 @@ def covisible(
         `(k,)` ids of the neighbors, the most shared points first, and `(k,)` numbers of shared points.
     """
     slam_map = slam_map.around(np.array([keyframe_id]))
-    mine, _ = distinct(slam_map.observations.point[slam_map.observations.keyframe == keyframe_id])
-    others = slam_map.observations.keyframe[has(mine, slam_map.observations.point)]
-    ids, counts = distinct(others[others != keyframe_id])
+    mine = slam_map.observations.point[slam_map.observations.keyframe == keyframe_id]
+    ids, counts = observers(slam_map, mine)
+    near = (ids != keyframe_id) & (counts >= at_least)
+    return ids[near], counts[near]
+
+
+def observers(slam_map: Map, point_ids: Ids) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+    """Return the keyframes that observe some points, and how many of them each observes.
+
+    The most come first, newer keyframes first if equal.
+    """
+    slam_map = slam_map.around(point_ids[:0], point_ids)
+    seen = has(distinct(point_ids)[0], slam_map.observations.point)
+    ids, counts = distinct(slam_map.observations.keyframe[seen])
     order = np.lexsort((-ids, -counts))
-    order = order[counts[order] >= at_least]
     return ids[order], counts[order]
 
 

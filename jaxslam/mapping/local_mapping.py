@@ -25,10 +25,10 @@ from jaxslam.loop_closing.loop_correction import with_loop_closed
 from jaxslam.loop_closing.loop_detector import LoopClosure
 from jaxslam.map.dynamic_removal import DynamicObservations, without_dynamic, without_dynamic_points
 from jaxslam.map.edit import with_descriptors, with_keyframe, with_observations, with_points
-from jaxslam.map.partial_map import PartialMap, extract_around, merge_back, most_shared
+from jaxslam.map.partial_map import PartialMap, extract_around, merge_back
 from jaxslam.map.point_fusion import with_fused_points
 from jaxslam.map.point_records import NONE, Observations, has, rows
-from jaxslam.map.types import Keyframe, Map, covisible, empty_map, point_submaps
+from jaxslam.map.types import Keyframe, Map, covisible, empty_map, observers, point_submaps
 from jaxslam.mapping.culling import (
     CONFIRM_WITHIN,
     within_memory,
@@ -393,10 +393,10 @@ def _ideal(
 def _part(slam_map: Map, keyframe_id: int, known: Ids) -> PartialMap:
     """Extract the part of the map that a new keyframe may change, given the map points that the tracker observed."""
     latest = slam_map.ids[slam_map.ids >= keyframe_id - CONFIRM_WITHIN]
-    near = np.concatenate([most_shared(slam_map, known, LOCAL_KEYFRAMES), latest])
+    near = np.concatenate([observers(slam_map, known)[0][:LOCAL_KEYFRAMES], latest])
     parent = slam_map.parent[slam_map.row(keyframe_id)]
     near = np.append(near, parent) if parent != NONE else near
-    around = most_shared(slam_map, extract_around(slam_map, near).map.points.ids, _PART_KEYFRAMES)
+    around = observers(slam_map, extract_around(slam_map, near).map.points.ids)[0][:_PART_KEYFRAMES]
     return extract_around(slam_map, np.concatenate([near, around]), known)
 
 

@@ -8,10 +8,10 @@ from small_map import arrays, in_order, keyframe, observations, pose, same, smal
 
 from jaxslam.map.edit import with_keyframe, with_observations, with_positions, without_points
 from jaxslam.map.keyframe_removal import without_keyframe
-from jaxslam.map.partial_map import extract_around, merge_back, most_shared
+from jaxslam.map.partial_map import extract_around, merge_back
 from jaxslam.map.point_fusion import with_fused_points
 from jaxslam.map.point_records import NONE
-from jaxslam.map.types import Map, covisible
+from jaxslam.map.types import Map, covisible, observers
 from jaxslam.map.validate import problems
 
 
@@ -62,7 +62,7 @@ def test_edits_of_a_part_are_edits_of_the_whole(seed):
         np.testing.assert_array_equal(array, before[name])
 
 
-def test_most_shared():
+def test_observers():
     slam_map = thinned(3)
     wanted = slam_map.points.ids[::2]
     counts = {
@@ -70,8 +70,10 @@ def test_most_shared():
         for number in range(6)
     }
     order = sorted(counts, key=lambda number: (-counts[number], -number))
-    assert most_shared(slam_map, wanted, 4).tolist() == order[:4]
-    assert most_shared(slam_map, wanted[:0], 4).tolist() == []
+    ids, shared = observers(slam_map, wanted)
+    assert ids.tolist() == [number for number in order if counts[number]]
+    assert shared.tolist() == [counts[number] for number in ids]
+    assert observers(slam_map, wanted[:0])[0].tolist() == []
 
 
 def test_an_id_that_was_never_given():
