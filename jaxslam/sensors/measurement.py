@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxlie import SE3
 from jaxslam_kernels.camera import distort, normalize, to_pixels
-from jaxslam_kernels.depth.sampling import sample_depth, valid_depth
+from jaxslam_kernels.depth.sampling import lacks_depth, sample_depth, valid_depth
 from jaxslam_kernels.flow.disparity import ROW_PLAN, row_disparities
 from jaxslam_kernels.flow.lk_flow import FlowPlan
 from jaxslam_kernels.image.pyramid import Pyramid, build_pyramid
@@ -55,6 +55,11 @@ class PreparedFrame(NamedTuple):
     def depth_at(self, uv: Pixels, sensor: SensorModel, *, reach: int = 1, max_step: float = 0.05) -> Weights:
         """Return the `(n,)` depth at pixels, meters; 0 where none is to be believed. See `believed_depth`."""
         return believed_depth(self.frame.depth, uv, sensor, reach=reach, max_step=max_step)
+
+    def lacks_depth(self, uv: Pixels, sensor: SensorModel, *, reach: int) -> Mask:
+        """Return the `(n,)` mask of the pixels around which no depth is to be believed. See `lacks_depth`."""
+        limits = {"nearest": sensor.min_depth_m, "farthest": sensor.max_depth_m}
+        return lacks_depth(self.frame.depth, uv, reach=reach, **limits)
 
     def with_right(self) -> "PreparedFrame":
         """The same frame with the right image of its pair, if it is one."""

@@ -28,8 +28,9 @@ class _Candidates(NamedTuple):
     Attributes:
         uv: `(2, m)` positions, pixels.
         score: `(m,)` scores of the corners.
-        rough: `(m,)` depths at the corners, meters, 0 where missing.
+        rough: `(m,)` depths at the corners, meters; where missing, the assumed depth, 0 if there is none.
         seen: Measurements of the corners.
+        known: `(m,)` mask of the corners of measured depth.
         good: `(m,)` mask of the corners that may become points.
     """
 
@@ -37,6 +38,7 @@ class _Candidates(NamedTuple):
     score: Weights
     rough: Weights
     seen: Measurements
+    known: Mask
     good: Mask
 
 
@@ -66,7 +68,9 @@ def detect_new_points(
         step: Context of the step; pixels that its frame ignores give no points.
         T_world_cam: Pose of the frame.
         twist: `(6,)` velocity of the camera in its own axes, m/s, then rad/s.
-        may_lack_depth: Whether corners of unknown depth become points too, which wait until their depth is known.
+        may_lack_depth: Whether corners of unknown depth become points too, which wait until it is known. In a frame
+            that has depth, they are those in whose windows there is none, as out of the sensor's reach (beside
+            silhouettes it is missing in a narrow strip only), and those of a pair that have no match.
         first: `(h, w)` mask of pixels whose corners come before all others; some slots are kept free for them.
         cell_px: Side of the cells instead of that of the plan, pixels, static.
 
@@ -87,6 +91,7 @@ def detect_new_points(
         seen = Measurements(seen.xy, matched, depth_sigma(matched, params.sensor))
         new &= may_lack_depth | (matched > 0)
     known = seen.depth > 0
+    new &= known | (jnp.cumsum(new & ~known, dtype=jnp.int32) <= _room_to_wait(points, step))
     X_world = to_world(T_world_cam, seen._replace(depth=jnp.where(known, seen.depth, assumed)).in_camera())
     X_anchor = jnp.where(known[None, :], X_world, T_world_cam.translation()[:, None])
     put = lambda old, fresh: jnp.where(new, fresh, old)
@@ -128,25 +133,44 @@ def _candidates(
     corners = grid_corners(corner_score(image), inside & trusted, cell=cell)
     taken = occupied_cells(points.uv / 2, points.valid, (image.shape[0], image.shape[1]), cell=cell)
     uv = corners.points * 2
-    rough = view.depth_at(uv, sensor, reach=2)
-    rough = jnp.where(rough > 0, rough, assumed)
+    measured = view.depth_at(uv, sensor, reach=2)
+    rough = jnp.where(measured > 0, measured, assumed)
     seen = pixel_rays(uv, sensor).measured(rough, twist, view.frame.depth, view.frame.depth_delay_s, sensor, reach=2)
-    good = (corners.score > _MIN_SCORE) & ~taken & ((assumed > 0) | ((rough > 0) & (seen.depth > 0)))
-    return _Candidates(uv, corners.score, rough, seen, good)
+    known = (measured > 0) & (seen.depth > 0)
+    may_wait = (assumed > 0) & view.lacks_depth(uv, sensor, reach=step.plan.flow.finest.window // 2)
+    good = (corners.score > _MIN_SCORE) & ~taken & (known | may_wait)
+    return _Candidates(uv, corners.score, rough, seen, known, good)
+
+
+def _room_to_wait(points: TrackedPoints, step: StepContext) -> Code:
+    """Return the number of points of unknown depth that may be added.
+
+    In a frame that has depth, those that wait are at most half of what is above `detect_below`: so new points are not
+    detected in every frame.
+    """
+    params, plan = step.params, step.plan
+    most = jnp.round(0.5 * (1 - params.detect_below) * plan.num_points).astype(jnp.int32)
+    waiting = jnp.sum(points.valid & ~points.has_position(), dtype=jnp.int32)
+    return jnp.where(step.has_depth(), jnp.maximum(most - waiting, 0), plan.num_points)
 
 
 def _order(
     found: _Candidates, step: StepContext, rank: Int[Array, " n"], first: Bool[Array, "h w"] | None
 ) -> tuple[Int[Array, " m"], Code]:
-    """Order the candidates: those in `first`, then good ones on one surface, then by score; and count those used."""
+    """Order the candidates, and count those used.
+
+    The order is: those in `first`, then those on one surface, then others of known depth, then those of unknown depth,
+    each from the highest score to the lowest; those that are not good are last.
+    """
     plan = step.plan
     reach = plan.flow.finest.window // 2
     one_surface = step.view.depth_at(found.uv, step.params.sensor, reach=reach, max_step=_DEPTH_STEP) > 0
-    ranks, room = [~found.good, ~one_surface], jnp.sum(found.good, dtype=jnp.int32)
+    ranks = [~found.good | ~found.known, ~found.good | (found.known & ~one_surface)]
+    room = jnp.sum(found.good, dtype=jnp.int32)
     if first is not None and plan.motion is not None:
         column, row = jnp.round(found.uv).astype(jnp.int32)
         ahead = found.good & first.at[row, column].get(mode="fill", fill_value=False)
-        ranks, num_ahead = [ranks[0], ~ahead, ranks[1]], jnp.sum(ahead, dtype=jnp.int32)
+        ranks, num_ahead = [~ahead, *ranks], jnp.sum(ahead, dtype=jnp.int32)
         room = jnp.minimum(room, jnp.maximum(num_ahead, rank[-1] + 1 - plan.motion.reserved))
     return _ascending(ranks, found.score), room
 

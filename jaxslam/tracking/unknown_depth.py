@@ -1,6 +1,7 @@
 """Points of unknown depth: followed without a vote until their depth is measured or known from parallax.
 
-A frame without depth (a dropout, a sensor at half the rate, a covered lens of a pair) still shows corners. Each is
+A frame without depth (a dropout, a sensor at half the rate, a covered lens of a pair) still shows corners, and so does
+what is out of the sensor's reach: in a room with walls 6 m away, people may cover all that has depth. Each corner is
 followed with the other points, from an assumed depth. It counts as soon as its depth is measured, or as the camera has
 moved aside far enough for its rays to tell the depth.
 """
@@ -46,7 +47,7 @@ def with_located(
     """Add the points of unknown depth that are still followed, with their positions where these are known by now.
 
     The rays along which a point was detected and is seen now are triangulated. A point that the first ray cannot
-    explain has moved, or flow has lost it: it is dropped. So is one without a measured depth in a frame that has depth.
+    explain has moved, or flow has lost it: it is dropped.
 
     Args:
         kept: The other points that stay after the frame.
@@ -73,7 +74,7 @@ def with_located(
     follows = reprojects(T_world_cam, to_world(T_world_cam, X_cam), seen.xy, params)
     measured = waiting & (seen.depth > 0)
     triangulated = waiting & ~measured & ahead & follows & (sine_squared > jnp.square(sigma / _DEPTH_ERROR))
-    located, stays = measured | triangulated, measured | (waiting & follows & (triangulated | ~step.has_depth()))
+    located, stays = measured | triangulated, measured | (waiting & follows)
     X_world = to_world(T_world_cam, jnp.where(measured[None, :], seen.in_camera(), X_cam))
     by_parallax = sine_squared / jnp.square(jnp.where(triangulated, X_cam[2], 1) * sigma)
     information = jnp.where(measured, 1 / jnp.square(seen.sigma), by_parallax)

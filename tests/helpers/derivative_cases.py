@@ -799,6 +799,12 @@ def _() -> DerivativeCase:
     return _simple(depth_image.sample_depth, {"depth": depth}, {"uv": uv})
 
 
+@maker("lacks_depth")
+def _() -> DerivativeCase:
+    uv = jnp.array([[3.2, 8.9], [4.4, 7.3]])
+    return _simple(depth_image.lacks_depth, {}, {"depth": 3.0 + 0.01 * _random(12, 14), "uv": uv}, bound={"reach": 1})
+
+
 def _choice_of_depth() -> dict[str, Any]:
     return {"depth": _random(12, 14, low=2, high=3), "intrinsics": camera.make_intrinsics(
         20.0, 20.0, 6.5, 5.5, dtype=jnp.float64

@@ -131,6 +131,7 @@ def cases(n: int = 11) -> dict[str, Case]:
         },
         depth_image.valid_depth: {"depth": f(n), "nearest": f(), "farthest": f()},
         depth_image.sample_depth: {"depth": f(40, 48), "uv": f(2, n)},
+        partial(depth_image.lacks_depth, reach=2): {"depth": f(40, 48), "uv": f(2, n)},
         disparity.row_disparities: {
             "left": pyramid,
             "right": pyramid,

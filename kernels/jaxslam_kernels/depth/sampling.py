@@ -6,7 +6,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxslam_kernels.checks import checked
 from jaxslam_kernels.program_parts import apart
-from jaxslam_kernels.types import DepthImage, Pixels, Scalar, Weights
+from jaxslam_kernels.types import DepthImage, Mask, Pixels, Scalar, Weights
 
 _OUTSIDE_PX = 2**20
 """Farther from the first pixel than the sides of any image."""
@@ -46,14 +46,44 @@ def sample_depth(
         farthest: depth from which on there is none. The result is that of `valid_depth` on the whole image first,
             which takes 0.2 ms for 640x480 pixels.
     """
+    around = _surroundings(depth, uv, reach)
+    low, high = jnp.min(around, axis=1), jnp.max(around, axis=1)
+    middle = around[:, around.shape[1] // 2]
+    smooth = (low > nearest) & (high < farthest) & (high - low <= max_step * middle + noise)
+    return jnp.where(smooth, middle, 0)
+
+
+@checked
+def lacks_depth(
+    depth: DepthImage,
+    uv: Pixels,
+    *,
+    reach: int,
+    nearest: Scalar | float = 0.0,
+    farthest: Scalar | float = float("inf"),
+) -> Mask:
+    """Tell around which pixels no depth is measured at all.
+
+    What is out of the reach of a sensor has a wide hole, while that along a silhouette is narrow.
+
+    Args:
+        depth: Depth image in meters, at least as large as the surroundings; 0 or NaN where missing.
+        uv: `(2, n)` pixel coordinates. Where one is not a number, or the surroundings leave the image, nothing is
+            measured.
+        reach: The surroundings are `2 * reach + 1` pixels a side; static.
+        nearest: Depth at or below which there is none to believe, meters, 0 or more, and
+        farthest: depth from which on there is none.
+    """
+    around = _surroundings(depth, uv, reach)
+    return ~jnp.any((around > nearest) & (around < farthest), axis=1)
+
+
+def _surroundings(depth: DepthImage, uv: Pixels, reach: int) -> Float[Array, "n m"]:
+    """Depths in the square windows around pixels; 0 where a window leaves the image or a pixel is not a number."""
     side = 2 * reach + 1
     # Far outside where it is not a number, and never so far that the conversion to integers overflows.
     center = lax.stop_gradient(jnp.where(jnp.abs(uv) < _OUTSIDE_PX, jnp.round(uv), -_OUTSIDE_PX)).astype(jnp.int32)
-    around = apart(lambda: _windows(depth, center[::-1].T - reach, side)).reshape(-1, side * side)
-    low, high = jnp.min(around, axis=1), jnp.max(around, axis=1)
-    middle = around[:, side * side // 2]
-    smooth = (low > nearest) & (high < farthest) & (high - low <= max_step * middle + noise)
-    return jnp.where(smooth, middle, 0)
+    return apart(lambda: _windows(depth, center[::-1].T - reach, side)).reshape(-1, side * side)
 
 
 def _windows(depth: DepthImage, corner: Int[Array, "n 2"], side: int) -> Float[Array, "n s s"]:

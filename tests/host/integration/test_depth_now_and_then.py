@@ -1,4 +1,4 @@
-"""Depth in some frames only: a sensor of a lower rate, and one that fails for a while."""
+"""Depth in some frames only, or in a part of each: a low rate, a sensor that fails for a while, and its reach."""
 
 import dataclasses
 import functools
@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from jaxslam_kernels.se3 import to_camera
 from real_networks import real_network
 from room_round import SETTINGS
 
@@ -85,6 +86,27 @@ def test_a_sensor_that_fails_for_a_second() -> None:
     assert all(result.keyframe == KeyframeReason.NONE for result in results[10:25])
     print("error in mm:", 1e3 * error_m(results, source.ground_truth))
     assert error_m(results, source.ground_truth) < 0.01
+
+
+def test_parallax_beyond_the_reach_of_the_sensor() -> None:
+    """Half of the room has no depth: points there are located as the camera moves, and hold it."""
+    source = SyntheticDataset(SyntheticConfig(width=320, height=240, frames=30, people=0, path="halfsphere", fps=15.0))
+    rendered = [source.render(index) for index in range(len(source))]
+    reach_m = float(np.median(rendered[0].exact_depth_m))
+    with Slam(source.camera, CONFIG) as slam:
+        for one in rendered:
+            within = np.where(one.exact_depth_m < reach_m, one.depth_m, 0)
+            result = slam.track(dataclasses.replace(one.measured, depth_m=within))
+            assert result.status in (TrackStatus.STARTED, TrackStatus.OK)
+        state = slam._tracker.state
+    column, row = np.round(np.asarray(state.points.uv)).astype(int)
+    true_m = rendered[-1].exact_depth_m[row, column]
+    beyond = np.asarray(state.points.valid & state.points.has_position()) & (true_m > 1.1 * reach_m)
+    depth_m = np.asarray(to_camera(state.T_world_cam, state.points.X_world))[2]
+    error = np.abs(depth_m[beyond] / true_m[beyond] - 1)
+    print(f"{beyond.sum()} points beyond {reach_m:.2f} m, median error of their depth {100 * np.median(error):.1f} %")
+    assert beyond.sum() > 20
+    assert np.median(error) < 0.1
 
 
 @pytest.mark.slow

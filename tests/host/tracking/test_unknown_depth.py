@@ -99,7 +99,8 @@ def test_measured_depth_comes_first() -> None:
     X = scene()
     measured_m = np.where(np.arange(N) < 25, X[2], 0)
     points = located((0.0, 0.0, 0.0), measured_m=measured_m, frame_has_depth=True).points
-    np.testing.assert_array_equal(points.valid, np.arange(N) < 25)  # the others have no depth in a frame that has it
+    np.testing.assert_array_equal(points.valid, WAITING)  # the others lie where the frame has no depth
+    np.testing.assert_array_equal(points.has_position(), np.arange(N) < 25)
     np.testing.assert_allclose(points.X_world[:, :25], X[:, :25], rtol=1e-5)
     np.testing.assert_allclose(
         points.information[:25], 1 / depth_sigma(points.depth[:25], PARAMS.sensor) ** 2, rtol=1e-5

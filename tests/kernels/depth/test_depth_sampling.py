@@ -1,4 +1,4 @@
-"""Depth sampled at points against a loop; edges, holes, borders and numbers that are none."""
+"""Depth sampled at points, and where it is missing, against a loop; edges, holes, borders and numbers that are none."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.test_util import check_grads
-from jaxslam_kernels.depth.sampling import sample_depth, valid_depth
+from jaxslam_kernels.depth.sampling import lacks_depth, sample_depth, valid_depth
 
 H, W, N = 12, 16, 60
 
@@ -163,3 +163,40 @@ class TestBelievable:
         depth = jnp.array([[1.0, jnp.nan, jnp.inf, 0.1]])
         gradient = jax.grad(lambda depth: jnp.sum(jnp.square(valid_depth(depth, 0.3, 8.0))))(depth)
         np.testing.assert_array_equal(gradient, [[2, 0, 0, 0]])
+
+
+class TestLacksDepth:
+    @pytest.mark.parametrize("reach", [0, 1, 3])
+    def test_matches_reference(self, reach: int) -> None:
+        """Holes of every width, at the edges too."""
+        depth, uv = _with_holes(), np.mgrid[:H, :W].reshape(2, -1)[::-1].astype(np.float32)
+        padded = np.pad(valid_depth(jnp.asarray(depth), 0.3, 8.0), reach)
+        windows = np.lib.stride_tricks.sliding_window_view(padded, (2 * reach + 1, 2 * reach + 1))
+        leaves = (np.minimum(*uv) < reach) | (uv[0] >= W - reach) | (uv[1] >= H - reach)
+        expected = leaves | ~(windows > 0).any(axis=(2, 3)).ravel()
+        missing = lacks_depth(jnp.asarray(depth), jnp.asarray(uv), reach=reach, nearest=0.3, farthest=8.0)
+        np.testing.assert_array_equal(missing, expected)
+        assert 0 < np.sum(missing) < len(expected)
+
+    def test_not_a_number_is_no_depth(self) -> None:
+        nothing, uv = jnp.full((H, W), jnp.nan, jnp.float32), jnp.full((2, 1), 5.0, jnp.float32)
+        one_pixel = nothing.at[4, 6].set(2.0)
+        assert lacks_depth(nothing, uv, reach=2).all()
+        assert not lacks_depth(one_pixel, uv, reach=2).any()
+        assert lacks_depth(one_pixel, uv * jnp.nan, reach=2).all()
+
+    def test_vmap_equals_loop(self) -> None:
+        depths = jnp.stack([_with_holes(seed) for seed in range(3)])
+        points = jnp.stack([_points(seed, np.float32) for seed in range(3)])
+        batched = jax.vmap(lambda d, uv: lacks_depth(d, uv, reach=2))(depths, points)
+        for k in range(3):
+            np.testing.assert_array_equal(batched[k], lacks_depth(depths[k], points[k], reach=2))
+
+
+def _with_holes(seed: int = 0) -> np.ndarray:
+    """A wide hole, a narrow one, and what is too near and too far."""
+    depth = _depth(seed, np.float32)
+    depth[:, 10:] = 0
+    depth[3:6, 4] = 0
+    depth[7:, :3], depth[:2, :4] = 0.2, 9.0
+    return depth
