@@ -183,7 +183,10 @@ def _with_new_points(
         wanted |= jnp.any(unmonitored) & (state.frame % _MONITOR_EVERY == 0)
     free = rejection.without_monitored(view, kept.monitored, plan)
     detect = partial(detect_new_points, step=step._replace(view=free), T_world_cam=motion.T_world_cam)
-    detect = partial(detect, twist=motion.twist, may_lack_depth=~lost, first=unmonitored)
+    # In a frame that has depth, half of the slots above `detect_below`: so new points are not sought in every frame.
+    beside = jnp.round(0.5 * (1 - params.detect_below) * plan.num_points).astype(jnp.int32)
+    most_waiting = jnp.where(lost, 0, jnp.where(candidate.has_depth, beside, plan.num_points))
+    detect = partial(detect, twist=motion.twist, most_waiting=most_waiting, first=unmonitored)
     branch = (motion.start | (wanted & ~lost)).astype(jnp.int32)
     branches = [lambda points: (points, jnp.zeros((), jnp.int32)), detect]
     if plan.motion is not None:  # more features from the rest, as in USD-SLAM

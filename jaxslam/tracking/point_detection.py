@@ -7,7 +7,7 @@ from jax import lax
 from jaxlie import SE3
 from jaxslam_kernels.image.corners import corner_score, grid_corners, occupied_cells
 from jaxslam_kernels.se3 import to_world
-from jaxslam_kernels.types import Code, Flag, Mask, Pixels, Scalar, Weights
+from jaxslam_kernels.types import Code, Mask, Pixels, Scalar, Weights
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.sensors.measurement import Measurements, depth_sigma, match_depth, pixel_rays
@@ -48,7 +48,7 @@ def detect_new_points(
     T_world_cam: SE3,
     twist: Float[Array, "6"],
     *,
-    may_lack_depth: Flag | bool = False,
+    most_waiting: Code | int = 0,
     first: Bool[Array, "h w"] | None = None,
     cell_px: int | None = None,
 ) -> tuple[TrackedPoints, Code]:
@@ -68,8 +68,8 @@ def detect_new_points(
         step: Context of the step; pixels that its frame ignores give no points.
         T_world_cam: Pose of the frame.
         twist: `(6,)` velocity of the camera in its own axes, m/s, then rad/s.
-        may_lack_depth: Whether corners of unknown depth become points too, which wait until it is known. In a frame
-            that has depth, they are those in whose windows there is none, as out of the sensor's reach (beside
+        most_waiting: Largest number of points of unknown depth there may be, with those of `points`; they wait until it
+            is known. New ones are corners in whose windows there is no depth, as out of the sensor's reach (beside
             silhouettes it is missing in a narrow strip only), and those of a pair that have no match.
         first: `(h, w)` mask of pixels whose corners come before all others; some slots are kept free for them.
         cell_px: Side of the cells instead of that of the plan, pixels, static.
@@ -78,7 +78,7 @@ def detect_new_points(
         The points, and the number of grid cells that hold a corner, with depth or without.
     """
     state, view, params, plan = step
-    assumed = jnp.where(may_lack_depth, assumed_depth(points, T_world_cam, params.sensor.min_depth_m), 0)
+    assumed = jnp.where(most_waiting > 0, assumed_depth(points, T_world_cam, params.sensor.min_depth_m), 0)
     found = _candidates(points, step, twist, (cell_px or plan.cell_px) // 2, assumed)
     rank = jnp.cumsum(~points.valid, dtype=jnp.int32) - 1
     order, room = _order(found, step, rank, first)
@@ -89,9 +89,9 @@ def detect_new_points(
     matched = match_depth(view, uv, rough, new, params.sensor, known_point=False, plan=plan.pair_flow)
     if matched is not None:
         seen = Measurements(seen.xy, matched, depth_sigma(matched, params.sensor))
-        new &= may_lack_depth | (matched > 0)
     known = seen.depth > 0
-    new &= known | (jnp.cumsum(new & ~known, dtype=jnp.int32) <= _room_to_wait(points, step))
+    waiting = jnp.sum(points.valid & ~points.has_position(), dtype=jnp.int32)
+    new &= known | (waiting + jnp.cumsum(new & ~known, dtype=jnp.int32) <= most_waiting)
     X_world = to_world(T_world_cam, seen._replace(depth=jnp.where(known, seen.depth, assumed)).in_camera())
     X_anchor = jnp.where(known[None, :], X_world, T_world_cam.translation()[:, None])
     put = lambda old, fresh: jnp.where(new, fresh, old)
@@ -140,18 +140,6 @@ def _candidates(
     may_wait = (assumed > 0) & view.lacks_depth(uv, sensor, reach=step.plan.flow.finest.window // 2)
     good = (corners.score > _MIN_SCORE) & ~taken & (known | may_wait)
     return _Candidates(uv, corners.score, rough, seen, known, good)
-
-
-def _room_to_wait(points: TrackedPoints, step: StepContext) -> Code:
-    """Return the number of points of unknown depth that may be added.
-
-    In a frame that has depth, those that wait are at most half of what is above `detect_below`: so new points are not
-    detected in every frame.
-    """
-    params, plan = step.params, step.plan
-    most = jnp.round(0.5 * (1 - params.detect_below) * plan.num_points).astype(jnp.int32)
-    waiting = jnp.sum(points.valid & ~points.has_position(), dtype=jnp.int32)
-    return jnp.where(step.has_depth(), jnp.maximum(most - waiting, 0), plan.num_points)
 
 
 def _order(

@@ -38,12 +38,14 @@ def wall(missing: np.ndarray) -> np.ndarray:
     return np.broadcast_to(np.where(missing, 0, 2), (HEIGHT, WIDTH)).astype(np.float32)
 
 
-def detected(depth_m: np.ndarray, *, may_lack_depth: bool = True, num_free: int = N) -> tuple[np.ndarray, np.ndarray]:
+def detected(
+    depth_m: np.ndarray, *, most_waiting: int = MOST_WAITING, num_free: int = N
+) -> tuple[np.ndarray, np.ndarray]:
     """Detect points in a textured image.
 
     Args:
         depth_m: Depth image.
-        may_lack_depth: Whether points may wait for their depth.
+        most_waiting: Largest number of points that wait for their depth.
         num_free: Number of free slots; the other points are in the first cell of the grid.
 
     Returns:
@@ -58,7 +60,7 @@ def detected(depth_m: np.ndarray, *, may_lack_depth: bool = True, num_free: int 
     before = state.points._replace(valid=taken, information=taken.astype(jnp.float32))
     step = StepContext(state, PreparedFrame(frame, pyramid, time), PARAMS, PLAN)
     origin = SE3(jnp.asarray([1, 0, 0, 0, 0, 0, 0], jnp.float32))
-    points, _ = detect_new_points(before, step, origin, jnp.zeros(6), may_lack_depth=may_lack_depth)
+    points, _ = detect_new_points(before, step, origin, jnp.zeros(6), most_waiting=most_waiting)
     new, known = np.asarray(points.valid & ~taken), np.asarray(points.has_position())
     columns = np.asarray(points.uv)[0]
     return columns[new & known], columns[new & ~known]
@@ -88,12 +90,12 @@ def test_known_depth_comes_first(num_free: int) -> None:
 
 
 def test_none_waits_if_none_may() -> None:
-    known, waiting = detected(wall(np.arange(WIDTH) >= EDGE), may_lack_depth=False)
+    known, waiting = detected(wall(np.arange(WIDTH) >= EDGE), most_waiting=0)
     assert len(known) > 50
     assert not len(waiting)
 
 
 def test_all_may_wait_in_a_frame_without_depth() -> None:
-    known, waiting = detected(wall(np.ones(WIDTH, bool)))
+    known, waiting = detected(wall(np.ones(WIDTH, bool)), most_waiting=N)
     assert not len(known)
     assert len(waiting) > MOST_WAITING
